@@ -1,0 +1,45 @@
+"""The command line: one module a command, nothing but parsing and printing.
+
+`main` is the only place where errors are caught: one sentence on stderr and exit code 2, never a traceback.
+Results go to stdout, everything else to stderr. Nothing heavy is imported before a command runs.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from coloc_graph._version import __version__
+from coloc_graph.cli import demo, evaluate, import_, info, simulate, solve
+from coloc_graph.errors import ColocError
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    top = argparse.ArgumentParser(
+        prog="coloc", description="Where each robot of a team is, from cameras and LED markers alone."
+    )
+    top.add_argument("--version", action="version", version=f"coloc {__version__}")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module in (demo, simulate, import_, info, solve, evaluate):
+        module.add(commands)
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    args = parser().parse_args(arguments)
+    try:
+        return int(args.run(args))
+    except ColocError as error:
+        print(f"coloc: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read us has gone; say no more
+        return 141
+    except OSError as error:
+        place = f" {error.filename}" if error.filename else ""
+        print(f"coloc: the system says: {error.strerror}{place}; check the path, its rights, the disk", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("coloc: interrupted", file=sys.stderr)
+        return 130

@@ -1,0 +1,44 @@
+"""coloc demo: the hallway from rendered images, solved, printed as the paper's Table II."""
+
+import argparse
+
+
+def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """The command's arguments."""
+    command = commands.add_parser("demo", help="simulate the hallway from rendered images, solve it, show it")
+    command.add_argument("--out", default="demo-out", metavar="DIR", help="folder for run and result (demo-out)")
+    command.add_argument("--stances", type=int, default=40)
+    command.add_argument("--seed", type=int, default=0)
+    command.add_argument("--no-browser", action="store_true", help="do not open the report")
+    command.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate, solve, print, show."""
+    import sys
+    import webbrowser
+    from pathlib import Path
+
+    from coloc_graph.cli.accuracy import print_accuracy
+    from coloc_graph.cli.printing import progress, warn
+    from coloc_graph.pipeline import solve
+    from coloc_graph.results import write_result
+    from coloc_graph.run import open_run
+    from coloc_graph.simulation import simulate
+
+    out = Path(args.out)
+    out.mkdir(parents=True, exist_ok=True)
+    run_path = out / "hallway.mcap"
+    with progress("stances rendered") as report:
+        simulate("hallway", run_path, depth="images", seed=args.seed, stances=args.stances, progress=report)
+    with progress("measurements made from the images") as report:
+        solution = solve(open_run(run_path), progress=report)
+    accuracy = write_result(solution, out / "result")
+    warn(solution.warnings)
+    assert accuracy is not None  # a simulated run holds truth
+    print_accuracy(accuracy)
+    html = out / "result" / "report.html"
+    print(f"the report: {html}")
+    if not args.no_browser and sys.stdout.isatty():
+        webbrowser.open(html.absolute().as_uri())
+    return 0

@@ -1,0 +1,30 @@
+"""coloc import tracks TEAM.toml TRACKS.csv --out RUN."""
+
+import argparse
+
+
+def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """The command's arguments."""
+    command = commands.add_parser("import", help="make a run of other data")
+    kinds = command.add_subparsers(dest="kind", required=True, metavar="KIND")
+    tracks = kinds.add_parser("tracks", help="marker tracks from a CSV: stance,time,robot,marker,u,v[,sigma]")
+    tracks.add_argument("team", metavar="TEAM.toml")
+    tracks.add_argument("tracks", metavar="TRACKS.csv")
+    tracks.add_argument("--planes", metavar="PLANES.csv", help="marker planes: stance,robot,nx,ny,nz,d")
+    tracks.add_argument("--moves", metavar="MOVES.csv", help="who moved before which stance: stance,robot")
+    tracks.add_argument("--out", required=True, metavar="RUN", help="the run to write (.mcap)")
+    tracks.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Import and print."""
+    from coloc_graph.cli.printing import progress, warn
+    from coloc_graph.exchange.tracks import import_tracks
+
+    with progress("stances imported") as report:
+        summary = import_tracks(
+            args.team, args.tracks, args.out, planes_path=args.planes, moves_path=args.moves, progress=report
+        )
+    warn(summary.warnings)
+    print(f"{args.out}: {summary.rows} rows, {summary.stances} stances, observers {', '.join(summary.observers)}")
+    return 0

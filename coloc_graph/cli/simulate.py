@@ -1,0 +1,60 @@
+"""coloc simulate SCENARIO --out RUN."""
+
+import argparse
+
+from coloc_graph.cli.printing import progress
+
+
+def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """The command's arguments."""
+    command = commands.add_parser("simulate", help="write a run of a simulated team, with truth in it")
+    command.add_argument("scenario", help="single-step, six-step or hallway")
+    command.add_argument("--out", required=True, metavar="RUN", help="the run to write (.mcap)")
+    command.add_argument("--depth", choices=("tracks", "images"), default="tracks", help="marker centres, or images")
+    command.add_argument("--seed", type=int, default=0)
+    command.add_argument("--stances", type=int, help="how many stances (hallway: 40)")
+    command.add_argument("--points", type=int, help="correspondences a stance")
+    command.add_argument("--noise", type=float, default=0.3, help="of a marker centre, px (tracks; default 0.3)")
+    command.add_argument("--mount-sigma", type=float, default=0.0, help="tilt and roll of the mounts, deg")
+    command.add_argument("--height-sigma", type=float, default=0.0, help="height of the mounts, m")
+    command.add_argument("--span-sigma", type=float, default=0.0, help="distance between a robot's markers, m")
+    command.add_argument("--floor-sigma", type=float, default=0.0, help="unevenness of the floor, deg")
+    command.add_argument("--clock-offset", type=float, default=0.0, help="of the other robots' clocks, s")
+    command.add_argument("--time-jitter", type=float, default=0.0, help="of the instants of capture, s")
+    command.add_argument("-l", type=float, help="single-step: distance between the observers, m")
+    command.add_argument("--theta", type=float, help="single-step: angle between the observers, deg")
+    command.add_argument("--fps", type=float, default=10.0, help="images a second (images; default 10)")
+    command.add_argument("--image-format", choices=("jpeg", "png", "raw"), default="jpeg")
+    command.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate."""
+    from coloc_graph.simulation import Imperfections, simulate
+
+    imperfections = Imperfections(
+        mount_sigma_deg=args.mount_sigma,
+        height_sigma=args.height_sigma,
+        span_sigma=args.span_sigma,
+        floor_sigma_deg=args.floor_sigma,
+        clock_offset=args.clock_offset,
+        time_jitter=args.time_jitter,
+        noise_px=args.noise,
+    )
+    with progress("stances simulated") as report:
+        simulate(
+            args.scenario,
+            args.out,
+            depth=args.depth,
+            seed=args.seed,
+            points=args.points,
+            stances=args.stances,
+            imperfections=imperfections,
+            l=args.l,
+            theta_deg=args.theta,
+            fps=args.fps,
+            image_format=args.image_format,
+            progress=report,
+        )
+    print(args.out)
+    return 0

@@ -1,0 +1,47 @@
+"""coloc solve RUN --out DIR."""
+
+import argparse
+
+from coloc_graph.cli.printing import print_json, progress, warn
+
+
+def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """The command's arguments."""
+    command = commands.add_parser("solve", help="estimate the poses of a run")
+    command.add_argument("run_path", metavar="RUN", help="the run (.mcap)")
+    command.add_argument("--out", required=True, metavar="DIR", help="folder for the result")
+    command.add_argument("--method", choices=("chain", "smooth"), default="smooth", help="chain is the paper's")
+    command.add_argument(
+        "--scale",
+        choices=("heights", "span"),
+        default="heights",
+        help="the plane's distance from the heights of camera and markers, or from the markers' span",
+    )
+    command.add_argument("--json", action="store_true", help="print the summary as JSON")
+    command.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve, write, print."""
+    from dataclasses import replace
+
+    from coloc_graph.cli.accuracy import print_accuracy
+    from coloc_graph.pipeline import SolveOptions, solve
+    from coloc_graph.results import summarise, write_result
+    from coloc_graph.run import open_run
+
+    options = SolveOptions(method=args.method).resolved()
+    assert options.frontend is not None
+    options = replace(options, frontend=replace(options.frontend, scale=args.scale))
+    with progress("measurements made") as report:
+        solution = solve(open_run(args.run_path), options, report)
+    accuracy = write_result(solution, args.out)
+    warn(solution.warnings)
+    if args.json:
+        print_json(summarise(solution, accuracy))
+        return 0
+    if accuracy is not None:
+        print_accuracy(accuracy)
+    used = sum(m.relative_pose is not None for m in solution.measurements)
+    print(f"{used} of {len(solution.measurements)} measurements used; {args.out} holds the result and report.html")
+    return 0

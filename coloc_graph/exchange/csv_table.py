@@ -1,0 +1,144 @@
+"""A CSV file as columns of text that remember their lines, so that what is wrong can be named by file and line."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import TracksError
+from coloc_graph.team import Team
+
+Array = NDArray[np.float64]
+
+#: Stance numbers above this are no numbers of stances, but something else in the wrong column.
+MAX_STANCE = 10**9
+
+
+@dataclass(frozen=True)
+class Table:
+    """The rows of a CSV: `columns` by name, and the `lines` of the file they are from, counted from 1.
+
+    The methods that convert a column raise `TracksError` at the first row that is wrong.
+    """
+
+    path: Path
+    columns: dict[str, list[str]]
+    lines: list[int]
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def error(self, row: int, what: str) -> TracksError:
+        """The sentence for a row that is wrong."""
+        return TracksError(f"{self.path}, line {self.lines[row]}: {what}")
+
+    def numbers(self, name: str) -> Array:
+        """A column of finite numbers, (n,)."""
+        texts = self.columns[name]
+        values = np.empty(len(texts))
+        for row, text in enumerate(texts):
+            try:
+                values[row] = float(text)
+            except ValueError:
+                raise self.error(row, f"`{name}` is {_quoted(text)}, not a number; {_remedy(text)}") from None
+        row = first(~np.isfinite(values))
+        if row is not None:
+            raise self.error(row, f"`{name}` is `{texts[row]}`; leave out the rows that were not measured")
+        return values
+
+    def stances(self) -> NDArray[np.int64]:
+        """The column `stance`, (n,): whole numbers from 0 on."""
+        texts = self.columns["stance"]
+        values = []
+        for row, text in enumerate(texts):
+            try:
+                values.append(int(text))
+            except ValueError:
+                what = f"`stance` is {_quoted(text)}, not a whole number; number the stances 0, 1, 2, ..."
+                raise self.error(row, what) from None
+            if not 0 <= values[-1] <= MAX_STANCE:
+                raise self.error(row, f"`stance` is {text}; number the stances 0, 1, 2, ...")
+        return np.array(values, np.int64)
+
+    def robots(self, team: Team) -> NDArray[np.int64]:
+        """The column `robot` as places in the team, (n,)."""
+        place = {name: index for index, name in enumerate(team.names)}
+        names = self.columns["robot"]
+        for unknown in set(names) - place.keys():
+            row = min(names.index(name) for name in {unknown, *names} - place.keys())
+            raise self.error(
+                row,
+                f"robot {_quoted(names[row])} is not in the team ({', '.join(team.names)}); "
+                "correct the name or add the robot to the team",
+            )
+        return np.array([place[name] for name in names], np.int64)
+
+
+def first(wrong: NDArray[np.bool_]) -> int | None:
+    """Index of the first True; None where there is none."""
+    return int(wrong.argmax()) if wrong.any() else None
+
+
+def read_table(path: Path, what: str, header: Sequence[str], *, optional: str | None = None) -> Table:
+    """The table in a UTF-8 CSV file with exactly this header, and perhaps one `optional` column after it.
+
+    Blank lines, spaces around cells, a byte order mark and Windows line ends are accepted. Raises `TracksError`
+    for a file that cannot be read or decoded, is empty, or whose header or a row has other columns; `what`
+    names the kind of file in the sentence.
+    """
+    expected = ",".join(header) + (f"[,{optional}]" if optional else "")
+    rows, lines = _rows(path, _text(path, what))
+    if not rows:
+        raise TracksError(f"{path}: is empty; begin it with the header {expected}")
+    found = rows.pop(0)
+    line = lines.pop(0)
+    if found not in ([*header], [*header, optional]):
+        raise TracksError(f"{path}, line {line}: the header is {_quoted(','.join(found))}; it must be `{expected}`")
+    for row, at in zip(rows, lines, strict=True):
+        if len(row) != len(found):
+            raise TracksError(
+                f"{path}, line {at}: {len(row)} columns, where the header has {len(found)} ({','.join(found)}); "
+                f"{'complete the row' if len(row) < len(found) else 'remove what is too much (decimals take a point)'}"
+            )
+    columns = zip(*rows, strict=True) if rows else ((),) * len(found)
+    return Table(path, {name: list(column) for name, column in zip(found, columns, strict=True)}, lines)
+
+
+def _text(path: Path, what: str) -> str:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise TracksError(f"{path}: cannot be read ({error.strerror}); give the path of a CSV with {what}") from error
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise TracksError(f"{path}, line {line}: is not UTF-8 text; save the {what} as CSV in UTF-8") from error
+
+
+def _rows(path: Path, text: str) -> tuple[list[list[str]], list[int]]:
+    """The rows that are not blank, and their lines."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    rows, lines = [], []
+    try:
+        for row in reader:
+            cells = [cell.strip() for cell in row]
+            if any(cells):
+                rows.append(cells)
+                lines.append(reader.line_num)
+    except csv.Error as error:
+        raise TracksError(f"{path}, line {reader.line_num}: is not CSV ({error}); correct the line") from error
+    return rows, lines
+
+
+def _quoted(text: str) -> str:
+    """The text as it is shown in a sentence, cut where it is long."""
+    return f"`{text}`" if len(text) <= 80 else f"`{text[:80]}...`"
+
+
+def _remedy(text: str) -> str:
+    return "write it with a decimal point" if text else "leave out the rows that were not measured"

@@ -1,0 +1,90 @@
+"""Trajectories in the TUM format: `timestamp tx ty tz qx qy qz qw`, and their covariances beside them.
+
+Source of the format: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", 2012; evo reads it.
+"""
+
+from pathlib import Path
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import InputError
+from coloc_graph.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+_AXES = ("rx", "ry", "rz", "tx", "ty", "tz")
+_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+COVARIANCE_HEADER = ",".join(["stance", "time", *(f"{_AXES[i]}_{_AXES[j]}" for i, j in _UPPER)])
+
+
+def write_tum(trajectory: Trajectory, path: Path) -> None:
+    """Write poses as `path` (.tum), and covariances with stance numbers as `path` with .cov.csv.
+
+    Covariances are the upper triangle in GTSAM's tangent: rotation [rad] first, then translation [m], in the
+    body frame. Numbers are written so that they read back to the bit.
+    """
+    lines = []
+    for time, T in zip(trajectory.times, trajectory.T_world_body, strict=True):
+        q = gtsam.Rot3(T[:3, :3]).toQuaternion()
+        numbers = [time, *T[:3, 3], q.x(), q.y(), q.z(), q.w()]
+        lines.append(" ".join(repr(float(number)) for number in numbers))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if trajectory.covariances is None or trajectory.stances is None:
+        return
+    rows = [COVARIANCE_HEADER]
+    for stance, time, covariance in zip(trajectory.stances, trajectory.times, trajectory.covariances, strict=True):
+        rows.append(",".join([str(int(stance)), *(repr(float(x)) for x in (time, *(covariance[ij] for ij in _UPPER)))]))
+    path.with_suffix(".cov.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
+def read_tum(path: Path) -> Trajectory:
+    """The trajectory in a .tum file, with covariances where the .cov.csv lies beside it; the robot is its name.
+
+    Raises `InputError` naming file and line.
+    """
+    poses, times = [], []
+    for number, line in enumerate(_lines(path), start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        values = _numbers(path, number, line.split(), 8)
+        x, y, z, w = values[4:]
+        if abs(np.hypot(np.hypot(x, y), np.hypot(z, w)) - 1) > 1e-3:
+            raise InputError(f"{path}, line {number}: the quaternion is not of unit length; write qx qy qz qw")
+        times.append(values[0])
+        poses.append(gtsam.Pose3(gtsam.Rot3(w, x, y, z), np.array(values[1:4])).matrix())
+    stances, covariances = None, None
+    beside = path.with_suffix(".cov.csv")
+    if beside.exists():
+        rows = [
+            _numbers(beside, number, line.split(","), 23)
+            for number, line in enumerate(_lines(beside), start=1)
+            if number > 1
+        ]
+        if len(rows) != len(poses):
+            raise InputError(f"{beside} has {len(rows)} rows and {path.name} {len(poses)} poses; write both anew")
+        stances = np.array([int(row[0]) for row in rows])
+        covariances = np.zeros((len(rows), 6, 6))
+        for row, covariance in zip(rows, covariances, strict=True):
+            for (i, j), value in zip(_UPPER, row[2:], strict=True):
+                covariance[i, j] = covariance[j, i] = value
+    T_world_body = np.array(poses).reshape(-1, 4, 4)
+    return Trajectory(path.name.removesuffix(".tum"), np.array(times), T_world_body, stances, covariances)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); give a trajectory in the TUM format") from error
+
+
+def _numbers(path: Path, line: int, parts: list[str], count: int) -> list[float]:
+    try:
+        values = [float(part) for part in parts]
+    except ValueError:
+        values = []
+    if len(values) != count or not np.isfinite(values).all():
+        raise InputError(f"{path}, line {line}: {count} finite numbers are expected; write the file anew")
+    return values

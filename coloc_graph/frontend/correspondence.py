@@ -1,0 +1,195 @@
+"""Which samples of two cameras show the same marker at the same instant.
+
+Samples are paired by time (5 ms, paper section V). Tracks whose marker has a name pair by name. Tracks without
+one pair by what they do (spatio-temporal features, paper section III): of all ways to pair them, the one that a
+single homography explains best.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.frontend.homography import PointPairs, fit_homography, squared_residuals
+from coloc_graph.frontend.plane import on_plane
+from coloc_graph.frontend.tracking import Track
+from coloc_graph.measurements import Plane
+from coloc_graph.team import Camera
+
+Array = NDArray[np.float64]
+
+#: Time difference up to which two samples count as one instant [s].
+PAIRING_WINDOW = 5e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """The same markers at the same instants in cameras i and j: `uv_*` (n, 2) [px], `times` (n,) of camera i.
+
+    `pairs` are the same in normalised coordinates with covariances. `markers` names which track of camera i
+    each belongs to (n,).
+    """
+
+    uv_i: Array
+    uv_j: Array
+    times: Array
+    markers: NDArray[np.int64]
+    pairs: PointPairs
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+
+def pair_by_time(times_i: Array, times_j: Array, window: float = PAIRING_WINDOW) -> NDArray[np.int64]:
+    """Indices (n, 2) of the samples nearest to each other in two ascending series, at most `window` [s] apart."""
+    if not len(times_i) or not len(times_j):
+        return np.empty((0, 2), np.int64)
+    after = np.clip(np.searchsorted(times_j, times_i), 1, max(len(times_j) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(times_j) - 1)
+    nearest = np.where(np.abs(times_j[before] - times_i) <= np.abs(times_j[after] - times_i), before, after)
+    gap = np.abs(times_j[nearest] - times_i)
+    order = np.lexsort((gap, nearest))  # each sample of j goes to the closest of i
+    first = np.ones(len(order), bool)
+    first[1:] = nearest[order][1:] != nearest[order][:-1]
+    kept = np.sort(order[first])
+    kept = kept[gap[kept] <= window]
+    return np.stack([kept, nearest[kept]], axis=1)
+
+
+def correspond(
+    tracks_i: Sequence[Track], tracks_j: Sequence[Track], camera_i: Camera, camera_j: Camera
+) -> Correspondences:
+    """The correspondences between two cameras' tracks; raises `DegenerateGeometry` where there are none."""
+    candidates = _Candidates(tracks_i, tracks_j, camera_i, camera_j)
+    named = [(a, b) for a, b in candidates.indices if tracks_i[a].marker and tracks_i[a].marker == tracks_j[b].marker]
+    chosen = named or _by_motion(candidates)
+    if not chosen:
+        raise DegenerateGeometry(
+            f"{tracks_i[0].robot if tracks_i else 'one observer'} and "
+            f"{tracks_j[0].robot if tracks_j else 'the other'} never see a marker at the same instant "
+            "(within 5 ms): bring the mover into both fields of view, and check the clocks"
+        )
+    return candidates.join(chosen)
+
+
+class _Candidates:
+    """All pairs of tracks that share instants, in pixels and in normalised coordinates."""
+
+    def __init__(
+        self, tracks_i: Sequence[Track], tracks_j: Sequence[Track], camera_i: Camera, camera_j: Camera
+    ) -> None:
+        self._i, self._j = list(tracks_i), list(tracks_j)
+        self._x_i = [normalised(track, camera_i) for track in self._i]
+        self._x_j = [normalised(track, camera_j) for track in self._j]
+        self.indices: dict[tuple[int, int], NDArray[np.int64]] = {}
+        for a, track_i in enumerate(self._i):
+            for b, track_j in enumerate(self._j):
+                shared = pair_by_time(track_i.times, track_j.times)
+                if len(shared):
+                    self.indices[a, b] = shared
+
+    def explained(self, H: Array, pairs: dict[tuple[int, int], PointPairs], gate: float) -> list[tuple[int, int]]:
+        """The pairs of tracks whose median squared residual is within the gate, the best first where two claim
+        the same sample."""
+        medians = {ab: float(np.median(squared_residuals(H, pair))) for ab, pair in pairs.items()}
+        free_i = [np.ones(len(track), bool) for track in self._i]
+        free_j = [np.ones(len(track), bool) for track in self._j]
+        chosen: list[tuple[int, int]] = []
+        for a, b in sorted((ab for ab in medians if medians[ab] < gate), key=lambda ab: medians[ab]):
+            m, n = self.indices[a, b].T
+            if free_i[a][m].all() and free_j[b][n].all():
+                chosen.append((a, b))
+                free_i[a][m] = free_j[b][n] = False
+        return sorted(chosen)
+
+    def join(self, chosen: Sequence[tuple[int, int]]) -> Correspondences:
+        parts = [(a, b, *self.indices[a, b].T) for a, b in chosen]
+        uv_i = np.concatenate([self._i[a].uv[m] for a, _, m, _ in parts])
+        uv_j = np.concatenate([self._j[b].uv[n] for _, b, _, n in parts])
+        return Correspondences(
+            uv_i=uv_i,
+            uv_j=uv_j,
+            times=np.concatenate([self._i[a].times[m] for a, _, m, _ in parts]),
+            markers=np.concatenate([np.full(len(m), a) for a, _, m, _ in parts]),
+            pairs=PointPairs(
+                np.concatenate([self._x_i[a][0][m] for a, _, m, _ in parts]),
+                np.concatenate([self._x_j[b][0][n] for _, b, _, n in parts]),
+                np.concatenate([self._x_i[a][1][m] for a, _, m, _ in parts]),
+                np.concatenate([self._x_j[b][1][n] for _, b, _, n in parts]),
+            ),
+        )
+
+
+def normalised(track: Track, camera: Camera) -> tuple[Array, Array]:
+    """A track in normalised coordinates (n, 2), with covariances (n, 2, 2)."""
+    x = camera.normalise(track.uv)
+    # the lens's scale at each place: how far a pixel to the right and one below go
+    step = 0.5
+    J = np.stack(
+        [
+            (camera.normalise(track.uv + offset) - camera.normalise(track.uv - offset)) / (2 * step)
+            for offset in ((step, 0.0), (0.0, step))
+        ],
+        axis=-1,
+    )
+    return x, J @ track.covariance @ J.swapaxes(1, 2)
+
+
+def _by_motion(candidates: _Candidates, least: int = 8, seeds: int = 24) -> list[tuple[int, int]]:
+    """The pairing of tracks that one homography explains best, most common samples first."""
+    by_size = sorted(candidates.indices, key=lambda ab: -len(candidates.indices[ab]))
+    pairs = {ab: candidates.join([ab]).pairs for ab in by_size}
+    best: list[tuple[int, int]] = []
+    best_inliers = 0
+    for seed in [ab for ab in by_size if len(candidates.indices[ab]) >= least][:seeds]:
+        chosen, inliers = [seed], 0
+        try:
+            for _ in range(3):
+                fit = fit_homography(candidates.join(chosen).pairs)
+                # a homography from one track extrapolates poorly: a wide gate first, the fit's own in the end
+                wide = len(chosen) == 1
+                again = candidates.explained(fit.H, pairs, 400.0 if wide else 25.0)
+                inliers = int(fit.inliers.sum())
+                if again == sorted(chosen):
+                    break
+                chosen = again or [seed]
+        except DegenerateGeometry:
+            continue
+        if inliers > best_inliers:
+            best, best_inliers = chosen, inliers
+    return best
+
+
+def span_samples(
+    tracks: Sequence[Track], camera: Camera, plane: Plane, span: float, tolerance: float = 0.35
+) -> list[tuple[int, int, NDArray[np.int64]]]:
+    """Pairs of tracks of one camera that are two markers of one robot: (a, b, sample indices (n, 2)).
+
+    They are where their distance on the marker plane is the robot's `span` [m] for most of the time. The
+    tolerance is wide because a tilt that is wrong by a degree is 15 % of the distance at 2 m; a reflection in
+    the floor, seen as if on the marker plane, is off by more than half.
+    """
+    on_floor = [on_plane(camera.normalise(track.uv), plane) for track in tracks]
+    found = []
+    for a in range(len(tracks)):
+        for b in range(a + 1, len(tracks)):
+            shared = pair_by_time(tracks[a].times, tracks[b].times)
+            if len(shared) >= 2:
+                distance = np.linalg.norm(on_floor[a][shared[:, 0]] - on_floor[b][shared[:, 1]], axis=1)
+                if (np.abs(distance / span - 1) < tolerance).mean() > 0.8:  # NaN, above the horizon, is not close
+                    found.append((a, b, shared))
+    return found
+
+
+def markers_of_movers(tracks: Sequence[Track], camera: Camera, plane: Plane, spans: Sequence[float]) -> list[Track]:
+    """Of all tracks of a camera those that are markers of a moving robot.
+
+    Lights that do not move are not. Where robots carry two markers, the tracks that are bound by a span are;
+    tracks with no partner are kept only if no track has one.
+    """
+    moving = [track for track in tracks if len(track) >= 4 and track.extent > 4.0]
+    bound = {index for span in spans for a, b, _ in span_samples(moving, camera, plane, span) for index in (a, b)}
+    return [moving[index] for index in sorted(bound)] if bound else moving

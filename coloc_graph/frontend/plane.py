@@ -1,0 +1,64 @@
+"""The plane of the markers in a camera's frame: from the mount, and its distance from a known marker span."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.measurements import Plane
+from coloc_graph.team import Floor, Markers, Mount
+
+Array = NDArray[np.float64]
+
+
+def plane_from_mount(mount: Mount, markers: Markers, floor: Floor | None = None) -> Plane:
+    """The plane at the markers' height above the floor that the robot stands on.
+
+    Raises `DegenerateGeometry` where the camera is not above the markers.
+    """
+    d = mount.height - markers.height
+    if d <= 0:
+        raise DegenerateGeometry(
+            f"the camera ({mount.height} m) is not above the markers ({markers.height} m), so that their plane's "
+            "distance d is not positive: mount the camera higher or the markers lower"
+        )
+    floor = floor or Floor()
+    return Plane(
+        N=mount.R_body_camera.T @ np.array([0.0, 0.0, -1.0]),
+        d=d,
+        normal_sigma=float(np.deg2rad(floor.tilt_sigma_deg)),
+        d_sigma=float(np.hypot(markers.height_sigma, floor.height_sigma)),
+        normal_from_mount=True,
+        d_from_mount=True,
+    )
+
+
+def on_plane(x: Array, plane: Plane) -> Array:
+    """Points (n, 3) [m] in the camera frame where the rays (x, y, 1) of `x` (n, 2) meet the plane.
+
+    Rays that do not meet it in front of the camera come back as NaN.
+    """
+    rays = np.concatenate([x, np.ones((len(x), 1))], axis=1)
+    along = rays @ plane.N
+    return np.asarray(rays * (plane.d / np.where(along > 1e-6, along, np.nan))[:, None])
+
+
+def distance_from_span(plane: Plane, x_a: Array, x_b: Array, markers: Markers) -> Plane:
+    """The plane with `d` such that two markers, seen at the same n instants, lie their known span apart.
+
+    `x_a`, `x_b` (n, 2) are normalised coordinates in one camera. The spread over the instants is the noise
+    that `d_sigma` carries, besides the tolerance of the span. Raises `DegenerateGeometry` with fewer than two
+    markers or instants.
+    """
+    if markers.span is None:
+        raise DegenerateGeometry("the robot carries one marker, so that there is no span to take the scale from")
+    spans = np.linalg.norm(on_plane(x_a, plane) - on_plane(x_b, plane), axis=1) / plane.d
+    spans = spans[np.isfinite(spans)]
+    if len(spans) < 2:
+        raise DegenerateGeometry("both markers of the robot are never seen at once: let it turn towards the camera")
+    middle = np.median(spans)
+    kept = spans[np.abs(spans - middle) <= 5 * 1.4826 * np.median(np.abs(spans - middle)) + 1e-12]
+    d = markers.span / kept.mean()
+    relative = np.hypot(markers.span_sigma / markers.span, kept.std() / kept.mean() / np.sqrt(len(kept)))
+    return replace(plane, d=float(d), d_sigma=float(d * relative), d_from_mount=False)

@@ -1,0 +1,185 @@
+"""Rotations, rigid motions and homographies as Lie groups: SO(3), SE(3), SL(3).
+
+Vectorised over leading axes. The tangent of SE(3) is GTSAM's: rotation first, then translation, in the body
+frame (T exp(xi)). The tangent of SL(3) is eight coordinates in the basis `SL3_BASIS`, also on the right.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def rotation_x(angle: float) -> Array:
+    """Rotation about x by an angle [rad], (3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+
+
+def rotation_y(angle: float) -> Array:
+    """Rotation about y by an angle [rad], (3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def rotation_z(angle: float) -> Array:
+    """Rotation about z by an angle [rad], (3, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def hat(v: ArrayLike) -> Array:
+    """Skew matrices (..., 3, 3) of vectors (..., 3): hat(a) @ b = a x b."""
+    v = np.asarray(v, float)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def closest_rotation(M: ArrayLike) -> Array:
+    """The rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the Frobenius norm."""
+    U, _, Vt = np.linalg.svd(np.asarray(M, float))
+    D = np.zeros_like(U)
+    D[..., 0, 0] = D[..., 1, 1] = 1.0
+    D[..., 2, 2] = np.linalg.det(U @ Vt)
+    return np.asarray(U @ D @ Vt)
+
+
+def so3_log(R: ArrayLike) -> Array:
+    """Rotation vectors (..., 3) [rad] of rotations (..., 3, 3); the angle is at most pi."""
+    R = np.asarray(R, float)
+    # by way of the quaternion, which is well conditioned at every angle (Shepperd's choice of the largest part)
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
+    parts = np.concatenate([trace[..., None], diagonal], axis=-1)
+    which = parts.argmax(-1)
+    q = np.empty((*R.shape[:-2], 4))
+    for case in range(4):
+        mask = which == case
+        if not np.any(mask):
+            continue
+        M, t = R[mask], trace[mask]
+        if case == 0:
+            w = 1 + t
+            v = np.stack([M[:, 2, 1] - M[:, 1, 2], M[:, 0, 2] - M[:, 2, 0], M[:, 1, 0] - M[:, 0, 1]], -1)
+            q[mask] = np.concatenate([w[:, None], v], -1)
+        else:
+            i = case - 1
+            j, k = (i + 1) % 3, (i + 2) % 3
+            part = np.empty((len(M), 4))
+            part[:, 0] = M[:, k, j] - M[:, j, k]
+            part[:, 1 + i] = 1 + M[:, i, i] - M[:, j, j] - M[:, k, k]
+            part[:, 1 + j] = M[:, j, i] + M[:, i, j]
+            part[:, 1 + k] = M[:, k, i] + M[:, i, k]
+            q[mask] = part
+    q /= np.linalg.norm(q, axis=-1, keepdims=True)
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1)
+    angle = 2 * np.arctan2(sine, q[..., 0])
+    scale = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
+    return np.asarray(scale[..., None] * q[..., 1:])
+
+
+def so3_exp(w: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    w = np.asarray(w, float)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    W = hat(w)
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + a * W + b * (W @ W))
+
+
+def se3_inverse(T_a_b: ArrayLike) -> Array:
+    """T_b_a of T_a_b, (..., 4, 4)."""
+    T = np.asarray(T_a_b, float)
+    out = np.zeros_like(T)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3] = Rt
+    out[..., :3, 3] = -(Rt @ T[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def se3(R: ArrayLike, t: ArrayLike) -> Array:
+    """Poses (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    R = np.asarray(R, float)
+    out = np.zeros((*R.shape[:-2], 4, 4))
+    out[..., :3, :3] = R
+    out[..., :3, 3] = t
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def floor_pose(x: ArrayLike, y: ArrayLike, yaw: ArrayLike) -> Array:
+    """Poses (..., 4, 4) on the floor: x, y [m], yaw [rad]."""
+    x, y, yaw = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float), np.asarray(yaw, float))
+    out = np.zeros((*x.shape, 4, 4))
+    out[..., 0, 0] = out[..., 1, 1] = np.cos(yaw)
+    out[..., 1, 0] = np.sin(yaw)
+    out[..., 0, 1] = -out[..., 1, 0]
+    out[..., 0, 3], out[..., 1, 3] = x, y
+    out[..., 2, 2] = out[..., 3, 3] = 1.0
+    return out
+
+
+def yaw(T: ArrayLike) -> Array:
+    """Heading [rad] of poses (..., 4, 4) or rotations (..., 3, 3)."""
+    T = np.asarray(T, float)
+    return np.asarray(np.arctan2(T[..., 1, 0], T[..., 0, 0]))
+
+
+def _sl3_basis() -> Array:
+    basis = []
+    for i in range(3):
+        for j in range(3):
+            if i != j:
+                E = np.zeros((3, 3))
+                E[i, j] = 1.0
+                basis.append(E)
+    return np.array([*basis, np.diag([1.0, -1.0, 0.0]), np.diag([0.0, 1.0, -1.0])])
+
+
+#: Basis of sl(3), (8, 3, 3): the six off-diagonal units in row order, then diag(1, -1, 0), diag(0, 1, -1).
+SL3_BASIS: Array = _sl3_basis()
+
+
+def sl3_hat(h: ArrayLike) -> Array:
+    """Traceless matrices (..., 3, 3) of coordinates (..., 8)."""
+    return np.asarray(np.tensordot(np.asarray(h, float), SL3_BASIS, axes=1))
+
+
+def sl3_vee(D: ArrayLike) -> Array:
+    """Coordinates (..., 8) of matrices (..., 3, 3), whose trace is removed first."""
+    D = np.asarray(D, float)
+    third = np.trace(D, axis1=-2, axis2=-1) / 3
+    return np.stack(
+        [
+            D[..., 0, 1], D[..., 0, 2], D[..., 1, 0], D[..., 1, 2], D[..., 2, 0], D[..., 2, 1],
+            D[..., 0, 0] - third, third - D[..., 2, 2],
+        ],
+        axis=-1,
+    )  # fmt: skip
+
+
+def sl3_normalise(H: ArrayLike) -> Array:
+    """Homographies (..., 3, 3) scaled to determinant 1 (the real cube root keeps the sign right)."""
+    H = np.asarray(H, float)
+    return np.asarray(H / np.cbrt(np.linalg.det(H))[..., None, None])
+
+
+def sl3_exp(h: ArrayLike) -> Array:
+    """Homographies (..., 3, 3) with determinant 1, of coordinates (..., 8)."""
+    D = sl3_hat(h)
+    # scaling and squaring about a Taylor series: exact to rounding for the small steps it serves, and batched
+    norm = float(np.abs(D).sum(-1).max(initial=0.0))
+    halvings = max(0, int(np.ceil(np.log2(norm / 0.25)))) if norm > 0.25 else 0
+    D = D / 2**halvings
+    E = term = np.broadcast_to(np.eye(3), D.shape)
+    for power in range(1, 13):
+        term = term @ D / power
+        E = E + term
+    for _ in range(halvings):
+        E = E @ E
+    return np.asarray(E)

@@ -1,0 +1,77 @@
+"""What passes between the front end and the back end; defined once, below both.
+
+Frames: `T_a_b` is the pose of b in a. Covariances are in GTSAM's tangent order, rotation [rad] first, then
+translation [m], in the body frame of the right-hand side: T_true = T_measured exp(xi).
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """The plane of the markers in a camera frame: N . X = d, N a unit normal (3,) from the camera to the plane.
+
+    `normal_sigma` [rad] and `d_sigma` [m] are what is uncertain besides the mount. Where the normal or the
+    distance was computed from the mount, its error is the mount's error too: `*_from_mount` say so.
+    """
+
+    N: Array
+    d: float
+    normal_sigma: float = 0.0
+    d_sigma: float = 0.0
+    normal_from_mount: bool = False
+    d_from_mount: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class HomographyMeasurement:
+    """The homography that the marker plane induces between two observers at rest in one stance.
+
+    `H_j_i` (3, 3) takes normalised coordinates in camera i to camera j, determinant 1. `information` (8, 8) is
+    that of its sl(3) coordinates on the right: H_true = H_j_i exp(sum of h_a SL3_BASIS[a]). `chi2` has `dof`
+    degrees of freedom. `overlap_px` is how many pixels of image i see what image j sees of the plane.
+    `unusable` is None, or why this is not a measurement, in words; the numbers then mean nothing.
+    """
+
+    stance: int
+    robot_i: str
+    robot_j: str
+    H_j_i: Array
+    information: Array
+    points: int
+    inliers: int
+    chi2: float
+    dof: int
+    overlap_px: float
+    time_offset: float = 0.0
+    unusable: str | None = None
+
+    @property
+    def residual(self) -> float:
+        """RMS residual in units of the noise."""
+        return float(np.sqrt(self.chi2 / self.dof)) if self.dof > 0 else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose:
+    """The pose of observer j's body in observer i's body, made of one homography measurement.
+
+    `covariance` is (6, 6). `T_ci_cj` is the same between the cameras. `solution` names which of the two SVD
+    solutions agrees with the known normal, `normal_error` [rad] is the angle between that solution's normal
+    and the known one.
+    """
+
+    stance: int
+    robot_i: str
+    robot_j: str
+    T_i_j: gtsam.Pose3
+    covariance: Array
+    T_ci_cj: gtsam.Pose3
+    solution: int
+    normal_error: float

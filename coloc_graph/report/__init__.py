@@ -1,0 +1,15 @@
+"""What one looks at: figures of a result (matplotlib) and the self-contained `report.html`.
+
+The only package that imports matplotlib; import it where a picture is wanted, not before.
+"""
+
+from coloc_graph.report.hero import hero_figure
+from coloc_graph.report.plots import error_figure, figure_svg, residual_figure, trajectories_figure
+
+__all__ = [
+    "error_figure",
+    "figure_svg",
+    "hero_figure",
+    "residual_figure",
+    "trajectories_figure",
+]

@@ -1,0 +1,250 @@
+"""Figures of a result: trajectories from above, errors against what was predicted, residuals by stance.
+
+Each function returns a `matplotlib.figure.Figure` of its own: no pyplot, no global state. `figure_svg` writes
+one as text, the same figure always as the same bytes.
+"""
+
+import io
+import re
+from collections.abc import Iterable
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+from scipy.stats import chi2
+
+from coloc_graph.backend import Estimate
+from coloc_graph.lie import se3_inverse, yaw
+from coloc_graph.measurements import HomographyMeasurement
+from coloc_graph.report.drawing import (
+    BAD,
+    COLOURS,
+    GREY,
+    INK,
+    K_95,
+    PALE,
+    Array,
+    Truth,
+    bounds,
+    colour_of,
+    draw_ellipses,
+    draw_headings,
+    heading_sigmas,
+    held_places,
+    marker_of,
+    position_sigmas,
+    standing_places,
+    styled,
+    thinned,
+    trajectories_of,
+    truth_of,
+)
+from coloc_graph.trajectory import Trajectory
+
+_WIDTH = 9.0  # [in]
+
+
+@styled
+def trajectories_figure(estimate: Estimate, truth: Truth | None = None) -> Figure:
+    """The team from above, world frame [m]: estimate over truth, headings, 95 % ellipses, held poses ringed.
+
+    Ellipses too small to be seen are drawn larger, by the round number that the legend states. Raises
+    `InputError` where `truth` has another number of poses than the estimate.
+    """
+    low, high = bounds(estimate, truth)
+    size = np.maximum(high - low, 0.5)
+    height = float(np.clip(_WIDTH * (size[1] + 0.4) / size[0] + 1.0, 2.8, 8.5))
+    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
+    scale = _ellipse_scale(estimate, float(size.max()))
+    for trajectory in trajectories_of(estimate):
+        colour = colour_of(estimate, trajectory.robot)
+        draw_ellipses(axes, trajectory, colour, scale)
+        _draw_path(axes, estimate, trajectory)
+        shown = thinned(standing_places(trajectory))
+        draw_headings(axes, trajectory.T_world_body[shown], colour, 0.022 * float(size.max()))
+        true = truth_of(trajectory, truth)
+        if true is not None:
+            axes.plot(*true[:, :2, 3].T, color=INK, linewidth=1.0, linestyle=(0, (4, 3)), zorder=5, gid="truth")
+        _label_start(axes, trajectory, colour, above=_is_above(estimate, trajectory))
+    axes.set_aspect("equal", adjustable="box")
+    axes.margins(x=0.03, y=max(0.08, 0.14 * float(size[0]) / _WIDTH / float(size[1])))
+    figure.legend(handles=_legend(estimate, truth, scale), loc="outside upper left", ncols=6)
+    return figure
+
+
+def _draw_path(axes: Axes, estimate: Estimate, trajectory: Trajectory) -> None:
+    colour, xy = colour_of(estimate, trajectory.robot), trajectory.positions[:, :2]
+    every = thinned(np.arange(len(trajectory)), 200).tolist()
+    size = 4.0 if len(trajectory) <= 200 else 2.0
+    axes.plot(
+        *xy.T, color=colour, linewidth=1.6, marker=marker_of(estimate, trajectory.robot), markersize=size,
+        markevery=every, zorder=3, label=trajectory.robot,
+    )  # fmt: skip
+    held = thinned(held_places(estimate, trajectory))
+    axes.plot(
+        *xy[held].T, linestyle="", marker="o", markersize=9.5, markerfacecolor="none", markeredgecolor=colour,
+        markeredgewidth=0.9, zorder=4, gid="held",
+    )  # fmt: skip
+
+
+def _is_above(estimate: Estimate, trajectory: Trajectory) -> bool:
+    """Whether a robot starts above the team's middle: where there is room for its label."""
+    starts = [one.positions[0, 1] for one in trajectories_of(estimate)]
+    return bool(trajectory.positions[0, 1] >= np.mean(starts))
+
+
+def _label_start(axes: Axes, trajectory: Trajectory, colour: str, above: bool) -> None:
+    axes.annotate(
+        f"{trajectory.robot} start", trajectory.positions[0, :2].tolist(), (0, 10 if above else -10),
+        textcoords="offset points", ha="center", va="bottom" if above else "top", color=colour, weight="bold", zorder=6,
+    )  # fmt: skip
+
+
+def _ellipse_scale(estimate: Estimate, extent: float) -> float:
+    """1, or the round number that makes the largest ellipse's half axis about a fortieth of the picture."""
+    sigmas = np.concatenate([[0.0], *[position_sigmas(one) for one in trajectories_of(estimate)]])
+    largest = K_95 * float(np.nanmax(sigmas))
+    if largest <= 0 or largest > 0.01 * extent:
+        return 1.0
+    wanted = extent / 40 / largest
+    decade = 10.0 ** np.floor(np.log10(wanted))
+    return float(decade * max(step for step in (1, 2, 5) if step <= wanted / decade * (1 + 1e-9)))
+
+
+def _legend(estimate: Estimate, truth: Truth | None, scale: float) -> list[Line2D | Patch]:
+    handles: list[Line2D | Patch] = []
+    for one in trajectories_of(estimate):
+        colour, marker = colour_of(estimate, one.robot), marker_of(estimate, one.robot)
+        handles.append(Line2D([], [], color=colour, marker=marker, markersize=4, label=one.robot))
+    if truth:
+        handles.append(Line2D([], [], color=INK, linewidth=1, linestyle=(0, (4, 3)), label="truth"))
+    if any(len(held_places(estimate, one)) for one in trajectories_of(estimate)):
+        ring = {"markerfacecolor": "none", "markeredgecolor": GREY, "markersize": 9}
+        handles.append(Line2D([], [], linestyle="", marker="o", label="stayed put", **ring))
+    if any(np.isfinite(position_sigmas(one)).any() for one in trajectories_of(estimate)):
+        drawn = f", {scale:g} times enlarged" if scale > 1 else ""
+        handles.append(Patch(facecolor=GREY + "40", edgecolor=GREY, label=f"95 % ellipse{drawn}"))
+    return handles
+
+
+@styled
+def error_figure(estimate: Estimate, truth: Truth | None = None) -> Figure:
+    """Errors of position (x, y) [cm] and heading [deg] against each robot's own estimated path length [m].
+
+    A band reaches to the predicted 2 sigma: in the worst direction for the position. Without truth the band is
+    all there is. Raises `InputError` where `truth` has another number of poses than the estimate.
+    """
+    figure = Figure(figsize=(_WIDTH, 4.6), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    any_truth = False
+    for trajectory in trajectories_of(estimate):
+        xy = trajectory.positions[:, :2]
+        travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+        off, turned = _errors(trajectory, truth_of(trajectory, truth))
+        any_truth |= off is not None
+        position, heading = 200 * position_sigmas(trajectory), 2 * np.rad2deg(heading_sigmas(trajectory))
+        _draw_error(above, estimate, trajectory.robot, travelled, off, np.zeros_like(position), position)
+        _draw_error(below, estimate, trajectory.robot, travelled, turned, -heading, heading)
+    above.set_ylim(bottom=0)
+    below.axhline(0, color=GREY, linewidth=0.8)
+    what = "error" if any_truth else "predicted 2σ"
+    above.set_ylabel(f"position {what} [cm]")
+    below.set_ylabel(f"heading {what} [°]")
+    below.set_xlabel("distance travelled, along the robot's estimated path [m]")
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=colour_of(estimate, one.robot), label=one.robot) for one in trajectories_of(estimate)
+    ]
+    handles.append(Patch(facecolor=GREY + "33", edgecolor=GREY, linestyle=":", label="predicted 2σ"))
+    figure.legend(handles=handles, loc="outside upper left", ncols=8)
+    return figure
+
+
+def _errors(trajectory: Trajectory, true: Array | None) -> tuple[Array | None, Array | None]:
+    """Distance in x, y [cm] and heading error [deg], each (n,)."""
+    if true is None:
+        return None, None
+    off = 100 * np.linalg.norm(trajectory.positions[:, :2] - true[:, :2, 3], axis=1)
+    turned = np.rad2deg(yaw(se3_inverse(true) @ trajectory.T_world_body))
+    return np.asarray(off), np.asarray(turned)
+
+
+def _draw_error(
+    axes: Axes, estimate: Estimate, robot: str, x: Array, error: Array | None, low: Array, high: Array
+) -> None:
+    colour = colour_of(estimate, robot)
+    axes.fill_between(x, low, high, color=colour, alpha=0.13, linewidth=0)
+    for edge in (low, high):
+        if np.any(edge):
+            axes.plot(x, edge, color=colour, linewidth=0.9, linestyle=":", gid="sigma")
+    if error is not None:
+        marker = marker_of(estimate, robot) if len(x) <= 200 else ""
+        axes.plot(x, error, color=colour, linewidth=1.6, marker=marker, markersize=3.5, label=robot)
+
+
+@styled
+def residual_figure(measurements: Iterable[HomographyMeasurement]) -> Figure:
+    """By stance: the RMS residual in units of the noise (1 is expected), and inliers of points.
+
+    A grey bar holds 95 % of what noise alone gives; a cross on the axis is a measurement that is unusable.
+    """
+    measured = list(measurements)
+    good = [one for one in measured if one.unusable is None]
+    bad = [one for one in measured if one.unusable is not None]
+    stance = np.array([one.stance for one in good], float)
+    size = 26 if len(measured) <= 200 else 6
+    figure = Figure(figsize=(_WIDTH, 4.2), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+
+    dof = np.array([max(one.dof, 1) for one in good], float)
+    _bars(above, stance, *[np.sqrt(chi2.ppf(p, dof) / dof) for p in (0.025, 0.975)], len(measured))
+    above.axhline(1, color=GREY, linewidth=0.9, linestyle="--")
+    above.scatter(stance, [one.residual for one in good], s=size, color=COLOURS[0], zorder=3)
+    above.set_ylabel("RMS residual [noise]")
+
+    points, inliers = ([getattr(one, name) for one in good] for name in ("points", "inliers"))
+    _bars(below, stance, np.array(inliers, float), np.array(points, float), len(measured))
+    below.scatter(stance, points, s=size, marker="_", color=GREY, zorder=3)
+    below.scatter(stance, inliers, s=size, color=COLOURS[0], zorder=3)
+    below.set_ylabel("points")
+    below.set_xlabel("stance")
+    below.xaxis.set_major_locator(MaxNLocator(integer=True))
+    for axes in (above, below):
+        axes.set_ylim(bottom=0, top=max(1.5 if axes is above else 1.0, 1.08 * axes.get_ylim()[1]))
+        at = [one.stance for one in bad]
+        axes.scatter(at, np.zeros(len(at)), marker="x", s=36, color=BAD, linewidths=1.8, clip_on=False, zorder=5)
+    figure.legend(handles=_residual_legend(bool(bad)), loc="outside upper left", ncols=4)
+    return figure
+
+
+def _bars(axes: Axes, x: Array, low: Array, high: Array, count: int) -> None:
+    lines = np.stack([np.stack([x, x], axis=1), np.stack([low, high], axis=1)], axis=2)
+    width = float(np.clip(300 / max(count, 1), 0.6, 9))
+    axes.add_collection(LineCollection(list(lines), colors=PALE, linewidths=width, capstyle="butt", zorder=1))
+
+
+def _residual_legend(any_bad: bool) -> list[Line2D | Patch]:
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], linestyle="", marker="o", markersize=5, color=COLOURS[0], label="residual; inliers"),
+        Line2D([], [], linestyle="", marker="_", markersize=8, color=GREY, label="all points"),
+        Patch(facecolor=PALE, label="95 % of what noise alone gives; outliers"),
+    ]
+    if any_bad:
+        handles.append(Line2D([], [], linestyle="", marker="x", markersize=6, color=BAD, label="not used"))
+    return handles
+
+
+@styled
+def figure_svg(figure: Figure, name: str = "figure") -> str:
+    """The figure as an <svg> element, to be put into HTML: ids begin with `name`, nothing refers outside."""
+    out = io.StringIO()
+    figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    svg = out.getvalue()
+    svg = svg[svg.index("<svg") :].strip()
+    svg = re.sub(r"\s*<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\bid="', f'id="{name}-', svg)
+    return re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", svg)

@@ -1,0 +1,195 @@
+"""A result on disk: written whole or not at all, and read back.
+
+DIR holds summary.json, trajectories/<robot>.tum (and .cov.csv), graph.g2o, measurements.csv, config.toml and
+report.html. The same run, options and version give the same bytes, except for `seconds` in summary.json.
+"""
+
+import csv
+import dataclasses
+import io
+import json
+import math
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from coloc_graph._version import __version__
+from coloc_graph.errors import InputError
+from coloc_graph.evaluation import Accuracy, align, evaluate
+from coloc_graph.exchange.g2o import write_g2o
+from coloc_graph.exchange.tum import read_tum, write_tum
+from coloc_graph.pipeline import Solution
+from coloc_graph.run import read_truth
+from coloc_graph.team import without_none
+from coloc_graph.trajectory import Trajectory
+
+SUMMARY = "summary.json"
+
+
+def assess(solution: Solution) -> tuple[Accuracy, dict[str, NDArray[np.float64]]] | None:
+    """A solution against its run's truth, with the true poses in its world; None where the run has no truth."""
+    truth = read_truth(solution.run.path)
+    if not truth:
+        return None
+    on_floor = solution.run.team.floor is not None
+    trajectories = solution.estimate.trajectories
+    true = align(trajectories, truth, solution.run.team.reference, on_floor=on_floor)
+    return evaluate(trajectories, true, on_floor=on_floor), true
+
+
+def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
+    """Write a solution to the folder `out`, compared with truth where the run has it.
+
+    An earlier result there is replaced. Raises `InputError` where `out` is something else than a result.
+    """
+    from coloc_graph.report import render_report  # matplotlib is heavy, and of no use to who only reads results
+
+    out = Path(out)
+    if out.exists() and not (out / SUMMARY).is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} exists and is not a result; give another folder, or remove it")
+    assessed = assess(solution)
+    accuracy, true = assessed if assessed is not None else (None, None)
+
+    part = out.with_name(out.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    (part / "trajectories").mkdir(parents=True)
+    try:
+        for robot, trajectory in solution.estimate.trajectories.items():
+            write_tum(trajectory, part / "trajectories" / f"{robot}.tum")
+        write_g2o(solution.estimate, part / "graph.g2o")
+        (part / "measurements.csv").write_text(_measurements(solution), encoding="utf-8")
+        (part / "config.toml").write_text(tomli_w.dumps(_config(solution)), encoding="utf-8")
+        (part / "report.html").write_text(render_report(solution, accuracy, true), encoding="utf-8")
+        run_path = os.path.relpath(solution.run.path.absolute(), out.absolute())
+        summary = summarise(solution, accuracy) | {"run": run_path}
+        (part / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        shutil.rmtree(out, ignore_errors=True)
+        part.rename(out)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    return accuracy
+
+
+def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
+    """What summary.json says; numbers that do not exist are null."""
+    estimate = solution.estimate
+    refused = [m.homography for m in solution.measurements if m.homography.unusable]
+    summary: dict[str, Any] = {
+        "version": __version__,
+        "method": estimate.method,
+        "robots": list(estimate.trajectories),
+        "stances": len(solution.run.stances),
+        "measurements": {"used": len(solution.measurements) - len(refused), "rejected": len(refused)},
+        "chi2": estimate.chi2,
+        "dof": estimate.dof,
+        "iterations": estimate.iterations,
+        "untied": [list(one) for one in estimate.untied],
+        "warnings": list(solution.warnings),
+        "seconds": {
+            "frontend": round(solution.seconds_frontend, 3),
+            "backend": round(solution.seconds_backend, 3),
+            "total": round(solution.seconds_frontend + solution.seconds_backend, 3),
+        },
+    }
+    if accuracy is not None:
+        summary["accuracy"] = accuracy_json(accuracy)
+    return summary
+
+
+def accuracy_json(accuracy: Accuracy) -> dict[str, Any]:
+    """An accuracy as in summary.json."""
+    return {
+        "length_error_percent": {row.robot: row.length_error_percent for row in accuracy.robots},
+        "ate_m": accuracy.ate,
+        "end_position_error_m": accuracy.end_position_error,
+        "heading_error_deg": accuracy.heading_error_deg,
+        "anees": accuracy.anees,
+        "robots": {
+            row.robot: {
+                "true_length_m": row.true_length,
+                "estimated_length_m": row.estimated_length,
+                "length_error_m": row.length_error,
+                "ate_m": row.ate,
+                "end_position_error_m": row.end_position_error,
+                "heading_error_deg": row.heading_error_deg,
+            }
+            for row in accuracy.robots
+        },
+    }
+
+
+def _measurements(solution: Solution) -> str:
+    """One row a homography. Angles in degrees, the relative pose is that of body j in body i."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(
+        "stance,robot_i,robot_j,points,inliers,residual,time_offset,overlap_px,normal_error_deg,solution,"
+        "distance,usable,why_not".split(",")
+    )
+    for measured in solution.measurements:
+        h, pose = measured.homography, measured.relative_pose
+        rows.writerow(
+            [
+                h.stance,
+                h.robot_i,
+                h.robot_j,
+                h.points,
+                h.inliers,
+                _cell(h.residual),
+                _cell(h.time_offset),
+                _cell(h.overlap_px),
+                _cell(math.degrees(pose.normal_error)) if pose else "",
+                pose.solution if pose else "",
+                _cell(float(np.linalg.norm(pose.T_i_j.translation()))) if pose else "",
+                "yes" if pose else "no",
+                h.unusable or "",
+            ]
+        )
+    return text.getvalue()
+
+
+def _cell(value: float) -> str:
+    return f"{value:.9g}" if math.isfinite(value) else ""
+
+
+def _config(solution: Solution) -> dict[str, Any]:
+    return {
+        "version": __version__,
+        "options": dataclasses.asdict(solution.options),
+        "team": without_none(msgspec.to_builtins(solution.run.team)),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A result read back: the summary, the trajectories, and where the run it was made of should be."""
+
+    path: Path
+    summary: dict[str, Any]
+    trajectories: Mapping[str, Trajectory]
+    run_path: Path
+
+
+def read_result(path: str | Path) -> Result:
+    """The result in a folder; `InputError` where it is none."""
+    path = Path(path)
+    try:
+        summary = json.loads((path / SUMMARY).read_text(encoding="utf-8"))
+        robots, run = list(summary["robots"]), str(summary["run"])
+    except OSError as error:
+        raise InputError(
+            f"{path} is not a result: {SUMMARY} cannot be read ({error.strerror}); give the folder of `coloc solve --out`"
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path / SUMMARY} is damaged ({error}); solve the run again") from error
+    trajectories = {robot: read_tum(path / "trajectories" / f"{robot}.tum") for robot in robots}
+    return Result(path, summary, trajectories, Path(os.path.normpath(path / run)))

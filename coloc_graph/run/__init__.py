@@ -1,0 +1,25 @@
+"""What a team recorded: `RunWriter` writes it, `open_run` gives it back lazily, as the records of `messages`.
+
+A run is one MCAP file that Foxglove opens; docs/run-format.md says what is in it. `read_truth` and
+`read_true_team` are for evaluation alone.
+"""
+
+from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Stance
+from coloc_graph.run.reader import Run, open_run, read_true_team, read_truth
+from coloc_graph.run.writer import RunWriter, whole_run
+
+__all__ = [
+    "Detections",
+    "Flag",
+    "Image",
+    "Motion",
+    "OdometrySample",
+    "Planes",
+    "Run",
+    "RunWriter",
+    "Stance",
+    "open_run",
+    "read_true_team",
+    "read_truth",
+    "whole_run",
+]

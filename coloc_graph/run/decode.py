@@ -1,0 +1,157 @@
+"""Bytes to records. A `MalformedError` says what is wrong, the reader adds where."""
+
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import RunError
+from coloc_graph.run import schemas
+from coloc_graph.run.encode import check_planes, check_stance
+from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Stance
+from coloc_graph.team import Team
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+class MalformedError(ValueError):
+    """A message is not what its topic says; the message says why."""
+
+
+def _json(data: memoryview, kind: type[T]) -> T:
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise MalformedError(str(error)) from error
+
+
+def decode_team(data: memoryview) -> Team:
+    """A team from its JSON."""
+    return _json(data, Team)
+
+
+def decode_detections(robot: str, ns: int, data: memoryview) -> Detections:
+    """The detections in one image."""
+    wire = _json(data, schemas.DetectionsWire)
+    n = len(wire.u)
+    for name in ("v", "covariance", "marker", "flags", "peak", "area"):
+        if len(getattr(wire, name)) != n:
+            raise MalformedError(f"`{name}` has {len(getattr(wire, name))} entries for {n} in `u`")
+    uu, uv, vv = np.array(wire.covariance, float).reshape(n, 3).T
+    flags = [sum(Flag[name.upper()] for name in set(names)) for names in wire.flags]
+    return Detections(
+        robot=robot,
+        time=schemas.to_seconds(ns),
+        uv=np.stack([np.array(wire.u, float), np.array(wire.v, float)], axis=-1),
+        covariance=np.stack([uu, uv, uv, vv], axis=-1).reshape(n, 2, 2),
+        markers=tuple(wire.marker),
+        flags=np.array(flags, np.uint8),
+        peak=np.array(wire.peak, float),
+        area=np.array(wire.area, float),
+    )
+
+
+def decode_odometry(robot: str, ns: int, data: memoryview) -> OdometrySample:
+    """One sample of a robot's odometry."""
+    wire = _json(data, schemas.OdometryWire)
+    return OdometrySample(
+        robot, schemas.to_seconds(ns), np.array([wire.x, wire.y, wire.yaw]), np.array(wire.covariance)
+    )
+
+
+def decode_motion(robot: str, ns: int, data: memoryview) -> Motion:
+    """The beginning or the end of a movement."""
+    return Motion(robot, schemas.to_seconds(ns), _json(data, schemas.MotionWire).moving)
+
+
+def decode_stance(ns: int, data: memoryview) -> Stance:
+    """A stance; its start is the message's time."""
+    wire = _json(data, schemas.StanceWire)
+    end = schemas.to_seconds(wire.end_ns) if abs(wire.end_ns) < 2**64 else -1.0
+    stance = Stance(wire.index, schemas.to_seconds(ns), end, wire.observers, wire.movers, wire.anchors)
+    try:
+        check_stance(stance, f"stance {stance.index}")
+    except RunError as error:
+        raise MalformedError(str(error)) from error
+    return stance
+
+
+def decode_planes(ns: int, data: memoryview) -> Planes:
+    """The marker planes of one stance."""
+    wire = _json(data, schemas.PlanesWire)
+    planes = Planes(wire.stance, schemas.to_seconds(ns), wire.planes)
+    try:
+        check_planes(planes, f"the planes of stance {planes.stance}")
+    except RunError as error:
+        raise MalformedError(str(error)) from error
+    return planes
+
+
+def decode_image(robot: str, ns: int, schema: str, data: memoryview) -> Image:
+    """An image, whichever way it is encoded."""
+    message = _protobuf(schema, ns, data)
+    pixels = _raw(message) if schema == schemas.RAW_IMAGE else _decompress(message)
+    return Image(robot, schemas.to_seconds(ns), pixels)
+
+
+def decode_pose(ns: int, data: memoryview) -> Array:
+    """T_world_body (4, 4) [m]."""
+    message = _protobuf(schemas.POSE_IN_FRAME, ns, data)
+    if message.frame_id != "world":
+        raise MalformedError(f"`frame_id` is `{message.frame_id}`; it must be `world`")
+    p, o = message.pose.position, message.pose.orientation
+    values = np.array([o.x, o.y, o.z, o.w, p.x, p.y, p.z])
+    if not np.isfinite(values).all() or abs(np.linalg.norm(values[:4]) - 1) > 1e-6:
+        raise MalformedError("`pose` is not a position and a unit quaternion")
+    x, y, z, w = values[:4] / np.linalg.norm(values[:4])
+    out: Array = np.eye(4)
+    out[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    out[:3, 3] = values[4:]
+    return out
+
+
+def _protobuf(schema: str, ns: int, data: memoryview) -> Any:
+    from google.protobuf.message import DecodeError
+
+    message = schemas.protobuf_type(schema)()
+    try:
+        message.ParseFromString(bytes(data))
+    except DecodeError as error:
+        raise MalformedError(f"not a {schema}") from error
+    stamp = message.timestamp.seconds * 1_000_000_000 + message.timestamp.nanos
+    if stamp != ns:
+        raise MalformedError(f"`timestamp` is {schemas.to_seconds(stamp)} s, not the message's log time")
+    return message
+
+
+def _raw(message: Any) -> NDArray[np.uint8]:
+    channels = {"mono8": 1, "bgr8": 3}.get(message.encoding)
+    if channels is None:
+        raise MalformedError(f"`encoding` is `{message.encoding}`; it must be mono8 or bgr8")
+    width, height, step = message.width, message.height, message.step
+    if not width or not height or step < width * channels or len(message.data) != step * height:
+        raise MalformedError(f"{len(message.data)} bytes of `data` are not {width} x {height} {message.encoding}")
+    rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * channels]
+    return rows.reshape((height, width) if channels == 1 else (height, width, 3)).copy()
+
+
+def _decompress(message: Any) -> NDArray[np.uint8]:
+    import cv2  # heavy, and only needed where there are images
+
+    if message.format not in ("jpeg", "png"):
+        raise MalformedError(f"`format` is `{message.format}`; it must be jpeg or png")
+    try:
+        pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise MalformedError(f"`data` is not a {message.format}") from error
+    if pixels is None:
+        raise MalformedError(f"`data` is not a {message.format}")
+    if pixels.dtype != np.uint8 or not (pixels.ndim == 2 or pixels.shape[2] == 3):
+        raise MalformedError(f"`data` has shape {pixels.shape} of {pixels.dtype}; it must be 8-bit grey or BGR")
+    return np.asarray(pixels, np.uint8)

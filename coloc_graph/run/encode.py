@@ -1,0 +1,212 @@
+"""Records to bytes, refusing what cannot be read back as it was meant."""
+
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import RunError
+from coloc_graph.lie import so3_log
+from coloc_graph.run import schemas
+from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Stance
+from coloc_graph.team import Team
+
+Array = NDArray[np.float64]
+ImageFormat = Literal["jpeg", "png", "raw"]
+Record = Detections | Image | OdometrySample | Motion | Stance | Planes
+
+JPEG_QUALITY = 95
+
+
+def flag_names(flag: int) -> list[schemas.FlagName]:
+    """The lower-case names of the flags that are set."""
+    return [flag_.name.lower() for flag_ in Flag if flag_ and flag & flag_]  # type: ignore[union-attr, misc]
+
+
+def encode_team(team: Team) -> bytes:
+    """The JSON of a team."""
+    return msgspec.json.encode(msgspec.to_builtins(team))
+
+
+def check_robots(team: Team, names: tuple[str, ...], where: str) -> None:
+    """RunError where one of the names is not a robot of the team."""
+    for name in names:
+        if name not in team.names:
+            raise RunError(
+                f"{where} names robot `{name}`, which is not in the team ({', '.join(team.names)}); "
+                "correct the name or add the robot to the team"
+            )
+
+
+def encode_record(record: Record, image_format: ImageFormat) -> tuple[str, str, float, bytes]:
+    """(topic, schema, time [s], bytes) of a record."""
+    match record:
+        case Image():
+            schema = schemas.RAW_IMAGE if image_format == "raw" else schemas.COMPRESSED_IMAGE
+            return _robot(record, "image"), schema, record.time, _image(record, image_format)
+        case Detections():
+            return _json(_robot(record, "detections"), record.time, _detections(record))
+        case OdometrySample():
+            return _json(_robot(record, "odometry"), record.time, _odometry(record))
+        case Motion():
+            moving = schemas.MotionWire(moving=bool(record.moving))
+            return _json(_robot(record, "motion"), record.time, moving)
+        case Stance():
+            return _json(schemas.STANCE_TOPIC, record.start, _stance(record))
+        case Planes():
+            return _json(schemas.PLANES_TOPIC, record.time, _planes(record))
+    raise TypeError(f"a {type(record).__name__} is not a record of a run")
+
+
+def encode_pose(time: float, T_world_body: Array) -> bytes:
+    """A foxglove.PoseInFrame in frame `world`."""
+    T = np.asarray(T_world_body, float)
+    rigid = T.shape == (4, 4) and np.isfinite(T).all()
+    if not rigid or abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() > 1e-6 or np.linalg.det(T[:3, :3]) < 0:
+        raise RunError(f"the true pose at {time} s is not a finite rigid transform (4, 4); give T_world_body")
+    half = so3_log(T[:3, :3]) / 2
+    angle = float(np.linalg.norm(half))
+    x, y, z = half * np.sinc(angle / np.pi)  # numpy's sinc has the pi in it
+    message = schemas.protobuf_type(schemas.POSE_IN_FRAME)(frame_id="world")
+    _stamp(message, time)
+    pose = message.pose
+    pose.position.x, pose.position.y, pose.position.z = T[:3, 3]
+    pose.orientation.x, pose.orientation.y, pose.orientation.z = x, y, z
+    pose.orientation.w = np.cos(angle)
+    return bytes(message.SerializeToString(deterministic=True))
+
+
+def _robot(record: Detections | Image | OdometrySample | Motion, kind: str) -> str:
+    return schemas.topic_of(record.robot, kind)
+
+
+def _json(topic: str, time: float, wire: schemas.Wire) -> tuple[str, str, float, bytes]:
+    return topic, schemas.schemas_of(topic)[0], time, msgspec.json.encode(wire)
+
+
+def _finite(what: str, time: float, shape: tuple[int, ...], values: Any) -> Array:
+    array = np.asarray(values, float)
+    if array.shape != shape:
+        raise RunError(f"{what} at {time} s has shape {array.shape}; give {shape}")
+    if not np.isfinite(array).all():
+        raise RunError(f"{what} at {time} s holds NaN or infinity; leave out what was not measured")
+    return array
+
+
+def _covariance(what: str, time: float, shape: tuple[int, ...], values: Any) -> Array:
+    array = _finite(what, time, shape, values)
+    if not np.allclose(array, array.swapaxes(-1, -2), rtol=1e-6, atol=0):
+        raise RunError(f"{what} at {time} s is not symmetric; give a covariance")
+    return array
+
+
+def _detections(record: Detections) -> schemas.DetectionsWire:
+    n, time = len(record.uv), record.time
+    of = f"`{record.robot}`'s detections"
+    uv = _finite(f"`uv` of {of}", time, (n, 2), np.reshape(record.uv, (n, 2)) if n == 0 else record.uv)
+    C = np.asarray(record.covariance, float)
+    C = _covariance(f"`covariance` of {of}", time, (n, 2, 2), C.reshape(0, 2, 2) if n == C.size == 0 else C)
+    if len(record.markers) != n:
+        raise RunError(f"{of} at {time} s have {len(record.markers)} `markers` for {n} points; give one a point")
+    return schemas.DetectionsWire(
+        u=uv[:, 0].tolist(),
+        v=uv[:, 1].tolist(),
+        covariance=np.stack([C[:, 0, 0], C[:, 0, 1], C[:, 1, 1]], axis=-1).tolist(),
+        marker=list(record.markers),
+        flags=[flag_names(int(flag)) for flag in _finite(f"`flags` of {of}", time, (n,), record.flags)],
+        peak=_finite(f"`peak` of {of}", time, (n,), record.peak).tolist(),
+        area=_finite(f"`area` of {of}", time, (n,), record.area).tolist(),
+    )
+
+
+def _odometry(record: OdometrySample) -> schemas.OdometryWire:
+    of = f"`{record.robot}`'s odometry"
+    x, y, yaw = _finite(f"`pose` of {of}", record.time, (3,), record.pose).tolist()
+    C = _covariance(f"`covariance` of {of}", record.time, (3, 3), record.covariance)
+    return schemas.OdometryWire(x=x, y=y, yaw=yaw, covariance=C.tolist())
+
+
+def _stance(record: Stance) -> schemas.StanceWire:
+    check_stance(record, f"stance {record.index}")
+    return schemas.StanceWire(
+        index=int(record.index),
+        end_ns=schemas.to_ns(record.end),
+        observers=tuple(record.observers),
+        movers=tuple(record.movers),
+        anchors=tuple(record.anchors),
+    )
+
+
+def check_stance(stance: Stance, where: str) -> None:
+    """RunError where a stance contradicts itself."""
+    if stance.index < 0:
+        raise RunError(f"{where}: the index is {stance.index}; number the stances from 0")
+    if not stance.end >= stance.start:
+        raise RunError(f"{where}: it ends at {stance.end} s, before it starts at {stance.start} s; correct the times")
+    both = sorted(set(stance.observers) & set(stance.movers))
+    if both:
+        raise RunError(f"{where}: robot `{both[0]}` is an observer and a mover; a robot either stands or moves")
+
+
+def _planes(record: Planes) -> schemas.PlanesWire:
+    check_planes(record, f"the planes of stance {record.stance}")
+    planes = {robot: _four(plane) for robot, plane in record.planes.items()}
+    return schemas.PlanesWire(stance=int(record.stance), planes=planes)
+
+
+def _four(plane: Any) -> tuple[float, float, float, float]:
+    nx, ny, nz, d = (float(value) for value in plane)
+    return nx, ny, nz, d
+
+
+def check_planes(planes: Planes, where: str) -> None:
+    """RunError where a plane is none: not four finite numbers, a normal that is not unit, a distance <= 0."""
+    for robot, plane in planes.planes.items():
+        values = np.asarray(plane, float)
+        if values.shape != (4,) or not np.isfinite(values).all():
+            raise RunError(f"{where}: that of `{robot}` is not four finite numbers; give (nx, ny, nz, d)")
+        if abs(np.linalg.norm(values[:3]) - 1) > 1e-3 or values[3] <= 0:
+            raise RunError(f"{where}: that of `{robot}` needs a unit normal and d > 0; give (nx, ny, nz, d)")
+
+
+def _image(record: Image, image_format: ImageFormat) -> bytes:
+    pixels = np.asarray(record.pixels)
+    of = f"`{record.robot}`'s image at {record.time} s"
+    if not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)) or not pixels.size:
+        raise RunError(f"{of} has shape {pixels.shape}; give (height, width) grey or (height, width, 3) BGR")
+    if pixels.dtype != np.uint8:
+        raise RunError(f"{of} holds {pixels.dtype}; give uint8")
+    if image_format == "raw":
+        height, width = pixels.shape[:2]
+        message = schemas.protobuf_type(schemas.RAW_IMAGE)(
+            width=width,
+            height=height,
+            encoding="mono8" if pixels.ndim == 2 else "bgr8",
+            step=width * (1 if pixels.ndim == 2 else 3),
+            data=pixels.tobytes(),
+        )
+    else:
+        message = schemas.protobuf_type(schemas.COMPRESSED_IMAGE)(
+            format=image_format, data=_compress(pixels, image_format, of)
+        )
+    message.frame_id = f"{record.robot}/camera"
+    _stamp(message, record.time)
+    return bytes(message.SerializeToString(deterministic=True))
+
+
+def _compress(pixels: NDArray[np.uint8], image_format: ImageFormat, of: str) -> bytes:
+    import cv2  # heavy, and only needed where there are images
+
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if image_format == "jpeg" else []
+    try:
+        done, data = cv2.imencode("." + image_format, np.ascontiguousarray(pixels), options)
+    except cv2.error as error:
+        raise RunError(f"{of} cannot be written as {image_format} ({error}); use `raw`") from error
+    if not done:
+        raise RunError(f"{of} cannot be written as {image_format}; use `raw`")
+    return bytes(data)
+
+
+def _stamp(message: Any, time: float) -> None:
+    message.timestamp.seconds, message.timestamp.nanos = divmod(schemas.to_ns(time), 1_000_000_000)

@@ -1,0 +1,215 @@
+"""`open_run` and the `Run` it gives; `read_truth` and `read_true_team`, which are for evaluation alone."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from coloc_graph.errors import RunError
+from coloc_graph.run import decode, schemas
+from coloc_graph.run.encode import check_robots
+from coloc_graph.run.index import Index, build_index
+from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Planes, Stance
+from coloc_graph.run.topics import Item, decoded, read_topic, time_span
+from coloc_graph.team import Team
+from coloc_graph.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a team recorded, read when it is asked for; it holds no open file. Truth is out of its reach.
+
+    `topics` counts the messages of each topic, `start` and `end` are the first and the last message's time
+    [UTC s] (None where there is none but the team). `warnings` are sentences on what could not be read.
+
+    The methods that iterate give the messages of one robot in the order of time, from `start` to `end`, both
+    included [UTC s]; at any time only one chunk is in memory. They raise RunError where the file is damaged,
+    naming the place.
+    """
+
+    path: Path
+    team: Team
+    warnings: tuple[str, ...]
+    stances: tuple[Stance, ...]
+    planes: dict[int, Planes]
+    topics: dict[str, int]
+    start: float | None
+    end: float | None
+    _index: Index = field(repr=False)
+
+    def images(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Image]:
+        """The images of a robot's camera."""
+        items = self._items(robot, "image", start, end)
+        return decoded(self._index, items, lambda item: decode.decode_image(robot, item.ns, item.schema, item.data))
+
+    def detections(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Detections]:
+        """What was detected in the images of a robot's camera, one record an image."""
+        items = self._items(robot, "detections", start, end)
+        return decoded(self._index, items, lambda item: decode.decode_detections(robot, item.ns, item.data))
+
+    def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
+        """A robot's odometry."""
+        items = self._items(robot, "odometry", start, end)
+        return decoded(self._index, items, lambda item: decode.decode_odometry(robot, item.ns, item.data))
+
+    def motions(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Motion]:
+        """The beginnings and ends of a robot's movements."""
+        items = self._items(robot, "motion", start, end)
+        return decoded(self._index, items, lambda item: decode.decode_motion(robot, item.ns, item.data))
+
+    def has_images(self, robot: str) -> bool:
+        """Whether there is an image of this robot's camera."""
+        return self._count(robot, "image") > 0
+
+    def has_detections(self, robot: str) -> bool:
+        """Whether there are detections of this robot's camera."""
+        return self._count(robot, "detections") > 0
+
+    def _count(self, robot: str, kind: str) -> int:
+        check_robots(self.team, (robot,), f"{self.path}: the question")
+        return self.topics.get(schemas.topic_of(robot, kind), 0)
+
+    def _items(self, robot: str, kind: str, start: float | None, end: float | None) -> tuple[str, Iterator[Item]]:
+        self._count(robot, kind)
+        topic = schemas.topic_of(robot, kind)
+        first = 0 if start is None else _clamped_ns(start)
+        last = None if end is None else _clamped_ns(end)
+        return topic, read_topic(self._index, topic, first, last)
+
+
+def open_run(path: str | Path) -> Run:
+    """The run in an MCAP file: team, stances and index are read now, everything else when asked for.
+
+    A file that was cut off opens up to its last whole chunk, with a warning. RunError, naming the place,
+    for a file that is damaged, is no run, or holds what contradicts itself.
+    """
+    index = build_index(Path(path))
+    _check_format(index)
+    topics = _counts(index)
+    team = _read_team(index, schemas.TEAM_TOPIC)
+    if team is None:
+        what = "is an MCAP file without a /team, so not a run; import it, or record it with RunWriter"
+        if index.lost is not None:
+            what = "was cut off before its /team, so nothing usable was recorded; record it again"
+        raise RunError(f"{index.path}: {what}")
+    if topics[schemas.TEAM_TOPIC] > 1:
+        raise RunError(f"{index.path}: has {topics[schemas.TEAM_TOPIC]} messages of /team; record one run a file")
+    unknown = _check_topics(index, team)
+    spans = [time_span(index, topic) for topic in topics if topic != schemas.TEAM_TOPIC and topic not in unknown]
+    return Run(
+        path=index.path,
+        team=team,
+        warnings=(
+            *_cut_off(index),
+            *(f"{index.path}: {topic} is no topic of a run and is left out" for topic in unknown),
+        ),
+        stances=_stances(index, team),
+        planes=_planes(index, team),
+        topics=topics,
+        start=min((schemas.to_seconds(first) for first, _ in spans), default=None),
+        end=max((schemas.to_seconds(last) for _, last in spans), default=None),
+        # without truth, so that nothing that is given a run can come upon it
+        _index=replace(index, channels={c: i for c, i in index.channels.items() if not schemas.is_truth(i.topic)}),
+    )
+
+
+def read_truth(path: str | Path) -> dict[str, Trajectory]:
+    """The true trajectories T_world_body, by robot. For evaluation: no estimator may call it."""
+    index = build_index(Path(path))
+    truth = {}
+    for topic in dict.fromkeys(info.topic for info in index.channels.values()):
+        split = schemas.robot_and_kind(topic)
+        if split and split[1] == "truth":
+            items = topic, read_topic(index, topic)
+            poses = list(decoded(index, items, lambda item: (item.ns, decode.decode_pose(item.ns, item.data))))
+            times = np.array([schemas.to_seconds(ns) for ns, _ in poses])
+            truth[split[0]] = Trajectory(split[0], times, np.array([T for _, T in poses]).reshape(-1, 4, 4))
+    return truth
+
+
+def read_true_team(path: str | Path) -> Team | None:
+    """What the team was really like, None where that is not recorded. For evaluation alone."""
+    return _read_team(build_index(Path(path)), schemas.TRUE_TEAM_TOPIC)
+
+
+def _clamped_ns(seconds: float) -> int:
+    """Nanoseconds of a bound, which may lie outside of what a file can hold."""
+    if np.isnan(seconds):
+        raise RunError("a time range cannot begin or end at NaN; give UTC seconds")
+    return schemas.to_ns(min(max(seconds, 0.0), 9e9))
+
+
+def _check_format(index: Index) -> None:
+    number = index.profile.removeprefix(schemas.PROFILE_PREFIX)
+    if number != index.profile and number != str(schemas.FORMAT):
+        raise RunError(
+            f"{index.path}: has format {number} and this version reads format {schemas.FORMAT}; "
+            "use the version of coloc-graph that wrote it, or a newer one"
+        )
+
+
+def _read_team(index: Index, topic: str) -> Team | None:
+    return next(decoded(index, (topic, read_topic(index, topic)), lambda item: decode.decode_team(item.data)), None)
+
+
+def _check_topics(index: Index, team: Team) -> list[str]:
+    """The topics that a run does not have; RunError for what a run has in another shape."""
+    unknown = []
+    for info in index.channels.values():
+        split = schemas.robot_and_kind(info.topic)
+        wanted = schemas.schemas_of(info.topic)
+        if split:
+            check_robots(team, split[:1], f"{index.path}: the topic {info.topic}")
+        if not wanted and not schemas.is_truth(info.topic):
+            unknown.append(info.topic)
+        elif info.schema not in wanted or info.encoding != ("protobuf" if info.schema.startswith("fox") else "json"):
+            raise RunError(
+                f"{index.path}: the messages of {info.topic} are `{info.schema}` in `{info.encoding}`, not "
+                f"{' or '.join(wanted)}; see docs/run-format.md"
+            )
+    return unknown
+
+
+def _counts(index: Index) -> dict[str, int]:
+    counts = {info.topic: 0 for info in index.channels.values() if not schemas.is_truth(info.topic)}
+    for chunk in index.chunks:
+        for channel, count in chunk.counts.items():
+            if index.channels[channel].topic in counts:
+                counts[index.channels[channel].topic] += count
+    return counts
+
+
+def _cut_off(index: Index) -> list[str]:
+    if index.lost is None:
+        return []
+    reach = max(chunk.end for chunk in index.chunks)
+    after = schemas.to_seconds(reach - min(chunk.start for chunk in index.chunks))
+    return [
+        f"{index.path}: was cut off, the last {index.lost} bytes could not be read; the data reach "
+        f"{schemas.to_seconds(reach):.3f} s (UTC), {after:.3f} s after they begin"
+    ]
+
+
+def _stances(index: Index, team: Team) -> tuple[Stance, ...]:
+    stances: dict[int, Stance] = {}
+    items = schemas.STANCE_TOPIC, read_topic(index, schemas.STANCE_TOPIC)
+    for stance in decoded(index, items, lambda item: decode.decode_stance(item.ns, item.data)):
+        where = f"{index.path}: stance {stance.index}"
+        check_robots(team, (*stance.observers, *stance.movers, *stance.anchors), where)
+        if stance.index in stances:
+            raise RunError(f"{where} is recorded twice; number each stance once")
+        stances[stance.index] = stance
+    return tuple(stances[k] for k in sorted(stances))
+
+
+def _planes(index: Index, team: Team) -> dict[int, Planes]:
+    planes: dict[int, Planes] = {}
+    items = schemas.PLANES_TOPIC, read_topic(index, schemas.PLANES_TOPIC)
+    for plane in decoded(index, items, lambda item: decode.decode_planes(item.ns, item.data)):
+        where = f"{index.path}: the planes of stance {plane.stance}"
+        check_robots(team, tuple(plane.planes), where)
+        if plane.stance in planes:
+            raise RunError(f"{where} are recorded twice; state them once a stance")
+        planes[plane.stance] = plane
+    return planes

@@ -1,0 +1,238 @@
+"""`RunWriter` records a run as it happens, `whole_run` writes one that is there whole or not at all."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from numpy.typing import ArrayLike
+
+from coloc_graph.errors import RunError
+from coloc_graph.run import schemas
+from coloc_graph.run.encode import ImageFormat, Record, check_robots, encode_pose, encode_record, encode_team
+from coloc_graph.run.messages import Planes, Stance
+from coloc_graph.team import Team
+
+CHUNK_SIZE = 128 * 1024
+
+
+class RunWriter:
+    """Writes a run to `path` as it happens; a context manager, which replaces a file that was there.
+
+    Messages are on their way to the disk (in the operating system's hands) at most `flush_every` seconds
+    after `write` returned, so that a killed process loses no more than that; None writes a chunk only when it
+    is full, and then the same input gives the same bytes. `image_format` is `jpeg` (quality 95, lossy),
+    `png` or `raw`. `write` may be called from several threads.
+
+    Raises RunError where a record cannot be read back as it was meant, and when the disk refuses.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        team: Team,
+        *,
+        image_format: ImageFormat = "jpeg",
+        flush_every: float | None = 0.5,
+    ) -> None:
+        if image_format not in ("jpeg", "png", "raw"):
+            raise RunError(f"the image format `{image_format}` is unknown; use jpeg, png or raw")
+        if flush_every is not None and not flush_every > 0:
+            raise RunError(f"`flush_every` is {flush_every}; give seconds above 0, or None")
+        self.path = Path(path)
+        self.team = team
+        self._image_format = image_format
+        self._true_team: Team | None = None
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        self._last: dict[str, int] = {}
+        self._counts: dict[int, int] = {}
+        self._started = False
+        self._closed = False
+        self._failure: OSError | None = None
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        try:
+            self._file = self.path.open("wb")
+        except OSError as error:
+            raise self._refused(error) from error
+        self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD)
+        try:
+            self._on_disk(self._begin)
+        except RunError:
+            self._close_file()
+            raise
+        self._flusher: threading.Thread | None = None
+        if flush_every is not None:
+            # at twice the rate, so that a flush that comes late is still in time
+            self._flusher = threading.Thread(
+                target=self._flush_regularly, args=(flush_every / 2,), name="run-flush", daemon=True
+            )
+            self._flusher.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # what was recorded until something went wrong is worth keeping: the file is finished either way
+        if error is None:
+            self.close()
+        else:
+            with suppress(RunError):
+                self.close()
+
+    def write(self, record: Record) -> None:
+        """Add a record; its time must not be before the last one of its topic."""
+        match record:
+            case Stance():
+                where = f"stance {record.index}"
+                check_robots(self.team, (*record.observers, *record.movers, *record.anchors), where)
+            case Planes():
+                check_robots(self.team, tuple(record.planes), f"the planes of stance {record.stance}")
+            case _:
+                check_robots(self.team, (record.robot,), f"the {type(record).__name__}")
+        topic, schema, time, data = encode_record(record, self._image_format)
+        self._add(topic, schema, time, data)
+
+    def write_truth(self, robot: str, time: float, T_world_body: ArrayLike) -> None:
+        """Add the true pose of a robot's body in the world, (4, 4) [m]; only evaluations see it."""
+        check_robots(self.team, (robot,), "the truth")
+        data = encode_pose(time, np.asarray(T_world_body, float))
+        self._add(schemas.topic_of(robot, "truth"), schemas.POSE_IN_FRAME, time, data)
+
+    def write_true_team(self, team: Team) -> None:
+        """Say, once, what the team was really like (true mounts, spans); only evaluations see it."""
+        with self._lock:
+            self._check_open()
+            if self._true_team is not None:
+                raise RunError(f"{self.path}: the true team was written twice; write it once")
+            self._true_team = team
+            if self._started:
+                self._on_disk(lambda: self._message(*self._of_team(schemas.TRUE_TEAM_TOPIC, team), self._start_ns))
+
+    def close(self) -> None:
+        """Finish the file; afterwards nothing can be written. Closing twice does nothing."""
+        self._stop.set()
+        if self._flusher is not None:
+            self._flusher.join()
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            if self._failure is None:
+                self._on_disk(self._finish)
+            self._close_file()
+            if self._failure is not None:
+                raise self._refused(self._failure) from self._failure
+
+    def _add(self, topic: str, schema: str, time: float, data: bytes) -> None:
+        ns = schemas.to_ns(time)
+        with self._lock:
+            self._check_open()
+            last = self._last.get(topic, 0)
+            if ns < last:
+                raise RunError(
+                    f"{self.path}: time runs backwards in {topic}, from {schemas.to_seconds(last)} s "
+                    f"to {time} s; write each topic in the order of time"
+                )
+            self._on_disk(lambda: self._start(ns))
+            self._on_disk(lambda: self._message(topic, schema, data, ns))
+            self._last[topic] = ns
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RunError(f"{self.path}: the run is closed; write before closing it")
+        if self._failure is not None:
+            raise self._refused(self._failure) from self._failure
+
+    def _begin(self) -> None:
+        self._mcap.start(profile=f"{schemas.PROFILE_PREFIX}{schemas.FORMAT}", library=schemas.LIBRARY)
+        self._file.flush()
+
+    def _start(self, ns: int) -> None:
+        # the team has no time of its own: that of the first message keeps Foxglove's time line short
+        if self._started:
+            return
+        self._started = True
+        self._start_ns = ns
+        self._message(*self._of_team(schemas.TEAM_TOPIC, self.team), ns)
+        if self._true_team is not None:
+            self._message(*self._of_team(schemas.TRUE_TEAM_TOPIC, self._true_team), ns)
+        self._flush()
+
+    def _of_team(self, topic: str, team: Team) -> tuple[str, str, bytes]:
+        return topic, schemas.schemas_of(topic)[0], encode_team(team)
+
+    def _message(self, topic: str, schema: str, data: bytes, ns: int) -> None:
+        channel = self._channel(topic, schema)
+        sequence = self._counts.get(channel, 0)
+        self._counts[channel] = sequence + 1
+        self._mcap.add_message(channel, log_time=ns, publish_time=ns, data=data, sequence=sequence)
+
+    def _channel(self, topic: str, schema: str) -> int:
+        if (topic, schema) not in self._channels:
+            encoding, message_encoding, data = schemas.schema_of(schema)
+            if schema not in self._schemas:
+                self._schemas[schema] = self._mcap.register_schema(schema, encoding, data)
+            self._channels[topic, schema] = self._mcap.register_channel(topic, message_encoding, self._schemas[schema])
+        return self._channels[topic, schema]
+
+    def _finish(self) -> None:
+        self._start(0)
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+        self._file.flush()
+
+    def _flush(self) -> None:
+        self._mcap.flush()  # type: ignore[no-untyped-call]
+
+    def _flush_regularly(self, period: float) -> None:
+        while not self._stop.wait(period):
+            with self._lock, suppress(RunError):  # a refusal is kept, and raised where the user writes next
+                if self._failure is None:
+                    self._on_disk(self._flush)
+
+    def _close_file(self) -> None:
+        with suppress(OSError):  # it flushes once more, and a disk that is full has said so before
+            self._file.close()
+
+    def _on_disk(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except OSError as error:
+            self._failure = error
+            raise self._refused(error) from error
+
+    def _refused(self, error: OSError) -> RunError:
+        return RunError(
+            f"{self.path}: cannot be written ({error.strerror}); check the folder and the space on the disk"
+        )
+
+
+@contextmanager
+def whole_run(
+    path: str | Path, team: Team, *, image_format: ImageFormat = "jpeg", flush_every: float | None = None
+) -> Iterator[RunWriter]:
+    """A `RunWriter` whose file is at `path` only once it is whole: nothing is left of it after an exception.
+
+    Until then it is beside it, as `path` + ".part". The same input gives the same bytes.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    if path.is_dir():
+        raise RunError(f"{path}: is a folder; give the path of a file")
+    writer = RunWriter(part, team, image_format=image_format, flush_every=flush_every)
+    try:
+        yield writer
+        writer.close()
+        part.replace(path)
+    except BaseException:
+        with suppress(RunError):
+            writer.close()
+        part.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,149 @@
+"""`simulate`: let a scenario happen and write it down as the run that a real team would have written."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path as FilePath
+from typing import Literal, Protocol, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coloc_graph.errors import InputError
+from coloc_graph.run import whole_run
+from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Stance
+from coloc_graph.simulation.paths import Array
+from coloc_graph.simulation.rig import Imperfections
+from coloc_graph.simulation.scenarios import scenario
+from coloc_graph.simulation.scenery import Scenery, frames, make_scenery
+from coloc_graph.simulation.tracks import observe
+from coloc_graph.simulation.wheels import Odometry, move_times, odometry
+from coloc_graph.simulation.world import EPOCH, Depth, World, build_world, stream
+from coloc_graph.team import Team
+
+ImageFormat = Literal["jpeg", "raw", "png"]
+Record = Detections | Image | OdometrySample | Motion | Stance
+
+
+class Recorder(Protocol):
+    """What a world is written to: `run.RunWriter`, or anything with these methods."""
+
+    def write(self, record: Record) -> None:
+        """Take one record."""
+
+    def write_truth(self, robot: str, time: float, T_world_body: ArrayLike) -> None:
+        """Take one true pose."""
+
+    def write_true_team(self, team: Team) -> None:
+        """Take the true team."""
+
+
+def simulate(
+    scenario_name: str,
+    out: str | FilePath,
+    *,
+    depth: Depth = "tracks",
+    seed: int = 0,
+    points: int | None = None,
+    stances: int | None = None,
+    imperfections: Imperfections | None = None,
+    l: float | None = None,  # noqa: E741 (the paper's name)
+    theta_deg: float | None = None,
+    fps: float = 10.0,
+    image_format: ImageFormat = "jpeg",
+    progress: Callable[[int, int], None] | None = None,
+) -> World:
+    """Simulate a scenario (`single-step`, `six-step`, `hallway`) and write it as a run to `out`.
+
+    `points` correspondences a stance (250 for single-step and for images, else 100), two from each frame at
+    depth images. `l` [m] and `theta_deg` are single-step's. `progress` is called with the stances done and their
+    number. The same arguments give the same bytes. Returns what was true. Raises `InputError`, and leaves no
+    file, where an argument is wrong or the pair has no common view.
+    """
+    if depth not in get_args(Depth):
+        raise InputError(f"`depth` is {depth!r}; use tracks or images")
+    if image_format not in get_args(ImageFormat):
+        raise InputError(f"`image_format` is {image_format!r}; use jpeg, png or raw")
+    if seed < 0:
+        raise InputError(f"`seed` is {seed}; give a whole number that is not negative")
+    what = scenario(scenario_name, stances=stances, l=l, theta_deg=theta_deg, rng=stream(seed, "formation"))
+    if points is None:
+        points = 250 if depth == "images" or scenario_name == "single-step" else 100
+    world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps)
+
+    with whole_run(out, world.team, image_format=image_format) as writer:
+        record(world, writer, depth, progress)
+    return world
+
+
+def record(world: World, recorder: Recorder, depth: Depth, progress: Callable[[int, int], None] | None = None) -> None:
+    """Write all that happens in a world to a recorder, each topic in the order of time."""
+    recorder.write_true_team(world.true_team)
+    wheels = {
+        robot: odometry(
+            path,
+            [(start, end) for mover, start, end in world.moves if mover == robot],
+            stream(world.seed, "wheels", world.team.names.index(robot)),
+        )
+        for robot, path in world.paths.items()
+    }
+    scenery = make_scenery(world) if depth == "images" else None
+    begin = EPOCH
+    for k, stance in enumerate(world.stances):
+        events = _truth(world, begin, stance)
+        events += _moves(world, begin, stance, wheels)
+        events += _seen(world, k, scenery)
+        # stable, so that what happens at one instant is written in the order above
+        for _, happen in sorted(events, key=lambda event: event[0]):
+            happen(recorder)
+        begin = stance.end
+        if progress is not None:
+            progress(k + 1, len(world.stances))
+
+
+Event = tuple[float, Callable[[Recorder], None]]
+
+
+def _write(record: Record, time: float) -> Event:
+    return time, lambda recorder: recorder.write(record)
+
+
+def _write_truth(robot: str, time: float, T_world_body: Array) -> Event:
+    return time, lambda recorder: recorder.write_truth(robot, time, T_world_body)
+
+
+def _truth(world: World, begin: float, stance: Stance) -> list[Event]:
+    """True poses of all robots: while they move at 10 Hz, and at both ends of the stance."""
+    events = []
+    for robot, path in world.paths.items():
+        moving = [move_times(s, e) for mover, s, e in world.moves if mover == robot and begin <= s < stance.end]
+        times = np.unique(np.concatenate([*moving, [stance.start, stance.end]]))
+        events += [_write_truth(robot, t, T) for t, T in zip(times.tolist(), path.pose_at(times), strict=True)]
+    return events
+
+
+def _moves(world: World, begin: float, stance: Stance, wheels: dict[str, Odometry]) -> list[Event]:
+    """The stance, and motions and odometry since `begin`, by the robots' own clocks."""
+    events = [_write(stance, stance.start)]
+    for robot, start, end in world.moves:
+        if begin <= start < stance.end:
+            on, off = world.clock(robot, [start, end]).tolist()
+            events += [_write(Motion(robot, on, True), on), _write(Motion(robot, off, False), off)]
+    for robot, odometer in wheels.items():
+        late = float(world.clock(robot, 0.0))
+        events += [_write(sample, sample.time) for sample in odometer.records(robot, begin, stance.end, late)]
+    return events
+
+
+def _seen(world: World, k: int, scenery: Scenery | None) -> list[Event]:
+    """What the observers of stance k took: images where there is scenery, otherwise detections."""
+    if scenery is None:
+        return [_write(found, found.time) for tracks in observe(world, k) for found in tracks.records()]
+    events = []
+    for capture in world.captures[k]:
+        images = frames(world, k, capture, scenery)
+        events += [(stamp, _write_next(images)) for stamp in capture.stamps.tolist()]
+    return events
+
+
+def _write_next(images: Iterator[Image]) -> Callable[[Recorder], None]:
+    # rendered when its turn comes: a stance's images need not be in memory together
+    return lambda recorder: recorder.write(next(images))

@@ -1,0 +1,106 @@
+"""The reference rig, and how far the truth may lie from what is said: `reference_team`, `Imperfections`."""
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+from msgspec.structs import replace
+
+from coloc_graph.errors import InputError
+from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Team
+
+#: A mild lens, OpenCV's (k1, k2, p1, p2): what the images are rendered through.
+MILD_LENS = (-0.10, 0.02, 5e-4, -3e-4)
+
+
+@dataclass(frozen=True)
+class Imperfections:
+    """Standard deviations from which a truth is drawn, and the clocks' faults. Zero by default but the noise.
+
+    `mount_sigma_deg` holds for tilt and for roll of each mount, `floor_sigma_deg` for roll and for pitch of a
+    body wherever it stands; heights and spans are in metres. A robot other than the reference stamps an
+    instant t with t + `clock_offset` [s]. `time_jitter` [s] moves the true instant of each capture; the stamp
+    moves with it. `noise_px` is that of a marker centre per axis (tracks depth only: images bring their own).
+    """
+
+    mount_sigma_deg: float = 0.0
+    height_sigma: float = 0.0
+    span_sigma: float = 0.0
+    floor_sigma_deg: float = 0.0
+    clock_offset: float = 0.0
+    time_jitter: float = 0.0
+    noise_px: float = 0.3
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not math.isfinite(value):
+                raise InputError(f"`{field.name}` is {value}; give a finite number")
+            if value < 0 and field.name != "clock_offset":
+                raise InputError(f"`{field.name}` is {value}; give a number that is not negative")
+
+    @property
+    def clocks_differ(self) -> bool:
+        """Whether two robots can stamp one instant differently, or capture at different instants."""
+        return self.clock_offset != 0 or self.time_jitter > 0
+
+
+def reference_team(distortion: tuple[float, ...] = ()) -> Team:
+    """Three robots A (the reference), B and C as in the design: PS3 Eye, 0.40 m up, tilted 20 deg, two LEDs.
+
+    `distortion` is OpenCV's, none by default; images are rendered through `MILD_LENS`.
+    """
+    camera = Camera(width=320, height=240, fx=301.0, fy=301.0, cx=159.5, cy=119.5, distortion=distortion, fps=100.0)
+    mount = Mount(height=0.40, tilt_deg=20.0)
+    markers = Markers(height=0.15, positions=((0.0, 0.125), (0.0, -0.125)))
+    robots = tuple(Robot(name=name, camera=camera, mount=mount, markers=markers) for name in "ABC")
+    return Team(reference="A", robots=robots, floor=Floor())
+
+
+def stated_team(team: Team, imperfections: Imperfections) -> Team:
+    """What the run says of the team: nominal values, with the tolerances filled in."""
+
+    def stated(robot: Robot) -> Robot:
+        # a camera's noise must be above 0 for a detection to have a covariance
+        camera = replace(robot.camera, noise_px=detection_sigma(imperfections))
+        mount = replace(
+            robot.mount,
+            height_sigma=imperfections.height_sigma,
+            tilt_sigma_deg=imperfections.mount_sigma_deg,
+            roll_sigma_deg=imperfections.mount_sigma_deg,
+        )
+        markers = robot.markers and replace(robot.markers, span_sigma=imperfections.span_sigma)
+        return replace(robot, camera=camera, mount=mount, markers=markers)
+
+    floor = Floor(tilt_sigma_deg=imperfections.floor_sigma_deg)
+    return replace(team, robots=tuple(map(stated, team.robots)), floor=floor)
+
+
+def true_team(stated: Team, rng: np.random.Generator) -> Team:
+    """What the team is: drawn from the tolerances of the stated one, which are zero in the outcome."""
+
+    def drawn(robot: Robot) -> Robot:
+        height, tilt, roll, span = rng.standard_normal(4).tolist()
+        m = robot.mount
+        mount = replace(
+            m,
+            height=m.height + height * m.height_sigma,
+            tilt_deg=m.tilt_deg + tilt * m.tilt_sigma_deg,
+            roll_deg=m.roll_deg + roll * m.roll_sigma_deg,
+            height_sigma=0.0,
+            tilt_sigma_deg=0.0,
+            roll_sigma_deg=0.0,
+        )
+        markers = robot.markers
+        if markers is not None and markers.span:
+            scale = 1 + span * markers.span_sigma / markers.span
+            positions = tuple((x * scale, y * scale) for x, y in markers.positions)
+            markers = replace(markers, positions=positions, span_sigma=0.0)
+        return replace(robot, mount=mount, markers=markers)
+
+    return replace(stated, robots=tuple(map(drawn, stated.robots)))
+
+
+def detection_sigma(imperfections: Imperfections) -> float:
+    """Standard deviation a detection is given [px]: the noise, or next to nothing where there is none."""
+    return max(imperfections.noise_px, 1e-3)

@@ -1,0 +1,134 @@
+"""Where the robots stand, stance by stance: `Scenario` and the formations of the paper's experiments."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from coloc_graph.errors import InputError
+
+#: x [m], y [m], yaw [rad] of a body on the floor.
+Pose = tuple[float, float, float]
+
+#: Half the angle between the pair's cameras in the multi-step experiments.
+HALF_ANGLE = math.radians(17.0)
+
+
+@dataclass(frozen=True)
+class Box:
+    """Where marker points are spread, from the middle of the standing pair: x and y from and to [m]."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A leap-frog: `poses[k]` is where robot `pair[k % 2]` stands; in stance k, poses k and k+1 are taken.
+
+    Robot `pair[(k + 1) % 2]` drives from `poses[k-1]` to `poses[k+1]` between stances k-1 and k, and `mover`
+    drives about during the stances. `box` is where its markers are spread.
+    """
+
+    name: str
+    poses: tuple[Pose, ...]
+    box: Box
+    pair: tuple[str, str] = ("A", "B")
+    mover: str = "C"
+
+    def __post_init__(self) -> None:
+        if len(self.poses) < 2:
+            raise InputError(f"scenario `{self.name}` has {len(self.poses)} standing poses; give at least 2")
+
+    @property
+    def stances(self) -> int:
+        """The number of stances."""
+        return len(self.poses) - 1
+
+    def stander(self, k: int) -> str:
+        """The robot that stands at `poses[k]`."""
+        return self.pair[k % 2]
+
+    def observers(self, k: int) -> tuple[str, str]:
+        """The robots of stance k: the one at `poses[k]`, the anchor, then the one at `poses[k+1]`."""
+        return self.stander(k), self.stander(k + 1)
+
+    def anchors(self, k: int) -> tuple[str, ...]:
+        """The robot that has stayed put since stance k-1."""
+        return (self.stander(k),) if k else ()
+
+    def standing(self, k: int) -> dict[str, int]:
+        """Robot -> number of its standing pose, in stance k."""
+        return {self.stander(k): k, self.stander(k + 1): k + 1}
+
+    def middle(self, k: int) -> tuple[float, float]:
+        """The middle of the pair in stance k [m]."""
+        (xi, yi, _), (xj, yj, _) = self.poses[k], self.poses[k + 1]
+        return (xi + xj) / 2, (yi + yj) / 2
+
+
+def single_step(l: float = 0.8, theta_deg: float = 35.0) -> Scenario:  # noqa: E741 (the paper's name)
+    """Fig. 4: A and B a distance `l` [m] apart, turned towards each other by `theta_deg` in all."""
+    if not (math.isfinite(l) and l > 0):
+        raise InputError(f"`l` is {l}; give the distance between the two robots in metres, above 0")
+    if not math.isfinite(theta_deg):
+        raise InputError(f"`theta_deg` is {theta_deg}; give the angle between the two robots in degrees")
+    half = math.radians(theta_deg) / 2
+    poses = ((0.0, l / 2, -half), (0.0, -l / 2, half))
+    return Scenario("single-step", poses, Box((0.2, 2.5), (-1.5, 1.5)))
+
+
+def six_step(stances: int = 6) -> Scenario:
+    """Table I: the standing points a to g at the paper's own distances, at most 6 stances."""
+    if not 1 <= stances <= 6:
+        raise InputError(f"six-step has 1 to 6 stances, not {stances}; use the hallway for more")
+    places = (
+        (0.0, 0.0), (-0.0127, -0.7713), (0.3622, 0.0), (0.3496, -0.7828), (0.7401, 0.0),
+        (0.718, -0.804), (1.0973, 0.0),
+    )  # fmt: skip
+    poses = tuple((x, y, HALF_ANGLE if k % 2 else -HALF_ANGLE) for k, (x, y) in enumerate(places))
+    return Scenario("six-step", poses[: stances + 1], Box((0.3, 2.5), (-1.0, 1.0)))
+
+
+def hallway(stances: int = 40, rng: np.random.Generator | None = None) -> Scenario:
+    """Table II: a leap-frog of 0.37 m steps down a hallway, each stop off by a centimetre and a degree."""
+    if stances < 1:
+        raise InputError(f"the hallway has {stances} stances; give at least 1")
+    rng = np.random.default_rng(0) if rng is None else rng
+    k = np.arange(stances + 1)
+    side = np.where(k % 2, -1.0, 1.0)
+    # row by row, so that a longer hallway begins as a shorter one does
+    off = rng.standard_normal((stances + 1, 3)) * (0.01, 0.01, np.deg2rad(1.0))
+    poses = np.stack([0.185 * k, 0.36 * side, -HALF_ANGLE * side], axis=1) + off
+    return Scenario("hallway", tuple((float(x), float(y), float(w)) for x, y, w in poses), Box((0.3, 2.5), (-1.0, 1.0)))
+
+
+def scenario(
+    name: str,
+    *,
+    stances: int | None = None,
+    l: float | None = None,  # noqa: E741
+    theta_deg: float | None = None,
+    rng: np.random.Generator | None = None,
+) -> Scenario:
+    """The scenario of a name; `InputError` where there is none, or an argument is not one of its own."""
+    if name != "single-step" and (l is not None or theta_deg is not None):
+        raise InputError(f"`l` and `theta_deg` belong to single-step, not to {name}; leave them out")
+    if name == "single-step":
+        if stances not in (None, 1):
+            raise InputError(f"single-step has one stance, not {stances}; leave `stances` out, or use the hallway")
+        return single_step(0.8 if l is None else l, 35.0 if theta_deg is None else theta_deg)
+    if name == "six-step":
+        return six_step(6 if stances is None else stances)
+    if name == "hallway":
+        return hallway(40 if stances is None else stances, rng)
+    raise InputError(f"there is no scenario `{name}`; choose one of {', '.join(SCENARIOS)}")
+
+
+#: The scenarios, by name.
+SCENARIOS: dict[str, Callable[..., Scenario]] = {
+    "single-step": single_step,
+    "six-step": six_step,
+    "hallway": hallway,
+}

@@ -1,0 +1,53 @@
+"""Depth tracks: the marker centres that each observer would have detected, with noise."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.run.messages import Detections
+from coloc_graph.simulation.paths import Array
+from coloc_graph.simulation.rig import detection_sigma
+from coloc_graph.simulation.world import World, stream
+
+
+@dataclass(frozen=True, eq=False)
+class StanceTracks:
+    """What one observer detected in one stance: `uv` (n, m, 2) [px] of m markers at `stamps` (n,) [s].
+
+    `seen` (n, m) tells which of them were detected; the others' uv mean nothing. `sigma` [px] is per axis.
+    """
+
+    robot: str
+    mover: str
+    stamps: Array
+    uv: Array
+    seen: NDArray[np.bool_]
+    sigma: float
+
+    def records(self) -> list[Detections]:
+        """One record a capture."""
+        names = np.array([f"{self.mover}/{m}" for m in range(self.uv.shape[1])])
+        covariance = np.broadcast_to(self.sigma**2 * np.eye(2), (len(names), 2, 2))
+        none = np.zeros(len(names))  # no image, so neither peak nor area was measured
+        flags = np.zeros(len(names), np.uint8)
+        out = []
+        for stamp, uv, seen in zip(self.stamps.tolist(), self.uv, self.seen, strict=True):
+            n = int(seen.sum())
+            markers = tuple(names[seen].tolist())
+            out.append(Detections(self.robot, stamp, uv[seen], covariance[:n], markers, flags[:n], none[:n], none[:n]))
+        return out
+
+
+def observe(world: World, k: int) -> tuple[StanceTracks, ...]:
+    """What the observers of stance k detect of the mover, in the order of `Stance.observers`."""
+    mover, rng = world.scenario.mover, stream(world.seed, "detection", k)
+    out = []
+    for capture in world.captures[k]:
+        uv, inside = capture.view.project(world.markers_world(mover, capture.times))
+        noisy = uv + world.imperfections.noise_px * rng.standard_normal(uv.shape)
+        seen = capture.recorded & inside
+        out.append(
+            StanceTracks(capture.robot, mover, capture.stamps, noisy, seen, detection_sigma(world.imperfections))
+        )
+    return tuple(out)

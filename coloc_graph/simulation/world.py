@@ -1,0 +1,252 @@
+"""The true world of one run: who the robots are, where each is at every instant, what happens when."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coloc_graph.errors import InputError
+from coloc_graph.lie import floor_pose
+from coloc_graph.run.messages import Stance
+from coloc_graph.simulation.paths import Array, Path, PathBuilder, drive, tilt_rotation
+from coloc_graph.simulation.rig import MILD_LENS, Imperfections, reference_team, stated_team, true_team
+from coloc_graph.simulation.scenarios import Pose, Scenario
+from coloc_graph.simulation.tours import LONGEST_BURST, Tour, View, patrol, scatter
+from coloc_graph.team import Team
+
+#: When every simulated run begins [UTC s].
+EPOCH = 1_700_000_000.0
+
+#: All stand still for this long [s] before and after the mover's drive; half of it belongs to the stance.
+REST = 0.5
+
+#: How many captures a pose of the mover gets where clocks differ: enough to tell how fast the marker moves.
+BURST = 3
+
+Depth = Literal["tracks", "images"]
+
+# every purpose draws from a stream of its own, so that, say, other noise leaves the geometry as it was
+_STREAMS = (
+    "formation",
+    "team",
+    "standing",
+    "floor",
+    "tour",
+    "clock",
+    "detection",
+    "wheels",
+    "scenery",
+    "sensor",
+)
+
+
+def stream(seed: int, purpose: str, index: int = 0) -> np.random.Generator:
+    """The random numbers of one purpose (a stance's or a robot's, by `index`) in the run of a seed."""
+    return np.random.default_rng((seed, _STREAMS.index(purpose), index))
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """The captures of one stance by one observer: at true `times` (n,) [s], by its clock at `stamps` (n,).
+
+    `recorded` (n, m) says which of the mover's markers its detections hold (tracks depth).
+    """
+
+    robot: str
+    view: View
+    times: Array
+    stamps: Array
+    recorded: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """Everything that is true of a run. `team` is the stated one; `stances` are in true time [UTC s].
+
+    `paths` maps a robot to its movement, `moves` are (robot, start, end) in order, `captures` (one tuple a
+    stance) what the observers take. The world frame is the floor, z = 0, not the reference's body.
+    """
+
+    scenario: Scenario
+    team: Team
+    true_team: Team
+    imperfections: Imperfections
+    seed: int
+    paths: dict[str, Path]
+    stances: tuple[Stance, ...]
+    moves: tuple[tuple[str, float, float], ...]
+    captures: tuple[tuple[Capture, ...], ...]
+
+    def clock(self, robot: str, times: ArrayLike) -> Array:
+        """What a robot's clock says at true times [s]."""
+        return _stamp(robot, self.team, self.imperfections, times)
+
+    def markers_world(self, robot: str, times: ArrayLike) -> Array:
+        """True places (n, m, 3) [m] of a robot's markers at true times (n,); m may be 0."""
+        markers = self.true_team[robot].markers
+        p_body = np.zeros((0, 3)) if markers is None else markers.p_body
+        T = self.paths[robot].pose_at(times)
+        return np.asarray(np.einsum("nij,mj->nmi", T[:, :3, :3], p_body) + T[:, None, :3, 3])
+
+
+def build_world(
+    scenario: Scenario,
+    *,
+    depth: Depth = "tracks",
+    seed: int = 0,
+    points: int = 100,
+    imperfections: Imperfections | None = None,
+    fps: float = 10.0,
+    team: Team | None = None,
+    burst: int | None = None,
+) -> World:
+    """Let a scenario happen once. Nothing is written, nothing rendered: for Monte Carlo, with `observe`.
+
+    `points` correspondences a stance at depth tracks, `points` / 2 frames at `fps` at depth images. `team` is
+    nominal (the reference rig by default). `burst` captures are made of each pose of the mover at depth
+    tracks, 1 by default or 3 where clocks differ. Raises `InputError` where the pair has no common view.
+    """
+    if points < 4:
+        raise InputError(f"`points` is {points}; a homography needs at least 4 a stance")
+    if not (np.isfinite(fps) and fps > 0):
+        raise InputError(f"`fps` is {fps}; give frames a second, above 0")
+    if seed < 0:
+        raise InputError(f"`seed` is {seed}; give a whole number that is not negative")
+    if burst is not None and not 1 <= burst <= LONGEST_BURST:
+        raise InputError(f"`burst` is {burst}; give 1 to {LONGEST_BURST} captures")
+    imperfections = imperfections or Imperfections()
+    nominal = team or reference_team(MILD_LENS if depth == "images" else ())
+    stated = stated_team(nominal, imperfections)
+    true = true_team(stated, stream(seed, "team"))
+    if burst is None:
+        burst = BURST if imperfections.clocks_differ else 1
+    return _Builder(scenario, true, imperfections, seed, points, depth, fps, burst).build(stated)
+
+
+class _Builder:
+    """Lays the stances of a scenario one after the other in time."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        true: Team,
+        imperfections: Imperfections,
+        seed: int,
+        points: int,
+        depth: Depth,
+        fps: float,
+        burst: int,
+    ) -> None:
+        self.scenario, self.true, self.imperfections, self.seed = scenario, true, imperfections, seed
+        self.points, self.depth, self.fps, self.burst = points, depth, fps, burst
+        self.sigma = float(np.deg2rad(imperfections.floor_sigma_deg))
+        # drawn for all standing poses first, row by row: those of a longer run begin as a shorter one's do
+        self.tilts = self.sigma * stream(seed, "standing").standard_normal((len(scenario.poses), 2))
+        self.moves: list[tuple[str, float, float]] = []
+        self.builders: dict[str, PathBuilder] = {}
+
+    def build(self, stated: Team) -> World:
+        stances, captures = [], []
+        time = EPOCH
+        for k in range(self.scenario.stances):
+            views = self._views(k)
+            tour = self._tour(k, views, time)
+            start = self._gather(k, tour, time) + REST if k else time + REST
+            tour = self._shifted(tour, start - float(tour.leg.times[0]))
+            if k == 0:
+                self._place(tour, time)
+            mover = self.scenario.mover
+            self.builders[mover].follow(tour.leg)
+            end = float(tour.leg.times[-1])
+            self.moves.append((mover, start, end))
+            observers = self.scenario.observers(k)
+            # the stance is longer than the drive, so that no capture falls out of it by its clock
+            stances.append(Stance(k, start - REST / 2, end + REST / 2, observers, (mover,), self.scenario.anchors(k)))
+            captures.append(self._captures(k, tour, views, stated))
+            time = end + REST
+        paths = {robot: builder.path() for robot, builder in self.builders.items()}
+        moves = tuple(sorted(self.moves, key=lambda move: move[1]))
+        return World(
+            scenario=self.scenario,
+            team=stated,
+            true_team=self.true,
+            imperfections=self.imperfections,
+            seed=self.seed,
+            paths=paths,
+            stances=tuple(stances),
+            moves=moves,
+            captures=tuple(captures),
+        )
+
+    def _views(self, k: int) -> tuple[View, View]:
+        first, second = (
+            View(
+                self.true[robot].camera,
+                standing_pose(self.scenario.poses[n], self.tilts[n]) @ self.true[robot].mount.T_body_camera,
+            )
+            for robot, n in self.scenario.standing(k).items()
+        )
+        return first, second
+
+    def _tour(self, k: int, views: tuple[View, View], start: float) -> Tour:
+        markers = self.true[self.scenario.mover].markers
+        if markers is None:
+            raise InputError(f"robot `{self.scenario.mover}` moves but has no markers; give it [robots.markers]")
+        where, rng, middle = f"stance {k}", stream(self.seed, "tour", k), self.scenario.middle(k)
+        if self.depth == "images":
+            frames = max(self.points // 2, 1)
+            return patrol(views, markers.p_body, middle, frames, self.fps, start, rng, where)
+        box = self.scenario.box
+        return scatter(views, markers.p_body, box, middle, self.points, self.burst, start, rng, where)
+
+    def _place(self, tour: Tour, time: float) -> None:
+        """Put every robot where it is at the beginning."""
+        scenario = self.scenario
+        for robot, n in scenario.standing(0).items():
+            floor = stream(self.seed, "floor", n)
+            self.builders[robot] = PathBuilder(time, scenario.poses[n], self.sigma, floor, self.tilts[n])
+        floor = stream(self.seed, "floor", 2)
+        self.builders[scenario.mover] = PathBuilder(time, tour.leg.knots[0], self.sigma, floor)
+
+    def _gather(self, k: int, tour: Tour, time: float) -> float:
+        """Between stances: the one behind overtakes its partner, the mover goes where its next tour begins.
+        Returns when both are there."""
+        scenario, ends = self.scenario, []
+        for robot, target, tilt in (
+            (scenario.stander(k + 1), np.array(scenario.poses[k + 1]), self.tilts[k + 1]),
+            (scenario.mover, tour.leg.knots[0], None),
+        ):
+            builder = self.builders[robot]
+            leg, _ = drive(np.stack([builder.pose, target]), time, reverse=robot == scenario.mover)
+            builder.follow(leg, tilt)
+            ends.append(float(leg.times[-1]))
+            self.moves.append((robot, time, ends[-1]))
+        return max(ends)
+
+    @staticmethod
+    def _shifted(tour: Tour, by: float) -> Tour:
+        leg = type(tour.leg)(tour.leg.times + by, tour.leg.knots)
+        return Tour(leg, tour.instants + by, tour.recorded)
+
+    def _captures(self, k: int, tour: Tour, views: tuple[View, View], stated: Team) -> tuple[Capture, ...]:
+        rng, out = stream(self.seed, "clock", k), []
+        for robot, view in zip(self.scenario.observers(k), views, strict=True):
+            jitter = self.imperfections.time_jitter * rng.standard_normal(len(tour.instants))
+            order = np.argsort(tour.instants + jitter)
+            times = (tour.instants + jitter)[order]
+            stamps = _stamp(robot, stated, self.imperfections, times)
+            out.append(Capture(robot, view, times, stamps, tour.recorded[order]))
+        return tuple(out)
+
+
+def _stamp(robot: str, team: Team, imperfections: Imperfections, times: ArrayLike) -> Array:
+    late = 0.0 if robot == team.reference else imperfections.clock_offset
+    return np.asarray(times, float) + late
+
+
+def standing_pose(pose: Pose, tilt: ArrayLike) -> Array:
+    """T_world_body (4, 4) of a robot at rest: x, y [m], yaw [rad], tilted by roll, pitch (2,) [rad]."""
+    T_world_body = floor_pose(*pose)
+    T_world_body[:3, :3] = T_world_body[:3, :3] @ tilt_rotation(*np.asarray(tilt, float))
+    return T_world_body
