@@ -43,7 +43,9 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
             findings.append(Finding(where, "no anchor: nothing ties it to the stance before; let one robot stay put"))
         for robot in stance.anchors:
             if any(motion.moving for motion in run.motions(robot, before.end, stance.start)):
-                findings.append(Finding(where, f"{robot} is called an anchor, yet it moved since stance {before.index}"))
+                findings.append(
+                    Finding(where, f"{robot} is called an anchor, yet it moved since stance {before.index}")
+                )
     times = {}
     for robot in stance.observers:
         if run.has_detections(robot):

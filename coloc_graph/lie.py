@@ -4,6 +4,8 @@ Vectorised over leading axes. The tangent of SE(3) is GTSAM's: rotation first, t
 frame (T exp(xi)). The tangent of SL(3) is eight coordinates in the basis `SL3_BASIS`, also on the right.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -46,34 +48,41 @@ def closest_rotation(M: ArrayLike) -> Array:
     return np.asarray(U @ D @ Vt)
 
 
+def quaternion(R: ArrayLike) -> tuple[float, float, float, float]:
+    """The unit quaternion (w, x, y, z), w >= 0, of one rotation (3, 3).
+
+    Shepperd, "Quaternion from Rotation Matrix", 1978: from the largest part, which is exact at every angle.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(R, float).tolist()
+    parts = (a + e + i, a - e - i, e - a - i, i - a - e)
+    largest = max(range(4), key=parts.__getitem__)
+    q = (
+        (1 + parts[0], h - f, c - g, d - b),
+        (h - f, 1 + parts[1], b + d, c + g),
+        (c - g, b + d, 1 + parts[2], f + h),
+        (d - b, c + g, f + h, 1 + parts[3]),
+    )[largest]
+    norm = math.copysign(math.sqrt(sum(part * part for part in q)), q[0])
+    return q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm
+
+
 def so3_log(R: ArrayLike) -> Array:
     """Rotation vectors (..., 3) [rad] of rotations (..., 3, 3); the angle is at most pi."""
     R = np.asarray(R, float)
-    # by way of the quaternion, which is well conditioned at every angle (Shepperd's choice of the largest part)
-    trace = np.trace(R, axis1=-2, axis2=-1)
-    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
-    parts = np.concatenate([trace[..., None], diagonal], axis=-1)
-    which = parts.argmax(-1)
-    q = np.empty((*R.shape[:-2], 4))
-    for case in range(4):
-        mask = which == case
-        if not np.any(mask):
-            continue
-        M, t = R[mask], trace[mask]
-        if case == 0:
-            w = 1 + t
-            v = np.stack([M[:, 2, 1] - M[:, 1, 2], M[:, 0, 2] - M[:, 2, 0], M[:, 1, 0] - M[:, 0, 1]], -1)
-            q[mask] = np.concatenate([w[:, None], v], -1)
-        else:
-            i = case - 1
-            j, k = (i + 1) % 3, (i + 2) % 3
-            part = np.empty((len(M), 4))
-            part[:, 0] = M[:, k, j] - M[:, j, k]
-            part[:, 1 + i] = 1 + M[:, i, i] - M[:, j, j] - M[:, k, k]
-            part[:, 1 + j] = M[:, j, i] + M[:, i, j]
-            part[:, 1 + k] = M[:, k, i] + M[:, i, k]
-            q[mask] = part
-    q /= np.linalg.norm(q, axis=-1, keepdims=True)
+    # all four of Shepperd's forms, and of each rotation the one with the largest part
+    a, b, c, d, e, f, g, h, i = np.moveaxis(R.reshape(*R.shape[:-2], 9), -1, 0)
+    parts = np.stack([a + e + i, a - e - i, e - a - i, i - a - e], axis=-1)
+    forms = np.stack(
+        [
+            np.stack([1 + parts[..., 0], h - f, c - g, d - b], axis=-1),
+            np.stack([h - f, 1 + parts[..., 1], b + d, c + g], axis=-1),
+            np.stack([c - g, b + d, 1 + parts[..., 2], f + h], axis=-1),
+            np.stack([d - b, c + g, f + h, 1 + parts[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    q = np.take_along_axis(forms, parts.argmax(-1)[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1)
     angle = 2 * np.arctan2(sine, q[..., 0])

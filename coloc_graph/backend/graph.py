@@ -15,7 +15,7 @@ from coloc_graph.team import Floor
 #: The world frame is fixed this firmly [rad, m]; far below anything that is measured.
 GAUGE_SIGMA = 1e-6
 #: A floor that is called exactly flat is taken as flat to this much [rad, m].
-LEAST_FLOOR_SIGMA = 1e-4
+LEAST_FLOOR_SIGMA = 1e-5
 
 
 @dataclass(frozen=True)

@@ -45,9 +45,9 @@ class Table:
                 values[row] = float(text)
             except ValueError:
                 raise self.error(row, f"`{name}` is {_quoted(text)}, not a number; {_remedy(text)}") from None
-        row = first(~np.isfinite(values))
-        if row is not None:
-            raise self.error(row, f"`{name}` is `{texts[row]}`; leave out the rows that were not measured")
+        unbounded = first(~np.isfinite(values))
+        if unbounded is not None:
+            raise self.error(unbounded, f"`{name}` is `{texts[unbounded]}`; leave out the rows that were not measured")
         return values
 
     def stances(self) -> NDArray[np.int64]:
@@ -68,8 +68,8 @@ class Table:
         """The column `robot` as places in the team, (n,)."""
         place = {name: index for index, name in enumerate(team.names)}
         names = self.columns["robot"]
-        for unknown in set(names) - place.keys():
-            row = min(names.index(name) for name in {unknown, *names} - place.keys())
+        row = next((row for row, name in enumerate(names) if name not in place), None)
+        if row is not None:
             raise self.error(
                 row,
                 f"robot {_quoted(names[row])} is not in the team ({', '.join(team.names)}); "
@@ -141,4 +141,4 @@ def _quoted(text: str) -> str:
 
 
 def _remedy(text: str) -> str:
-    return "write it with a decimal point" if text else "leave out the rows that were not measured"
+    return "write it like 12.5" if text else "leave out the rows that were not measured"

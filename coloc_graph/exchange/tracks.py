@@ -349,12 +349,13 @@ def _warnings(tracks: _Tracks, team: Team, stances: list[Stance], *, moves_known
             f"{alone[0].index}, with `{alone[0].observers[0]}`) and give no measurement"
         )
     size = np.array([(robot.camera.width, robot.camera.height) for robot in team.robots])[tracks.robot]
-    far = (tracks.uv < -0.5 - IMAGE_MARGIN) | (tracks.uv > size - 0.5 + IMAGE_MARGIN)
-    row = first(far.any(axis=1))
+    beyond = np.maximum(-0.5 - tracks.uv, tracks.uv - (size - 0.5)).max(axis=1)
+    far = beyond > IMAGE_MARGIN
+    row = first(far)
     if row is not None:
         u, v = tracks.uv[row]
         yield (
-            f"{path}: {far.any(axis=1).sum()} of {len(far)} rows are outside of their robot's image (the first is "
+            f"{path}: {far.sum()} of {len(far)} rows are outside of their robot's image (the first is "
             f"line {tracks.table.lines[row]}, ({u:g}, {v:g}) in {size[row][0]} x {size[row][1]} px); "
             "check the camera's width and height in the team, and that u goes right and v down in pixels"
         )

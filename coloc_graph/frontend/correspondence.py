@@ -88,6 +88,8 @@ class _Candidates:
         for a, track_i in enumerate(self._i):
             for b, track_j in enumerate(self._j):
                 shared = pair_by_time(track_i.times, track_j.times)
+                # where a lens cannot be inverted there is no ray, and one NaN would spoil the whole stance
+                shared = shared[_finite(self._x_i[a])[shared[:, 0]] & _finite(self._x_j[b])[shared[:, 1]]]
                 if len(shared):
                     self.indices[a, b] = shared
 
@@ -136,6 +138,11 @@ def normalised(track: Track, camera: Camera) -> tuple[Array, Array]:
         axis=-1,
     )
     return x, J @ track.covariance @ J.swapaxes(1, 2)
+
+
+def _finite(normalised_track: tuple[Array, Array]) -> NDArray[np.bool_]:
+    x, covariance = normalised_track
+    return np.asarray(np.isfinite(x).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
 
 
 def _by_motion(candidates: _Candidates, least: int = 8, seeds: int = 24) -> list[tuple[int, int]]:

@@ -162,6 +162,17 @@ def _latent_step(residual: Array, S_inverse: Array, r_i: Array, by_z: Array, pai
     return np.asarray(r_i + (pairs.covariance_i @ back)[..., 0])
 
 
+def _solve(normal: Array, right: Array) -> Array:
+    """A Gauss-Newton step; `DegenerateGeometry` where it leads nowhere (points beyond the horizon, wrong pairs)."""
+    try:
+        step = np.linalg.solve(normal, right)
+    except np.linalg.LinAlgError:
+        step = np.full(8, np.nan)
+    if not np.abs(step).max() < 10.0:
+        raise DegenerateGeometry("no homography explains the tracks: look for wrong pairs, let the moving robot turn")
+    return step
+
+
 def _reprojection(pairs: PointPairs, H: Array, max_iterations: int = 20) -> tuple[Array, Array, int]:
     """Maximum likelihood: H, its information (8, 8), iterations."""
     z = pairs.x_i
@@ -169,7 +180,7 @@ def _reprojection(pairs: PointPairs, H: Array, max_iterations: int = 20) -> tupl
         residual, S_inverse, r_i, by_z, A = _eliminated(H, z, pairs)
         weighted = S_inverse @ A
         information = np.einsum("nka,nkb->ab", A, weighted)
-        step = np.linalg.solve(information, np.einsum("nka,nk->a", weighted, residual))
+        step = _solve(information, np.einsum("nka,nk->a", weighted, residual))
         z = z + _latent_step(residual - A @ step, S_inverse, r_i, by_z, pairs)
         H = H @ sl3_exp(step)
         if step @ information @ step < 1e-12:
@@ -183,7 +194,7 @@ def _transfer(pairs: PointPairs, H: Array, max_iterations: int = 20) -> tuple[Ar
         p, J = transfer(H, pairs.x_i)
         A = _derivative_by_h(H, pairs.x_i, J)
         normal = np.einsum("nka,nkb->ab", A, A)
-        step = np.linalg.solve(normal, np.einsum("nka,nk->a", A, pairs.x_j - p))
+        step = _solve(normal, np.einsum("nka,nk->a", A, pairs.x_j - p))
         H = H @ sl3_exp(step)
         if step @ normal @ step < 1e-12 * pairs.sigma**2:
             break

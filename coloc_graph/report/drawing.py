@@ -105,7 +105,7 @@ def world_covariances(trajectory: Trajectory) -> tuple[Array, Array]:
     if covariances is None:
         covariances = np.full((len(trajectory), 6, 6), np.nan)
     R = trajectory.T_world_body[:, :3, :3]
-    finite = np.isfinite(covariances).all(axis=(1, 2))[:, None, None]
+    finite = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))[:, None, None]
     both = [R @ covariances[:, s, s] @ R.transpose(0, 2, 1) for s in (slice(3, 6), slice(0, 3))]
     return np.where(finite, both[0], np.nan), np.where(finite, both[1], np.nan)
 
@@ -115,19 +115,19 @@ def position_sigmas(trajectory: Trajectory) -> Array:
     planar = world_covariances(trajectory)[0][:, :2, :2]
     a, b, c = planar[:, 0, 0], planar[:, 1, 1], planar[:, 0, 1]
     largest = (a + b) / 2 + np.hypot((a - b) / 2, c)
-    return np.sqrt(largest.clip(min=0))
+    return np.asarray(np.sqrt(largest.clip(min=0)))
 
 
 def heading_sigmas(trajectory: Trajectory) -> Array:
     """Standard deviation of the heading, (n,) [rad]; NaN where there is no covariance."""
-    return np.sqrt(world_covariances(trajectory)[1][:, 2, 2].clip(min=0))
+    return np.asarray(np.sqrt(world_covariances(trajectory)[1][:, 2, 2].clip(min=0)))
 
 
 def thinned(index: NDArray[np.int64], most: int = MOST_SHOWN) -> NDArray[np.int64]:
     """At most so many of the indices, evenly, first and last among them."""
     if len(index) <= most:
         return index
-    return index[np.linspace(0, len(index) - 1, most).round().astype(int)]
+    return np.asarray(index[np.linspace(0, len(index) - 1, most).round().astype(int)])
 
 
 def standing_places(trajectory: Trajectory) -> NDArray[np.int64]:
@@ -172,6 +172,4 @@ def draw_headings(axes: Axes, T_world_body: Array, colour: str, length: float, w
     start = T_world_body[:, :2, 3]
     heading = yaw(T_world_body)
     end = start + length * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    axes.add_collection(
-        LineCollection(list(np.stack([start, end], axis=1)), colors=colour, linewidths=width, zorder=4)
-    )
+    axes.add_collection(LineCollection(list(np.stack([start, end], axis=1)), colors=colour, linewidths=width, zorder=4))

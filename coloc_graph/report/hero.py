@@ -1,5 +1,9 @@
 """The README's picture: a team leap-frogs down a hallway, and where the estimate says it is."""
 
+import itertools
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -7,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, ConnectionPatch, FancyArrowPatch, Rectangle, Wedge
 
 from coloc_graph.backend import Estimate
-from coloc_graph.lie import yaw
+from coloc_graph.lie import floor_pose, yaw
 from coloc_graph.report.drawing import (
     GREY,
     INK,
@@ -30,8 +34,10 @@ from coloc_graph.trajectory import Trajectory
 
 #: Radius of a robot as drawn [m]: the paper's iRobot Create.
 BODY_RADIUS = 0.16
+#: Room about the poses [m]: ahead of them, their cameras look.
+_BEFORE, _AHEAD = np.array([0.35, 0.3]), np.array([0.75, 0.3])
 _FLOOR = "#f4f6f8"
-_TRUTH = {"color": INK, "linewidth": 1.0, "linestyle": (0, (4, 3))}
+_TRUTH: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (4, 3))}
 
 
 @styled
@@ -41,24 +47,44 @@ def hero_figure(estimate: Estimate, truth: Truth | None = None, fov_deg: float =
     `fov_deg` is the cameras' horizontal field of view, drawn along the robots' headings. Raises `InputError`
     where `truth` has another number of poses than the estimate.
     """
+    estimate, truth = _along_x(estimate, truth)
     figure = Figure(figsize=(12, 6), facecolor="white")
     whole = _panel(figure, (0.03, 0.505, 0.94, 0.365))
     first = _panel(figure, (0.03, 0.065, 0.445, 0.355))
-    end = _panel(figure, (0.505, 0.065, 0.1775, 0.355))
+    end = _panel(figure, (0.7925, 0.065, 0.1775, 0.355))
     trajectories = trajectories_of(estimate)
     low, high = bounds(estimate, truth)
-    _frame(whole, low - (0.35, 0.3), high + (0.75, 0.3))
+    _frame(whole, low - _BEFORE, high + _AHEAD)
     for trajectory in trajectories:
         _draw_whole(whole, estimate, trajectory, truth_of(trajectory, truth), fov_deg)
-    _scale_bar(whole, 1.0, "1 m")
+    _scale_bar(whole, 1.0, "1 m", at=0.55)
     _draw_first_leaps(first, estimate, truth, fov_deg)
     if trajectories:
-        last = max(trajectories, key=lambda one: float(np.linalg.norm(one.positions[-1] - one.positions[0])))
+        last = max(trajectories, key=_how_far)
         _draw_end(end, estimate, last, truth_of(last, truth))
         _connect(figure, whole, first, box=True)
         _connect(figure, whole, end, box=False)
     _write_text(figure, estimate, truth)
     return figure
+
+
+def _along_x(estimate: Estimate, truth: Truth | None) -> tuple[Estimate, Truth | None]:
+    """The same, turned about the world's z so that the team travels to the right."""
+    ways = [one.positions[-1] - one.positions[0] for one in trajectories_of(estimate)]
+    x, y, _ = np.sum([np.zeros(3), *ways], axis=0)
+    T_picture_world = floor_pose(0.0, 0.0, -np.arctan2(y, x))
+    turned = {
+        robot: replace(one, T_world_body=T_picture_world @ one.T_world_body)
+        for robot, one in estimate.trajectories.items()
+    }
+    true = None if truth is None else {robot: T_picture_world @ T for robot, T in truth.items()}
+    return replace(estimate, trajectories=turned), true
+
+
+def _how_far(one: Trajectory) -> tuple[float, float]:
+    """How far a robot got, to the centimetre, and then how uncertain its end is."""
+    sigma = float(np.nan_to_num(position_sigmas(one)[-1]))
+    return round(float(np.linalg.norm(one.positions[-1] - one.positions[0])), 2), sigma
 
 
 def _panel(figure: Figure, place: tuple[float, float, float, float]) -> Axes:
@@ -103,16 +129,16 @@ def _draw_camera(axes: Axes, T: Array, colour: str, fov_deg: float, reach: float
     axes.add_patch(Wedge(tuple(T[:2, 3]), reach, *cone, color=colour, alpha=alpha, linewidth=0, zorder=1))
 
 
-def _first_places(trajectory: Trajectory, count: int = 3) -> Array:
+def _first_places(trajectory: Trajectory, count: int = 5) -> Array:
     return np.asarray(trajectory.T_world_body[standing_places(trajectory)[:count]])
 
 
 def _draw_first_leaps(axes: Axes, estimate: Estimate, truth: Truth | None, fov_deg: float) -> None:
-    """The first three places of each robot, as bodies, with their cameras, and arrows from each to the next."""
+    """The first five places of each robot, as bodies, with their cameras, and arrows from each to the next."""
     trajectories = trajectories_of(estimate)
     seen = np.concatenate([np.zeros((0, 2)), *[_first_places(one)[:, :2, 3] for one in trajectories]])
     if len(seen):
-        _frame(axes, seen.min(axis=0) - (0.35, 0.3), seen.max(axis=0) + (0.75, 0.3))
+        _frame(axes, seen.min(axis=0) - _BEFORE, seen.max(axis=0) + _AHEAD)
     side_of = [one.positions[0, 1] for one in trajectories]
     for trajectory in trajectories:
         colour, places = colour_of(estimate, trajectory.robot), _first_places(trajectory)
@@ -121,23 +147,19 @@ def _draw_first_leaps(axes: Axes, estimate: Estimate, truth: Truth | None, fov_d
             last = number == len(places) - 1
             _draw_camera(axes, T, colour, fov_deg, 0.75, 0.14 if last else 0.07)
             _draw_body(axes, T, colour, "white" if not last else colour)
-        for T, T_next in zip(places, places[1:], strict=False):
-            axes.add_patch(
-                FancyArrowPatch(
-                    tuple(T[:2, 3] + (0, side * 0.1)), tuple(T_next[:2, 3] + (0, side * 0.1)),
-                    connectionstyle=f"arc3,rad={-0.55 * side}", arrowstyle="-|>", mutation_scale=12, color=colour,
-                    linewidth=1.4, zorder=6,
-                )  # fmt: skip
-            )
+        for T, T_next in itertools.pairwise(places):
+            here, there = (tuple(one[:2, 3] + (0, 1.15 * BODY_RADIUS * side)) for one in (T, T_next))
+            arc = f"arc3,rad={-0.5 * side}"
+            look: dict[str, Any] = {"mutation_scale": 12, "color": colour, "linewidth": 1.4, "zorder": 6}
+            axes.add_patch(FancyArrowPatch(here, there, connectionstyle=arc, arrowstyle="-|>", **look))
         true = truth_of(trajectory, truth)
         if true is not None:
             axes.plot(*true[:, :2, 3].T, **_TRUTH, zorder=5)
 
 
 def _draw_body(axes: Axes, T: Array, colour: str, face: str) -> None:
-    radius = 0.5 * BODY_RADIUS
-    axes.add_patch(Circle(tuple(T[:2, 3]), radius, facecolor=face, edgecolor=colour, linewidth=1.6, zorder=3))
-    draw_headings(axes, T[None], colour if face == "white" else "white", radius, 2.0)
+    axes.add_patch(Circle(tuple(T[:2, 3]), BODY_RADIUS, facecolor=face, edgecolor=colour, linewidth=1.6, zorder=3))
+    draw_headings(axes, T[None], colour if face == "white" else "white", BODY_RADIUS, 2.0)
 
 
 def _draw_end(axes: Axes, estimate: Estimate, trajectory: Trajectory, true: Array | None) -> None:
@@ -160,9 +182,9 @@ def _only_last(one: Trajectory) -> Trajectory:
     return Trajectory(one.robot, one.times[-1:], one.T_world_body[-1:], None, covariances)
 
 
-def _scale_bar(axes: Axes, length: float, label: str) -> None:
+def _scale_bar(axes: Axes, length: float, label: str, at: float = 0.97) -> None:
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    x, y = right - 0.03 * (right - left), low + 0.08 * (high - low)
+    x, y = left + at * (right - left), low + 0.08 * (high - low)
     axes.plot([x - length, x], [y, y], color=GREY, linewidth=2, solid_capstyle="butt", zorder=7)
     axes.annotate(label, (x - length / 2, y), (0, 3), textcoords="offset points", ha="center", color=GREY, size=9)
 
@@ -171,41 +193,47 @@ def _connect(figure: Figure, whole: Axes, part: Axes, box: bool) -> None:
     """Mark in the whole what a part shows, and lead the eye there."""
     (left, right), (low, high) = part.get_xlim(), part.get_ylim()
     if box:
+        (least_x, most_x), (least_y, most_y) = whole.get_xlim(), whole.get_ylim()
+        left, right = max(left, least_x), min(right, most_x)
+        low, high = max(low, least_y), min(high, most_y)
         whole.add_patch(Rectangle((left, low), right - left, high - low, fill=False, edgecolor=GREY, linewidth=0.8))
         pairs = [((left, low), (0.0, 1.0)), ((right, low), (1.0, 1.0))]
     else:
         middle = ((left + right) / 2, (low + high) / 2)
         pairs = [(middle, (0.0, 1.0)), (middle, (1.0, 1.0))]
     for at, corner in pairs:
-        line = ConnectionPatch(at, corner, whole.transData, part.transAxes, color=GREY, linewidth=0.8, zorder=0)
+        line = ConnectionPatch(at, corner, whole.transData, part.transAxes, color="#afb8c1", linewidth=0.7, zorder=9)
         figure.add_artist(line)
 
 
 def _write_text(figure: Figure, estimate: Estimate, truth: Truth | None) -> None:
     trajectories = trajectories_of(estimate)
     stances = len(estimate.graph.stances)
-    who = " and ".join(one.robot for one in trajectories) if len(trajectories) < 3 else f"{len(trajectories)} robots"
-    figure.text(0.03, 0.925, f"{who}, {stances} stance{'s' * (stances != 1)}, no GPS", size=19, weight="bold")
-    small = {"size": 10, "color": GREY}
-    figure.text(0.97, 0.9, "cameras and LED markers alone", ha="right", **small)
-    figure.text(0.03, 0.022, "While one stays put, the other leaps ahead.", **small)
+    lengths = [float(np.linalg.norm(one.positions[-1] - one.positions[0])) for one in trajectories]
+    count = {1: "One robot", 2: "Two robots", 3: "Three robots"}.get(len(lengths), f"{len(lengths)} robots")
+    way = [f"{max(lengths):.1f} m"] if lengths and max(lengths) > 0.05 else []
+    title = [count, *way, f"{stances} stance{'s' * (stances != 1)}", "no GPS"]
+    figure.text(0.03, 0.915, "  ·  ".join(title), size=20, weight="bold")
+    small: dict[str, Any] = {"size": 10, "color": GREY}
+    figure.text(0.97, 0.9, "from cameras and LED markers alone", ha="right", **small)
+    figure.text(0.03, 0.02, "While one stays put, the other leaps ahead; their cameras watch a third.", **small)
     if trajectories:
-        figure.text(0.505, 0.022, "The last pose, 95 % ellipse.", **small)
+        cross = ", + truth" if truth else ""
+        figure.text(0.97, 0.02, f"Where it ends: 95 % ellipse{cross}", ha="right", **small)
     y = 0.385
-    for one in trajectories[:4]:
+    for one, length in zip(trajectories[:3], lengths, strict=False):
         colour, true = colour_of(estimate, one.robot), truth_of(one, truth)
-        length = float(np.linalg.norm(one.positions[-1] - one.positions[0]))
         big, note = f"{one.robot}  {100 * length:.1f} cm", f"± {200 * position_sigmas(one)[-1]:.1f} cm predicted (2σ)"
         if true is not None:
             right = float(np.linalg.norm(true[-1, :3, 3] - true[0, :3, 3]))
             rate = f", {100 * abs(length - right) / right:.2f} %" if right > 0.05 else ""
-            note = f"true {100 * right:.1f} cm: length error {100 * abs(length - right):.1f} cm{rate}"
-        figure.text(0.71, y, big, size=18, weight="bold", color=colour, va="center")
-        figure.text(0.71, y - 0.045, note, size=10.5, va="center")
+            note = f"true {100 * right:.1f} cm, length error {100 * abs(length - right):.1f} cm{rate}"
+        figure.text(0.505, y, big, size=18, weight="bold", color=colour, va="center")
+        figure.text(0.505, y - 0.045, note, size=10, va="center")
         y -= 0.105
     handles = [Line2D([], [], color=colour_of(estimate, one.robot), linewidth=2.2) for one in trajectories[:1]]
     labels = ["estimate"] * len(handles)
     if truth:
         handles.append(Line2D([], [], **_TRUTH))
         labels.append("truth")
-    figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.70, 0.045), ncols=2)
+    figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.495, 0.045), ncols=2)

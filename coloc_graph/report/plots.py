@@ -57,7 +57,7 @@ def trajectories_figure(estimate: Estimate, truth: Truth | None = None) -> Figur
     """
     low, high = bounds(estimate, truth)
     size = np.maximum(high - low, 0.5)
-    height = float(np.clip(_WIDTH * (size[1] + 0.4) / size[0] + 1.0, 2.8, 8.5))
+    height = float(np.clip(0.95 * _WIDTH * size[1] / size[0] + 1.6, 2.8, 6.0))
     figure = Figure(figsize=(_WIDTH, height), layout="constrained")
     axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
     scale = _ellipse_scale(estimate, float(size.max()))
@@ -71,8 +71,8 @@ def trajectories_figure(estimate: Estimate, truth: Truth | None = None) -> Figur
         if true is not None:
             axes.plot(*true[:, :2, 3].T, color=INK, linewidth=1.0, linestyle=(0, (4, 3)), zorder=5, gid="truth")
         _label_start(axes, trajectory, colour, above=_is_above(estimate, trajectory))
-    axes.set_aspect("equal", adjustable="box")
-    axes.margins(x=0.03, y=max(0.08, 0.14 * float(size[0]) / _WIDTH / float(size[1])))
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(x=0.05, y=0.12)
     figure.legend(handles=_legend(estimate, truth, scale), loc="outside upper left", ncols=6)
     return figure
 
@@ -124,8 +124,9 @@ def _legend(estimate: Estimate, truth: Truth | None, scale: float) -> list[Line2
     if truth:
         handles.append(Line2D([], [], color=INK, linewidth=1, linestyle=(0, (4, 3)), label="truth"))
     if any(len(held_places(estimate, one)) for one in trajectories_of(estimate)):
-        ring = {"markerfacecolor": "none", "markeredgecolor": GREY, "markersize": 9}
-        handles.append(Line2D([], [], linestyle="", marker="o", label="stayed put", **ring))
+        ring = Line2D([], [], linestyle="", marker="o", markersize=9, markeredgecolor=GREY, label="stayed put")
+        ring.set_markerfacecolor("none")
+        handles.append(ring)
     if any(np.isfinite(position_sigmas(one)).any() for one in trajectories_of(estimate)):
         drawn = f", {scale:g} times enlarged" if scale > 1 else ""
         handles.append(Patch(facecolor=GREY + "40", edgecolor=GREY, label=f"95 % ellipse{drawn}"))
@@ -150,6 +151,8 @@ def error_figure(estimate: Estimate, truth: Truth | None = None) -> Figure:
         position, heading = 200 * position_sigmas(trajectory), 2 * np.rad2deg(heading_sigmas(trajectory))
         _draw_error(above, estimate, trajectory.robot, travelled, off, np.zeros_like(position), position)
         _draw_error(below, estimate, trajectory.robot, travelled, turned, -heading, heading)
+    if above.get_xlim()[1] < 0.1:
+        above.set_xlim(-0.5, 0.5)  # nobody went anywhere
     above.set_ylim(bottom=0)
     below.axhline(0, color=GREY, linewidth=0.8)
     what = "error" if any_truth else "predicted 2σ"
@@ -178,6 +181,8 @@ def _draw_error(
 ) -> None:
     colour = colour_of(estimate, robot)
     axes.fill_between(x, low, high, color=colour, alpha=0.13, linewidth=0)
+    if x[-1] == 0:  # a band without width would not be seen
+        axes.vlines(x[-1:], low[-1:], high[-1:], color=colour, alpha=0.3, linewidth=8)
     for edge in (low, high):
         if np.any(edge):
             axes.plot(x, edge, color=colour, linewidth=0.9, linestyle=":", gid="sigma")
@@ -201,7 +206,8 @@ def residual_figure(measurements: Iterable[HomographyMeasurement]) -> Figure:
     above, below = figure.subplots(2, 1, sharex=True)
 
     dof = np.array([max(one.dof, 1) for one in good], float)
-    _bars(above, stance, *[np.sqrt(chi2.ppf(p, dof) / dof) for p in (0.025, 0.975)], len(measured))
+    least, most = (np.sqrt(chi2.ppf(p, dof) / dof) for p in (0.025, 0.975))
+    _bars(above, stance, least, most, len(measured))
     above.axhline(1, color=GREY, linewidth=0.9, linestyle="--")
     above.scatter(stance, [one.residual for one in good], s=size, color=COLOURS[0], zorder=3)
     above.set_ylabel("RMS residual [noise]")
@@ -212,6 +218,8 @@ def residual_figure(measurements: Iterable[HomographyMeasurement]) -> Figure:
     below.scatter(stance, inliers, s=size, color=COLOURS[0], zorder=3)
     below.set_ylabel("points")
     below.set_xlabel("stance")
+    numbers = [one.stance for one in measured] or [0]
+    below.set_xlim(min(numbers) - 0.7, max(numbers) + 0.7)
     below.xaxis.set_major_locator(MaxNLocator(integer=True))
     for axes in (above, below):
         axes.set_ylim(bottom=0, top=max(1.5 if axes is above else 1.0, 1.08 * axes.get_ylim()[1]))
@@ -246,5 +254,18 @@ def figure_svg(figure: Figure, name: str = "figure") -> str:
     svg = out.getvalue()
     svg = svg[svg.index("<svg") :].strip()
     svg = re.sub(r"\s*<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r'\bid="', f'id="{name}-', svg)
+    return _with_ids_of_its_own(svg, name)
+
+
+def _with_ids_of_its_own(svg: str, name: str) -> str:
+    """Keep the ids that something refers to, once each (matplotlib repeats equal definitions), under `name`."""
+    wanted = set(re.findall(r'(?:href="#|url\(#)([^")]+)', svg))
+
+    def keep(match: re.Match[str]) -> str:
+        if match[1] not in wanted:
+            return ""
+        wanted.remove(match[1])
+        return f' id="{name}-{match[1]}"'
+
+    svg = re.sub(r'\sid="([^"]*)"', keep, svg)
     return re.sub(r'(href="#|url\(#)', rf"\g<1>{name}-", svg)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import RunError
-from coloc_graph.lie import so3_log
+from coloc_graph.lie import quaternion
 from coloc_graph.run import schemas
 from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Stance
 from coloc_graph.team import Team
@@ -65,15 +65,13 @@ def encode_pose(time: float, T_world_body: Array) -> bytes:
     rigid = T.shape == (4, 4) and np.isfinite(T).all()
     if not rigid or abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() > 1e-6 or np.linalg.det(T[:3, :3]) < 0:
         raise RunError(f"the true pose at {time} s is not a finite rigid transform (4, 4); give T_world_body")
-    half = so3_log(T[:3, :3]) / 2
-    angle = float(np.linalg.norm(half))
-    x, y, z = half * np.sinc(angle / np.pi)  # numpy's sinc has the pi in it
+    w, x, y, z = quaternion(T[:3, :3])
     message = schemas.protobuf_type(schemas.POSE_IN_FRAME)(frame_id="world")
     _stamp(message, time)
     pose = message.pose
     pose.position.x, pose.position.y, pose.position.z = T[:3, 3]
     pose.orientation.x, pose.orientation.y, pose.orientation.z = x, y, z
-    pose.orientation.w = np.cos(angle)
+    pose.orientation.w = w
     return bytes(message.SerializeToString(deterministic=True))
 
 
@@ -96,7 +94,7 @@ def _finite(what: str, time: float, shape: tuple[int, ...], values: Any) -> Arra
 
 def _covariance(what: str, time: float, shape: tuple[int, ...], values: Any) -> Array:
     array = _finite(what, time, shape, values)
-    if not np.allclose(array, array.swapaxes(-1, -2), rtol=1e-6, atol=0):
+    if not (np.abs(array - array.swapaxes(-1, -2)) <= 1e-6 * np.abs(array)).all():
         raise RunError(f"{what} at {time} s is not symmetric; give a covariance")
     return array
 

@@ -84,8 +84,8 @@ def six_step(stances: int = 6) -> Scenario:
     if not 1 <= stances <= 6:
         raise InputError(f"six-step has 1 to 6 stances, not {stances}; use the hallway for more")
     places = (
-        (0.0, 0.0), (-0.0127, -0.7713), (0.3622, 0.0), (0.3496, -0.7828), (0.7401, 0.0),
-        (0.718, -0.804), (1.0973, 0.0),
+        (0.0, 0.0), (-0.0127, -0.7713), (0.3622, 0.0), (0.3496, -0.7828), (0.7401, 0.0076),
+        (0.7262, -0.7970), (1.0971, 0.0211),
     )  # fmt: skip
     poses = tuple((x, y, HALF_ANGLE if k % 2 else -HALF_ANGLE) for k, (x, y) in enumerate(places))
     return Scenario("six-step", poses[: stances + 1], Box((0.3, 2.5), (-1.0, 1.0)))

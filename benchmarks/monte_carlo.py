@@ -1,0 +1,84 @@
+"""Simulated runs in memory, and statistics over seeds; what the benchmarks share.
+
+A file per seed would only cost time: this is the same world, seen through the same methods that `Run` has.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from scipy.stats import chi2
+
+from coloc_graph.evaluation import Accuracy, align, evaluate
+from coloc_graph.pipeline import Solution, SolveOptions, solve
+from coloc_graph.run import Detections, Planes
+from coloc_graph.simulation import EPOCH, World, build_world, observe, scenario
+from coloc_graph.simulation.world import stream
+from coloc_graph.trajectory import Trajectory
+
+T = TypeVar("T")
+
+
+class MemoryRun:
+    """A world at depth tracks, as `Run` shows it."""
+
+    def __init__(self, world: World) -> None:
+        self.path = Path(f"{world.scenario.name}-{world.seed}")
+        self.team = world.team
+        self.warnings: tuple[str, ...] = ()
+        self.stances = tuple(world.stances)
+        self.planes: dict[int, Planes] = {}
+        self._detections: dict[str, list[Detections]] = {name: [] for name in world.team.names}
+        for k in range(len(world.stances)):
+            for tracks in observe(world, k):
+                self._detections[tracks.robot] += tracks.records()
+
+    def has_detections(self, robot: str) -> bool:
+        return bool(self._detections[robot])
+
+    def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
+        return (one for one in self._detections[robot] if start <= one.time <= end)
+
+
+def truth_of(world: World) -> dict[str, Trajectory]:
+    """The truth at the beginning of each stance, as the run's file would hold it."""
+    times = np.array([EPOCH, *(stance.start for stance in world.stances)])
+    return {robot: Trajectory(robot, times, path.pose_at(times)) for robot, path in world.paths.items()}
+
+
+def simulated(name: str, seed: int, *, points: int, **options: Any) -> World:
+    """The world that `coloc simulate NAME --seed SEED` writes, at depth tracks."""
+    shape = {key: options.pop(key) for key in ("stances", "l", "theta_deg") if key in options}
+    what = scenario(name, rng=stream(seed, "formation"), **{"stances": None, "l": None, "theta_deg": None} | shape)
+    return build_world(what, depth="tracks", seed=seed, points=points, **options)
+
+
+def solved(world: World, options: SolveOptions) -> tuple[Solution, Accuracy]:
+    """A world solved and compared with its truth."""
+    solution = solve(MemoryRun(world), options)  # type: ignore[arg-type]
+    on_floor = world.team.floor is not None
+    true = align(solution.estimate.trajectories, truth_of(world), world.team.reference, on_floor=on_floor)
+    return solution, evaluate(solution.estimate.trajectories, true, on_floor=on_floor)
+
+
+def over_seeds(work: Callable[[int], T], seeds: Sequence[int], processes: int = 2) -> list[T]:
+    """`work` of each seed, in the order of the seeds, on several processes."""
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        return list(pool.map(work, seeds))
+
+
+def rms_interval(errors: Sequence[float], confidence: float = 0.95) -> tuple[float, float, float]:
+    """RMS of zero-mean errors and its confidence interval."""
+    n, square = len(errors), float(np.square(errors).mean())
+    low, high = chi2.ppf([(1 - confidence) / 2, (1 + confidence) / 2], n)
+    return np.sqrt(square), np.sqrt(n * square / high), np.sqrt(n * square / low)
+
+
+def anees_interval(poses: int, dimensions: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Where the average NEES per degree of freedom of so many independent poses lies if covariances are right."""
+    dof = poses * dimensions
+    low, high = chi2.ppf([(1 - confidence) / 2, (1 + confidence) / 2], dof)
+    return low / dof, high / dof

@@ -1,0 +1,276 @@
+"""Eq. (2) on real images: a chessboard before two cameras, against OpenCV's stereo calibration of the same images.
+
+    python benchmarks/stereo_board.py [--data FOLDER] [--json]
+
+The corners of each of the 29 pairs come in as a user's own tracks (`import_tracks`), one stance a pair, with
+the board's plane from PnP in the left camera. Each pair's homography gives one relative pose by eq. (2); the
+true one is what `cv2.stereoCalibrate` finds from all pairs together. `cv2.decomposeHomographyMat` on the same
+corners, its solution chosen by the same normal, stands beside it.
+
+Frames: (R, T) = T_right_left takes coordinates in the left camera to the right one (optical: x right, y down,
+z forward). Metres; errors in degrees and in percent of |T|.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph import pipeline
+from coloc_graph.exchange.tracks import import_tracks
+from coloc_graph.frontend import FrontendOptions, PairMeasurement
+from coloc_graph.frontend.homography import Criterion
+from coloc_graph.lie import se3, se3_inverse, so3_log
+from coloc_graph.run import Run, open_run
+from coloc_graph.team import Camera, Mount, Robot, Team, write_team
+
+Array = NDArray[np.float64]
+
+BOARD = (9, 6)  # inner corners
+SQUARE = 0.02423  # [m]
+PAIRS = 29
+CAMERAS = ("left", "right")
+TARGET_DEG, TARGET_PERCENT = 0.21, 1.8  # medians of eq. (2), criterion transfer, over all pairs
+FIRST_SIGMA = 0.25  # [px], until the corners have said their own
+DEFAULT_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "stereo_board"
+
+
+@dataclass(frozen=True, eq=False)
+class Stereo:
+    """What OpenCV makes of the images: both cameras, T_right_left (4, 4) [m], its RMS [px], the corners.
+
+    `corners` are (pairs, 2 cameras, corners, 2) [px]; `planes` (pairs, 4) are N [unit] and d [m] in the left
+    camera, by PnP.
+    """
+
+    cameras: tuple[Camera, Camera]
+    T_right_left: Array
+    rms: float
+    corners: Array
+    planes: Array
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: errors over `pairs` relative poses, rotation [deg] and translation [% of |T|]."""
+
+    method: str
+    pairs: int
+    rotation_deg_median: float
+    rotation_deg_p90: float
+    translation_percent_median: float
+    translation_percent_p90: float
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the benchmark; 2 where the data are not there, else 0."""
+    parser = argparse.ArgumentParser(description="eq. (2) on a chessboard against OpenCV's stereo calibration")
+    parser.add_argument("--data", type=Path, default=DEFAULT_DATA, help="folder with left*.jpg and right*.jpg")
+    parser.add_argument("--json", action="store_true", help="print figures as JSON instead of a table")
+    options = parser.parse_args(arguments)
+    if not any(options.data.glob("left*.jpg")):
+        what = "has no left*.jpg" if options.data.is_dir() else "there is no such folder"
+        print(f"{options.data}: {what}; give the stereo_board folder with --data", file=sys.stderr)
+        return 2
+    figures = benchmark(calibrate(*find_corners(options.data)))
+    print(json.dumps(figures, indent=2) if options.json else table(figures))
+    return 0
+
+
+def find_corners(folder: Path) -> tuple[Array, tuple[int, int]]:
+    """Corners (pairs, 2, 54, 2) [px] of the pairs in which both cameras see the whole board; width and height."""
+    found = []
+    size = (0, 0)
+    for left in sorted(folder.glob("left*.jpg"), key=lambda path: int(path.stem.removeprefix("left"))):
+        both = []
+        for path in (left, left.with_name(left.name.replace("left", "right"))):
+            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            if image is None:
+                break
+            size = (image.shape[1], image.shape[0])
+            flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+            seen, corners = cv2.findChessboardCorners(image, BOARD, flags=flags)
+            if not seen:
+                break
+            criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
+            both.append(cv2.cornerSubPix(image, corners, (4, 4), (-1, -1), criteria).reshape(-1, 2))
+        if len(both) == 2:
+            found.append(both)
+    return np.array(found, np.float64), size
+
+
+def calibrate(corners: Array, size: tuple[int, int]) -> Stereo:
+    """OpenCV's calibration of each camera, then of the pair with the intrinsics held, and PnP of each board."""
+    board = np.zeros((BOARD[0] * BOARD[1], 3), np.float32)
+    board[:, :2] = np.mgrid[0 : BOARD[0], 0 : BOARD[1]].T.reshape(-1, 2) * SQUARE
+    boards = [board] * len(corners)
+    images = [[pair[side].astype(np.float32) for pair in corners] for side in (0, 1)]
+    K_D = [cv2.calibrateCamera(boards, seen, size, None, None)[1:3] for seen in images]
+    (K1, D1), (K2, D2) = K_D
+    rms, _, _, _, _, R, T, *_ = cv2.stereoCalibrate(
+        boards, images[0], images[1], K1, D1, K2, D2, size, flags=cv2.CALIB_FIX_INTRINSIC
+    )
+    planes = []
+    for seen in images[0]:
+        _, turn, shift = cv2.solvePnP(board, seen, K1, D1)
+        N = cv2.Rodrigues(turn)[0][:, 2]
+        d = float(N @ shift.ravel())
+        planes.append([*(N * np.sign(d)), abs(d)])
+    cameras = [
+        Camera(
+            width=size[0],
+            height=size[1],
+            fx=float(K[0, 0]),
+            fy=float(K[1, 1]),
+            cx=float(K[0, 2]),
+            cy=float(K[1, 2]),
+            distortion=tuple(D.ravel()[:5].tolist()),
+        )
+        for K, D in K_D
+    ]
+    return Stereo((cameras[0], cameras[1]), se3(R, T.ravel()), float(rms), corners, np.array(planes))
+
+
+def benchmark(stereo: Stereo) -> dict[str, object]:
+    """All figures, as `--json` prints them."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = bring_in(stereo, FIRST_SIGMA, Path(folder))
+        sigma = FIRST_SIGMA * float(np.sqrt(chi2_per_dof(solve(run, "smooth", "reprojection").measurements)))
+        run = bring_in(stereo, sigma, Path(folder))
+        chained, smoothed = solve(run, "chain", "transfer"), solve(run, "smooth", "reprojection")
+    rows = [
+        _row("eq. (2), criterion transfer (the paper's)", stereo, _poses(chained)),
+        _row("eq. (2), criterion reprojection", stereo, _poses(smoothed)),
+        _row("cv2.decomposeHomographyMat", stereo, opencv_poses(stereo)),
+        _row("smooth: one pose fused from all", stereo, fused_pose(smoothed)[None]),
+    ]
+    estimate = smoothed.estimate
+    return {
+        "opencv": cv2.__version__,
+        "pairs": len(stereo.corners),
+        "stereo_calibration_rms_px": stereo.rms,
+        "baseline_m": float(np.linalg.norm(stereo.T_right_left[:3, 3])),
+        "corner_sigma_px": sigma,
+        "chi2_per_dof_transfer": chi2_per_dof(chained.measurements),
+        "chi2_per_dof_reprojection": chi2_per_dof(smoothed.measurements),
+        "fused_chi2_per_dof": estimate.chi2 / estimate.dof,
+        "rows": [asdict(row) for row in rows],
+        "target_met": rows[0].pairs >= PAIRS
+        and rows[0].rotation_deg_median <= TARGET_DEG
+        and rows[0].translation_percent_median <= TARGET_PERCENT,
+    }
+
+
+def bring_in(stereo: Stereo, sigma: float, folder: Path) -> Run:
+    """The corners as a user would bring them: TEAM.toml and three CSVs in `folder`, one stance a pair."""
+    robots = [
+        Robot(name=name, camera=camera, mount=Mount(height=0.0))
+        for name, camera in zip(CAMERAS, stereo.cameras, strict=True)
+    ]
+    write_team(Team(reference=CAMERAS[0], robots=tuple(robots)), folder / "TEAM.toml")
+    tracks, planes = ["stance,time,robot,marker,u,v,sigma"], ["stance,robot,nx,ny,nz,d"]
+    for stance, (pair, plane) in enumerate(zip(stereo.corners.tolist(), stereo.planes.tolist(), strict=True)):
+        planes.append(f"{stance},{CAMERAS[0]}," + ",".join(map(repr, plane)))
+        tracks += [
+            f"{stance},{stance},{name},corner{index},{u!r},{v!r},{sigma!r}"
+            for name, corners in zip(CAMERAS, pair, strict=True)
+            for index, (u, v) in enumerate(corners)
+        ]
+    (folder / "TRACKS.csv").write_text("\n".join(tracks), encoding="utf-8")
+    (folder / "PLANES.csv").write_text("\n".join(planes), encoding="utf-8")
+    (folder / "MOVES.csv").write_text("stance,robot\n", encoding="utf-8")  # the cameras never moved
+    import_tracks(
+        folder / "TEAM.toml",
+        folder / "TRACKS.csv",
+        folder / "RUN.mcap",
+        planes_path=folder / "PLANES.csv",
+        moves_path=folder / "MOVES.csv",
+    )
+    return open_run(folder / "RUN.mcap")
+
+
+def solve(run: Run, method: pipeline.Method, criterion: Criterion) -> pipeline.Solution:
+    """The whole road, with one criterion."""
+    return pipeline.solve(run, pipeline.SolveOptions(method, FrontendOptions(criterion=criterion)))
+
+
+def chi2_per_dof(measurements: Sequence[PairMeasurement]) -> float:
+    """Of the corners about all homographies, each corner in units of its sigma; 1 where the sigma is right."""
+    used = [m.homography for m in measurements if m.homography.unusable is None]
+    return float(sum(one.chi2 for one in used) / sum(one.dof for one in used))
+
+
+def _poses(solution: pipeline.Solution) -> Array:
+    """T_right_left (n, 4, 4) of each pair by eq. (2)."""
+    found = [m.relative_pose.T_ci_cj.matrix() for m in solution.measurements if m.relative_pose is not None]
+    return se3_inverse(np.array(found))
+
+
+def fused_pose(solution: pipeline.Solution) -> Array:
+    """T_right_left (4, 4) of the pose graph: one pose from all pairs, since both cameras stayed put."""
+    left, right = (solution.run.team[name].mount.T_body_camera for name in CAMERAS)
+    T_left_right = se3_inverse(left) @ solution.estimate.pose(CAMERAS[1], 0).matrix() @ right
+    return se3_inverse(T_left_right)
+
+
+def opencv_poses(stereo: Stereo) -> Array:
+    """T_right_left (n, 4, 4) by OpenCV: least-squares homography, the solution whose normal is the nearest."""
+    poses = []
+    for (left, right), (*normal, d) in zip(stereo.corners, stereo.planes, strict=True):
+        x_left, x_right = stereo.cameras[0].normalise(left), stereo.cameras[1].normalise(right)
+        H, _ = cv2.findHomography(x_left, x_right, 0)
+        _, Rs, Ts, Ns = cv2.decomposeHomographyMat(H, np.eye(3))
+        nearest = int(np.argmax([np.ravel(N) @ np.array(normal) for N in Ns]))
+        poses.append(se3(Rs[nearest], d * np.ravel(Ts[nearest])))
+    return np.array(poses)
+
+
+def _row(method: str, stereo: Stereo, T_right_left: Array) -> Row:
+    true = stereo.T_right_left
+    turned = so3_log(np.swapaxes(T_right_left[:, :3, :3], 1, 2) @ true[:3, :3])
+    degrees = np.rad2deg(np.linalg.norm(turned, axis=1))
+    percent = 100 * np.linalg.norm(T_right_left[:, :3, 3] - true[:3, 3], axis=1) / np.linalg.norm(true[:3, 3])
+    return Row(
+        method,
+        len(T_right_left),
+        *(float(value) for error in (degrees, percent) for value in (np.median(error), np.percentile(error, 90))),
+    )
+
+
+def table(figures: dict[str, object]) -> str:
+    """The figures for people."""
+    lines = [
+        f"{figures['pairs']} pairs, OpenCV {figures['opencv']}, stereo calibration "
+        f"{figures['stereo_calibration_rms_px']:.3f} px RMS, |T| {figures['baseline_m']:.4f} m",
+        f"corner noise as measured: {figures['corner_sigma_px']:.3f} px an axis; with it chi2/dof is "
+        f"{figures['chi2_per_dof_reprojection']:.2f} (reprojection), {figures['chi2_per_dof_transfer']:.2f} (transfer)",
+        "",
+        "T_right_left (takes left camera to right), error against cv2.stereoCalibrate",
+        f"{'':44}{'rotation [deg]':>18}{'|dT|/|T| [%]':>18}",
+        f"{'':38}{'pairs':>6}{'median':>9}{'p90':>9}{'median':>9}{'p90':>9}",
+    ]
+    rows = figures["rows"]
+    assert isinstance(rows, list)
+    for row in rows:
+        numbers = [
+            row[f"{what}_{which}"] for what in ("rotation_deg", "translation_percent") for which in ("median", "p90")
+        ]
+        lines.append(f"{row['method']:<42}{row['pairs']:>2}" + "".join(f"{number:9.3f}" for number in numbers))
+    lines += [
+        "",
+        f"the fused pose's chi2/dof is {figures['fused_chi2_per_dof']:.1f} (the planes from PnP come without a sigma)",
+        f"target for the first row, {PAIRS} pairs, medians {TARGET_DEG} deg and {TARGET_PERCENT} %: "
+        f"{'met' if figures['target_met'] else 'NOT met'}",
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
