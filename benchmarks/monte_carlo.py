@@ -37,9 +37,11 @@ class MemoryRun:
                 self._detections[tracks.robot] += tracks.records()
 
     def has_detections(self, robot: str) -> bool:
+        """As `Run`."""
         return bool(self._detections[robot])
 
     def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
+        """As `Run`."""
         return (one for one in self._detections[robot] if start <= one.time <= end)
 
 

@@ -41,11 +41,11 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
     if before is not None:
         if not stance.anchors:
             findings.append(Finding(where, "no anchor: nothing ties it to the stance before; let one robot stay put"))
-        for robot in stance.anchors:
-            if any(motion.moving for motion in run.motions(robot, before.end, stance.start)):
-                findings.append(
-                    Finding(where, f"{robot} is called an anchor, yet it moved since stance {before.index}")
-                )
+        findings += [
+            Finding(where, f"{robot} is called an anchor, yet it moved since stance {before.index}")
+            for robot in stance.anchors
+            if any(motion.moving for motion in run.motions(robot, before.end, stance.start))
+        ]
     times = {}
     for robot in stance.observers:
         if run.has_detections(robot):

@@ -32,6 +32,10 @@ from coloc_graph.team import without_none
 from coloc_graph.trajectory import Trajectory
 
 SUMMARY = "summary.json"
+MEASUREMENT_COLUMNS = (
+    *("stance", "robot_i", "robot_j", "points", "inliers", "residual", "time_offset", "overlap_px"),
+    *("normal_error_deg", "solution", "distance", "usable", "why_not"),
+)
 
 
 def assess(solution: Solution) -> tuple[Accuracy, dict[str, NDArray[np.float64]]] | None:
@@ -131,10 +135,7 @@ def _measurements(solution: Solution) -> str:
     """One row a homography. Angles in degrees, the relative pose is that of body j in body i."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(
-        "stance,robot_i,robot_j,points,inliers,residual,time_offset,overlap_px,normal_error_deg,solution,"
-        "distance,usable,why_not".split(",")
-    )
+    rows.writerow(MEASUREMENT_COLUMNS)
     for measured in solution.measurements:
         h, pose = measured.homography, measured.relative_pose
         rows.writerow(
@@ -187,7 +188,8 @@ def read_result(path: str | Path) -> Result:
         robots, run = list(summary["robots"]), str(summary["run"])
     except OSError as error:
         raise InputError(
-            f"{path} is not a result: {SUMMARY} cannot be read ({error.strerror}); give the folder of `coloc solve --out`"
+            f"{path} is not a result: {SUMMARY} cannot be read ({error.strerror}); "
+            "give the folder that `coloc solve --out` wrote"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path / SUMMARY} is damaged ({error}); solve the run again") from error

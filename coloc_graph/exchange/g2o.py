@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 
 from coloc_graph.backend import Estimate
+from coloc_graph.lie import quaternion
 
 _TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
 
@@ -48,5 +49,5 @@ def write_g2o(estimate: Estimate, path: Path) -> None:
 
 
 def _pose(pose: gtsam.Pose3) -> str:
-    q = pose.rotation().toQuaternion()
-    return " ".join(repr(float(x)) for x in (*pose.translation(), q.x(), q.y(), q.z(), q.w()))
+    w, x, y, z = quaternion(pose.rotation().matrix())
+    return " ".join(repr(float(number)) for number in (*pose.translation(), x, y, z, w))

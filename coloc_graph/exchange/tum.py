@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
+from coloc_graph.lie import quaternion
 from coloc_graph.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -27,8 +28,8 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
     """
     lines = []
     for time, T in zip(trajectory.times, trajectory.T_world_body, strict=True):
-        q = gtsam.Rot3(T[:3, :3]).toQuaternion()
-        numbers = [time, *T[:3, 3], q.x(), q.y(), q.z(), q.w()]
+        w, x, y, z = quaternion(T[:3, :3])
+        numbers = [time, *T[:3, 3], x, y, z, w]
         lines.append(" ".join(repr(float(number)) for number in numbers))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     if trajectory.covariances is None or trajectory.stances is None:

@@ -84,12 +84,13 @@ class _Candidates:
         self._i, self._j = list(tracks_i), list(tracks_j)
         self._x_i = [normalised(track, camera_i) for track in self._i]
         self._x_j = [normalised(track, camera_j) for track in self._j]
+        # where a lens cannot be inverted there is no ray, and one NaN would spoil the whole stance
+        finite_i, finite_j = [_finite(x) for x in self._x_i], [_finite(x) for x in self._x_j]
         self.indices: dict[tuple[int, int], NDArray[np.int64]] = {}
         for a, track_i in enumerate(self._i):
             for b, track_j in enumerate(self._j):
                 shared = pair_by_time(track_i.times, track_j.times)
-                # where a lens cannot be inverted there is no ray, and one NaN would spoil the whole stance
-                shared = shared[_finite(self._x_i[a])[shared[:, 0]] & _finite(self._x_j[b])[shared[:, 1]]]
+                shared = shared[finite_i[a][shared[:, 0]] & finite_j[b][shared[:, 1]]]
                 if len(shared):
                     self.indices[a, b] = shared
 

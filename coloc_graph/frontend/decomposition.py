@@ -23,8 +23,9 @@ def metric_scale(H: ArrayLike) -> Array:
 def decompose_with_normal(H: ArrayLike, N: ArrayLike, d: ArrayLike) -> tuple[Array, Array]:
     """Eq. (2): R (..., 3, 3) and T (..., 3) [m] of H (..., 3, 3), known normal N (..., 3) and distance d [m].
 
-    v2 is the right singular vector of H for its middle singular value. Without noise N is orthogonal to v2;
-    with noise it is made so, and R is projected to SO(3).
+    v2 is the right singular vector of H for its middle singular value. Without noise N is orthogonal to v2 and
+    W U^T is a rotation. With noise N is made orthogonal for U; T is made of W U^T as the paper prints it, and R
+    is the rotation nearest to it.
     """
     H, N, d = metric_scale(H), np.asarray(N, float), np.asarray(d, float)
     v2 = np.linalg.svd(H)[2][..., 1, :]
@@ -34,9 +35,9 @@ def decompose_with_normal(H: ArrayLike, N: ArrayLike, d: ArrayLike) -> tuple[Arr
     U = np.stack(np.broadcast_arrays(v2, u, N_level), axis=-1)
     Hv2, Hu = (H @ v2[..., None])[..., 0], (H @ u[..., None])[..., 0]
     W = np.stack([Hv2, Hu, np.cross(Hv2, Hu)], axis=-1)
-    R = closest_rotation(W @ np.swapaxes(U, -1, -2))
-    T = d[..., None] * ((H - R) @ N[..., None])[..., 0]
-    return R, np.asarray(T)
+    WUt = W @ np.swapaxes(U, -1, -2)
+    T = d[..., None] * ((H - WUt) @ N[..., None])[..., 0]
+    return closest_rotation(WUt), np.asarray(T)
 
 
 def decompose_svd(H: ArrayLike) -> tuple[Array, Array, Array]:

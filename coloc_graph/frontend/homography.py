@@ -170,7 +170,7 @@ def _solve(normal: Array, right: Array) -> Array:
         step = np.full(8, np.nan)
     if not np.abs(step).max() < 10.0:
         raise DegenerateGeometry("no homography explains the tracks: look for wrong pairs, let the moving robot turn")
-    return step
+    return np.asarray(step, float)
 
 
 def _reprojection(pairs: PointPairs, H: Array, max_iterations: int = 20) -> tuple[Array, Array, int]:
