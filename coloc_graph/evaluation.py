@@ -115,9 +115,10 @@ def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory) -> Array:
         raise InputError(f"the truth does not hold robot {estimated.robot}, which the estimate does")
     index = np.searchsorted(true.times, estimated.times + 1e-6, side="right") - 1
     if (index < 0).any():
+        first = int((index < 0).argmax())
+        stance = first if estimated.stances is None else int(estimated.stances[first])
         raise InputError(
-            f"the truth of robot {estimated.robot} begins after stance {int((index < 0).argmax())}; "
-            "record it from the first stance on"
+            f"the truth of robot {estimated.robot} begins after stance {stance}; record it from the first stance on"
         )
     return true.T_world_body[index]
 

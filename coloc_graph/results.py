@@ -11,6 +11,7 @@ import json
 import math
 import os
 import shutil
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +50,18 @@ def assess(solution: Solution) -> tuple[Accuracy, dict[str, NDArray[np.float64]]
     return evaluate(trajectories, true, on_floor=on_floor), true
 
 
+def require_place(out: str | Path) -> None:
+    """Raise `InputError` where a result cannot go to `out`: it is something else, or its folder cannot be one."""
+    out = Path(out)
+    if out.exists() and not (out / SUMMARY).is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} exists and is not a result; give another folder, or remove it")
+    above = next(folder for folder in out.absolute().parents if folder.exists())
+    if not above.is_dir():
+        raise InputError(f"{out} cannot be made, since {above} is not a folder; give another folder")
+    if not os.access(above, os.W_OK):
+        raise InputError(f"{out} cannot be written, since {above} is not yours to write to; give another folder")
+
+
 def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
     """Write a solution to the folder `out`, compared with truth where the run has it.
 
@@ -57,13 +70,15 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
     from coloc_graph.report import render_report  # matplotlib is heavy, and of no use to who only reads results
 
     out = Path(out)
-    if out.exists() and not (out / SUMMARY).is_file() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} exists and is not a result; give another folder, or remove it")
+    require_place(out)
     assessed = assess(solution)
     accuracy, true = assessed if assessed is not None else (None, None)
 
-    part = out.with_name(out.name + ".part")
-    shutil.rmtree(part, ignore_errors=True)
+    place = out.resolve()  # "." has no name, and a link's target is what is replaced
+    place.parent.mkdir(parents=True, exist_ok=True)
+    # a folder of our own beside it, whose name nobody else has
+    work = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
+    part, old = work / "new", work / "old"
     (part / "trajectories").mkdir(parents=True)
     try:
         for robot, trajectory in solution.estimate.trajectories.items():
@@ -75,11 +90,15 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
         run_path = os.path.relpath(solution.run.path.absolute(), out.absolute())
         summary = summarise(solution, accuracy) | {"run": run_path}
         (part / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-        shutil.rmtree(out, ignore_errors=True)
-        part.rename(out)
+        if place.exists():
+            place.rename(old)
+        part.rename(place)
     except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
+        if old.exists() and not place.exists():
+            old.rename(place)
         raise
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
     return accuracy
 
 

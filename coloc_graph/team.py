@@ -39,7 +39,10 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Pinhole camera with OpenCV's distortion; pixels, (0, 0) is the centre of the top-left pixel.
 
     `distortion` is OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for none. `noise_px` is the standard
-    deviation of a detected marker centre per axis where a detection does not bring its own.
+    deviation of a detected marker centre per axis where a detection does not bring its own. `shot_gain` is the
+    variance [grey levels^2] that one grey level of light adds to a pixel; it decides how sure a centre is.
+    `bias_px` is the standard deviation per axis of an error that all centres of one marker share during a stance,
+    and that no number of them averages away: what calibration leaves of the lens, a background that pulls.
     """
 
     width: int
@@ -51,12 +54,15 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     distortion: tuple[float, ...] = ()
     fps: float = 100.0
     noise_px: float = 0.3
+    shot_gain: float = 0.1
+    bias_px: float = 0.0
 
     def __post_init__(self) -> None:
         _finite(self)
         for name in ("width", "height", "fx", "fy", "fps", "noise_px"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
+        _not_negative(self, ("shot_gain", "bias_px"))
         if len(self.distortion) not in (0, 4, 5, 8):
             raise ValueError(
                 f"`distortion` has {len(self.distortion)} numbers; give none, or OpenCV's 4, 5 or 8 coefficients"
@@ -85,11 +91,16 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return uv, inside & ahead
 
     def _unfolded(self, x: Array, y: Array) -> NDArray[np.bool_]:
-        """Where the radial polynomial still grows: beyond, a lens model folds far points back into the image."""
-        k1, k2, _, _, k3 = (*self.distortion, *([0.0] * 5))[:5]
+        """Where the distorted radius still grows: beyond, a lens model folds far points back into the image."""
+        k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *([0.0] * (8 - len(self.distortion))))
         r2 = x * x + y * y
         with np.errstate(invalid="ignore"):
-            return np.asarray(1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0)
+            above, below = (1 + r2 * (a + r2 * (b + r2 * c)) for a, b, c in ((k1, k2, k3), (k4, k5, k6)))
+            above_grows, below_grows = (
+                2 * r2 * (a + r2 * (2 * b + r2 * 3 * c)) for a, b, c in ((k1, k2, k3), (k4, k5, k6))
+            )
+            # the sign of d(r above / below)/dr
+            return np.asarray((above + above_grows) * below - above * below_grows > 0)
 
     def _lens(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Radial factor and tangential shift of the lens at undistorted normalised coordinates."""
@@ -246,7 +257,7 @@ class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         if len(names) < 2:
             raise ValueError("a team has at least two robots; add another under [[robots]]")
         if self.reference not in names:
-            raise ValueError(f"`reference` is `{self.reference}`, which not one of the robots {', '.join(names)}")
+            raise ValueError(f"`reference` is `{self.reference}`, which is not one of the robots {', '.join(names)}")
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ def require_gtsam(installed: str | None = None) -> None:
             installed = version("gtsam")
         except PackageNotFoundError:
             installed = "none"
-    if not installed.startswith("4.3"):
+    if installed.split(".")[:2] != ["4", "3"]:
         raise ColocError(
             f"coloc-graph needs GTSAM 4.3 and found {installed}; in a virtual environment with CPython 3.11 to 3.14 "
             "on Linux or macOS, run: pip install 'gtsam>=4.3,<4.4'"

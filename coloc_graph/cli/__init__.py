@@ -7,17 +7,23 @@ Results go to stdout, everything else to stderr. Nothing heavy is imported befor
 import argparse
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from coloc_graph._version import __version__
 from coloc_graph.cli import demo, evaluate, import_, info, simulate, solve
 from coloc_graph.errors import ColocError
 
 
+class _Parser(argparse.ArgumentParser):
+    """Wrong arguments are one sentence as any other bad input, not a page of usage."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"coloc: {message}; see `{self.prog} --help`\n")
+
+
 def parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    top = argparse.ArgumentParser(
-        prog="coloc", description="Where each robot of a team is, from cameras and LED markers alone."
-    )
+    top = _Parser(prog="coloc", description="Where each robot of a team is, from cameras and LED markers alone.")
     top.add_argument("--version", action="version", version=f"coloc {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in (demo, simulate, import_, info, solve, evaluate):

@@ -17,20 +17,27 @@ def run(args: argparse.Namespace) -> int:
     """Simulate, solve, print, show."""
     import sys
     import webbrowser
+    from contextlib import suppress
     from pathlib import Path
 
     from coloc_graph.cli.accuracy import print_accuracy
     from coloc_graph.cli.printing import progress, warn
     from coloc_graph.pipeline import solve
-    from coloc_graph.results import write_result
+    from coloc_graph.results import require_place, write_result
     from coloc_graph.run import open_run
     from coloc_graph.simulation import simulate
 
     out = Path(args.out)
+    require_place(out / "result")
     out.mkdir(parents=True, exist_ok=True)
     run_path = out / "hallway.mcap"
-    with progress("stances rendered") as report:
-        simulate("hallway", run_path, depth="images", seed=args.seed, stances=args.stances, progress=report)
+    try:
+        with progress("stances rendered") as report:
+            simulate("hallway", run_path, depth="images", seed=args.seed, stances=args.stances, progress=report)
+    except BaseException:
+        with suppress(OSError):  # it goes again where nothing came to be in it
+            out.rmdir()
+        raise
     with progress("measurements made from the images") as report:
         solution = solve(open_run(run_path), progress=report)
     accuracy = write_result(solution, out / "result")

@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.cli.printing import progress, warn
     from coloc_graph.exchange.tracks import import_tracks
 
-    with progress("stances imported") as report:
+    with progress("rows imported") as report:
         summary = import_tracks(
             args.team, args.tracks, args.out, planes_path=args.planes, moves_path=args.moves, progress=report
         )

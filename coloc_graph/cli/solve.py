@@ -27,9 +27,10 @@ def run(args: argparse.Namespace) -> int:
 
     from coloc_graph.cli.accuracy import print_accuracy
     from coloc_graph.pipeline import SolveOptions, solve
-    from coloc_graph.results import summarise, write_result
+    from coloc_graph.results import require_place, summarise, write_result
     from coloc_graph.run import open_run
 
+    require_place(args.out)  # before the work, not after it
     options = SolveOptions(method=args.method).resolved()
     assert options.frontend is not None
     options = replace(options, frontend=replace(options.frontend, scale=args.scale))

@@ -50,9 +50,10 @@ def read_tum(path: Path) -> Trajectory:
         if not line.strip() or line.startswith("#"):
             continue
         values = _numbers(path, number, line.split(), 8)
-        x, y, z, w = values[4:]
-        if abs(np.hypot(np.hypot(x, y), np.hypot(z, w)) - 1) > 1e-3:
+        length = float(np.linalg.norm(values[4:]))
+        if abs(length - 1) > 1e-3:
             raise InputError(f"{path}, line {number}: the quaternion is not of unit length; write qx qy qz qw")
+        x, y, z, w = (value / length for value in values[4:])  # GTSAM does not normalise
         times.append(values[0])
         poses.append(gtsam.Pose3(gtsam.Rot3(w, x, y, z), np.array(values[1:4])).matrix())
     stances, covariances = None, None

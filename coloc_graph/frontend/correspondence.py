@@ -7,6 +7,7 @@ single homography explains best.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,11 @@ Array = NDArray[np.float64]
 
 #: Time difference up to which two samples count as one instant [s].
 PAIRING_WINDOW = 5e-3
+
+#: A light whose track stays in a box of this diagonal stands still [px].
+STILL = 8.0
+#: More than a float64 of UTC seconds is rounded by: a gap of the window itself is within it [s].
+CLOCK_GRAIN = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +61,7 @@ def pair_by_time(times_i: Array, times_j: Array, window: float = PAIRING_WINDOW)
     first = np.ones(len(order), bool)
     first[1:] = nearest[order][1:] != nearest[order][:-1]
     kept = np.sort(order[first])
-    kept = kept[gap[kept] <= window]
+    kept = kept[gap[kept] <= window + CLOCK_GRAIN]
     return np.stack([kept, nearest[kept]], axis=1)
 
 
@@ -64,8 +70,13 @@ def correspond(
 ) -> Correspondences:
     """The correspondences between two cameras' tracks; raises `DegenerateGeometry` where there are none."""
     candidates = _Candidates(tracks_i, tracks_j, camera_i, camera_j)
-    named = [(a, b) for a, b in candidates.indices if tracks_i[a].marker and tracks_i[a].marker == tracks_j[b].marker]
-    chosen = named or _by_motion(candidates)
+    named = all(track.marker for track in (*tracks_i, *tracks_j))
+    chosen = list(candidates.indices) if named else _by_motion(candidates)
+    if not chosen and candidates.indices:
+        raise DegenerateGeometry(
+            f"no pairing of the tracks of {tracks_i[0].robot} and {tracks_j[0].robot} is explained by one homography: "
+            "let the moving robot turn and drive further, and look for reflections"
+        )
     if not chosen:
         raise DegenerateGeometry(
             f"{tracks_i[0].robot if tracks_i else 'one observer'} and "
@@ -76,7 +87,7 @@ def correspond(
 
 
 class _Candidates:
-    """All pairs of tracks that share instants, in pixels and in normalised coordinates."""
+    """All pairs of tracks that may be one marker: they share instants, and their names, where they have some."""
 
     def __init__(
         self, tracks_i: Sequence[Track], tracks_j: Sequence[Track], camera_i: Camera, camera_j: Camera
@@ -89,6 +100,8 @@ class _Candidates:
         self.indices: dict[tuple[int, int], NDArray[np.int64]] = {}
         for a, track_i in enumerate(self._i):
             for b, track_j in enumerate(self._j):
+                if track_i.marker and track_j.marker and track_i.marker != track_j.marker:
+                    continue
                 shared = pair_by_time(track_i.times, track_j.times)
                 shared = shared[finite_i[a][shared[:, 0]] & finite_j[b][shared[:, 1]]]
                 if len(shared):
@@ -128,17 +141,15 @@ class _Candidates:
 
 def normalised(track: Track, camera: Camera) -> tuple[Array, Array]:
     """A track in normalised coordinates (n, 2), with covariances (n, 2, 2)."""
-    x = camera.normalise(track.uv)
-    # the lens's scale at each place: how far a pixel to the right and one below go
+    J = per_pixel(track.uv, camera)
+    return camera.normalise(track.uv), J @ track.covariance @ J.swapaxes(1, 2)
+
+
+def per_pixel(uv: Array, camera: Camera) -> Array:
+    """The lens's scale at pixels (n, 2): how far one pixel to the right, and one down, go, (n, 2, 2)."""
     step = 0.5
-    J = np.stack(
-        [
-            (camera.normalise(track.uv + offset) - camera.normalise(track.uv - offset)) / (2 * step)
-            for offset in ((step, 0.0), (0.0, step))
-        ],
-        axis=-1,
-    )
-    return x, J @ track.covariance @ J.swapaxes(1, 2)
+    sides = [camera.normalise(uv + off) - camera.normalise(uv - off) for off in ((step, 0.0), (0.0, step))]
+    return np.stack(sides, axis=-1) / (2 * step)
 
 
 def _finite(normalised_track: tuple[Array, Array]) -> NDArray[np.bool_]:
@@ -152,18 +163,23 @@ def _by_motion(candidates: _Candidates, least: int = 8, seeds: int = 24) -> list
     pairs = {ab: candidates.join([ab]).pairs for ab in by_size}
     best: list[tuple[int, int]] = []
     best_inliers = 0
-    for seed in [ab for ab in by_size if len(candidates.indices[ab]) >= least][:seeds]:
-        chosen, inliers = [seed], 0
+    # one marker's track may be straight, and two tell more than one: couples after single pairs
+    large = [ab for ab in by_size if len(candidates.indices[ab]) >= least]
+    couples = [[p, q] for p, q in combinations(large, 2) if p[0] != q[0] and p[1] != q[1]]
+    for seed in [*([ab] for ab in large[:seeds]), *couples[:seeds]]:
+        if best and len(seed) > 1:
+            break
+        chosen, inliers = seed, 0
         try:
             for _ in range(3):
                 fit = fit_homography(candidates.join(chosen).pairs)
                 # a homography from one track extrapolates poorly: a wide gate first, the fit's own in the end
                 wide = len(chosen) == 1
-                again = candidates.explained(fit.H, pairs, 400.0 if wide else 25.0)
+                again = candidates.explained(fit.H, pairs, 2500.0 if wide else 100.0)
                 inliers = int(fit.inliers.sum())
                 if again == sorted(chosen):
                     break
-                chosen = again or [seed]
+                chosen = again or seed
         except DegenerateGeometry:
             continue
         if inliers > best_inliers:
@@ -198,6 +214,6 @@ def markers_of_movers(tracks: Sequence[Track], camera: Camera, plane: Plane, spa
     Lights that do not move are not. Where robots carry two markers, the tracks that are bound by a span are;
     tracks with no partner are kept only if no track has one.
     """
-    moving = [track for track in tracks if len(track) >= 4 and track.extent > 4.0]
+    moving = [track for track in tracks if len(track) >= 4 and track.extent > STILL]
     bound = {index for span in spans for a, b, _ in span_samples(moving, camera, plane, span) for index in (a, b)}
     return [moving[index] for index in sorted(bound)] if bound else moving

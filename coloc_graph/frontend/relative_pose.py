@@ -12,8 +12,8 @@ from coloc_graph.team import R_BODY_OPTICAL, Mount
 
 Array = NDArray[np.float64]
 
-# The unknowns of a relative pose, in this order: the homography's h (8), the normal's rotation about the
-# camera's x and y (2), the distance (1), and of each mount height, tilt, roll (3 + 3).
+# The unknowns of a relative pose, in this order: the homography's h (8), the normal's rotation about two
+# axes across it (2), the distance (1), and of each mount height, tilt, roll (3 + 3).
 _H, _NORMAL, _D, _MOUNT_I, _MOUNT_J = slice(0, 8), slice(8, 10), 10, slice(11, 14), slice(14, 17)
 
 
@@ -82,8 +82,8 @@ def _poses(unknowns: Array, H: Array, mount_i: Mount, mount_j: Mount, plane: Pla
         # the world's vertical is what stays when the mount's tilt is another than thought
         turned = T_bi_ci[:, :3, :3].swapaxes(1, 2) @ mount_i.R_body_camera
         N = (turned @ plane.N)[..., :]
-    about = np.concatenate([unknowns[:, _NORMAL], np.zeros((len(unknowns), 1))], axis=1)
-    N = (so3_exp(about) @ N[..., None])[..., 0]
+    across = np.linalg.svd(plane.N[None])[2][1:]
+    N = (so3_exp(unknowns[:, _NORMAL] @ across) @ N[..., None])[..., 0]
     d = plane.d + unknowns[:, _D] + (unknowns[:, _MOUNT_I][:, 0] if plane.d_from_mount else 0.0)
     R_cj_ci, t_cj_ci = decompose_with_normal(H @ sl3_exp(unknowns[:, _H]), N, d)
     T_ci_cj = se3_inverse(se3(R_cj_ci, t_cj_ci))

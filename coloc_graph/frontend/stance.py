@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend.correspondence import Correspondences, correspond, markers_of_movers, span_samples
+from coloc_graph.errors import DegenerateGeometry, InputError
+from coloc_graph.frontend.correspondence import Correspondences, correspond, markers_of_movers, per_pixel, span_samples
 from coloc_graph.frontend.detection import Blobs, detector_for
-from coloc_graph.frontend.homography import Criterion, HomographyFit, fit_homography
+from coloc_graph.frontend.homography import Criterion, HomographyFit, fit_homography, shared_error
 from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
@@ -63,7 +63,7 @@ def measure_pair(run: Run, stance: Stance, robot_i: str, robot_j: str, options: 
                 f"only {fit.inliers.sum()} of {len(found)} points agree on one homography: "
                 "look for wrong marker names, reflections, or clocks that differ by more than the pairing window"
             )
-        measurement = _measurement(stance, robot_i, robot_j, fit, camera_i, camera_j)
+        measurement = _measurement(stance, robot_i, robot_j, fit, found, camera_i, camera_j)
         if options.scale == "span":
             plane = _plane_by_span(plane, tracks_i, camera_i, stance_markers(run, stance))
         pose = relative_pose(measurement, run.team[robot_i].mount, run.team[robot_j].mount, plane)
@@ -107,7 +107,7 @@ def stance_tracks(run: Run, stance: Stance, robot: str, options: FrontendOptions
 
     Detections that name their marker are tracks already; the others, and images, go through the tracker.
     """
-    detector = detector_for(stance_markers(run, stance))
+    detector = detector_for(stance_markers(run, stance), run.team[robot].camera)
     count = sum(len(m.positions) for name in stance.movers if (m := run.team[name].markers))
     tracker = MarkerTracker(robot, detector, replace(options.tracker, markers=max(count, 1)))
     if run.has_detections(robot):
@@ -117,7 +117,14 @@ def stance_tracks(run: Run, stance: Stance, robot: str, options: FrontendOptions
         for one in seen:
             tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
     else:
+        camera = run.team[robot].camera
         for image in run.images(robot, stance.start, stance.end):
+            if image.pixels.shape[:2] != (camera.height, camera.width):
+                raise InputError(
+                    f"{run.path}: stance {stance.index}: the images of {robot} are {image.pixels.shape[1]} x "
+                    f"{image.pixels.shape[0]} pixels and its camera is {camera.width} x {camera.height} in the team: "
+                    "correct the camera, and its calibration"
+                )
             tracker.step(image)
     plane = stance_plane(run, stance, robot)
     spans = {m.span for name in stance.movers if (m := run.team[name].markers) and m.span}
@@ -151,20 +158,38 @@ def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: M
 
 
 def _measurement(
-    stance: Stance, robot_i: str, robot_j: str, fit: HomographyFit, camera_i: Camera, camera_j: Camera
+    stance: Stance,
+    robot_i: str,
+    robot_j: str,
+    fit: HomographyFit,
+    found: Correspondences,
+    camera_i: Camera,
+    camera_j: Camera,
 ) -> HomographyMeasurement:
+    roots = _bias_root(found.uv_i, camera_i), _bias_root(found.uv_j, camera_j)
+    shared = shared_error(fit, found.pairs, found.markers, roots)
     return HomographyMeasurement(
         stance=stance.index,
         robot_i=robot_i,
         robot_j=robot_j,
         H_j_i=fit.H,
-        information=fit.information,
+        information=np.asarray(np.linalg.inv(np.linalg.inv(fit.information) + shared), float),
         points=len(fit.inliers),
         inliers=int(fit.inliers.sum()),
         chi2=fit.chi2,
         dof=fit.dof,
         overlap_px=overlap(fit.H, camera_i, camera_j),
     )
+
+
+def _bias_root(uv: Array, camera: Camera) -> Array:
+    """Square root (n, 2, 6) of the covariance of a camera's bias: an error that is smooth over the image.
+
+    It has a part that is the same everywhere and one that grows across the points, each `bias_px` large.
+    """
+    across = (uv - uv.mean(axis=0)) / np.maximum(uv.std(axis=0), 1.0)
+    root = camera.bias_px * per_pixel(uv, camera)
+    return np.concatenate([root, across[:, :1, None] * root, across[:, 1:, None] * root], axis=2)
 
 
 def _unusable(

@@ -223,9 +223,9 @@ def whole_run(
     Until then it is beside it, as `path` + ".part". The same input gives the same bytes.
     """
     path = Path(path)
-    part = path.with_name(path.name + ".part")
     if path.is_dir():
         raise RunError(f"{path}: is a folder; give the path of a file")
+    part = path.with_name(path.name + ".part")
     writer = RunWriter(part, team, image_format=image_format, flush_every=flush_every)
     try:
         yield writer

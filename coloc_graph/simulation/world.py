@@ -10,7 +10,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.lie import floor_pose
 from coloc_graph.run.messages import Stance
 from coloc_graph.simulation.paths import Array, Path, PathBuilder, drive, tilt_rotation
-from coloc_graph.simulation.rig import MILD_LENS, Imperfections, reference_team, stated_team, true_team
+from coloc_graph.simulation.rig import IMAGE_BIAS, MILD_LENS, Imperfections, reference_team, stated_team, true_team
 from coloc_graph.simulation.scenarios import Pose, Scenario
 from coloc_graph.simulation.tours import LONGEST_BURST, Tour, View, patrol, scatter
 from coloc_graph.team import Team
@@ -116,7 +116,7 @@ def build_world(
     if burst is not None and not 1 <= burst <= LONGEST_BURST:
         raise InputError(f"`burst` is {burst}; give 1 to {LONGEST_BURST} captures")
     imperfections = imperfections or Imperfections()
-    nominal = team or reference_team(MILD_LENS if depth == "images" else ())
+    nominal = team or (reference_team(MILD_LENS, IMAGE_BIAS) if depth == "images" else reference_team())
     stated = stated_team(nominal, imperfections)
     true = true_team(stated, stream(seed, "team"))
     if burst is None:

@@ -1,0 +1,47 @@
+# make demo   a virtual environment, the package, and the main job: render, solve, show
+# make test   the same environment: lint, format, types, tests
+# make bench  the benchmarks behind the figures in the README
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+ARGS ?=
+
+.PHONY: demo test lint types unit bench clean
+
+demo: $(VENV)/installed
+	$(BIN)/coloc demo $(ARGS)
+
+test: lint types unit
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/installed-dev
+	$(BIN)/mypy
+
+unit: $(VENV)/installed-dev
+	$(BIN)/pytest $(ARGS)
+
+bench: $(VENV)/installed-dev
+	$(BIN)/python benchmarks/single_step.py
+	$(BIN)/python benchmarks/hallway.py
+
+$(VENV)/made:
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 15) else \
+	"coloc-graph needs CPython 3.11 to 3.14 (GTSAM has wheels for these) and this is %d.%d: " % v + \
+	"run again with make PYTHON=/path/to/python3.12")'
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/installed: $(VENV)/made pyproject.toml
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+$(VENV)/installed-dev: $(VENV)/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) demo-out .pytest_cache .mypy_cache .ruff_cache *.egg-info

@@ -1,0 +1,93 @@
+"""Small runs and their solutions, made once for the whole suite."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from coloc_graph.pipeline import SolveOptions, solve
+from coloc_graph.results import write_result
+from coloc_graph.run import RunWriter, open_run, read_true_team, read_truth
+from coloc_graph.simulation import simulate
+
+
+def copy_run(source, to, *, change=lambda record: record, stances=None, team=None, truth=False):
+    """The run `source` written anew to `to`, without its truth unless asked for.
+
+    `change` is given each record and returns what is written instead (None: nothing).
+    """
+    run = open_run(source)
+    records = [*(run.stances if stances is None else stances), *run.planes.values()]
+    for robot in run.team.names:
+        records += [*run.detections(robot), *run.images(robot), *run.odometry(robot), *run.motions(robot)]
+    records = [changed for record in records if (changed := change(record)) is not None]
+    with RunWriter(to, team or run.team, image_format="raw") as writer:
+        if truth:
+            writer.write_true_team(read_true_team(source) or run.team)
+            for robot, true in read_truth(source).items():
+                for time, T in zip(true.times.tolist(), true.T_world_body, strict=True):
+                    writer.write_truth(robot, time, T)
+        for record in sorted(records, key=lambda one: one.start if hasattr(one, "anchors") else one.time):
+            writer.write(record)
+    return to
+
+
+def on_a_line(detections):
+    """The same detections with all markers moved onto one line of the image."""
+    uv = detections.uv.copy()
+    uv[:, 1] = 100 + 0.2 * uv[:, 0]
+    return dataclasses.replace(detections, uv=uv)
+
+
+@pytest.fixture(scope="session")
+def copied():
+    """The function `copy_run`."""
+    return copy_run
+
+
+@pytest.fixture(scope="session")
+def collinear():
+    """The function `on_a_line`."""
+    return on_a_line
+
+
+@pytest.fixture(scope="session")
+def hallway(tmp_path_factory):
+    """Path of a hallway of 8 stances, as tracks."""
+    path = tmp_path_factory.mktemp("hallway") / "hallway.mcap"
+    simulate("hallway", path, stances=8, seed=3)
+    return path
+
+
+@pytest.fixture(scope="session")
+def short(tmp_path_factory):
+    """Path of a hallway of 3 stances with few points: quick to solve."""
+    path = tmp_path_factory.mktemp("short") / "short.mcap"
+    simulate("hallway", path, stances=3, seed=1, points=40)
+    return path
+
+
+@pytest.fixture(scope="session")
+def solutions(hallway):
+    """The solutions of the hallway by method."""
+    return {method: solve(open_run(hallway), SolveOptions(method=method)) for method in ("chain", "smooth")}
+
+
+@pytest.fixture(scope="session")
+def short_solution(short):
+    """The solution of the short run."""
+    return solve(open_run(short))
+
+
+@pytest.fixture(scope="session")
+def result(solutions, hallway):
+    """A result on disk beside the hallway; tests read it and leave it alone."""
+    out = hallway.parent / "result"
+    write_result(solutions["smooth"], out)
+    return out
+
+
+@pytest.fixture
+def rng():
+    """The same random numbers in each test."""
+    return np.random.default_rng(7)

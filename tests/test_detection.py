@@ -1,0 +1,173 @@
+"""Marker centres in rendered images: where the light is, how sure, what is doubtful, and nothing where nothing is."""
+
+import time
+
+import numpy as np
+import pytest
+
+from coloc_graph.frontend import detect_hue, detect_leds, detector_for
+from coloc_graph.run import Flag
+from coloc_graph.simulation import Sensor, render, spots
+from coloc_graph.team import Markers
+
+SIZE = (64, 48)
+EVEN = Sensor(read_noise=3.0, shot_gain=0.0)
+
+
+def led_image(uv, radius=1.5, level=240.0, motion=(0.0, 0.0), *, size=SIZE, sensor=EVEN, background=12.0, seed=0):
+    rng = np.random.default_rng(seed)
+    return render(spots(uv, radius, level, motion), size=size, background=background, sensor=sensor, rng=rng)
+
+
+@pytest.fixture(scope="module", params=["even noise", "the sensor's noise"])
+def measured(request):
+    """Errors (n, 2) and stated covariances of 300 LEDs at random places between pixels."""
+    rng = np.random.default_rng(1)
+    sensor = EVEN if request.param == "even noise" else Sensor()
+    errors, covariances = [], []
+    for seed in range(300):
+        uv = np.array([30.0, 22.0]) + rng.uniform(-0.5, 0.5, 2)
+        blobs = detect_leds(led_image(uv, sensor=sensor, seed=seed))
+        assert blobs.flags.tolist() == [Flag.NONE]
+        errors.append(blobs.uv[0] - uv)
+        covariances.append(blobs.covariance[0])
+    return np.array(errors), np.mean(covariances, axis=0)
+
+
+def test_the_centre_is_right_to_a_twentieth_of_a_pixel_and_has_no_bias(measured):
+    errors, _ = measured
+    assert (np.sqrt((errors**2).mean(axis=0)) < 0.05).all()
+    assert (np.abs(errors.mean(axis=0)) < 0.02).all()
+
+
+def test_the_bias_does_not_depend_on_where_between_pixels_the_centre_is():
+    for phase in np.stack(np.meshgrid([0.0, 0.25, 0.5, 0.75], [0.0, 0.3, 0.6]), -1).reshape(-1, 2):
+        uv = np.array([30.0, 22.0]) + phase
+        blobs = detect_leds(render(spots(uv, 1.5, 240.0), size=SIZE, background=12.0))
+        assert blobs.uv[0] == pytest.approx(uv, abs=0.02)
+
+
+def test_the_stated_sigma_is_that_of_the_errors_to_35_percent(measured):
+    errors, covariance = measured
+    ratio = np.sqrt(np.diag(covariance)) / errors.std(axis=0)
+    assert (ratio > 1 / 1.4).all()
+    assert (ratio < 1.4).all()
+    assert abs(covariance[0, 1]) < 0.1 * covariance[0, 0]
+
+
+def test_a_dim_led_is_less_certain_than_a_bright_one():
+    dim, bright = (detect_leds(led_image((30.2, 22.4), 0.7, level)) for level in (240.0, 700.0))
+    assert dim.covariance[0, 0, 0] > 4 * bright.covariance[0, 0, 0]
+    assert dim.peak[0] < bright.peak[0]
+
+
+def test_a_spot_at_the_sensors_limit_is_saturated_and_still_centred():
+    blobs = detect_leds(led_image((30.3, 22.4), 2.5, 600.0))
+    assert blobs.flags[0] & Flag.SATURATED
+    assert blobs.uv[0] == pytest.approx((30.3, 22.4), abs=0.1)
+
+
+@pytest.mark.parametrize("uv", [(0.3, 22), (63.0, 22), (30, 0.4), (30, 46.9)])
+def test_a_spot_at_the_border_of_the_image_is_clipped(uv):
+    blobs = detect_leds(led_image(uv))
+    assert len(blobs) == 1
+    assert blobs.flags[0] & Flag.CLIPPED
+
+
+@pytest.mark.parametrize("angle", [0, 30, 45, 60, 90, 135])
+@pytest.mark.parametrize(("radius", "apart"), [(1.5, 5.0), (2.5, 7.0)])
+def test_two_leds_that_touch_are_merged_at_whatever_angle(angle, radius, apart):
+    off = apart / 2 * np.array([np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))])
+    blobs = detect_leds(led_image(np.add((30.2, 22.3), [-off, off]), radius, 220.0))
+    assert len(blobs) == 1
+    assert blobs.flags[0] & Flag.MERGED
+
+
+@pytest.mark.parametrize("angle", [0, 30, 45, 60, 90, 135])
+def test_a_spot_drawn_out_by_motion_is_blurred_and_not_merged(angle):
+    motion = 10.0 * np.array([np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))])
+    blobs = detect_leds(led_image((30.2, 22.3), 1.0, 800.0, motion))
+    assert blobs.flags.tolist() == [Flag.BLURRED]
+    assert blobs.uv[0] == pytest.approx((30.2, 22.3), abs=0.2)
+
+
+def test_two_leds_apart_are_two():
+    blobs = detect_leds(led_image([(20.2, 22.3), (29.7, 22.3)]))
+    assert blobs.uv[np.argsort(blobs.uv[:, 0])] == pytest.approx(np.array([(20.2, 22.3), (29.7, 22.3)]), abs=0.1)
+    assert not blobs.flags.any()
+
+
+@pytest.mark.parametrize("shape", [(240, 320), (240, 320, 3)])
+@pytest.mark.parametrize("level", [0, 12, 255])
+@pytest.mark.parametrize(
+    "find", [detector_for(None), detector_for(Markers(height=0, positions=((0, 0),), hue_deg=120))]
+)
+def test_an_even_image_holds_nothing(shape, level, find):
+    blobs = find(np.full(shape, level, np.uint8), None)
+    assert len(blobs) == 0
+    assert blobs.uv.shape == (0, 2)
+    assert blobs.covariance.shape == (0, 2, 2)
+    assert len(find(np.full(shape, level, np.uint8), (10, 10, 50, 50))) == 0
+
+
+def test_noise_holds_nothing_and_does_not_take_long():
+    rng = np.random.default_rng(0)
+    for sigma in (3, 8):
+        assert len(detect_leds(np.clip(rng.normal(20, sigma, (240, 320)), 0, 255).astype(np.uint8))) == 0
+    begin = time.process_time()
+    assert len(detect_leds(rng.integers(0, 256, (240, 320)).astype(np.uint8))) == 0
+    assert time.process_time() - begin < 2.0
+
+
+def test_a_lamp_larger_than_any_marker_is_not_one():
+    assert len(detect_leds(led_image((160, 120), 20.0, 200.0, size=(320, 240)))) == 0
+
+
+@pytest.mark.parametrize("uv", [(160.3, 120.2), (141.0, 120.0), (178.9, 101.4)])
+def test_a_box_gives_what_the_whole_image_gives_even_where_it_cuts_the_blob(uv):
+    image = led_image([uv, (60.0, 60.0)], size=(320, 240))
+    whole, part = detect_leds(image), detect_leds(image, (140, 100, 180, 140))
+    nearest = np.linalg.norm(whole.uv - uv, axis=1).argmin()
+    assert len(whole) == 2
+    assert part.uv == pytest.approx(whole.uv[[nearest]], abs=2e-3)
+    assert part.covariance == pytest.approx(whole.covariance[[nearest]], rel=0.02)
+    assert part.flags.tolist() == [Flag.NONE]
+
+
+def test_a_blob_outside_the_box_is_not_found_and_a_box_at_the_images_edge_clips():
+    image = led_image([(0.2, 30.0), (30.0, 22.0)])
+    assert len(detect_leds(image, (34, 10, 60, 40))) == 0
+    assert detect_leds(image, (0, 10, 20, 48)).flags[0] & Flag.CLIPPED
+
+
+def coloured(lights, seed=0):
+    """A BGR image of (uv, (b, g, r)) lights."""
+    rng = np.random.default_rng(seed)
+    uv = np.array([one for one, _ in lights])
+    channels = [
+        render(spots(uv, 2.0, [bgr[c] for _, bgr in lights]), size=(160, 120), background=12, sensor=EVEN, rng=rng)
+        for c in range(3)
+    ]
+    return np.stack(channels, axis=2)
+
+
+@pytest.mark.parametrize(
+    ("hue", "bgr"), [(0, (0, 0, 220)), (120, (0, 220, 0)), (240, (220, 0, 0)), (300, (220, 0, 220))]
+)
+def test_a_coloured_marker_is_found_among_other_colours_and_white_lamps(hue, bgr):
+    others = [(0, 0, 220), (0, 220, 0), (220, 0, 0), (220, 0, 220), (220, 220, 220), (220, 220, 0)]
+    lights = [((20.0 + 18 * n, 30.0 + 7 * n), other) for n, other in enumerate(others) if other != bgr]
+    image = coloured([((100.3, 99.8), bgr), *lights])
+    markers = Markers(height=0.15, positions=((0, 0),), hue_deg=float(hue))
+    found = detector_for(markers)(image, None)
+    assert len(found) == 1
+    assert found.uv[0] == pytest.approx((100.3, 99.8), abs=0.15)
+    in_box = detect_hue(image, (80, 80, 120, 120), hue_deg=hue)
+    assert in_box.uv == pytest.approx(found.uv, abs=0.01)
+
+
+def test_a_grey_image_holds_no_hue_and_white_leds_are_found_in_colour():
+    image = coloured([((80.2, 60.4), (220, 220, 220))])
+    assert len(detect_hue(image[..., 0], hue_deg=120)) == 0
+    assert len(detect_hue(image, hue_deg=120)) == 0
+    assert detect_leds(image).uv == pytest.approx(np.array([(80.2, 60.4)]), abs=0.1)

@@ -1,0 +1,198 @@
+"""From a run to an estimate: accuracy, repeatability, ignorance of the truth, and runs that are partly bad."""
+
+import itertools
+
+import msgspec
+import numpy as np
+import pytest
+
+from coloc_graph.errors import EstimationError, InputError
+from coloc_graph.evaluation import align, evaluate
+from coloc_graph.lie import floor_pose, se3_inverse
+from coloc_graph.pipeline import METHODS, SolveOptions, solve
+from coloc_graph.run import Detections, Stance, open_run, read_truth, whole_run
+from coloc_graph.simulation import reference_team
+
+
+def same_trajectories(a, b):
+    assert list(a.estimate.trajectories) == list(b.estimate.trajectories)
+    for robot, one in a.estimate.trajectories.items():
+        other = b.estimate.trajectories[robot]
+        for name in ("times", "T_world_body", "stances", "covariances"):
+            assert np.array_equal(getattr(one, name), getattr(other, name)), (robot, name)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_hallway_is_found_within_its_own_sigmas(solutions, hallway, method):
+    solution = solutions[method]
+    trajectories = solution.estimate.trajectories
+    true = align(trajectories, read_truth(hallway), "A", on_floor=True)
+    accuracy = evaluate(trajectories, true, on_floor=True)
+    assert {row.robot for row in accuracy.robots} == {"A", "B"}
+    assert accuracy.ate < 0.03 and accuracy.end_position_error < 0.06 and accuracy.heading_error_deg < 2
+    for robot, trajectory in trajectories.items():
+        off = (
+            trajectory.T_world_body[:, :3, :3].swapaxes(1, 2)
+            @ (trajectory.positions - true[robot][:, :3, 3])[..., None]
+        )
+        sigma = np.sqrt(trajectory.covariances[:, [3, 4], [3, 4]])
+        assert (np.abs(off[:, :2, 0]) < 4.5 * sigma + 1e-5).all(), robot
+        # not so large that anything would fit
+        assert sigma.max() < 0.1
+    assert accuracy.nees_poses == 8 and 0.05 < accuracy.anees < 4
+    assert solution.warnings == ()
+    assert [m.homography.stance for m in solution.measurements] == list(range(8))
+
+
+def test_maximum_likelihood_promises_more_than_the_papers_road(solutions):
+    """The same run, the smaller covariance: otherwise smoothing threw something away."""
+    sigma = {
+        method: np.sqrt(np.trace(s.estimate.trajectories["A"].covariances[-1][3:5, 3:5]))
+        for method, s in solutions.items()
+    }
+    assert sigma["smooth"] < sigma["chain"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_solving_twice_gives_the_same_to_the_bit(short, method):
+    first, second = (solve(open_run(short), SolveOptions(method=method)) for _ in range(2))
+    same_trajectories(first, second)
+    assert first.estimate.chi2 == second.estimate.chi2
+
+
+def test_the_estimate_does_not_depend_on_the_truth_in_the_run(short, short_solution, copied, tmp_path):
+    without = copied(short, tmp_path / "without.mcap")
+    assert read_truth(short) and not read_truth(without)
+    same_trajectories(short_solution, solve(open_run(without)))
+
+
+def test_a_run_has_no_way_to_its_truth(short):
+    run = open_run(short)
+    assert not [topic for topic in run.topics if "truth" in topic]
+    assert not [name for name in dir(run) if "tru" in name]
+    assert not [info.topic for info in run._index.channels.values() if "tru" in info.topic]
+
+
+def spoilt(source, to, copied, collinear, stance_numbers):
+    spans = [(s.start, s.end) for s in open_run(source).stances if s.index in stance_numbers]
+
+    def change(record):
+        if isinstance(record, Detections) and any(start <= record.time <= end for start, end in spans):
+            return collinear(record)
+        return record
+
+    return open_run(copied(source, to, change=change))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_straight_drive_in_the_middle_is_a_warning_and_what_hung_on_it_is_untied(
+    hallway, solutions, copied, collinear, tmp_path, method
+):
+    solution = solve(spoilt(hallway, tmp_path / "bad.mcap", copied, collinear, {3}), SolveOptions(method=method))
+    assert [m.homography.stance for m in solution.measurements if m.homography.unusable] == [3]
+    assert any("stance 3" in warning and "line" in warning and "turn" in warning for warning in solution.warnings)
+    # at stance 3 B is the anchor and A has moved: from there on nothing ties A, and with it anything
+    assert solution.estimate.untied[0] == ("A", 3)
+    assert {stance for _, stance in solution.estimate.untied} == set(range(3, 8))
+    assert any("not tied to the reference" in w and "A at stance 3" in w for w in solution.warnings)
+    # what came before is as if nothing had happened
+    for robot, whole in solutions[method].estimate.trajectories.items():
+        part = solution.estimate.trajectories[robot]
+        assert part.stances.max() <= 3
+        np.testing.assert_allclose(part.T_world_body, whole.T_world_body[: len(part)], atol=0.02)
+
+
+def test_a_straight_drive_at_the_end_costs_the_last_pose_alone(hallway, copied, collinear, tmp_path):
+    solution = solve(spoilt(hallway, tmp_path / "bad.mcap", copied, collinear, {7}))
+    assert {stance for _, stance in solution.estimate.untied} == {7} and len(solution.estimate.untied) == 1
+
+
+def test_nothing_but_straight_drives_is_an_error_with_its_remedy(short, copied, collinear, tmp_path):
+    run = spoilt(short, tmp_path / "bad.mcap", copied, collinear, {0, 1, 2})
+    with pytest.raises(EstimationError, match=r"bad.mcap: no stance gives a relative pose; at stance 0, .*turn"):
+        solve(run)
+
+
+def test_a_bad_first_stance_ties_nobody_and_says_so(short, copied, collinear, tmp_path):
+    run = spoilt(short, tmp_path / "bad.mcap", copied, collinear, {0})
+    with pytest.raises(EstimationError, match=r"no measurement ties a robot to the reference A; stance 0, .*turn"):
+        solve(run)
+
+
+def test_a_healthy_run_agrees_with_itself_as_well_as_its_noise_lets_it(solutions):
+    estimate = solutions["smooth"].estimate
+    assert estimate.dof == 24
+    assert 8 < estimate.chi2 < 53  # the 0.1 % tails
+
+
+def test_mounts_that_are_not_as_stated_are_warned_of(hallway, copied, tmp_path):
+    team = open_run(hallway).team
+    tilted = tuple(
+        msgspec.structs.replace(robot, mount=msgspec.structs.replace(robot.mount, tilt_deg=robot.mount.tilt_deg + d))
+        for robot, d in zip(team.robots, (2.0, -2.0, 0.0), strict=True)
+    )
+    run = open_run(copied(hallway, tmp_path / "tilted.mcap", team=msgspec.structs.replace(team, robots=tilted)))
+    assert any("the measurements disagree" in warning for warning in solve(run).warnings)
+
+
+def test_progress_counts_every_pair(short):
+    seen = []
+    solve(open_run(short), progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_a_run_without_stances_or_with_one_observer_is_refused(short, copied, tmp_path):
+    with pytest.raises(InputError, match=r"empty.mcap: the run holds no stance"):
+        solve(open_run(copied(short, tmp_path / "empty.mcap", stances=())))
+    alone = [Stance(s.index, s.start, s.end, s.observers[:1], s.movers) for s in open_run(short).stances]
+    with pytest.raises(InputError, match=r"alone.mcap: stance 0 has one observer only"):
+        solve(open_run(copied(short, tmp_path / "alone.mcap", stances=alone)))
+
+
+def test_an_unknown_method_is_refused(short):
+    with pytest.raises(InputError, match="no method `guess`; choose one of chain, smooth"):
+        solve(open_run(short), SolveOptions(method="guess"))
+
+
+def test_three_observers_at_once_make_three_measurements_that_agree(tmp_path):
+    """A square of points seen by A, B and C: redundancy is averaged, and the loop closes."""
+    team = reference_team()
+    markers = team.robots[0].markers
+    watched = msgspec.structs.replace(team.robots[0], name="D", markers=markers)
+    team = msgspec.structs.replace(team, robots=(*team.robots, watched))
+    poses = {"A": floor_pose(0, 0, 0), "B": floor_pose(0.05, 0.5, -0.3), "C": floor_pose(0.1, -0.5, 0.3)}
+    x, y = np.meshgrid(np.linspace(1.0, 1.6, 6), np.linspace(-0.2, 0.2, 6))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, markers.height)], axis=1)
+    rng = np.random.default_rng(0)
+    with whole_run(tmp_path / "three.mcap", team) as writer:
+        writer.write(Stance(0, 100.0, 110.0, ("A", "B", "C"), ("D",)))
+        for robot, T_world_body in poses.items():
+            T = se3_inverse(T_world_body @ team[robot].mount.T_body_camera)
+            uv, inside = team[robot].camera.project(points @ T[:3, :3].T + T[:3, 3])
+            assert inside.all()
+            uv += rng.normal(0, 0.3, uv.shape)
+            for k, one in enumerate(uv):
+                flat = np.zeros(1)
+                writer.write(
+                    Detections(
+                        robot,
+                        100 + 0.1 * k,
+                        one[None],
+                        0.09 * np.eye(2)[None],
+                        ("D/0",),
+                        flat.astype(np.uint8),
+                        flat,
+                        flat,
+                    )
+                )
+    solution = solve(open_run(tmp_path / "three.mcap"))
+    pairs = {(m.homography.robot_i, m.homography.robot_j) for m in solution.measurements}
+    assert pairs == set(itertools.combinations("ABC", 2))
+    # rows: the gauge's 6, the floor's 3 for B and for C, 6 for each measurement; unknowns: 6 for each robot
+    assert solution.estimate.dof == 6 + 2 * 3 + 3 * 6 - 3 * 6
+    for robot, T in poses.items():
+        sigma = np.sqrt(np.diag(solution.estimate.covariance(robot, 0))[3:5])
+        off = solution.estimate.pose(robot, 0).matrix()[:2, 3] - T[:2, 3]
+        assert np.linalg.norm(off) < 5 * np.linalg.norm(sigma) + 1e-6
+    chained = solve(open_run(tmp_path / "three.mcap"), SolveOptions(method="chain"))
+    assert set(chained.estimate.trajectories) == {"A", "B", "C"}

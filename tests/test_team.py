@@ -1,0 +1,237 @@
+"""The team file: what is written reads back, and what is wrong is named by its path."""
+
+import cv2
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from coloc_graph.errors import TeamError
+from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Team, read_team, write_team
+
+LENSES = [
+    (),
+    (-0.1, 0.02, 5e-4, -3e-4),
+    (-0.3, 0.1, 1e-3, -1e-3, -0.02),
+    (0.3, 0.05, -1e-3, 5e-4, 0.01, 0.25, 0.03, 0.002),
+]
+TOML = """
+reference = "A"
+
+[[robots]]
+name = "A"
+[robots.camera]
+width = 320
+height = 240
+fx = 301.0
+fy = 301.0
+cx = 159.5
+cy = 119.5
+[robots.mount]
+height = 0.4
+tilt_deg = 20.0
+
+[[robots]]
+name = "C"
+[robots.camera]
+width = 320
+height = 240
+fx = 301.0
+fy = 301.0
+cx = 159.5
+cy = 119.5
+[robots.mount]
+height = 0.4
+[robots.markers]
+height = 0.15
+positions = [[0.0, 0.125], [0.0, -0.125]]
+"""
+
+
+def camera(distortion=(), **changes):
+    return Camera(**{"width": 640, "height": 480, "fx": 500.0, "fy": 510.0, "cx": 310.0, "cy": 250.0} | changes,
+                  distortion=distortion)  # fmt: skip
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read_text(text):
+        path = tmp_path / "team.toml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_team(path)
+
+    return read_text
+
+
+@pytest.mark.parametrize("hue", [None, 120.0])
+@pytest.mark.parametrize("floor", [None, Floor(tilt_sigma_deg=0.1, height_sigma=1e-3)])
+def test_a_team_reads_back_as_it_was_written(tmp_path, hue, floor):
+    markers = Markers(height=0.15, positions=((0.1, 0.2), (-1 / 3, 0.0)), hue_deg=hue, span_sigma=1e-4)
+    mount = Mount(height=0.4, tilt_deg=20.1, roll_deg=-0.3, yaw_deg=5.0, x=0.01, y=-0.02, tilt_sigma_deg=0.3)
+    robots = (
+        Robot(name="A", camera=camera(LENSES[1], noise_px=0.1 + 0.2), mount=mount),
+        Robot(name="b-2_c", camera=camera(LENSES[3]), mount=mount, markers=markers),
+    )
+    team = Team(reference="b-2_c", robots=robots, floor=floor)
+    write_team(team, tmp_path / "team.toml")
+    assert read_team(tmp_path / "team.toml") == team
+
+
+def test_the_example_is_sound(read):
+    team = read(TOML)
+    assert team.names == ("A", "C")
+    assert team.floor is None
+    assert team["C"].markers.span == 0.25
+
+
+WRONG = {
+    "an unknown field": ("tilt_deg = 20.0", "tilt = 20.0", ["`tilt`", "$.robots[0].mount"]),
+    "an unknown field at the top": ('reference = "A"', 'reference = "A"\ncolour = 1', ["`colour`"]),
+    "a missing field": ("fx = 301.0\n", "", ["`fx`", "$.robots[0].camera"]),
+    "a wrong type": ("height = 0.15", 'height = "low"', ["float", "$.robots[1].markers.height"]),
+    "a broken number of pixels": ("width = 320", "width = 320.5", ["int", "$.robots[0].camera.width"]),
+    "not a number": ("fx = 301.0", "fx = nan", ["`fx` is nan", "$.robots[0].camera"]),
+    "an infinite number": ("tilt_deg = 20.0", "tilt_deg = inf", ["`tilt_deg` is inf", "$.robots[0].mount"]),
+    "a marker at nan": ("0.125]", "nan]", ["`positions`", "$.robots[1].markers"]),
+    "a focal length of 0": ("fy = 301.0", "fy = 0.0", ["`fy` is 0", "$.robots[0].camera"]),
+    "distortion of 3": ("cy = 119.5", "cy = 119.5\ndistortion = [0.1, 0.2, 0.3]", ["3 numbers", "$.robots[0].camera"]),
+    "distortion with nan": (
+        "cy = 119.5",
+        "cy = 119.5\ndistortion = [0.1, nan, 0.0, 0.0]",
+        ["`distortion`", "$.robots[0].camera"],
+    ),
+    "a camera below the floor": (
+        "height = 0.4\ntilt",
+        "height = -0.4\ntilt",
+        ["`height` is -0.4", "$.robots[0].mount"],
+    ),
+    "markers below the floor": ("height = 0.15", "height = -0.15", ["`height` is -0.15", "$.robots[1].markers"]),
+    "no marker": ("[[0.0, 0.125], [0.0, -0.125]]", "[]", ["`positions` is empty", "$.robots[1].markers"]),
+    "a marker in space": ("[0.0, 0.125]", "[0.0, 0.125, 0.15]", ["$.robots[1].markers.positions[0]"]),
+    "a hue beyond the circle": (
+        "height = 0.15",
+        "height = 0.15\nhue_deg = 360.0",
+        ["`hue_deg`", "$.robots[1].markers"],
+    ),
+    "a robot twice": ('name = "C"', 'name = "A"', ["two robots are called `A`"]),
+    "a name with a slash": ('name = "C"', 'name = "a/b"', ["`a/b`", "$.robots[1]"]),
+    "an unknown reference": ('reference = "A"', 'reference = "D"', ["`reference` is `D`", "A, C"]),
+    "no robots": (TOML, 'reference = "A"\nrobots = []', ["at least two"]),
+    "not TOML": ("[[robots]]", "[[robots]", ["line"]),
+    "nothing": (TOML, "", ["`reference`"]),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "wanted"), WRONG.values(), ids=WRONG)
+def test_what_is_wrong_with_a_team_is_named(read, old, new, wanted):
+    assert old in TOML
+    with pytest.raises(TeamError) as caught:
+        read(TOML.replace(old, new, 1))
+    message = str(caught.value)
+    assert "team.toml" in message
+    assert "\n" not in message
+    for words in wanted:
+        assert words in message
+
+
+def test_bytes_that_are_not_utf8_are_an_error_in_words(read):
+    with pytest.raises(TeamError, match=r"team\.toml"):
+        read(TOML.encode() + b"# \xff\xfe\n")
+
+
+def test_a_missing_file_and_a_folder_are_errors_in_words(tmp_path):
+    with pytest.raises(TeamError, match=r"nowhere\.toml: cannot be read"):
+        read_team(tmp_path / "nowhere.toml")
+    with pytest.raises(TeamError, match="cannot be read"):
+        read_team(tmp_path)
+
+
+def test_a_robot_that_is_not_in_the_team_is_an_error_that_lists_those_who_are(read):
+    with pytest.raises(TeamError, match=r"`D` is not in the team \(A, C\)"):
+        read(TOML)["D"]
+
+
+def test_marker_height_is_none_where_the_robots_differ(read):
+    team = read(TOML)
+    assert team.marker_height() == 0.15
+    higher = replace(team["C"], name="D", markers=replace(team["C"].markers, height=0.2))
+    team = replace(team, robots=(*team.robots, higher))
+    assert team.marker_height() is None
+    assert team.marker_height(["D"]) == 0.2
+
+
+@pytest.mark.parametrize("distortion", LENSES, ids=len)
+def test_projection_is_opencvs(distortion):
+    points = np.random.default_rng(0).uniform((-0.6, -0.5, 0.8), (0.6, 0.5, 3.0), (200, 3))
+    lens = camera(distortion)
+    uv, _ = lens.project(points)
+    wanted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.K, np.array(distortion or [0.0] * 4))
+    assert uv == pytest.approx(wanted[:, 0], abs=1e-9)
+
+
+@pytest.mark.parametrize("distortion", LENSES, ids=len)
+def test_normalise_is_the_inverse_of_project(distortion):
+    lens = camera(distortion)
+    x = np.random.default_rng(1).uniform((-0.6, -0.45), (0.6, 0.45), (300, 2))
+    uv, inside = lens.project(np.column_stack([x, np.ones(300)]) * 1.7)
+    assert inside.sum() > 100
+    assert lens.normalise(uv[inside]) == pytest.approx(x[inside], abs=1e-9)
+
+
+def test_points_behind_the_camera_are_nan_and_not_inside():
+    uv, inside = camera(LENSES[1]).project([[0.1, 0.1, -1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert np.isnan(uv[:2]).all()
+    assert uv[2] == pytest.approx((310.0, 250.0))
+    assert inside.tolist() == [False, False, True]
+
+
+def test_the_border_of_the_image_is_half_a_pixel_beyond_the_centres_of_the_outer_pixels():
+    lens = camera()
+    uv = np.array([[-0.4, 10], [-0.6, 10], [639.4, 10], [639.6, 10], [10, -0.4], [10, -0.6], [10, 479.4], [10, 479.6]])
+    _, inside = lens.project(np.column_stack([lens.normalise(uv), np.ones(8)]))
+    assert inside.tolist() == [True, False] * 4
+
+
+def test_a_point_that_a_barrel_lens_folds_back_is_not_inside():
+    lens = camera((-0.3, 0.0, 0.0, 0.0))
+    uv, inside = lens.project([[0.0, 1.75, 1.0]])
+    assert 0 < uv[0, 1] < 480
+    assert not inside[0]
+
+
+def test_a_rational_lens_that_does_not_fold_loses_no_point():
+    lens = camera((-0.6, 0.0, 0.0, 0.0, 0.0, -0.5, 0.0, 0.0), fy=250.0)
+    y = np.linspace(0, 0.9, 50)
+    uv, inside = lens.project(np.column_stack([np.zeros(50), y, np.full(50, 1.0)]))
+    assert (np.diff(uv[:, 1]) > 0).all()
+    assert uv[-1, 1] > 440
+    assert inside.all()
+
+
+def test_normalise_says_nan_where_the_lens_cannot_be_inverted():
+    x = camera((-0.3, 0.0, 0.0, 0.0)).normalise([[320.0, 240.0], [320.0, 5000.0]])
+    assert np.isfinite(x[0]).all()
+    assert np.isnan(x[1]).all()
+
+
+def test_a_camera_looks_along_the_bodys_x_with_its_y_down():
+    T = Mount(height=0.4, x=0.1, y=-0.2).T_body_camera
+    assert T[:3, 3] == pytest.approx((0.1, -0.2, 0.4))
+    right, down, ahead = T[:3, :3].T
+    assert ahead == pytest.approx((1, 0, 0))
+    assert right == pytest.approx((0, -1, 0))
+    assert down == pytest.approx((0, 0, -1))
+
+
+def test_tilt_looks_down_yaw_looks_left_and_roll_lowers_the_right():
+    c, s = np.cos(np.deg2rad(20)), np.sin(np.deg2rad(20))
+    assert Mount(height=0.4, tilt_deg=20).R_body_camera[:, 2] == pytest.approx((c, 0, -s))
+    assert Mount(height=0.4, yaw_deg=20).R_body_camera[:, 2] == pytest.approx((c, s, 0))
+    rolled = Mount(height=0.4, roll_deg=20).R_body_camera
+    assert rolled[:, 2] == pytest.approx((1, 0, 0))
+    assert rolled[:, 0] == pytest.approx((0, -c, -s))
+
+
+def test_yaw_comes_before_tilt_so_that_a_turned_camera_keeps_its_horizon():
+    R = Mount(height=0.4, yaw_deg=70, tilt_deg=20).R_body_camera
+    assert R[2, 0] == pytest.approx(0, abs=1e-15)
+    assert R[2, 2] == pytest.approx(-np.sin(np.deg2rad(20)))

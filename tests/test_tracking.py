@@ -1,0 +1,131 @@
+"""Markers followed through images: where is looked, who is who, and when a track ends."""
+
+import numpy as np
+import pytest
+
+from coloc_graph.frontend import MarkerTracker, TrackerOptions, detect_leds
+from coloc_graph.run import Image
+from coloc_graph.simulation import Sensor, render, spots
+
+T0 = 1_700_000_000.0
+SIZE = (320, 240)
+
+
+def frames(lights, seed=0, step=0.1):
+    """Images of lights (k, n, 2) [px]; a light at NaN is dark."""
+    rng = np.random.default_rng(seed)
+    for k, uv in enumerate(lights):
+        pixels = render(spots(uv, 1.5, 220.0), size=SIZE, background=12.0, sensor=Sensor(), rng=rng)
+        yield Image("A", T0 + step * k, pixels)
+
+
+def tracked(lights, options=None, detector=detect_leds):
+    tracker = MarkerTracker("A", detector, options or TrackerOptions(markers=lights.shape[1]))
+    for image in frames(lights):
+        tracker.step(image)
+    return tracker.tracks()
+
+
+def moving(k, start, velocity):
+    return np.asarray(start, float) + np.arange(k)[:, None] * np.asarray(velocity)
+
+
+def owner(track, lights):
+    """Which light (n) each sample of a track is."""
+    frame = np.rint((track.times - T0) / 0.1).astype(int)
+    apart = np.linalg.norm(lights[frame] - track.uv[:, None], axis=2)
+    assert np.nanmin(apart, axis=1).max() < 0.3
+    return np.nanargmin(apart, axis=1)
+
+
+def test_two_moving_leds_and_a_still_light_are_three_whole_tracks():
+    n = 40
+    lights = np.stack([moving(n, (40, 60), (5, 2)), moving(n, (60, 160), (4, -1)), moving(n, (300, 30), (0, 0))], 1)
+    tracks = tracked(lights)
+    assert [len(track) for track in tracks] == [n, n, n]
+    owners = [owner(track, lights) for track in tracks]
+    assert all((one == one[0]).all() for one in owners)
+    assert {int(one[0]) for one in owners} == {0, 1, 2}
+    still = next(track for track, one in zip(tracks, owners, strict=True) if one[0] == 2)
+    assert still.extent < 1.0
+    assert min(track.extent for track in tracks if track is not still) > 100
+    for track in tracks:
+        assert track.times == pytest.approx(T0 + 0.1 * np.arange(n))
+        assert (np.linalg.eigvalsh(track.covariance) > 0).all()
+
+
+def test_leds_that_pass_each_other_closely_keep_their_identity():
+    n = 30
+    lights = np.stack([moving(n, (40, 100), (8, 0)), moving(n, (280, 114), (-8, 0))], 1)
+    tracks = tracked(lights)
+    assert [len(track) for track in tracks] == [n, n]
+    for track in tracks:
+        one = owner(track, lights)
+        assert (one == one[0]).all()
+
+
+def test_a_patch_is_searched_where_the_led_would_be_if_it_went_on():
+    boxes = []
+
+    def looking(pixels, box):
+        boxes.append(box)
+        return detect_leds(pixels, box)
+
+    lights = moving(9, (60, 60), (12, 7))[:, None]
+    track = tracked(lights, TrackerOptions(patch=40, markers=1), looking)[0]
+    assert boxes[0] is None
+    assert len(boxes) == 9
+    for k in range(2, 9):
+        u, v = np.rint(2 * track.uv[k - 1] - track.uv[k - 2]).astype(int)
+        assert boxes[k] == (u - 20, v - 20, u + 20, v + 20)
+
+
+def test_an_led_that_two_overlapping_patches_see_is_one_and_whole():
+    n = 12
+    lights = np.stack([moving(n, (60, 60), (4, 0)), moving(n, (79.5, 60), (4, 0))], 1)
+    tracks = tracked(lights)
+    assert [len(track) for track in tracks] == [n, n]
+    for track in tracks:
+        assert np.unique(owner(track, lights)).size == 1
+        assert np.linalg.norm(track.uv - lights[:, owner(track, lights)[0]], axis=1).max() < 0.15
+
+
+def test_an_led_that_is_dark_for_3_frames_stays_one_track():
+    lights = moving(25, (40, 60), (4, 3))[:, None]
+    lights[10:13] = np.nan
+    (track,) = tracked(lights)
+    assert len(track) == 22
+
+
+def test_an_led_that_is_lost_for_5_frames_is_found_again_in_the_first_frame_it_shines():
+    lights = np.stack([moving(30, (40, 60), (4, 3)), moving(30, (300, 200), (-3, 0))], 1)
+    lights[10:15, 0] = np.nan
+    tracks = tracked(lights)
+    assert sorted(len(track) for track in tracks) == [10, 15, 30]
+    again = next(track for track in tracks if len(track) == 15)
+    assert again.times[0] == pytest.approx(T0 + 1.5)
+    assert (owner(again, lights) == 0).all()
+
+
+def test_an_led_that_comes_into_view_later_is_found_within_10_frames_though_all_others_are_tracked():
+    lights = np.stack([moving(30, (40, 60), (3, 0)), moving(30, (60, 160), (3, 0))], 1)
+    lights[:11, 1] = np.nan
+    tracks = tracked(lights, TrackerOptions(markers=1))
+    assert len(tracks) == 2
+    assert tracks[1].times[0] <= T0 + 2.0 + 1e-6
+
+
+def test_an_led_that_leaves_the_image_ends_its_track_there():
+    lights = np.stack([moving(30, (270, 60), (6, 0)), moving(30, (60, 160), (3, 0))], 1)
+    first, second = sorted(tracked(lights), key=len)
+    assert len(second) == 30
+    assert 7 <= len(first) <= 9
+    assert first.uv[:, 0].max() < SIZE[0] - 2
+
+
+def test_no_images_and_dark_images_give_no_track():
+    tracker = MarkerTracker("A", detect_leds)
+    assert tracker.tracks() == []
+    for k in range(5):
+        tracker.step(Image("A", T0 + k, np.zeros((240, 320), np.uint8)))
+    assert tracker.tracks() == []
