@@ -23,7 +23,8 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.cli.accuracy import print_accuracy
     from coloc_graph.cli.printing import progress, warn
     from coloc_graph.pipeline import solve
-    from coloc_graph.results import require_place, write_result
+    from coloc_graph.report import hero_figure
+    from coloc_graph.results import assess, require_place, write_result
     from coloc_graph.run import open_run
     from coloc_graph.simulation import simulate
 
@@ -41,11 +42,14 @@ def run(args: argparse.Namespace) -> int:
     with progress("measurements made from the images") as report:
         solution = solve(open_run(run_path), progress=report)
     accuracy = write_result(solution, out / "result")
+    picture = out / "hallway.png"
+    assessed = assess(solution)
+    hero_figure(solution.estimate, assessed[1] if assessed else None).savefig(picture, dpi=130)
     warn(solution.warnings)
     assert accuracy is not None  # a simulated run holds truth
     print_accuracy(accuracy)
     html = out / "result" / "report.html"
-    print(f"the report: {html}")
+    print(f"the report: {html}, and a picture: {picture}")
     if not args.no_browser and sys.stdout.isatty():
         webbrowser.open(html.absolute().as_uri())
     return 0
