@@ -31,10 +31,10 @@ REFERENCE = dict(
 
 def one_cell(index: int, worlds: int, draws: int) -> list[float]:
     """Errors |l_est - l| [cm] of all draws of a cell."""
-    l, theta = CELLS[index]  # noqa: E741
+    baseline, theta = CELLS[index]
     errors = []
     for seed in range(worlds):
-        run = MemoryRun(simulated("single-step", seed, points=250, l=l, theta_deg=float(theta)))
+        run = MemoryRun(simulated("single-step", seed, points=250, l=baseline, theta_deg=float(theta)))
         found = measure_pair(run, run.stances[0], "A", "B", FrontendOptions(criterion="transfer"))
         plane = stance_plane(run, run.stances[0], "A")
         rng = np.random.default_rng((seed, index))
@@ -42,7 +42,7 @@ def one_cell(index: int, worlds: int, draws: int) -> list[float]:
             few = rng.choice(len(found.correspondences), 50, replace=False)
             fit = fit_homography(found.correspondences.pairs[few], "transfer")
             _, T = decompose_with_normal(fit.H, plane.N, plane.d)
-            errors.append(100 * abs(np.linalg.norm(T) - l))
+            errors.append(100 * abs(np.linalg.norm(T) - baseline))
     return errors
 
 
@@ -59,14 +59,17 @@ def main() -> int:
     spread = [np.std(np.reshape(errors, (args.worlds, -1)).mean(axis=1)) / np.sqrt(args.worlds) for errors in every]
     sigmas = dict(zip(CELLS, spread, strict=True))
     if args.json:
-        print(json.dumps([{"l": l, "theta_deg": a, "mean_cm": means[l, a], "sigma_cm": sigmas[l, a],
-                           "reference_cm": REFERENCE[l, a]} for l, a in CELLS], indent=2))  # fmt: skip
+        rows = [
+            {"l": cell[0], "theta_deg": cell[1], "mean_cm": means[cell], "sigma_cm": sigmas[cell],
+             "reference_cm": REFERENCE[cell]} for cell in CELLS
+        ]  # fmt: skip
+        print(json.dumps(rows, indent=2))
         return 0
     print("mean |l_est - l| of eq. (2) [cm] +- its standard error (reference), 50 of 250 points, 0.3 px")
     print(f"{'l':>7}" + "".join(f"{angle:>19} deg" for angle in ANGLES))
-    for l in BASELINES:  # noqa: E741
-        cells = (f"{means[l, a]:8.2f} +-{sigmas[l, a]:5.2f} ({REFERENCE[l, a]:.2f})" for a in ANGLES)
-        print(f"{100 * l:4.0f} cm" + "".join(cells))
+    for row in (CELLS[start : start + len(ANGLES)] for start in range(0, len(CELLS), len(ANGLES))):
+        cells = (f"{means[cell]:8.2f} +-{sigmas[cell]:5.2f} ({REFERENCE[cell]:.2f})" for cell in row)
+        print(f"{100 * row[0][0]:4.0f} cm" + "".join(cells))
     ratio = [means[cell] / REFERENCE[cell] for cell in CELLS]
     print(f"ratio to the reference: {min(ratio):.2f} to {max(ratio):.2f}, mean {np.mean(ratio):.2f}")
     return 0
