@@ -15,9 +15,10 @@ from coloc_graph.frontend import FrontendOptions
 from coloc_graph.pipeline import SolveOptions
 
 METHODS = {
-    "eq. (2), chained": SolveOptions("chain"),
-    "eq. (2), chained, ML homographies": SolveOptions("chain", FrontendOptions(criterion="reprojection")),
-    "smoothed": SolveOptions("smooth"),
+    "eq. (2), chained (the paper)": SolveOptions("chain"),
+    "eq. (2), ML homographies, chained": SolveOptions("chain", FrontendOptions(pose="eq2")),
+    "eq. (2), ML homographies, smoothed": SolveOptions("smooth", FrontendOptions(pose="eq2")),
+    "ML poses, smoothed (the default)": SolveOptions("smooth"),
 }
 
 

@@ -192,3 +192,29 @@ def sl3_exp(h: ArrayLike) -> Array:
     for _ in range(halvings):
         E = E @ E
     return np.asarray(E)
+
+
+def sl3_log(H: ArrayLike) -> Array:
+    """Coordinates (..., 8) of homographies (..., 3, 3) near the identity (determinant 1, off by less than 0.5)."""
+    E = np.asarray(H, float) - np.eye(3)
+    power, total = E, E
+    for n in range(2, 40):
+        power = -power @ E
+        total = total + power / n
+        if np.abs(power).max() < 1e-17:
+            break
+    return sl3_vee(total)
+
+
+def se3_exp(xi: ArrayLike) -> Array:
+    """Poses (..., 4, 4) of tangents (..., 6), rotation first."""
+    xi = np.asarray(xi, float)
+    w, v = xi[..., :3], xi[..., 3:]
+    W = hat(w)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    a = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    V = np.eye(3) + a * W + b * (W @ W)
+    return se3(so3_exp(w), (V @ v[..., None])[..., 0])

@@ -37,6 +37,10 @@ class HomographyMeasurement:
     that of its sl(3) coordinates on the right: H_true = H_j_i exp(sum of h_a SL3_BASIS[a]). `chi2` has `dof`
     degrees of freedom. `overlap_px` is how many pixels of image i see what image j sees of the plane.
     `unusable` is None, or why this is not a measurement, in words; the numbers then mean nothing.
+
+    What i's clock calls t, j's calls t + `time_offset` [s]; `time_offset_sigma` [s] is its standard deviation, which
+    `information` contains (both 0 where the clocks are said to agree). `warning` is None, or what about the
+    measurement is weaker than it looks, in words.
     """
 
     stance: int
@@ -51,6 +55,8 @@ class HomographyMeasurement:
     overlap_px: float
     time_offset: float = 0.0
     unusable: str | None = None
+    time_offset_sigma: float = 0.0
+    warning: str | None = None
 
     @property
     def residual(self) -> float:

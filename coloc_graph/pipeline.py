@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 from coloc_graph.backend import Estimate, PoseGraph, chain, smooth
 from coloc_graph.errors import EstimationError, InputError
-from coloc_graph.frontend import FrontendOptions, PairMeasurement, measure_pair
+from coloc_graph.frontend import FrontendOptions, PairMeasurement, measure_pair, share_clock_offsets
 from coloc_graph.run import Run
 
 Method = Literal["chain", "smooth"]
@@ -23,7 +23,7 @@ class SolveOptions:
     """Everything that a result depends on besides the run.
 
     `chain` is the paper: homographies by least squares in one image, eq. (2), composition. `smooth` takes
-    maximum-likelihood homographies into a pose graph.
+    maximum-likelihood homographies and relative poses into a pose graph.
     """
 
     method: Method = "smooth"
@@ -33,8 +33,8 @@ class SolveOptions:
         """With the front end that belongs to the method, where none is chosen."""
         if self.frontend is not None:
             return self
-        criterion: Literal["transfer", "reprojection"] = "transfer" if self.method == "chain" else "reprojection"
-        return replace(self, frontend=FrontendOptions(criterion=criterion))
+        paper = FrontendOptions(criterion="transfer", pose="eq2")
+        return replace(self, frontend=paper if self.method == "chain" else FrontendOptions())
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
     _require_observers(run)
     started = time.perf_counter()
 
-    measurements = _measure(run, options, progress)
+    measurements, clock_warnings = share_clock_offsets(_measure(run, options, progress), run.team.clock_sigma)
     poses = tuple(m.relative_pose for m in measurements if m.relative_pose is not None)
     if not poses:
         first = measurements[0].homography
@@ -85,7 +85,7 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
         options=options,
         estimate=estimate,
         measurements=measurements,
-        warnings=(*run.warnings, *_warnings(estimate, measurements)),
+        warnings=(*run.warnings, *clock_warnings, *_warnings(estimate, measurements)),
         seconds_frontend=measured - started,
         seconds_backend=solved - measured,
     )

@@ -242,14 +242,18 @@ class Floor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The robots, the floor (None where they do not stand on a common one), and the reference robot.
 
-    The world frame is the body of `reference` at stance 0.
+    The world frame is the body of `reference` at stance 0. `clock_sigma` [s] is how well the clocks of any two
+    robots agree, one standard deviation; where it is 0 they agree, and no offset is estimated.
     """
 
     reference: str
     robots: tuple[Robot, ...]
     floor: Floor | None = None
+    clock_sigma: float = 0.0
 
     def __post_init__(self) -> None:
+        _finite(self)
+        _not_negative(self, ("clock_sigma",))
         names = [robot.name for robot in self.robots]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:

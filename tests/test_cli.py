@@ -15,7 +15,7 @@ from coloc_graph.cli import main
 from coloc_graph.run import open_run
 
 COLOC = Path(sys.executable).with_name("coloc")
-COMMANDS = ["", "demo", "simulate", "import", "import tracks", "info", "solve", "evaluate"]
+COMMANDS = ["", "demo", "simulate", "import", "import tracks", "info", "solve", "evaluate", "experiment"]
 
 
 def coloc(*arguments, cwd=None):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coloc_graph.frontend import MarkerTracker, TrackerOptions, detect_leds
+from coloc_graph.frontend import Detector, MarkerTracker, TrackerOptions
 from coloc_graph.run import Image
 from coloc_graph.simulation import Sensor, render, spots
 
@@ -19,8 +19,8 @@ def frames(lights, seed=0, step=0.1):
         yield Image("A", T0 + step * k, pixels)
 
 
-def tracked(lights, options=None, detector=detect_leds):
-    tracker = MarkerTracker("A", detector, options or TrackerOptions(markers=lights.shape[1]))
+def tracked(lights, options=None, detector=None):
+    tracker = MarkerTracker("A", detector or Detector(), options or TrackerOptions(markers=lights.shape[1]))
     for image in frames(lights):
         tracker.step(image)
     return tracker.tracks()
@@ -67,12 +67,13 @@ def test_leds_that_pass_each_other_closely_keep_their_identity():
 def test_a_patch_is_searched_where_the_led_would_be_if_it_went_on():
     boxes = []
 
-    def looking(pixels, box):
-        boxes.append(box)
-        return detect_leds(pixels, box)
+    class Looking(Detector):
+        def find(self, image, box=None):
+            boxes.append(box)
+            return super().find(image, box)
 
     lights = moving(9, (60, 60), (12, 7))[:, None]
-    track = tracked(lights, TrackerOptions(patch=40, markers=1), looking)[0]
+    track = tracked(lights, TrackerOptions(patch=40, markers=1), Looking())[0]
     assert boxes[0] is None
     assert len(boxes) == 9
     for k in range(2, 9):
@@ -124,7 +125,7 @@ def test_an_led_that_leaves_the_image_ends_its_track_there():
 
 
 def test_no_images_and_dark_images_give_no_track():
-    tracker = MarkerTracker("A", detect_leds)
+    tracker = MarkerTracker("A", Detector())
     assert tracker.tracks() == []
     for k in range(5):
         tracker.step(Image("A", T0 + k, np.zeros((240, 320), np.uint8)))

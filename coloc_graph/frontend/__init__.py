@@ -3,18 +3,24 @@
 `measure_pair` is the whole road for two observers in one stance; its steps are modules of their own.
 """
 
+from coloc_graph.frontend.clock_offset import ClockFit, ClockOffset
 from coloc_graph.frontend.correspondence import Correspondences, correspond, pair_by_time
 from coloc_graph.frontend.decomposition import choose_by_normal, decompose_svd, decompose_with_normal, metric_scale
-from coloc_graph.frontend.detection import Blobs, Threshold, detect_hue, detect_leds, detector_for
+from coloc_graph.frontend.detection import Blobs, Detector, Threshold, detect_hue, detect_leds, detector_for
 from coloc_graph.frontend.homography import HomographyFit, PointPairs, fit_homography
+from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.plane import distance_from_span, on_plane, plane_from_mount
 from coloc_graph.frontend.relative_pose import relative_pose
+from coloc_graph.frontend.shared_clock import share_clock_offsets
 from coloc_graph.frontend.stance import FrontendOptions, PairMeasurement, measure_pair
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
 
 __all__ = [
     "Blobs",
+    "ClockFit",
+    "ClockOffset",
     "Correspondences",
+    "Detector",
     "FrontendOptions",
     "HomographyFit",
     "MarkerTracker",
@@ -34,8 +40,10 @@ __all__ = [
     "fit_homography",
     "measure_pair",
     "metric_scale",
+    "most_likely_pose",
     "on_plane",
     "pair_by_time",
     "plane_from_mount",
     "relative_pose",
+    "share_clock_offsets",
 ]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography import PointPairs, fit_homography, squared_residuals
+from coloc_graph.frontend.interpolation import LONGEST_GAP
 from coloc_graph.frontend.plane import on_plane
 from coloc_graph.frontend.tracking import Track
 from coloc_graph.measurements import Plane
@@ -69,7 +70,28 @@ def correspond(
     tracks_i: Sequence[Track], tracks_j: Sequence[Track], camera_i: Camera, camera_j: Camera
 ) -> Correspondences:
     """The correspondences between two cameras' tracks; raises `DegenerateGeometry` where there are none."""
-    candidates = _Candidates(tracks_i, tracks_j, camera_i, camera_j)
+    return _chosen(_Candidates(tracks_i, tracks_j, camera_i, camera_j), tracks_i, tracks_j)[1]
+
+
+def correspond_roughly(
+    tracks_i: Sequence[Track],
+    tracks_j: Sequence[Track],
+    camera_i: Camera,
+    camera_j: Camera,
+    offset: float,
+    sigma: float,
+) -> tuple[list[tuple[int, int]], Correspondences]:
+    """The same for clocks that differ by `offset`, known to `sigma` [s]: which tracks (a, b) are one marker's.
+
+    Nearest samples are paired and moved to the same instant; what the sigma makes of a marker's speed is in
+    camera j's covariances. Raises `DegenerateGeometry` as `correspond` does.
+    """
+    return _chosen(_Candidates(tracks_i, tracks_j, camera_i, camera_j, (offset, sigma)), tracks_i, tracks_j)
+
+
+def _chosen(
+    candidates: "_Candidates", tracks_i: Sequence[Track], tracks_j: Sequence[Track]
+) -> tuple[list[tuple[int, int]], Correspondences]:
     named = all(track.marker for track in (*tracks_i, *tracks_j))
     chosen = list(candidates.indices) if named else _by_motion(candidates)
     if not chosen and candidates.indices:
@@ -83,14 +105,22 @@ def correspond(
             f"{tracks_j[0].robot if tracks_j else 'the other'} never see a marker at the same instant "
             "(within 5 ms): bring the mover into both fields of view, and check the clocks"
         )
-    return candidates.join(chosen)
+    return chosen, candidates.join(chosen)
 
 
 class _Candidates:
-    """All pairs of tracks that may be one marker: they share instants, and their names, where they have some."""
+    """All pairs of tracks that may be one marker: they share instants, and their names, where they have some.
+
+    `clock` is the clocks' offset and its sigma [s], None for clocks that agree.
+    """
 
     def __init__(
-        self, tracks_i: Sequence[Track], tracks_j: Sequence[Track], camera_i: Camera, camera_j: Camera
+        self,
+        tracks_i: Sequence[Track],
+        tracks_j: Sequence[Track],
+        camera_i: Camera,
+        camera_j: Camera,
+        clock: tuple[float, float] | None = None,
     ) -> None:
         self._i, self._j = list(tracks_i), list(tracks_j)
         self._x_i = [normalised(track, camera_i) for track in self._i]
@@ -98,11 +128,16 @@ class _Candidates:
         # where a lens cannot be inverted there is no ray, and one NaN would spoil the whole stance
         finite_i, finite_j = [_finite(x) for x in self._x_i], [_finite(x) for x in self._x_j]
         self.indices: dict[tuple[int, int], NDArray[np.int64]] = {}
+        self._clock = clock
+        offset, window = (0.0, PAIRING_WINDOW) if clock is None else (clock[0], LONGEST_GAP / 2)
+        self._slopes = [np.empty((0, 2))] * len(self._j)
+        if clock is not None:
+            self._slopes = [_speed(track.times, x[0]) for track, x in zip(self._j, self._x_j, strict=True)]
         for a, track_i in enumerate(self._i):
             for b, track_j in enumerate(self._j):
                 if track_i.marker and track_j.marker and track_i.marker != track_j.marker:
                     continue
-                shared = pair_by_time(track_i.times, track_j.times)
+                shared = pair_by_time(track_i.times, track_j.times - offset, window)
                 shared = shared[finite_i[a][shared[:, 0]] & finite_j[b][shared[:, 1]]]
                 if len(shared):
                     self.indices[a, b] = shared
@@ -125,6 +160,7 @@ class _Candidates:
         parts = [(a, b, *self.indices[a, b].T) for a, b in chosen]
         uv_i = np.concatenate([self._i[a].uv[m] for a, _, m, _ in parts])
         uv_j = np.concatenate([self._j[b].uv[n] for _, b, _, n in parts])
+        seen_j = [self._at_j(a, b, m, n) for a, b, m, n in parts]
         return Correspondences(
             uv_i=uv_i,
             uv_j=uv_j,
@@ -132,11 +168,21 @@ class _Candidates:
             markers=np.concatenate([np.full(len(m), a) for a, _, m, _ in parts]),
             pairs=PointPairs(
                 np.concatenate([self._x_i[a][0][m] for a, _, m, _ in parts]),
-                np.concatenate([self._x_j[b][0][n] for _, b, _, n in parts]),
+                np.concatenate([x for x, _ in seen_j]),
                 np.concatenate([self._x_i[a][1][m] for a, _, m, _ in parts]),
-                np.concatenate([self._x_j[b][1][n] for _, b, _, n in parts]),
+                np.concatenate([covariance for _, covariance in seen_j]),
             ),
         )
+
+    def _at_j(self, a: int, b: int, m: NDArray[np.int64], n: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Samples n (k,) of track b, where they are at the instants of samples m (k,) of track a."""
+        x, covariance = self._x_j[b][0][n], self._x_j[b][1][n]
+        if self._clock is None:
+            return x, covariance
+        offset, sigma = self._clock
+        slope = self._slopes[b][n]
+        ahead = self._i[a].times[m] + offset - self._j[b].times[n]
+        return x + slope * ahead[:, None], covariance + sigma**2 * slope[:, :, None] * slope[:, None, :]
 
 
 def normalised(track: Track, camera: Camera) -> tuple[Array, Array]:
@@ -150,6 +196,17 @@ def per_pixel(uv: Array, camera: Camera) -> Array:
     step = 0.5
     sides = [camera.normalise(uv + off) - camera.normalise(uv - off) for off in ((step, 0.0), (0.0, step))]
     return np.stack(sides, axis=-1) / (2 * step)
+
+
+def _speed(times: Array, x: Array) -> Array:
+    """Roughly how fast a track (n, 2) moves at its samples [1/s]; 0 where a sample stands alone."""
+    if len(times) < 2:
+        return np.zeros_like(x)
+    step = np.diff(times)
+    joined = (step > 1e-4) & (step < LONGEST_GAP)
+    between = np.where(joined[:, None], np.diff(x, axis=0) / np.where(joined, step, 1.0)[:, None], 0.0)
+    count = np.maximum(np.append(joined, 0) + np.append(0, joined), 1)
+    return np.asarray((np.vstack([between, np.zeros(2)]) + np.vstack([np.zeros(2), between])) / count[:, None])
 
 
 def _finite(normalised_track: tuple[Array, Array]) -> NDArray[np.bool_]:

@@ -76,12 +76,8 @@ def _root_covariance(measurement: HomographyMeasurement, mount_i: Mount, mount_j
 
 def _poses(unknowns: Array, H: Array, mount_i: Mount, mount_j: Mount, plane: Plane) -> tuple[Array, Array]:
     """T_i_j and T_ci_cj, (m, 4, 4) each, for errors (m, 17) of the unknowns."""
-    T_bi_ci, T_bj_cj = _mounted(mount_i, unknowns[:, _MOUNT_I]), _mounted(mount_j, unknowns[:, _MOUNT_J])
-    N = np.broadcast_to(plane.N, (len(unknowns), 3))
-    if plane.normal_from_mount:
-        # the world's vertical is what stays when the mount's tilt is another than thought
-        turned = T_bi_ci[:, :3, :3].swapaxes(1, 2) @ mount_i.R_body_camera
-        N = (turned @ plane.N)[..., :]
+    T_bi_ci, T_bj_cj = mounted(mount_i, unknowns[:, _MOUNT_I]), mounted(mount_j, unknowns[:, _MOUNT_J])
+    N = turned_normal(plane, mount_i, T_bi_ci)
     across = np.linalg.svd(plane.N[None])[2][1:]
     N = (so3_exp(unknowns[:, _NORMAL] @ across) @ N[..., None])[..., 0]
     d = plane.d + unknowns[:, _D] + (unknowns[:, _MOUNT_I][:, 0] if plane.d_from_mount else 0.0)
@@ -90,7 +86,17 @@ def _poses(unknowns: Array, H: Array, mount_i: Mount, mount_j: Mount, plane: Pla
     return T_bi_ci @ T_ci_cj @ se3_inverse(T_bj_cj), T_ci_cj
 
 
-def _mounted(mount: Mount, errors: Array) -> Array:
+def turned_normal(plane: Plane, mount: Mount, T_body_camera: Array) -> Array:
+    """The plane's normal (m, 3) in cameras that sit on the body as `T_body_camera` (m, 4, 4), not as thought.
+
+    Where the normal was computed from the mount, the body's vertical is what stays.
+    """
+    if not plane.normal_from_mount:
+        return np.broadcast_to(plane.N, (len(T_body_camera), 3))
+    return np.asarray(T_body_camera[:, :3, :3].mT @ mount.R_body_camera @ plane.N)
+
+
+def mounted(mount: Mount, errors: Array) -> Array:
     """T_body_camera (m, 4, 4) for errors (m, 3) of height, tilt, roll."""
     tilt = np.deg2rad(mount.tilt_deg) + errors[:, 1]
     roll = np.deg2rad(mount.roll_deg) + errors[:, 2]

@@ -1,17 +1,34 @@
 """One stance of a run: from its images or detections to the homography between two observers."""
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry, InputError
-from coloc_graph.frontend.correspondence import Correspondences, correspond, markers_of_movers, per_pixel, span_samples
+from coloc_graph.frontend.clock_offset import (
+    ClockFit,
+    ClockOffset,
+    PairedTracks,
+    fit_at_offset,
+    fit_with_offset,
+    require_searchable,
+)
+from coloc_graph.frontend.correspondence import (
+    Correspondences,
+    correspond,
+    correspond_roughly,
+    markers_of_movers,
+    per_pixel,
+    span_samples,
+)
 from coloc_graph.frontend.detection import Blobs, detector_for
 from coloc_graph.frontend.homography import Criterion, HomographyFit, fit_homography, shared_error
+from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
@@ -23,14 +40,22 @@ Array = NDArray[np.float64]
 
 #: A homography that fewer of the points than this share agree on is not believed.
 LEAST_AGREEMENT = 0.5
+#: An offset of two clocks that is known no better than this share of what was known before is not observed.
+LEAST_OBSERVED = 0.5
+NOT_OBSERVABLE = (
+    "the offset of the clocks is not observable: the mover drove at constant speed; let it stop and go "
+    "(the offset is left at what the clocks are said to agree to)"
+)
 
 
 @dataclass(frozen=True)
 class FrontendOptions:
     """How measurements are made. `scale` is where the plane's distance comes from: the stated heights of
-    camera and markers, or the known span between two markers of one robot."""
+    camera and markers, or the known span between two markers of one robot. `pose` is eq. (2), or the maximum
+    likelihood."""
 
     criterion: Criterion = "reprojection"
+    pose: Literal["eq2", "ml"] = "ml"
     scale: Literal["heights", "span"] = "heights"
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
 
@@ -40,35 +65,110 @@ class PairMeasurement:
     """What one pair of observers measured in one stance, with what it was made of.
 
     Where `homography.unusable` says why, `relative_pose` is None; `correspondences` is None where there are
-    none.
+    none. Where clocks are not said to agree, `offset_evidence` is what this stance alone knows of their offset
+    (None: nothing), and `at_offset` measures once more with an offset that is known from elsewhere.
     """
 
     homography: HomographyMeasurement
     relative_pose: RelativePose | None
     correspondences: Correspondences | None
+    offset_evidence: ClockOffset | None = None
+    at_offset: "Callable[[ClockOffset], PairMeasurement] | None" = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a pair of observers saw in one stance."""
+
+    run: Run
+    stance: Stance
+    robot_i: str
+    robot_j: str
+    options: FrontendOptions
+    plane: Plane
+    tracks_i: list[Track]
+    tracks_j: list[Track]
+
+    @property
+    def cameras(self) -> tuple[Camera, Camera]:
+        return self.run.team[self.robot_i].camera, self.run.team[self.robot_j].camera
 
 
 def measure_pair(run: Run, stance: Stance, robot_i: str, robot_j: str, options: FrontendOptions) -> PairMeasurement:
-    """The homography and relative pose between two observers in one stance; degenerate geometry is an answer."""
+    """The homography and relative pose between two observers in one stance; degenerate geometry is an answer.
+
+    Where the team's clocks are not said to agree (`Team.clock_sigma`), their offset is estimated with it.
+    """
     found: Correspondences | None = None
     try:
         plane = stance_plane(run, stance, robot_i)
         tracks_i = stance_tracks(run, stance, robot_i, options)
         tracks_j = stance_tracks(run, stance, robot_j, options)
-        camera_i, camera_j = run.team[robot_i].camera, run.team[robot_j].camera
-        found = correspond(tracks_i, tracks_j, camera_i, camera_j)
-        fit = fit_homography(found.pairs, options.criterion)
-        if fit.inliers.mean() < LEAST_AGREEMENT:
-            raise DegenerateGeometry(
-                f"only {fit.inliers.sum()} of {len(found)} points agree on one homography: "
-                "look for wrong marker names, reflections, or clocks that differ by more than the pairing window"
-            )
-        measurement = _measurement(stance, robot_i, robot_j, fit, found, camera_i, camera_j)
-        if options.scale == "span":
-            plane = _plane_by_span(plane, tracks_i, camera_i, stance_markers(run, stance))
-        pose = relative_pose(measurement, run.team[robot_i].mount, run.team[robot_j].mount, plane)
+        seen = _Seen(run, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j)
+        if run.team.clock_sigma > 0:
+            return _measure_with_clocks(seen)
+        found = correspond(tracks_i, tracks_j, *seen.cameras)
+        return _measured(seen, found, fit_homography(found.pairs, options.criterion))
     except DegenerateGeometry as why:
         return PairMeasurement(_unusable(stance, robot_i, robot_j, found, str(why)), None, found)
+
+
+def _measure_with_clocks(seen: _Seen) -> PairMeasurement:
+    prior = ClockOffset(0.0, seen.run.team.clock_sigma)
+    require_searchable(prior)
+    chosen, rough = correspond_roughly(seen.tracks_i, seen.tracks_j, *seen.cameras, prior.value, prior.sigma)
+    tracks = PairedTracks(seen.tracks_i, seen.tracks_j, chosen, *seen.cameras)
+    again = partial(_measure_at_offset, seen, tracks)
+    try:
+        clock = fit_with_offset(tracks, rough, prior, seen.options.criterion)
+    except DegenerateGeometry as why:
+        return PairMeasurement(
+            _unusable(seen.stance, seen.robot_i, seen.robot_j, rough, str(why)), None, rough, None, again
+        )
+    return replace(_measured_or_why(seen, clock), offset_evidence=clock.evidence, at_offset=again)
+
+
+def _measure_at_offset(seen: _Seen, tracks: PairedTracks, offset: ClockOffset) -> PairMeasurement:
+    try:
+        clock = fit_at_offset(tracks, offset, seen.options.criterion)
+    except DegenerateGeometry as why:
+        return PairMeasurement(_unusable(seen.stance, seen.robot_i, seen.robot_j, None, str(why)), None, None)
+    return _measured_or_why(seen, clock)
+
+
+def _measured_or_why(seen: _Seen, clock: ClockFit) -> PairMeasurement:
+    try:
+        return _measured(seen, clock.found, clock.fit, clock.offset)
+    except DegenerateGeometry as why:
+        unusable = _unusable(seen.stance, seen.robot_i, seen.robot_j, clock.found, str(why))
+        return PairMeasurement(unusable, None, clock.found)
+
+
+def _measured(
+    seen: _Seen, found: Correspondences, fit: HomographyFit, offset: ClockOffset | None = None
+) -> PairMeasurement:
+    """The measurement that a fit is; raises `DegenerateGeometry` where it is none."""
+    robot_i, robot_j, plane = seen.run.team[seen.robot_i], seen.run.team[seen.robot_j], seen.plane
+    if fit.inliers.mean() < LEAST_AGREEMENT:
+        raise DegenerateGeometry(
+            f"only {fit.inliers.sum()} of {len(found)} points agree on one homography: "
+            "look for wrong marker names, reflections, or clocks that differ by more than "
+            + ("the pairing window" if offset is None else "`clock_sigma` says")
+        )
+    measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
+    if offset is not None:
+        said = seen.run.team.clock_sigma
+        measurement = replace(
+            measurement,
+            time_offset=offset.value,
+            time_offset_sigma=offset.sigma,
+            warning=NOT_OBSERVABLE if offset.sigma > LEAST_OBSERVED * said else None,
+        )
+    if seen.options.scale == "span":
+        plane = _plane_by_span(plane, seen.tracks_i, robot_i.camera, stance_markers(seen.run, seen.stance))
+    # without the floor: the graph knows it, and must not count it twice
+    make_pose = relative_pose if seen.options.pose == "eq2" else most_likely_pose
+    pose = make_pose(measurement, robot_i.mount, robot_j.mount, plane)
     return PairMeasurement(measurement, pose, found)
 
 

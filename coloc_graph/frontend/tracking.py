@@ -4,16 +4,22 @@ Each track searches a patch (40x40 by default) centred at x_k + (x_k - x_{k-1});
 start, after a loss, and from time to time for markers that came into view.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from coloc_graph.frontend.detection import Blobs, Detector
+from coloc_graph.frontend.detection import Blobs, Candidate, Detector, Pixels
 from coloc_graph.run.messages import Flag, Image
 
 Array = NDArray[np.float64]
+
+#: Detections that no track takes.
+DOUBTFUL = np.uint8(Flag.CLIPPED | Flag.MERGED)
+#: A light that keeps within so many pixels stands still.
+STILL_PX = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,105 +54,174 @@ class TrackerOptions:
     patience: int = 3
     reacquire_every: int = 10
     markers: int = 2  # with fewer live tracks than this the full frame is searched
+    still_after: int = 50  # frames after which a light that stands still is parked
 
 
-@dataclass
+@dataclass(slots=True)
 class _Live:
-    times: list[float]
-    uv: list[Array]
-    covariance: list[Array]
-    peak: list[float]
+    """A track that goes on: rough centres to predict with, and what each sample is measured from in the end."""
+
+    times: list[float] = field(default_factory=list)
+    uv: list[tuple[float, float]] = field(default_factory=list)
+    samples: list[Candidate | int] = field(default_factory=list)
     misses: int = 0
 
-    def predict(self, time: float) -> Array:
+    def predict(self, time: float) -> tuple[float, float]:
+        (u, v) = self.uv[-1]
         if len(self.uv) < 2 or self.times[-1] <= self.times[-2]:
-            return self.uv[-1]
-        return self.uv[-1] + (self.uv[-1] - self.uv[-2]) * (time - self.times[-1]) / (self.times[-1] - self.times[-2])
+            return u, v
+        ahead = (time - self.times[-1]) / (self.times[-1] - self.times[-2])
+        return u + (u - self.uv[-2][0]) * ahead, v + (v - self.uv[-2][1]) * ahead
 
 
-@dataclass
 class MarkerTracker:
-    """Follows every blob of one camera; which of them are markers of a mover is decided later, with all in view."""
+    """Follows every blob of one camera; which of them are markers of a mover is decided later, with all in view.
 
-    robot: str
-    detector: Detector
-    options: TrackerOptions = field(default_factory=TrackerOptions)
-    _live: list[_Live] = field(default_factory=list)
-    _ended: list[_Live] = field(default_factory=list)
-    _frame: int = 0
+    Feed it images with `step`, or what was detected elsewhere with `take`, not both. Lights that stand still
+    for long are parked: they are no longer searched for, and reported as they were.
+    """
 
-    def step(self, image: Image) -> Blobs:
-        """Take in the next image; returns the blobs found in it."""
+    def __init__(self, robot: str, detector: Detector, options: TrackerOptions | None = None) -> None:
+        self.robot = robot
+        self._detector = detector
+        self._options = options or TrackerOptions()
+        self._live: list[_Live] = []
+        self._ended: list[_Live] = []
+        self._parked: list[_Live] = []
+        self._taken: list[tuple[Array, Array, float]] = []
+        self._frame = 0
+
+    def step(self, image: Image) -> None:
+        """Take in the next image."""
         predicted = [track.predict(image.time) for track in self._live]
-        full = (
-            self._frame % self.options.reacquire_every == 0
-            or len(self._live) < self.options.markers
-            or any(track.misses for track in self._live)
-        )
-        blobs = self.detector(image.pixels, None) if full else self._in_patches(image, predicted)
-        self._take(image.time, predicted, blobs, births=full)
-        return blobs
+        full = self._search_all()
+        if full:
+            found = self._detector.find(image.pixels)
+        else:
+            found = self._in_patches(image.pixels, predicted)
+        found = [one for one in found if not one.clipped]
+        self._advance(image.time, predicted, [one.uv for one in found], found, births=full)
 
     def take(self, time: float, blobs: Blobs) -> None:
         """Take in what a detector elsewhere found in the whole of the next image."""
-        self._take(time, [track.predict(time) for track in self._live], blobs, births=True)
-
-    def _take(self, time: float, predicted: list[Array], blobs: Blobs, *, births: bool) -> None:
-        blobs = blobs[(blobs.flags & (Flag.CLIPPED | Flag.MERGED)) == 0]
-        taken = self._assign(time, predicted, blobs)
-        if births:
-            for index in sorted(set(range(len(blobs))) - taken):
-                self._live.append(_Live([], [], [], []))
-                self._extend(self._live[-1], time, blobs, index)
-        self._ended += [track for track in self._live if track.misses > self.options.patience]
-        self._live = [track for track in self._live if track.misses <= self.options.patience]
-        self._frame += 1
+        predicted = [track.predict(time) for track in self._live]
+        whole = blobs[(blobs.flags & DOUBTFUL) == 0]
+        numbers = range(len(self._taken), len(self._taken) + len(whole))
+        self._taken += zip(whole.uv, whole.covariance, whole.peak.tolist(), strict=True)
+        self._advance(time, predicted, [(u, v) for u, v in whole.uv.tolist()], list(numbers), births=True)
 
     def tracks(self) -> list[Track]:
-        """All tracks so far, ended or live, oldest first."""
-        return [
-            Track(self.robot, "", np.array(t.times), np.array(t.uv), np.array(t.covariance), np.array(t.peak))
-            for t in sorted(self._ended + self._live, key=lambda t: t.times[0])
-        ]
+        """All tracks so far, ended or live, oldest first; their samples are measured now, all at once."""
+        lives = sorted(self._ended + self._parked + self._live, key=lambda live: live.times[0])
+        candidates = [one for live in lives for one in live.samples if isinstance(one, Candidate)]
+        if not candidates:
+            return [self._track(live, [self._taken[one] for one in live.samples]) for live in lives]  # type: ignore[index]
+        blobs, real = self._detector.measure(candidates)
+        real &= (blobs.flags & DOUBTFUL) == 0
+        tracks, begin = [], 0
+        for live in lives:
+            own = slice(begin, begin + len(live.samples))
+            begin = own.stop
+            good = real[own]
+            tracks.append(
+                Track(
+                    self.robot,
+                    "",
+                    np.array(live.times)[good],
+                    blobs.uv[own][good],
+                    blobs.covariance[own][good],
+                    blobs.peak[own][good],
+                )
+            )
+        return [track for track in tracks if len(track)]
 
-    def _in_patches(self, image: Image, predicted: list[Array]) -> Blobs:
-        height, width = image.pixels.shape[:2]
-        half = self.options.patch // 2
-        found: list[Blobs] = []
+    def _track(self, live: _Live, samples: list[tuple[Array, Array, float]]) -> Track:
+        uv, covariance, peak = zip(*samples, strict=True)
+        return Track(self.robot, "", np.array(live.times), np.array(uv), np.array(covariance), np.array(peak))
+
+    def _search_all(self) -> bool:
+        return (
+            self._frame % self._options.reacquire_every == 0
+            or len(self._live) < self._options.markers
+            or any(track.misses for track in self._live)
+        )
+
+    def _in_patches(self, pixels: Pixels, predicted: list[tuple[float, float]]) -> list[Candidate]:
+        height, width = pixels.shape[:2]
+        half = self._options.patch // 2
+        found: list[Candidate] = []
         for centre in predicted:
-            u, v = np.rint(centre).astype(int)
+            u, v = round(centre[0]), round(centre[1])
             box = (max(u - half, 0), max(v - half, 0), min(u + half, width), min(v + half, height))
             if box[2] - box[0] >= 3 and box[3] - box[1] >= 3:
-                found.append(self.detector(image.pixels, box))
-        if not found:
-            return self.detector(image.pixels, None)
-        blobs = Blobs(
-            *(np.concatenate([getattr(b, n) for b in found]) for n in ("uv", "covariance", "flags", "peak", "area"))
-        )
-        # overlapping patches see a blob twice
-        apart = np.linalg.norm(blobs.uv[:, None] - blobs.uv[None], axis=2) if len(blobs) else np.empty((0, 0))
-        again = np.tril(apart < 2.0, k=-1).any(axis=1)
-        return blobs[np.asarray(~again)]
+                # overlapping patches see a blob twice
+                found += [
+                    one
+                    for one in self._detector.find(pixels, box)
+                    if all(max(abs(one.uv[0] - o.uv[0]), abs(one.uv[1] - o.uv[1])) > 0.5 for o in found)
+                ]
+        return found
 
-    def _assign(self, time: float, predicted: list[Array], blobs: Blobs) -> set[int]:
-        taken: set[int] = set()
-        gate = self.options.patch / 2
-        if predicted and len(blobs):
-            distance = np.linalg.norm(np.array(predicted)[:, None] - blobs.uv[None], axis=2)
-            rows, columns = linear_sum_assignment(np.minimum(distance, gate))
-            for row, column in zip(rows, columns, strict=True):
-                if distance[row, column] < gate:
-                    self._extend(self._live[row], time, blobs, int(column))
-                    taken.add(int(column))
-        for track in self._live:
-            if track.times[-1] != time:
+    def _advance(
+        self,
+        time: float,
+        predicted: list[tuple[float, float]],
+        places: list[tuple[float, float]],
+        samples: Sequence[Candidate | int],
+        *,
+        births: bool,
+    ) -> None:
+        taken = set()
+        for track, index in zip(self._live, self._assigned(predicted, places), strict=True):
+            if index is None:
                 track.misses += 1
-        return taken
+            else:
+                self._extend(track, time, places[index], samples[index])
+                taken.add(index)
+        if births:
+            for index in sorted(set(range(len(places))) - taken):
+                if not self._is_parked(places[index]):
+                    self._live.append(_Live())
+                    self._extend(self._live[-1], time, places[index], samples[index])
+            if self._frame % self._options.reacquire_every == 0:
+                self._park()
+        if any(track.misses > self._options.patience for track in self._live):
+            self._ended += [track for track in self._live if track.misses > self._options.patience]
+            self._live = [track for track in self._live if track.misses <= self._options.patience]
+        self._frame += 1
+
+    def _assigned(self, predicted: list[tuple[float, float]], places: list[tuple[float, float]]) -> list[int | None]:
+        """For each track the blob it goes on to: the least total distance, none farther than half a patch."""
+        if not predicted or not places:
+            return [None] * len(predicted)
+        distance = np.hypot(*(np.array(predicted)[:, None] - np.array(places)[None]).transpose(2, 0, 1))
+        gate = self._options.patch / 2
+        near = distance < gate
+        if (near.sum(axis=0) <= 1).all() and (near.sum(axis=1) <= 1).all():  # nothing to decide
+            return [int(row.argmax()) if row.any() else None for row in near]
+        rows, columns = linear_sum_assignment(np.minimum(distance, gate))
+        chosen = {int(r): int(c) for r, c in zip(rows, columns, strict=True) if near[r, c]}
+        return [chosen.get(row) for row in range(len(predicted))]
+
+    def _park(self) -> None:
+        """Set aside the lights that have not moved for `still_after` frames."""
+        going = []
+        for track in self._live:
+            still = len(track.uv) >= self._options.still_after
+            if still:
+                recent = np.array(track.uv[-self._options.still_after :])
+                still = bool(np.ptp(recent, axis=0).max() < STILL_PX)
+            (self._parked if still else going).append(track)
+        self._live = going
+
+    def _is_parked(self, place: tuple[float, float]) -> bool:
+        return any(
+            max(abs(place[0] - track.uv[-1][0]), abs(place[1] - track.uv[-1][1])) < STILL_PX for track in self._parked
+        )
 
     @staticmethod
-    def _extend(track: _Live, time: float, blobs: Blobs, index: int) -> None:
+    def _extend(track: _Live, time: float, place: tuple[float, float], sample: Candidate | int) -> None:
         track.times.append(time)
-        track.uv.append(blobs.uv[index])
-        track.covariance.append(blobs.covariance[index])
-        track.peak.append(float(blobs.peak[index]))
+        track.uv.append(place)
+        track.samples.append(sample)
         track.misses = 0

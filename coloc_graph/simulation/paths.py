@@ -100,6 +100,20 @@ def drive(poses: ArrayLike, start: float, reverse: bool = False) -> tuple[Leg, N
     return Leg(times, knots), 3 * np.arange(len(poses))
 
 
+def stop_and_go(leg: Leg, go: float = 1.5, stand: float = 0.5, ramp: float = 0.3) -> Leg:
+    """The same way driven in spells of `go` [s], with rests of `stand` [s] between them.
+
+    In each spell it gathers speed for `ramp` [s] and loses it as long. Knots are 10 ms apart.
+    """
+    period, gain = go + stand, go - ramp  # what a spell brings the leg forward [s]
+    spells = int(np.ceil((leg.times[-1] - leg.times[0]) / gain))
+    t = np.arange(0.0, spells * period, 0.01)
+    rate = np.clip(np.minimum(t % period, go - t % period) / ramp, 0.0, 1.0)
+    progress = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * 0.01)])
+    knots = np.stack([np.interp(leg.times[0] + progress, leg.times, column) for column in leg.knots.T], axis=1)
+    return Leg(leg.times[0] + t, knots)
+
+
 def travel(waypoints: ArrayLike, start: float) -> Leg:
     """Drive through `waypoints` (n, 2), n > 1, in straight lines, backwards where that means less turning."""
     waypoints = np.asarray(waypoints, float)

@@ -79,7 +79,8 @@ def stated_team(team: Team, imperfections: Imperfections) -> Team:
         return replace(robot, camera=camera, mount=mount, markers=markers)
 
     floor = Floor(tilt_sigma_deg=imperfections.floor_sigma_deg)
-    return replace(team, robots=tuple(map(stated, team.robots)), floor=floor)
+    robots = tuple(map(stated, team.robots))
+    return replace(team, robots=robots, floor=floor, clock_sigma=abs(imperfections.clock_offset))
 
 
 def true_team(stated: Team, rng: np.random.Generator) -> Team:
@@ -104,7 +105,7 @@ def true_team(stated: Team, rng: np.random.Generator) -> Team:
             markers = replace(markers, positions=positions, span_sigma=0.0)
         return replace(robot, mount=mount, markers=markers)
 
-    return replace(stated, robots=tuple(map(drawn, stated.robots)))
+    return replace(stated, robots=tuple(map(drawn, stated.robots)), clock_sigma=0.0)
 
 
 def detection_sigma(imperfections: Imperfections) -> float:

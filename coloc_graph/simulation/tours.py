@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.lie import se3_inverse
-from coloc_graph.simulation.paths import SPEED, Array, Leg, drive, travel, wrap
+from coloc_graph.simulation.paths import SPEED, Array, Leg, drive, stop_and_go, travel, wrap
 from coloc_graph.simulation.scenarios import Box
 from coloc_graph.team import Camera
 
@@ -177,23 +177,30 @@ def patrol(
     start: float,
     rng: np.random.Generator,
     where: str,
+    stopping: bool = False,
 ) -> Tour:
     """A drive from corner to corner of the common view, and `frames` captures at `fps` [1/s] from its start.
 
-    The corners are taken in an order that spreads the markers widely however early the drive ends.
+    The corners are taken in an order that spreads the markers widely however early the drive ends. With `stopping`
+    it stops and goes on its way, softly.
     """
+
+    def driven(waypoints: Array) -> Leg:
+        leg = travel(waypoints, start)
+        return stop_and_go(leg) if stopping else leg
+
     duration = frames / fps
     left = bool(rng.integers(2))  # which of the far corners comes first
     for far in np.arange(FAR, FAR_IN_HASTE - 1e-9, -0.1):
         lap = _corners(views, markers, middle, float(far), left, where)
-        leg = travel(lap[:3], start)
+        leg = driven(lap[:3])
         if leg.times[-1] - start <= duration:
             break
     waypoints = lap
-    leg = travel(waypoints, start)
+    leg = driven(waypoints)
     while leg.times[-1] - start < duration:
         waypoints = np.concatenate([waypoints, lap])
-        leg = travel(waypoints, start)
+        leg = driven(waypoints)
     instants = start + (np.arange(frames, dtype=np.float64) + 0.5) / fps
     return Tour(leg.cut(duration), instants, np.ones((frames, len(markers)), bool))
 

@@ -100,12 +100,14 @@ def build_world(
     fps: float = 10.0,
     team: Team | None = None,
     burst: int | None = None,
+    stopping: bool = False,
 ) -> World:
     """Let a scenario happen once. Nothing is written, nothing rendered: for Monte Carlo, with `observe`.
 
     `points` correspondences a stance at depth tracks, `points` / 2 frames at `fps` at depth images. `team` is
     nominal (the reference rig by default). `burst` captures are made of each pose of the mover at depth
-    tracks, 1 by default or 3 where clocks differ. Raises `InputError` where the pair has no common view.
+    tracks, 1 by default or 3 where clocks differ. With `stopping` the mover stops and goes on its way at depth
+    images. Raises `InputError` where the pair has no common view.
     """
     if points < 4:
         raise InputError(f"`points` is {points}; a homography needs at least 4 a stance")
@@ -121,7 +123,7 @@ def build_world(
     true = true_team(stated, stream(seed, "team"))
     if burst is None:
         burst = BURST if imperfections.clocks_differ else 1
-    return _Builder(scenario, true, imperfections, seed, points, depth, fps, burst).build(stated)
+    return _Builder(scenario, true, imperfections, seed, points, depth, fps, burst, stopping).build(stated)
 
 
 class _Builder:
@@ -137,9 +139,10 @@ class _Builder:
         depth: Depth,
         fps: float,
         burst: int,
+        stopping: bool,
     ) -> None:
         self.scenario, self.true, self.imperfections, self.seed = scenario, true, imperfections, seed
-        self.points, self.depth, self.fps, self.burst = points, depth, fps, burst
+        self.points, self.depth, self.fps, self.burst, self.stopping = points, depth, fps, burst, stopping
         self.sigma = float(np.deg2rad(imperfections.floor_sigma_deg))
         # drawn for all standing poses first, row by row: those of a longer run begin as a shorter one's do
         self.tilts = self.sigma * stream(seed, "standing").standard_normal((len(scenario.poses), 2))
@@ -196,7 +199,7 @@ class _Builder:
         where, rng, middle = f"stance {k}", stream(self.seed, "tour", k), self.scenario.middle(k)
         if self.depth == "images":
             frames = max(self.points // 2, 1)
-            return patrol(views, markers.p_body, middle, frames, self.fps, start, rng, where)
+            return patrol(views, markers.p_body, middle, frames, self.fps, start, rng, where, self.stopping)
         box = self.scenario.box
         return scatter(views, markers.p_body, box, middle, self.points, self.burst, start, rng, where)
 

@@ -1,0 +1,30 @@
+"""The paper's experiments, simulated: Figs. 4 and 5, Tables I and II, each with the paper's own figures,
+eq. (2) as the paper computes it, and our estimate, side by side.
+
+`fig4`, `fig5`, `table1`, `table2` run one and return its result, which `save` writes as PNG, SVG and JSON.
+Both depths go the same road: a run is simulated to a file, opened, and measured by the front end.
+"""
+
+from coloc_graph.experiments.fig4 import Fig4, fig4
+from coloc_graph.experiments.fig5 import Fig5, fig5
+from coloc_graph.experiments.output import Experiment, require_place, save
+from coloc_graph.experiments.single_step import CELLS, Cell, measure_cells
+from coloc_graph.experiments.table1 import Table1, table1
+from coloc_graph.experiments.table2 import Table2, table2
+
+__all__ = [
+    "CELLS",
+    "Cell",
+    "Experiment",
+    "Fig4",
+    "Fig5",
+    "Table1",
+    "Table2",
+    "fig4",
+    "fig5",
+    "measure_cells",
+    "require_place",
+    "save",
+    "table1",
+    "table2",
+]

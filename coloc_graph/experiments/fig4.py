@@ -1,0 +1,136 @@
+"""Fig. 4: how the error of the distance between two robots is distributed, in 20 cells of l and theta."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.experiments.paper import BIN_CM, FIG4_MEAN_CM, fig4_within_1cm
+from coloc_graph.experiments.pool import Progress
+from coloc_graph.experiments.single_step import CELLS, Cell, Estimates, measure_cells
+from coloc_graph.simulation.world import Depth
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Fig4:
+    """The cells and what they were measured with."""
+
+    depth: Depth
+    seed: int
+    runs: int
+    draws: int
+    cells: tuple[Cell, ...]
+    name: str = "fig4"
+
+    @property
+    def header(self) -> list[str]:
+        """The table's columns."""
+        return ["l", "theta", "overlap", "paper's mean", "eq. (2) mean", "ours mean", "eq. (2) / ours"]
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """One row a cell; means of |l_est - l|."""
+        return [
+            [
+                f"{100 * cell.baseline:.0f} cm",
+                f"{cell.theta_deg:.0f} deg",
+                f"{cell.overlap_px / 1000:.1f} kpx",
+                paper_says(cell),
+                f"{cell.mean_cm(cell.eq2):.2f} cm",
+                f"{cell.mean_cm(cell.ours):.2f} cm",
+                f"{cell.mean_cm(cell.eq2) / cell.mean_cm(cell.ours):.1f}",
+            ]
+            for cell in self.cells
+        ]
+
+    @property
+    def summary(self) -> str:
+        """The result in a sentence."""
+        ratios = [cell.mean_cm(cell.eq2) / cell.mean_cm(cell.ours) for cell in self.cells]
+        return (
+            f"Mean |l_est - l| of {self.runs} runs of {self.draws} points a cell, depth {self.depth}, seed {self.seed}: "
+            f"ours is {min(ratios):.1f} to {max(ratios):.1f} times smaller than eq. (2), {np.median(ratios):.1f} times "
+            "in the median."
+        )
+
+    def numbers(self) -> dict[str, Any]:
+        """Everything that the figure shows, for JSON; lengths in cm."""
+        return {
+            "depth": self.depth,
+            "seed": self.seed,
+            "runs": self.runs,
+            "draws": self.draws,
+            "bin_cm": BIN_CM,
+            "cells": [
+                {
+                    "l_cm": 100 * cell.baseline,
+                    "theta_deg": cell.theta_deg,
+                    "recorded_points": cell.recorded,
+                    "overlap_px": cell.overlap_px,
+                    "paper_mean_cm": FIG4_MEAN_CM.get((cell.baseline, cell.theta_deg)),
+                    "paper_mean_within_1cm": fig4_within_1cm(cell.baseline, cell.theta_deg),
+                    "eq2": estimates_json(cell, cell.eq2),
+                    "ours": estimates_json(cell, cell.ours),
+                }
+                for cell in self.cells
+            ],
+        }
+
+    def figure(self) -> "Figure":
+        """The histograms as the paper draws them: eq. (2) above, ours below."""
+        from coloc_graph.experiments.figures_single_step import fig4_figure
+
+        return fig4_figure(self)
+
+
+def fig4(
+    *,
+    depth: Depth = "tracks",
+    seed: int = 0,
+    runs: int = 500,
+    draws: int = 50,
+    cells: Sequence[tuple[float, float]] = CELLS,
+    processes: int = 1,
+    progress: Progress | None = None,
+) -> Fig4:
+    """Measure Fig. 4; arguments and errors are those of `measure_cells`."""
+    measured = measure_cells(
+        cells, depth=depth, seed=seed, runs=runs, draws=draws, processes=processes, progress=progress
+    )
+    return Fig4(depth, seed, runs, draws, measured)
+
+
+def paper_says(cell: Cell) -> str:
+    """What the paper's text says of a cell's mean error."""
+    mean = FIG4_MEAN_CM.get((cell.baseline, cell.theta_deg))
+    if mean is not None:
+        return f"{mean:.1f} cm"
+    return {True: "< 1 cm", False: "> 1 cm", None: "-"}[fig4_within_1cm(cell.baseline, cell.theta_deg)]
+
+
+def histogram(errors_cm: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Counts of errors (n,) [cm] in bins of 0.5 cm from 0 to the largest; NaN are in none."""
+    finite = errors_cm[np.isfinite(errors_cm)]
+    return np.bincount((finite / BIN_CM).astype(np.int64), minlength=1)
+
+
+def estimates_json(cell: Cell, estimates: Estimates) -> dict[str, Any]:
+    """A method's figures in one cell, for JSON; lengths in cm."""
+    errors = cell.errors_cm(estimates)
+    finite = errors[np.isfinite(errors)]
+    if not len(finite):
+        return {"without_pose": len(errors)}
+    return {
+        "mean_cm": float(finite.mean()),
+        "median_cm": float(np.median(finite)),
+        "rms_cm": float(np.sqrt((finite**2).mean())),
+        "bias_cm": float(100 * (np.nanmean(estimates.lengths) - cell.baseline)),
+        "without_pose": len(errors) - len(finite),
+        "histogram": histogram(errors).tolist(),
+        "l_est_cm": [None if np.isnan(one) else round(100 * one, 4) for one in estimates.lengths.tolist()],
+    }

@@ -1,0 +1,63 @@
+"""Work spread over processes, in order; and the checks that all experiments share."""
+
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import TypeVar, get_args
+
+import cv2
+
+from coloc_graph.errors import InputError
+from coloc_graph.simulation.world import Depth
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+#: Called with how many parts of the work are done, and of how many.
+Progress = Callable[[int, int], None]
+
+
+def spread(
+    work: Callable[[Item], Result], items: Sequence[Item], processes: int = 1, progress: Progress | None = None
+) -> list[Result]:
+    """`work` of each item, in the order of the items, by new (spawned) processes or, with one, by this.
+
+    What it returns does not depend on `processes`. A script that asks for more than one needs the usual
+    `if __name__ == "__main__":`. The first error of any item ends it all and is raised here.
+    """
+    results: list[Result] = []
+
+    def take(result: Result) -> None:
+        results.append(result)
+        if progress is not None:
+            progress(len(results), len(items))
+
+    if min(processes, len(items)) <= 1:
+        for item in items:
+            take(work(item))
+        return results
+    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_begin)
+    try:
+        for future in [pool.submit(work, item) for item in items]:
+            take(future.result())
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return results
+
+
+def _begin() -> None:
+    cv2.setNumThreads(1)  # the processes are what is parallel
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker without a traceback of its own
+
+
+def check(depth: str, seed: int, runs: int, processes: int) -> None:
+    """Raise `InputError` where an argument that all experiments have is wrong."""
+    if depth not in get_args(Depth):
+        raise InputError(f"`depth` is {depth!r}; use tracks or images")
+    if seed < 0:
+        raise InputError(f"`seed` is {seed}; give a whole number that is not negative")
+    if runs < 1:
+        raise InputError(f"`runs` is {runs}; give at least 1")
+    if processes < 1:
+        raise InputError(f"`processes` is {processes}; give at least 1")
