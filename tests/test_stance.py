@@ -81,7 +81,6 @@ def test_clocks_that_are_seconds_apart_are_said_in_words(tmp_path):
     assert "clocks" in found.homography.unusable
 
 
-@pytest.mark.xfail(strict=True, reason="the offset between two clocks is not estimated yet")
 def test_clocks_50_ms_apart_give_the_right_pose_or_none(tmp_path, runs):
     found = run_with_clock_offset(tmp_path / "run.mcap", 0.05)
     if found.homography.unusable is None:

@@ -53,9 +53,9 @@ class Fig4:
         """The result in a sentence."""
         ratios = [cell.mean_cm(cell.eq2) / cell.mean_cm(cell.ours) for cell in self.cells]
         return (
-            f"Mean |l_est - l| of {self.runs} runs of {self.draws} points a cell, depth {self.depth}, seed {self.seed}: "
-            f"ours is {min(ratios):.1f} to {max(ratios):.1f} times smaller than eq. (2), {np.median(ratios):.1f} times "
-            "in the median."
+            f"Mean |l_est - l| of {self.runs} runs of {self.draws} points a cell, depth {self.depth}, seed {self.seed}"
+            f": ours is {min(ratios):.1f} to {max(ratios):.1f} times smaller than eq. (2), {np.median(ratios):.1f} in "
+            "the median."
         )
 
     def numbers(self) -> dict[str, Any]:

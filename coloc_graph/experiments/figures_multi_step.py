@@ -180,7 +180,7 @@ def _draw_courses(axes: Axes, outing: Outing, title: str) -> None:
             f"{100 * course.length(course.true):.0f} cm", (x[-1], y[-1]), (9, 0), textcoords="offset points", ha="left",
             va="center", size=9, color=INK,
         )  # fmt: skip
-    axes.margins(x=0.07, y=0.16)
+    axes.margins(x=0.09, y=0.16)
     axes.set_ylabel("across [m]")
     axes.set_title(title, loc="left", size=10.5, weight="bold")
 

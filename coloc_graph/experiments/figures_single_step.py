@@ -64,8 +64,8 @@ def fig4_figure(result: Fig4) -> Figure:
         figure,
         "Error of the distance between two robots from one step (the paper's Fig. 4)",
         f"{result.runs} runs of {result.draws} points a cell, bins of {BIN_CM} cm, one world of seed {result.seed}, "
-        f"{DEPTHS[result.depth]}. Both rows use the same points. {beyond} of {2 * len(result.cells) * result.runs} runs "
-        "lie above the panels.",
+        f"{DEPTHS[result.depth]}. Both rows use the same points. {beyond} of {2 * len(result.cells) * result.runs} "
+        "runs lie above the panels.",
     )
     figure.text(0.5, 0.38 / height, "angle θ between the robots", ha="center", color="#24292f")
     _legend(figure)

@@ -17,8 +17,8 @@ FIG4_MORE_THAN_200 = (0.6, 0.0)
 
 
 def fig4_within_1cm(baseline: float, theta_deg: float) -> bool | None:
-    """Whether the text puts a cell's mean error within 1 cm; None where it says nothing (100 and 120 cm)."""
-    if baseline > 0.8:
+    """Whether the text puts a cell's mean error within 1 cm; None where it says nothing."""
+    if baseline not in (0.6, 0.8) or theta_deg not in ANGLES:
         return None
     return (baseline, theta_deg) not in FIG4_ABOVE_1CM
 

@@ -78,8 +78,8 @@ def measure_cells(
     """Simulate each cell (l [m], theta [deg]) once, and estimate l from `draws` of its 250 points, `runs` times.
 
     Eq. (2) takes least-squares homographies in one image, as the paper; ours takes maximum-likelihood ones of
-    the same points, and the most likely pose on the floor. Raises `InputError` where an argument is wrong or a cell has no common view, and
-    `DegenerateGeometry` where a cell cannot be measured.
+    the same points, and the most likely pose on the floor. Raises `InputError` where an argument is wrong or a
+    cell has no common view, and `DegenerateGeometry` where a cell cannot be measured.
     """
     check(depth, seed, runs, processes)
     if not LEAST_DRAWN <= draws <= RECORDED:

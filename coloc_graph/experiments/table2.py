@@ -76,8 +76,8 @@ class Table2:
         eq2, ours, n = self.rms("eq2"), self.rms("ours"), len(self.outings)
         return (
             f"RMS over {n} run{'s' * (n > 1)} from seed {self.outings[0].seed} on, depth {self.depth}, {self.stances} "
-            f"stances: length error eq. (2) {eq2['rate_percent']:.2f} %, ours {ours['rate_percent']:.2f} % (paper: 0.20 "
-            f"to 0.34 %); end position eq. (2) {eq2['end_error_cm']:.1f} cm, ours {ours['end_error_cm']:.1f} cm."
+            f"stances: length error eq. (2) {eq2['rate_percent']:.2f} %, ours {ours['rate_percent']:.2f} % (paper: "
+            f"0.20 to 0.34 %); end position eq. (2) {eq2['end_error_cm']:.1f} cm, ours {ours['end_error_cm']:.1f} cm."
         )
 
     def numbers(self) -> dict[str, Any]:

@@ -120,7 +120,7 @@ def fit_at_offset(
     if criterion == "reprojection":
         # the robust fit takes points for independent; points between the same samples are not
         for iterations in range(1, 11):
-            step = np.linalg.solve(system.by_H, system.score_H)
+            step = np.asarray(np.linalg.solve(system.by_H, system.score_H), float)
             H = H @ sl3_exp(step)
             system = _System(tracks, at, H, kept, system.moved(step))
             if step @ system.by_H @ step < 1e-12:
@@ -134,7 +134,7 @@ def fit_at_offset(
         by_offset = np.linalg.lstsq(A, v, rcond=None)[0]
     squared = squared_residuals(H, found.pairs)
     own = np.linalg.inv(information)
-    marginal = np.linalg.inv(own + offset.sigma**2 * np.outer(by_offset, by_offset))
+    marginal = np.asarray(np.linalg.inv(own + offset.sigma**2 * np.outer(by_offset, by_offset)), float)
     joint = np.zeros((9, 9))
     joint[:8, :8] = information
     joint[:8, 8] = joint[8, :8] = -information @ by_offset
@@ -225,7 +225,7 @@ class PairedTracks:
     def noise_j(self, at: _At, which: NDArray[np.int64]) -> sparse.csc_array:
         """Covariance (2k, 2k) of camera j's points `which`, which share samples."""
         wide = sparse.kron(at.interpolated.position[which], sparse.eye_array(2), format="csr")
-        return (wide @ self._noise @ wide.T).tocsc()
+        return sparse.csc_array(wide @ self._noise @ wide.T)
 
     def speed(self, at: _At, which: NDArray[np.int64]) -> Array:
         """The exact derivative (k, 2) of points by the offset, with all its noise [1/s]."""
@@ -249,7 +249,7 @@ class PairedTracks:
 def _finite(track: Track, camera: Camera) -> tuple[Array, Array, Array, Array]:
     """Times, normalised points, covariances and pixels of a track, where all are finite and time goes on."""
     x, covariance = normalised(track, camera)
-    good = np.isfinite(x).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    good = np.asarray(np.isfinite(x).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
     good[1:] &= np.diff(track.times) > 1e-4
     return track.times[good], x[good], covariance[good], track.uv[good]
 
@@ -348,7 +348,7 @@ def _evidence(
         if information <= NOISE_SIGMAS * fluctuation:
             return None
         step = float(np.clip(score / information, -prior.sigma, prior.sigma))
-        h = np.linalg.solve(system.by_H, system.score_H + system.by_H_offset * step)
+        h = np.asarray(np.linalg.solve(system.by_H, system.score_H + system.by_H_offset * step), float)
         z_all[which] = system.moved(h, step, speed)
         H, offset = H @ sl3_exp(h), offset + step
         if abs(offset - prior.value) > 1.5 * SEARCH_SIGMAS * prior.sigma:

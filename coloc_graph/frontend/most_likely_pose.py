@@ -70,7 +70,7 @@ def most_likely_pose(
         steps = np.zeros((len(width), len(free)))
         steps[:, free] = np.diag(width)
         rows = unknowns + np.concatenate([np.zeros((1, len(free))), steps, -steps])
-        T_i_j, T_ci_cj, N, d = model.build(rows)
+        _, T_ci_cj, N, d = model.build(rows)
         T_cj_ci = se3_inverse(T_ci_cj)
         H = T_cj_ci[:, :3, :3] + T_cj_ci[:, :3, 3:] * (N / d[:, None])[:, None, :]
         residuals = sl3_log(sl3_normalise(H_inverse @ sl3_normalise(H))) @ root.T

@@ -30,7 +30,8 @@ def share_clock_offsets(
             values = [1e3 * one.value for one in known_by_stances]
             warnings.append(
                 f"the stances disagree on the offset of the clocks of {pair[0]} and {pair[1]} ({min(values):.1f} to "
-                f"{max(values):.1f} ms): the clocks drift or were set during the run; synchronise them, or split the run"
+                f"{max(values):.1f} ms): the clocks drift or were set during the run: synchronise them, "
+                "or split the run"
             )
         if fused[pair].sigma > LEAST_OBSERVED * clock_sigma:
             warnings.append(f"{pair[0]} and {pair[1]}: {NOT_OBSERVABLE}")

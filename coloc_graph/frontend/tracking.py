@@ -95,10 +95,7 @@ class MarkerTracker:
         """Take in the next image."""
         predicted = [track.predict(image.time) for track in self._live]
         full = self._search_all()
-        if full:
-            found = self._detector.find(image.pixels)
-        else:
-            found = self._in_patches(image.pixels, predicted)
+        found = self._detector.find(image.pixels) if full else self._in_patches(image.pixels, predicted)
         found = [one for one in found if not one.clipped]
         self._advance(image.time, predicted, [one.uv for one in found], found, births=full)
 
@@ -205,7 +202,7 @@ class MarkerTracker:
 
     def _park(self) -> None:
         """Set aside the lights that have not moved for `still_after` frames."""
-        going = []
+        going: list[_Live] = []
         for track in self._live:
             still = len(track.uv) >= self._options.still_after
             if still:

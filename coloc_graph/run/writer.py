@@ -60,7 +60,7 @@ class RunWriter:
             self._file = self.path.open("wb")
         except OSError as error:
             raise self._refused(error) from error
-        self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD)
+        self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE, compression=CompressionType.LZ4)
         try:
             self._on_disk(self._begin)
         except RunError:
