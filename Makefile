@@ -1,11 +1,12 @@
 # make demo   a virtual environment, the package, and the main job: render, solve, show
 # make test   the same environment: lint, format, types, tests
-# make bench  the benchmarks behind the figures in the README
+# make bench  the benchmarks behind the figures in the README; DATA=DIR for that on the stereo pairs of a chessboard
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+DATA ?=
 
 .PHONY: demo test lint types unit bench clean
 
@@ -26,7 +27,12 @@ unit: $(VENV)/installed-dev
 
 bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/single_step.py
-	$(BIN)/python benchmarks/hallway.py
+	$(BIN)/python benchmarks/hallway.py --seeds 40
+ifneq ($(DATA),)
+	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)
+else
+	@echo "benchmarks/stereo_board.py is left out: give the folder of its images with make bench DATA=DIR"
+endif
 
 $(VENV)/made:
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 15) else \

@@ -1,5 +1,6 @@
 """An estimate against truth: lengths as in the paper's Table II, ATE, heading, and NEES."""
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ from coloc_graph.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
+#: A robot that got no further than this stayed where it was [m].
+STAYED = 0.05
 #: Tangent components of a pose on the floor: heading, x, y.
 PLANAR = [2, 3, 4]
 
@@ -36,13 +39,29 @@ class RobotAccuracy:
     @property
     def length_error_percent(self) -> float | None:
         """Size of the length error in % of the true length; None for a robot that did not get anywhere."""
-        return 100 * abs(self.length_error) / self.true_length if self.true_length > 0.05 else None
+        return 100 * abs(self.length_error) / self.true_length if self.true_length > STAYED else None
+
+
+@dataclass(frozen=True)
+class DistanceAccuracy:
+    """The distance between two robots that stayed where they were [m]."""
+
+    robot_i: str
+    robot_j: str
+    true: float
+    estimated: float
+
+    @property
+    def error(self) -> float:
+        """Estimated less true distance [m]."""
+        return self.estimated - self.true
 
 
 @dataclass(frozen=True)
 class Accuracy:
     """A team's accuracy: RMS position error over all poses [m], the largest end errors of any robot, and the
-    average NEES per degree of freedom (1 where the covariances tell the truth) over `nees_poses` poses."""
+    average NEES per degree of freedom (1 where the covariances tell the truth) over `nees_poses` poses. `distances`
+    are those of the pairs of robots that stayed where they were, of which lengths say nothing."""
 
     robots: tuple[RobotAccuracy, ...]
     ate: float
@@ -50,6 +69,7 @@ class Accuracy:
     heading_error_deg: float
     anees: float | None
     nees_poses: int
+    distances: tuple[DistanceAccuracy, ...] = ()
 
 
 def align(
@@ -101,6 +121,15 @@ def evaluate(estimated: Mapping[str, Trajectory], true: Mapping[str, Array], *, 
         heading_error_deg=max(row.heading_error_deg for row in rows),
         anees=float(all_nees.mean()) if len(all_nees) else None,
         nees_poses=len(all_nees),
+        distances=tuple(
+            DistanceAccuracy(
+                i,
+                j,
+                true=float(np.linalg.norm(true[j][-1, :3, 3] - true[i][-1, :3, 3])),
+                estimated=float(np.linalg.norm(estimated[j].positions[-1] - estimated[i].positions[-1])),
+            )
+            for i, j in itertools.combinations([row.robot for row in rows if row.true_length <= STAYED], 2)
+        ),
     )
 
 

@@ -1,4 +1,7 @@
-"""What is in a run, and what is wrong with it: every reason for which a solve would use less than all of it."""
+"""What is in a run, and what is wrong with it: every reason for which a solve would use less than all of it.
+
+Detections that name their markers are measured as a solve does; images are not looked into.
+"""
 
 import itertools
 from dataclasses import dataclass
@@ -6,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend.correspondence import PAIRING_WINDOW, pair_by_time
-from coloc_graph.frontend.stance import stance_plane
-from coloc_graph.run import Run, Stance
+from coloc_graph.frontend.correspondence import PAIRING_WINDOW, correspond_roughly, pair_by_time
+from coloc_graph.frontend.plausibility import implausible
+from coloc_graph.frontend.stance import FrontendOptions, measure_pair, named_tracks, stance_plane
+from coloc_graph.run import Detections, Run, Stance
 
 
 @dataclass(frozen=True)
@@ -46,20 +50,30 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
             for robot in stance.anchors
             if any(motion.moving for motion in run.motions(robot, before.end, stance.start))
         ]
-    times = {}
-    for robot in stance.observers:
+    times, named, measurable = {}, {}, True
+    for place, robot in enumerate(stance.observers):
+        seen: list[Detections] = []
         if run.has_detections(robot):
-            times[robot] = np.array([d.time for d in run.detections(robot, stance.start, stance.end)])
+            seen = list(run.detections(robot, stance.start, stance.end))
+            times[robot] = np.array([d.time for d in seen])
         else:
             times[robot] = np.array([image.time for image in run.images(robot, stance.start, stance.end)])
+        if seen and all(marker for one in seen for marker in one.markers):
+            named[robot] = seen
         if not len(times[robot]):
             findings.append(Finding(where, f"{robot} recorded neither detections nor images: check its camera"))
+            measurable = False
+        if place == len(stance.observers) - 1 and place > 0:
+            continue  # a pair needs the plane of its first observer
         try:
             stance_plane(run, stance, robot)
         except DegenerateGeometry as why:
             findings.append(Finding(where, f"{robot}: {why}"))
+            measurable = False
+    if not measurable:
+        return findings
     for i, j in itertools.combinations(stance.observers, 2):
-        if len(times[i]) and len(times[j]) and not len(pair_by_time(times[i], times[j])):
+        if run.team.clock_sigma == 0 and not len(pair_by_time(times[i], times[j])):
             nearest = np.abs(times[i][:, None] - times[j][None]).min()
             findings.append(
                 Finding(
@@ -68,4 +82,28 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
                     f"{1e3 * nearest:.1f} ms apart): synchronise their clocks",
                 )
             )
-    return findings
+        elif i in named and j in named:
+            findings += [Finding(where, what) for what in _of_detections(run, stance, i, j, named)]
+    return list(dict.fromkeys(findings))  # two pairs may find the same
+
+
+def _of_detections(run: Run, stance: Stance, i: str, j: str, named: dict[str, list[Detections]]) -> list[str]:
+    """What is wrong with what two observers detected by name."""
+    sigma = run.team.clock_sigma
+    if sigma > 0:  # the search for the clocks' offset is for a solve
+        tracks_i, tracks_j = (named_tracks(robot, named[robot]) for robot in (i, j))
+        camera_i, camera_j = (run.team[robot].camera for robot in (i, j))
+        try:
+            found = correspond_roughly(tracks_i, tracks_j, camera_i, camera_j, 0.0, sigma)[1]
+        except DegenerateGeometry as why:
+            return [f"{i} and {j}: {why}"]
+        unlikely = implausible(run, stance, i, found)
+        return [unlikely] if unlikely else []
+    measured = measure_pair(run, stance, i, j, FrontendOptions())
+    what = []
+    if measured.homography.unusable:
+        what.append(f"{i} and {j}: {measured.homography.unusable}")
+    if measured.correspondences is not None:
+        unlikely = implausible(run, stance, i, measured.correspondences)
+        what += [unlikely] if unlikely else []
+    return what

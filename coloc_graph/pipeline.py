@@ -1,18 +1,28 @@
 """The whole road from a run to an estimate; reads like sections III and IV of the paper."""
 
 import itertools
+import math
+import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
+
+from scipy.special import chdtrc
 
 from coloc_graph.backend import Estimate, PoseGraph, chain, smooth
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.frontend import FrontendOptions, PairMeasurement, measure_pair, share_clock_offsets
+from coloc_graph.frontend.plausibility import implausible
 from coloc_graph.run import Run
 
 Method = Literal["chain", "smooth"]
 METHODS: tuple[Method, ...] = get_args(Method)
+
+#: Measurements that noise alone lets disagree less often than this are warned of.
+LEAST_CHANCE = 1e-4
+#: So many kinds of reasons are named where every measurement is refused.
+REASONS_NAMED = 3
 
 #: Called with how many measurements are done, and of how many.
 Progress = Callable[[int, int], None]
@@ -29,6 +39,10 @@ class SolveOptions:
     method: Method = "smooth"
     frontend: FrontendOptions | None = None
 
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InputError(f"there is no method `{self.method}`; choose one of {', '.join(METHODS)}")
+
     def resolved(self) -> "SolveOptions":
         """With the front end that belongs to the method, where none is chosen."""
         if self.frontend is not None:
@@ -37,7 +51,7 @@ class SolveOptions:
         return replace(self, frontend=paper if self.method == "chain" else FrontendOptions())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Solution:
     """A result: the estimate, every measurement it was made of or that was refused, and how long it took [s]."""
 
@@ -49,6 +63,13 @@ class Solution:
     seconds_frontend: float
     seconds_backend: float
 
+    def __repr__(self) -> str:
+        used = sum(m.relative_pose is not None for m in self.measurements)
+        return (
+            f"Solution({self.run!r}, {self.options.method}, {used} of {len(self.measurements)} measurements used, "
+            f"{len(self.warnings)} warnings)"
+        )
+
 
 def solve(run: Run, options: SolveOptions | None = None, progress: Progress | None = None) -> Solution:
     """Localise a team: measure every pair of observers in every stance, and make an estimate of it all.
@@ -57,19 +78,13 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
     any robot to the reference; what is merely left out is said in `Solution.warnings`.
     """
     options = (options or SolveOptions()).resolved()
-    if options.method not in METHODS:
-        raise InputError(f"there is no method `{options.method}`; choose one of {', '.join(METHODS)}")
     _require_observers(run)
     started = time.perf_counter()
 
     measurements, clock_warnings = share_clock_offsets(_measure(run, options, progress), run.team.clock_sigma)
     poses = tuple(m.relative_pose for m in measurements if m.relative_pose is not None)
     if not poses:
-        first = measurements[0].homography
-        raise EstimationError(
-            f"{run.path}: no stance gives a relative pose; at stance {first.stance}, {first.robot_i} and "
-            f"{first.robot_j}: {first.unusable}"
-        )
+        raise EstimationError(f"{run.path}: no stance gives a relative pose; {_reasons(measurements)}")
     measured = time.perf_counter()
 
     graph = PoseGraph(run.team.reference, run.team.names, run.stances, poses, run.team.floor)
@@ -85,7 +100,12 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
         options=options,
         estimate=estimate,
         measurements=measurements,
-        warnings=(*run.warnings, *clock_warnings, *_warnings(estimate, measurements)),
+        warnings=(
+            *run.warnings,
+            *clock_warnings,
+            *_implausible(run, options, measurements),
+            *_warnings(estimate, measurements),
+        ),
         seconds_frontend=measured - started,
         seconds_backend=solved - measured,
     )
@@ -112,6 +132,49 @@ def _measure(run: Run, options: SolveOptions, progress: Progress | None) -> tupl
     return tuple(measurements)
 
 
+def _reasons(measurements: Sequence[PairMeasurement]) -> str:
+    """Why all measurements were refused: one of each kind of reason with how many there are, most frequent first."""
+    kinds: dict[str, list[str]] = {}
+    for measured in measurements:
+        h = measured.homography
+        kinds.setdefault(_kind(h.unusable or "", h.robot_i, h.robot_j), []).append(
+            f"at stance {h.stance}, {h.robot_i} and {h.robot_j}: {h.unusable}"
+        )
+    by_count = sorted(kinds.values(), key=lambda kind: -len(kind))
+    total = len(measurements)
+    named = [
+        kind[0] + (f" (the same in {len(kind)} of {total} measurements)" if total > 1 else "")
+        for kind in by_count[:REASONS_NAMED]
+    ]
+    more = sum(map(len, by_count[REASONS_NAMED:]))
+    return "; ".join([*named, f"and {more} more for other reasons"] if more else named)
+
+
+def _kind(reason: str, *robots: str) -> str:
+    """A reason without the numbers and names that differ from stance to stance."""
+    for robot in robots:
+        reason = re.sub(rf"\b{re.escape(robot)}\b", "?", reason)
+    return re.sub(r"\d+(\.\d+)?(e[+-]?\d+)?", "?", reason)
+
+
+def _implausible(run: Run, options: SolveOptions, measurements: Sequence[PairMeasurement]) -> Iterator[str]:
+    """Where the stated plane contradicts the markers that were seen; the first of each observer, and how many."""
+    assert options.frontend is not None
+    if options.frontend.scale == "span":
+        return  # the stated distance is not used
+    stances = {stance.index: stance for stance in run.stances}
+    found: dict[str, list[tuple[int, str]]] = {}
+    for measured in measurements:
+        if measured.correspondences is not None:
+            robot, stance = measured.homography.robot_i, stances[measured.homography.stance]
+            what = implausible(run, stance, robot, measured.correspondences)
+            if what is not None and stance.index not in [index for index, _ in found.get(robot, [])]:
+                found.setdefault(robot, []).append((stance.index, what))
+    for each in found.values():
+        others = len(each) - 1
+        yield f"stance {each[0][0]}{f' (and {others} more alike)' if others else ''}: {each[0][1]}"
+
+
 def _why_untied(estimate: Estimate, measurements: tuple[PairMeasurement, ...]) -> str:
     refused = [m.homography for m in measurements if m.homography.unusable]
     if refused:
@@ -129,13 +192,24 @@ def _warnings(estimate: Estimate, measurements: tuple[PairMeasurement, ...]) -> 
     ]
     if estimate.untied:
         robot, stance = estimate.untied[0]
+        several = len(estimate.untied) > 1
         warnings.append(
-            f"{len(estimate.untied)} poses are not tied to the reference, from robot {robot} at stance {stance} on, "
-            "and are left out: a measurement there, or an anchor that stays, would tie them"
+            f"{len(estimate.untied)} {'poses are' if several else 'pose is'} not tied to the reference, from robot "
+            f"{robot} at stance {stance} on, and {'are' if several else 'is'} left out: a measurement there, or an "
+            f"anchor that stays, would tie {'them' if several else 'it'}"
         )
-    if estimate.dof > 0 and estimate.chi2 > 3 * estimate.dof:
+    chance = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
+    if chance < LEAST_CHANCE:
         warnings.append(
-            f"the measurements disagree (chi2/dof {estimate.chi2 / estimate.dof:.1f}, expected 1): "
-            "a robot moved that is called an anchor, or mounts, heights or the floor are not as stated"
+            f"the measurements disagree (chi2/dof {estimate.chi2 / estimate.dof:.1f} with {estimate.dof} degrees of "
+            f"freedom, expected 1; noise alone does that {_once_in(chance)}): a robot moved that is called an anchor, "
+            "or mounts, heights, the floor or the noise are not as stated"
         )
     return warnings
+
+
+def _once_in(chance: float) -> str:
+    """A small probability in words."""
+    if chance < 1e-9:
+        return "less than once in 1 000 000 000 runs"
+    return f"about once in {10 ** round(-math.log10(chance)):,} runs".replace(",", " ")

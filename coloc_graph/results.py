@@ -28,7 +28,7 @@ from coloc_graph.evaluation import Accuracy, align, evaluate
 from coloc_graph.exchange.g2o import write_g2o
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.pipeline import Solution
-from coloc_graph.run import read_truth
+from coloc_graph.run import read_truth, run_id
 from coloc_graph.team import without_none
 from coloc_graph.trajectory import Trajectory
 
@@ -50,10 +50,15 @@ def assess(solution: Solution) -> tuple[Accuracy, dict[str, NDArray[np.float64]]
     return evaluate(trajectories, true, on_floor=on_floor), true
 
 
+def holds_result(out: str | Path) -> bool:
+    """Whether there is a result in a folder."""
+    return (Path(out) / SUMMARY).is_file()
+
+
 def require_place(out: str | Path) -> None:
     """Raise `InputError` where a result cannot go to `out`: it is something else, or its folder cannot be one."""
     out = Path(out)
-    if out.exists() and not (out / SUMMARY).is_file() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and not holds_result(out) and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out} exists and is not a result; give another folder, or remove it")
     above = next(folder for folder in out.absolute().parents if folder.exists())
     if not above.is_dir():
@@ -88,7 +93,7 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
         (part / "config.toml").write_text(tomli_w.dumps(_config(solution)), encoding="utf-8")
         (part / "report.html").write_text(render_report(solution, accuracy, true), encoding="utf-8")
         run_path = os.path.relpath(solution.run.path.absolute(), out.absolute())
-        summary = summarise(solution, accuracy) | {"run": run_path}
+        summary = summarise(solution, accuracy) | {"run": run_path, "run_id": run_id(solution.run.path)}
         (part / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         if place.exists():
             place.rename(old)
@@ -147,6 +152,10 @@ def accuracy_json(accuracy: Accuracy) -> dict[str, Any]:
             }
             for row in accuracy.robots
         },
+        "distances": [
+            {"robots": [row.robot_i, row.robot_j], "true_m": row.true, "estimated_m": row.estimated}
+            for row in accuracy.distances
+        ],
     }
 
 
@@ -191,12 +200,25 @@ def _config(solution: Solution) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A result read back: the summary, the trajectories, and where the run it was made of should be."""
+    """A result read back: the summary, the trajectories, and where the run it was made of should be.
+
+    `run_id` is that run's id (None in results of versions that did not write it).
+    """
 
     path: Path
     summary: dict[str, Any]
     trajectories: Mapping[str, Trajectory]
     run_path: Path
+    run_id: str | None = None
+
+    def require_run(self, path: str | Path) -> None:
+        """Raise `InputError` where the file at `path` is not the run that this result was made of."""
+        if not Path(path).exists():
+            raise InputError(f"{self.path}: the run that it was made of is no longer at {path}; give --run RUN")
+        if self.run_id is not None and run_id(path) != self.run_id:
+            raise InputError(
+                f"{path} is not the run that {self.path} was made of; give that one with --run, or solve this one"
+            )
 
 
 def read_result(path: str | Path) -> Result:
@@ -213,4 +235,4 @@ def read_result(path: str | Path) -> Result:
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path / SUMMARY} is damaged ({error}); solve the run again") from error
     trajectories = {robot: read_tum(path / "trajectories" / f"{robot}.tum") for robot in robots}
-    return Result(path, summary, trajectories, Path(os.path.normpath(path / run)))
+    return Result(path, summary, trajectories, Path(os.path.normpath(path / run)), summary.get("run_id"))

@@ -23,7 +23,7 @@ from coloc_graph.experiments import fig5
 from coloc_graph.report import figure_svg
 
 cells = [(baseline, theta) for baseline in (0.6, 0.8, 1.0, 1.2) for theta in (0.0, 30.0)]
-result = fig5(runs=20, cells=cells, seed=0)
+result = fig5(runs=15, cells=cells, seed=0)
 print(result.summary)
 
 # %%

@@ -22,7 +22,7 @@ from IPython.display import SVG, display
 from coloc_graph.experiments import table2
 from coloc_graph.report import figure_svg
 
-result = table2(runs=2, stances=8, seed=0)
+result = table2(runs=2, stances=6, seed=0)
 print(result.summary)
 
 # %%

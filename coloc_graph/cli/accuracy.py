@@ -1,11 +1,21 @@
-"""The table of the paper's Table II."""
+"""The table of the paper's Table II, and where the robots are with how far to trust it."""
 
-from coloc_graph.cli.printing import print_table
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from coloc_graph.cli.printing import counted, print_table
 from coloc_graph.evaluation import Accuracy
+
+if TYPE_CHECKING:
+    from coloc_graph.trajectory import Trajectory
 
 
 def print_accuracy(accuracy: Accuracy) -> None:
-    """Per robot true length, estimated length, error in cm and %; then the team's figures."""
+    """Per robot true length, estimated length, error in cm and %; then the team's figures.
+
+    Of robots that stayed where they were the distances between them.
+    """
     rows = []
     for row in accuracy.robots:
         percent = row.length_error_percent
@@ -21,5 +31,70 @@ def print_accuracy(accuracy: Accuracy) -> None:
             ]
         )
     print_table(["robot", "true", "estimated", "error", "error rate", "end position", "heading"], rows)
-    anees = "-" if accuracy.anees is None else f"{accuracy.anees:.2f} over {accuracy.nees_poses} poses (1 is honest)"
+    poses = counted(accuracy.nees_poses, "pose")
+    anees = "-" if accuracy.anees is None else f"{accuracy.anees:.2f} over {poses} (1 is honest)"
     print(f"RMS position error of all poses {100 * accuracy.ate:.2f} cm; average NEES per degree of freedom {anees}")
+    if accuracy.distances:
+        print_table(
+            ["distance", "true", "estimated", "error"],
+            [
+                [
+                    f"{row.robot_i} to {row.robot_j}",
+                    f"{100 * row.true:.1f} cm",
+                    f"{100 * row.estimated:.1f} cm",
+                    f"{100 * abs(row.error):.2f} cm",
+                ]
+                for row in accuracy.distances
+            ],
+        )
+
+
+def print_promised(trajectories: "Mapping[str, Trajectory]") -> None:
+    """What the covariances promise of each robot's last pose, one sigma, in a line."""
+    promised = []
+    for robot, trajectory in trajectories.items():
+        sigmas = last_sigmas(trajectory)
+        if sigmas is not None:
+            promised.append(f"{robot} {100 * math.hypot(*sigmas[:2]):.2f} cm, {math.degrees(sigmas[2]):.2f} deg")
+    if promised:
+        print("predicted 1-sigma at the end: " + "; ".join(promised))
+
+
+def print_last_poses(trajectories: "Mapping[str, Trajectory]") -> None:
+    """Per robot the length of its path, and its last pose in the world with one sigma."""
+    import numpy as np
+
+    from coloc_graph.lie import yaw
+
+    rows = []
+    for robot, trajectory in trajectories.items():
+        length = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()
+        x, y = 100 * trajectory.positions[-1, :2]
+        heading = math.degrees(float(yaw(trajectory.T_world_body[-1])))
+        sigmas = last_sigmas(trajectory)
+        of_x, of_y, of_heading = ("", "", "")
+        if sigmas is not None:
+            of_x, of_y = (f" +- {100 * sigma:.2f}" for sigma in sigmas[:2])
+            of_heading = f" +- {math.degrees(sigmas[2]):.2f}"
+        rows.append(
+            [
+                robot,
+                f"{100 * length:.1f} cm",
+                f"{x:.1f}{of_x} cm",
+                f"{y:.1f}{of_y} cm",
+                f"{heading:.2f}{of_heading} deg",
+            ]
+        )
+    print_table(["robot", "path length", "x at the end", "y", "heading"], rows)
+
+
+def last_sigmas(trajectory: "Trajectory") -> tuple[float, float, float] | None:
+    """Standard deviations of x, y [m] in the world and heading [rad] of the last pose; None without covariance."""
+    import numpy as np
+
+    if trajectory.covariances is None:
+        return None
+    R, covariance = trajectory.T_world_body[-1, :3, :3], trajectory.covariances[-1]
+    of_x, of_y, _ = np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T))
+    # the body stands upright but for the floor's unevenness, so that its z is the world's
+    return float(of_x), float(of_y), math.sqrt(covariance[2, 2])

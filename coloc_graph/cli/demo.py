@@ -20,7 +20,7 @@ def run(args: argparse.Namespace) -> int:
     from contextlib import suppress
     from pathlib import Path
 
-    from coloc_graph.cli.accuracy import print_accuracy
+    from coloc_graph.cli.accuracy import print_accuracy, print_promised
     from coloc_graph.cli.printing import progress, warn
     from coloc_graph.pipeline import solve
     from coloc_graph.report import hero_figure
@@ -48,6 +48,7 @@ def run(args: argparse.Namespace) -> int:
     warn(solution.warnings)
     assert accuracy is not None  # a simulated run holds truth
     print_accuracy(accuracy)
+    print_promised(solution.estimate.trajectories)
     html = out / "result" / "report.html"
     print(f"the report: {html}, and a picture: {picture}")
     if not args.no_browser and sys.stdout.isatty():

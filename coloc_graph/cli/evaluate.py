@@ -14,7 +14,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate and print."""
-    from coloc_graph.cli.accuracy import print_accuracy
+    from coloc_graph.cli.accuracy import print_accuracy, print_promised
     from coloc_graph.cli.printing import print_json
     from coloc_graph.errors import InputError
     from coloc_graph.evaluation import align, evaluate
@@ -23,6 +23,7 @@ def run(args: argparse.Namespace) -> int:
 
     result = read_result(args.dir)
     run_path = args.run_path or result.run_path
+    result.require_run(run_path)
     team = open_run(run_path).team
     truth = read_truth(run_path)
     if not truth:
@@ -34,4 +35,5 @@ def run(args: argparse.Namespace) -> int:
         print_json(accuracy_json(accuracy))
     else:
         print_accuracy(accuracy)
+        print_promised(result.trajectories)
     return 0

@@ -2,6 +2,8 @@
 
 import argparse
 
+from coloc_graph.cli.place import add_out, require_run_place
+
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """The command's arguments."""
@@ -12,19 +14,21 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     tracks.add_argument("tracks", metavar="TRACKS.csv")
     tracks.add_argument("--planes", metavar="PLANES.csv", help="marker planes: stance,robot,nx,ny,nz,d")
     tracks.add_argument("--moves", metavar="MOVES.csv", help="who moved before which stance: stance,robot")
-    tracks.add_argument("--out", required=True, metavar="RUN", help="the run to write (.mcap)")
+    add_out(tracks)
     tracks.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Import and print."""
-    from coloc_graph.cli.printing import progress, warn
+    from coloc_graph.cli.printing import counted, progress, warn
     from coloc_graph.exchange.tracks import import_tracks
 
+    require_run_place(args.out, force=args.force)
     with progress("rows imported") as report:
         summary = import_tracks(
             args.team, args.tracks, args.out, planes_path=args.planes, moves_path=args.moves, progress=report
         )
     warn(summary.warnings)
-    print(f"{args.out}: {summary.rows} rows, {summary.stances} stances, observers {', '.join(summary.observers)}")
+    rows, stances = counted(summary.rows, "row"), counted(summary.stances, "stance")
+    print(f"{args.out}: {rows}, {stances}, observers {', '.join(summary.observers)}")
     return 0

@@ -31,6 +31,11 @@ def progress(what: str) -> Iterator[Callable[[int, int], None]]:
     yield report
 
 
+def counted(n: int, what: str) -> str:
+    """`1 stance`, `2 stances`."""
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
 def print_json(value: Any) -> None:
     """Figures for programs."""
     print(json.dumps(value, indent=2))

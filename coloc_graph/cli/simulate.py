@@ -2,6 +2,7 @@
 
 import argparse
 
+from coloc_graph.cli.place import add_out, require_run_place
 from coloc_graph.cli.printing import progress
 
 
@@ -9,12 +10,12 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     """The command's arguments."""
     command = commands.add_parser("simulate", help="write a run of a simulated team, with truth in it")
     command.add_argument("scenario", help="single-step, six-step or hallway")
-    command.add_argument("--out", required=True, metavar="RUN", help="the run to write (.mcap)")
+    add_out(command)
     command.add_argument("--depth", choices=("tracks", "images"), default="tracks", help="marker centres, or images")
     command.add_argument("--seed", type=int, default=0)
     command.add_argument("--stances", type=int, help="how many stances (hallway: 40)")
-    command.add_argument("--points", type=int, help="correspondences a stance")
-    command.add_argument("--noise", type=float, default=0.3, help="of a marker centre, px (tracks; default 0.3)")
+    command.add_argument("--points", type=int, help="correspondences a stance, at least 6")
+    command.add_argument("--noise", type=float, help="of a marker centre, px (tracks; default 0.3)")
     command.add_argument("--mount-sigma", type=float, default=0.0, help="tilt and roll of the mounts, deg")
     command.add_argument("--height-sigma", type=float, default=0.0, help="height of the mounts, m")
     command.add_argument("--span-sigma", type=float, default=0.0, help="distance between a robot's markers, m")
@@ -23,15 +24,21 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--time-jitter", type=float, default=0.0, help="of the instants of capture, s")
     command.add_argument("-l", type=float, help="single-step: distance between the observers, m")
     command.add_argument("--theta", type=float, help="single-step: angle between the observers, deg")
-    command.add_argument("--fps", type=float, default=10.0, help="images a second (images; default 10)")
-    command.add_argument("--image-format", choices=("jpeg", "png", "raw"), default="jpeg")
+    command.add_argument("--fps", type=float, help="images a second (images; default 10)")
+    command.add_argument("--image-format", choices=("jpeg", "png", "raw"), help="images; default jpeg")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate."""
+    from coloc_graph.errors import InputError
     from coloc_graph.simulation import Imperfections, simulate
 
+    require_run_place(args.out, force=args.force)
+    other = {"tracks": ("fps", "image_format"), "images": ("noise",)}[args.depth]
+    for name in other:
+        if getattr(args, name) is not None:
+            raise InputError(f"--{name.replace('_', '-')} says nothing at depth {args.depth}; leave it out")
     imperfections = Imperfections(
         mount_sigma_deg=args.mount_sigma,
         height_sigma=args.height_sigma,
@@ -39,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         floor_sigma_deg=args.floor_sigma,
         clock_offset=args.clock_offset,
         time_jitter=args.time_jitter,
-        noise_px=args.noise,
+        noise_px=0.3 if args.noise is None else args.noise,
     )
     with progress("stances simulated") as report:
         simulate(
@@ -52,8 +59,8 @@ def run(args: argparse.Namespace) -> int:
             imperfections=imperfections,
             l=args.l,
             theta_deg=args.theta,
-            fps=args.fps,
-            image_format=args.image_format,
+            fps=10.0 if args.fps is None else args.fps,
+            image_format=args.image_format or "jpeg",
             progress=report,
         )
     print(args.out)

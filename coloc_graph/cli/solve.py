@@ -2,7 +2,7 @@
 
 import argparse
 
-from coloc_graph.cli.printing import print_json, progress, warn
+from coloc_graph.cli.printing import counted, print_json, progress, warn
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -25,24 +25,38 @@ def run(args: argparse.Namespace) -> int:
     """Solve, write, print."""
     from dataclasses import replace
 
-    from coloc_graph.cli.accuracy import print_accuracy
+    from coloc_graph.cli.accuracy import print_accuracy, print_last_poses, print_promised
+    from coloc_graph.errors import ColocError
     from coloc_graph.pipeline import SolveOptions, solve
-    from coloc_graph.results import require_place, summarise, write_result
+    from coloc_graph.results import holds_result, require_place, summarise, write_result
     from coloc_graph.run import open_run
 
     require_place(args.out)  # before the work, not after it
     options = SolveOptions(method=args.method).resolved()
     assert options.frontend is not None
     options = replace(options, frontend=replace(options.frontend, scale=args.scale))
-    with progress("measurements made") as report:
-        solution = solve(open_run(args.run_path), options, report)
-    accuracy = write_result(solution, args.out)
+    try:
+        with progress("measurements made") as report:
+            solution = solve(open_run(args.run_path), options, report)
+        accuracy = write_result(solution, args.out)
+    except ColocError as error:
+        if holds_result(args.out):
+            raise type(error)(f"{error}; {args.out} still holds an earlier result") from error
+        raise
     warn(solution.warnings)
     if args.json:
         print_json(summarise(solution, accuracy))
         return 0
-    if accuracy is not None:
+    estimate = solution.estimate
+    if accuracy is None:
+        print_last_poses(estimate.trajectories)
+    else:
         print_accuracy(accuracy)
+        print_promised(estimate.trajectories)
     used = sum(m.relative_pose is not None for m in solution.measurements)
-    print(f"{used} of {len(solution.measurements)} measurements used; {args.out} holds the result and report.html")
+    agreement = f", chi2/dof {estimate.chi2 / estimate.dof:.2f}" if estimate.dof > 0 else ""
+    print(
+        f"{used} of {counted(len(solution.measurements), 'measurement')} used{agreement}; "
+        f"{args.out} holds trajectories, measurements.csv and report.html"
+    )
     return 0

@@ -86,6 +86,7 @@ def import_tracks(
     moved = _read_moves(Path(moves_path), team, tracks) if moves_path is not None else {}
     planes = _read_planes(Path(planes_path), team, tracks) if planes_path is not None else {}
     stances = _stances(tracks, team, observers, moved)
+    _require_planes(tracks_path, stances, planes)
 
     with whole_run(out, team) as writer:
         _write(writer, tracks, stances, planes, moved, progress)
@@ -211,6 +212,11 @@ def _read_moves(path: Path, team: Team, tracks: _Tracks) -> dict[int, tuple[str,
         if stance == min(known):
             raise table.error(row, f"stance {stance} is the first, and nobody moved before it; remove the row")
         if stance not in known:
+            if stance < max(known):
+                raise TracksError(
+                    f"{tracks.table.path}: has no rows of stance {stance} and some of later ones, while "
+                    f"{table.path}, line {table.lines[row]}, has it; number the stances 0, 1, 2, ... without gaps"
+                )
             raise table.error(row, f"{_no_stance(stance, tracks)}; correct the number or remove the row")
         moved[stance] = tuple(dict.fromkeys((*moved.get(stance, ()), team.names[place])))
     return moved
@@ -292,6 +298,18 @@ def _stances(
     return stances
 
 
+def _require_planes(
+    path: Path, stances: list[Stance], planes: Mapping[int, dict[str, tuple[float, float, float, float]]]
+) -> None:
+    """`TracksError` where no stance has a marker plane: no mover of the team carries markers, and none is stated."""
+    if planes or any(stance.movers for stance in stances):
+        return
+    raise TracksError(
+        f"{path}: no robot of the team moves that carries markers, and no plane is stated, so that there is no marker "
+        "plane: add the robot whose markers these are to the team (with its markers), or state the planes with --planes"
+    )
+
+
 def _write(
     writer: RunWriter,
     tracks: _Tracks,
@@ -345,8 +363,8 @@ def _warnings(tracks: _Tracks, team: Team, stances: list[Stance], *, moves_known
     alone = [stance for stance in stances if len(stance.observers) < 2]
     if alone:
         yield (
-            f"{path}: {len(alone)} of {len(stances)} stances have one observer only (the first is stance "
-            f"{alone[0].index}, with `{alone[0].observers[0]}`) and give no measurement"
+            f"{path}: in {len(alone)} of {len(stances)} stances there is one observer only (the first is stance "
+            f"{alone[0].index}, with `{alone[0].observers[0]}`), so that they give no measurement"
         )
     size = np.array([(robot.camera.width, robot.camera.height) for robot in team.robots])[tracks.robot]
     beyond = np.maximum(-0.5 - tracks.uv, tracks.uv - (size - 0.5)).max(axis=1)

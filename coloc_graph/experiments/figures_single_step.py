@@ -113,7 +113,7 @@ def _draw_means(axes: Axes, cells: Sequence[Cell], method: str) -> None:
     means = [cell.mean_cm(estimates_of(cell, method)) for cell in cells]
     axes.plot(
         range(len(cells)), means, linestyle="", marker="o", markersize=6.5, markerfacecolor="#00000055",
-        markeredgecolor="white", markeredgewidth=1.6, zorder=4, gid="mean",
+        markeredgecolor="white", markeredgewidth=1.6, zorder=4, gid="mean", clip_on=False,
         path_effects=[withStroke(linewidth=3.2, foreground="#000000aa")],
     )  # fmt: skip
     for column, mean in enumerate(means):

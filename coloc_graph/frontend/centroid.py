@@ -17,6 +17,8 @@ MAX_ITERATIONS = 12
 CONVERGED = 1e-3
 #: No spot is narrower than this [px^2]: a lens and a pixel blur as much.
 LEAST_VARIANCE = 0.1
+#: Nor wider than this [px^2].
+MOST_VARIANCE = 400.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,59 +48,72 @@ def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_ga
     n, height, width = light.shape
     x, y = np.arange(width, dtype=float), np.arange(height, dtype=float)
 
-    first = np.where(inner, signal, 0.0)
+    first = signal * inner
     total = np.maximum(first.sum(axis=(1, 2)), 1e-9)
     centre = np.stack([(first.sum(axis=1) @ x) / total, (first.sum(axis=2) @ y) / total], axis=1)
     round_shape = np.maximum(inner.sum(axis=(1, 2)) / (2 * np.pi), 0.6)[:, None, None] * np.eye(2)
     shape, found = round_shape.copy(), np.ones(n, bool)
+    gain = np.broadcast_to(2 * np.eye(2), (n, 2, 2)).copy()
+    total = np.ones(n)
     going = np.arange(n)
     for _ in range(MAX_ITERATIONS):
-        w, dx, dy = _window(centre[going], shape[going], x, y)
-        ws = w * signal[going]
-        total = ws.sum(axis=(1, 2))
-        found[going[total <= 0]] = False
-        total = np.maximum(total, 1e-9)
-        columns, rows = ws.sum(axis=1), ws.sum(axis=2)
-        # a Gaussian spot in a window of its own shape: half its shift and half its moments are seen
-        step = 2 * np.stack([(columns * dx).sum(-1), (rows * dy).sum(-1)], axis=1) / total[:, None]
-        xx, yy = (columns * dx * dx).sum(-1), (rows * dy * dy).sum(-1)
-        xy = ((ws @ dx[..., None])[..., 0] * dy).sum(-1)
-        seen = 2 * np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2) / total[:, None, None]
-        narrow = ~(_least_eigenvalue(seen) >= LEAST_VARIANCE)
-        shape[going] = np.where(narrow[:, None, None], round_shape[going], seen)
+        window = shape[going][:, [0, 1], [0, 1]]
+        moments = _moments(signal[going], *_windows(centre[going], window, x, y))
+        total[going] = moments[:, 0, 0]
+        inside = np.maximum(moments[:, 0, 0], 1e-9)
+        mean = np.stack([moments[:, 0, 1], moments[:, 1, 0]], axis=1) / inside[:, None]
+        spread = np.stack([moments[:, 0, 2], moments[:, 1, 1], moments[:, 1, 1], moments[:, 2, 0]], axis=1)
+        seen = (spread / inside[:, None]).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None, :]
+        # of a Gaussian spot in a Gaussian window their precisions add up, and so what is seen is undone
+        shape[going], gain[going] = _undone(seen, window, round_shape[going])
+        step = (gain[going] @ mean[:, :, None])[:, :, 0]
         centre[going] += np.clip(step, -1.0, 1.0)
-        going = going[np.abs(step).max(axis=1) >= CONVERGED]
+        going = going[(np.abs(step).max(axis=1) >= CONVERGED) & (total[going] > 0)]
         if not len(going):
             break
 
-    w, dx, dy = _window(centre, shape, x, y)
-    total = np.maximum((w * signal).sum(axis=(1, 2)), 1e-9)
-    weight = w * w * (noise[:, None, None] ** 2 + shot_gain * np.maximum(signal, 0.0))
-    columns, rows = weight.sum(axis=1), weight.sum(axis=2)
-    xx, yy = (columns * dx * dx).sum(-1), (rows * dy * dy).sum(-1)
-    xy = ((weight @ dx[..., None])[..., 0] * dy).sum(-1)
+    wx, wy, dx, dy = _windows(centre, shape[:, [0, 1], [0, 1]], x, y)
+    shot = _moments(np.maximum(signal, 0.0), wx * wx, wy * wy, dx, dy)
+    even = _moments(np.ones((1, height, width)), wx * wx, wy * wy, dx, dy)
+    variance = (noise**2)[:, None, None] * even + shot_gain * shot
     # the background's own noise: a row (column) of it is the mean of four pixels, and off as a whole
-    xx += noise**2 / 4 * ((w.sum(axis=1) * dx) ** 2).sum(-1)
-    yy += noise**2 / 4 * ((w.sum(axis=2) * dy) ** 2).sum(-1)
-    covariance = 4 * np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2) / (total**2)[:, None, None]
-    found &= np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(centre).all(axis=1)
+    xx = variance[:, 0, 2] + noise**2 / 4 * wy.sum(1) ** 2 * ((wx * dx) ** 2).sum(1)
+    yy = variance[:, 2, 0] + noise**2 / 4 * wx.sum(1) ** 2 * ((wy * dy) ** 2).sum(1)
+    of_mean = np.stack([xx, variance[:, 1, 1], variance[:, 1, 1], yy], axis=1).reshape(-1, 2, 2)
+    covariance = gain @ of_mean @ gain.mT / np.maximum(total**2, 1e-9)[:, None, None]
+    found &= (total > 0) & np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(centre).all(axis=1)
     return Spots(centre, covariance, shape, signal, noise, found)
 
 
-def _window(centre: Array, shape: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Gaussian windows (n, h, w), and the distances dx (n, w), dy (n, h) from their centres."""
+def _windows(centre: Array, variances: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """A Gaussian window's factors (n, w) and (n, h), and the distances from its centre along x and y.
+
+    Its axes are the image's: it is then a product, and moments are two small matrix products.
+    """
     dx, dy = x - centre[:, :1], y - centre[:, 1:]
-    a, b, c = shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]
+    return np.exp(-0.5 / variances[:, :1] * dx * dx), np.exp(-0.5 / variances[:, 1:] * dy * dy), dx, dy
+
+
+def _moments(light: Array, wx: Array, wy: Array, dx: Array, dy: Array) -> Array:
+    """Moments (n, 3, 3) of windowed light: [i, j] is the sum over the window of wy dy^i light wx dx^j."""
+    in_y = np.stack([wy, wy * dy, wy * dy * dy], axis=1)
+    in_x = np.stack([wx, wx * dx, wx * dx * dx], axis=2)
+    return np.asarray(in_y @ light @ in_x)
+
+
+def _undone(seen: Array, window: Array, otherwise: Array) -> tuple[Array, Array]:
+    """A spot's own moments (n, 2, 2) from those seen through a window with variances (n, 2), and by how much a
+    shift of the spot is more than is seen of it (n, 2, 2); `otherwise` where the moments are no spot's."""
+    det = seen[:, 0, 0] * seen[:, 1, 1] - seen[:, 0, 1] ** 2
+    det = np.where(det > 1e-6, det, np.inf)
+    a, c = seen[:, 1, 1] / det - 1 / window[:, 0], seen[:, 0, 0] / det - 1 / window[:, 1]
+    b = -seen[:, 0, 1] / det
     det = a * c - b * b
-    exponent = (-0.5 * c / det)[:, None, None] * (dx * dx)[:, None, :]
-    exponent = exponent + (-0.5 * a / det)[:, None, None] * (dy * dy)[:, :, None]
-    exponent += (b / det)[:, None, None] * dx[:, None, :] * dy[:, :, None]
-    return np.exp(exponent), dx, dy
-
-
-def _least_eigenvalue(M: Array) -> Array:
-    half = (M[:, 0, 0] + M[:, 1, 1]) / 2
-    return np.asarray(half - np.hypot((M[:, 0, 0] - M[:, 1, 1]) / 2, M[:, 0, 1]))
+    spot = np.stack([c, -b, -b, a], axis=1).reshape(-1, 2, 2) / np.where(det > 0, det, np.inf)[:, None, None]
+    half, apart = (spot[:, 0, 0] + spot[:, 1, 1]) / 2, np.hypot((spot[:, 0, 0] - spot[:, 1, 1]) / 2, spot[:, 0, 1])
+    good = (a > 0) & (det > 0) & (half - apart >= LEAST_VARIANCE) & (half + apart < MOST_VARIANCE)
+    shape = np.where(good[:, None, None], spot, otherwise)
+    return shape, np.eye(2) + shape / window[:, None, :]
 
 
 def axes(shape: Array) -> tuple[Array, Array, Array]:

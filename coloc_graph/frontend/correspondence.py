@@ -100,12 +100,34 @@ def _chosen(
             "let the moving robot turn and drive further, and look for reflections"
         )
     if not chosen:
-        raise DegenerateGeometry(
-            f"{tracks_i[0].robot if tracks_i else 'one observer'} and "
-            f"{tracks_j[0].robot if tracks_j else 'the other'} never see a marker at the same instant "
-            "(within 5 ms): bring the mover into both fields of view, and check the clocks"
-        )
+        raise DegenerateGeometry(_why_none(tracks_i, tracks_j, candidates.window))
     return chosen, candidates.join(chosen)
+
+
+def _why_none(tracks_i: Sequence[Track], tracks_j: Sequence[Track], window: float) -> str:
+    if not tracks_i or not tracks_j:
+        seeing = next((track.robot for track in (*tracks_i, *tracks_j)), None)
+        who = "both saw none" if seeing is None else f"{seeing} alone saw one"
+        return (
+            f"the observers never see a marker at the same instant, since {who}: bring the mover into both fields of "
+            "view, and check the cameras"
+        )
+    i, j = tracks_i[0].robot, tracks_j[0].robot
+    names_i, names_j = ({track.marker for track in tracks} for tracks in (tracks_i, tracks_j))
+    if all(names_i | names_j) and not names_i & names_j:
+        return (
+            f"no marker name is shared: {i} saw {_listed(names_i)} and {j} saw {_listed(names_j)}: "
+            "give the same marker the same name in every camera"
+        )
+    return (
+        f"{i} and {j} never see a marker at the same instant (within {1e3 * window:.0f} ms): "
+        "bring the mover into both fields of view, and check the clocks"
+    )
+
+
+def _listed(names: set[str]) -> str:
+    shown = ", ".join(f"`{name}`" for name in sorted(names)[:3])
+    return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 class _Candidates:
@@ -130,6 +152,7 @@ class _Candidates:
         self.indices: dict[tuple[int, int], NDArray[np.int64]] = {}
         self._clock = clock
         offset, window = (0.0, PAIRING_WINDOW) if clock is None else (clock[0], LONGEST_GAP / 2)
+        self.window = window
         self._slopes = [np.empty((0, 2))] * len(self._j)
         if clock is not None:
             self._slopes = [_speed(track.times, x[0]) for track, x in zip(self._j, self._x_j, strict=True)]

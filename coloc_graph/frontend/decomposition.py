@@ -27,8 +27,11 @@ def decompose_with_normal(H: ArrayLike, N: ArrayLike, d: ArrayLike) -> tuple[Arr
     W U^T is a rotation. With noise N is made orthogonal for U; T is made of W U^T as the paper prints it, and R
     is the rotation nearest to it.
     """
-    H, N, d = metric_scale(H), np.asarray(N, float), np.asarray(d, float)
-    v2 = np.linalg.svd(H)[2][..., 1, :]
+    H, N, d = np.asarray(H, float), np.asarray(N, float), np.asarray(d, float)
+    # the middle eigenvector and eigenvalue of H^T H are the middle right singular vector and value, squared
+    squares, vectors = np.linalg.eigh(H.mT @ H)
+    v2 = vectors[..., 1]
+    H = H * (np.sign(np.linalg.det(H)) / np.sqrt(squares[..., 1]))[..., None, None]
     N_level = N - np.sum(N * v2, -1, keepdims=True) * v2
     N_level = N_level / np.linalg.norm(N_level, axis=-1, keepdims=True)
     u = np.cross(N_level, v2)

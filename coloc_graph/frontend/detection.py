@@ -23,6 +23,8 @@ Box = tuple[int, int, int, int]
 
 #: How far around a box is looked at [px]: more than the radius of the largest blob, and its margin.
 BORDER = 20
+#: How far around a box is looked at first [px].
+RIM = 4
 #: Pixels between a candidate and the border of its window.
 MARGIN = 3
 #: Windows come in these sizes [px], so that many are measured at once.
@@ -112,22 +114,29 @@ class Detector:
         u0, v0 = (max(box[0] - BORDER, 0), max(box[1] - BORDER, 0)) if box else (0, 0)
         light = self.light(image[v0 : box[3] + BORDER, u0 : box[2] + BORDER] if box else image)
         t = self.threshold
-        # a few hundred pixels tell the median as well as all of them do
-        coarse = max(1, min(light.shape) // 20)
-        few = light[::coarse, ::coarse].ravel()
-        level = float(np.partition(few, len(few) // 2)[len(few) // 2]) + t.levels
-        above = cv2.threshold(light, level, 255, cv2.THRESH_BINARY)[1]
-        if above.dtype != np.uint8:
-            above = above.astype(np.uint8)
-        n, _, stats, centres = cv2.connectedComponentsWithStats(above, connectivity=8, ltype=cv2.CV_16U)
+        if box is None:
+            area = (0, 0, light.shape[1], light.shape[0])
+        else:  # the box and a rim; what is cut by the rim is looked at again with all that is around
+            left, top = max(box[0] - RIM - u0, 0), max(box[1] - RIM - v0, 0)
+            area = (left, top, min(box[2] + RIM - u0, light.shape[1]), min(box[3] + RIM - v0, light.shape[0]))
+        part = light[area[1] : area[3], area[0] : area[2]]
+        # some fifty pixels tell the median to a grey level, and a small list is sorted faster than an array
+        coarse = max(1, min(part.shape) // 6)
+        few = sorted(part[::coarse, ::coarse].ravel().tolist())
+        level = float(few[len(few) // 2]) + t.levels
+        blobs = _components(part, level)
+        if box is not None and any(_cut_off(blob, area, light.shape) for blob, _ in blobs):
+            area = (0, 0, light.shape[1], light.shape[0])
+            blobs = _components(light, level)
         found = []
-        for (left, top, width, height, area), (x, y) in zip(stats.tolist()[1:n], centres.tolist()[1:n], strict=True):
-            u, v = x + u0, y + v0
+        for (left, top, width, height, pixels), (x, y) in blobs:
+            left, top = left + area[0], top + area[1]
+            u, v = x + area[0] + u0, y + area[1] + v0
             inside = box is None or (box[0] - 1 <= u < box[2] + 1 and box[1] - 1 <= v < box[3] + 1)
-            if inside and t.min_area <= area <= t.max_area:
+            if inside and t.min_area <= pixels <= t.max_area:
                 clipped = left + u0 <= 0 or top + v0 <= 0
                 clipped |= left + u0 + width >= image.shape[1] or top + v0 + height >= image.shape[0]
-                found.append(_cut(light, (left, top, width, height), (u0, v0), (u, v), area, level, clipped))
+                found.append(_cut(light, (left, top, width, height), (u0, v0), (u, v), pixels, level, clipped))
         return found
 
     def measure(self, candidates: Sequence[Candidate]) -> tuple[Blobs, NDArray[np.bool_]]:
@@ -168,6 +177,28 @@ class Detector:
         flags[(long > 1.4 * short) & (middle < DIP * side)] |= np.uint8(Flag.MERGED)
         corners = np.array([one.corner for one in candidates], float)
         return spots.centre + corners, spots.covariance, flags, peak, real
+
+
+def _components(
+    light: NDArray[np.uint8] | NDArray[np.float32], level: float
+) -> list[tuple[list[int], list[float]]]:
+    """Connected pixels above a level: (left, top, width, height, pixels) and the centre of area of each."""
+    above = cv2.threshold(light, level, 255, cv2.THRESH_BINARY)[1]
+    if above.dtype != np.uint8:
+        above = above.astype(np.uint8)
+    _, _, stats, centres = cv2.connectedComponentsWithStats(above, connectivity=8, ltype=cv2.CV_16U)
+    return list(zip(stats[1:].tolist(), centres[1:].tolist(), strict=True))
+
+
+def _cut_off(blob: list[int], area: Box, shape: tuple[int, ...]) -> bool:
+    """Whether a blob ends at the border of the area searched, where the light (h, w) goes on."""
+    left, top, width, height, _ = blob
+    return (
+        (left == 0 and area[0] > 0)
+        or (top == 0 and area[1] > 0)
+        or (left + width == area[2] - area[0] and area[2] < shape[1])
+        or (top + height == area[3] - area[1] and area[3] < shape[0])
+    )
 
 
 def _cut(

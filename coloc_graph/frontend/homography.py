@@ -9,6 +9,7 @@ Two criteria (Hartley and Zisserman, "Multiple View Geometry", section 4.2):
 The coordinates of a homography are those of sl(3) on the right: H exp(h), `lie.SL3_BASIS`.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -32,6 +33,8 @@ WIDEST_SCALE = 25.0
 COLLINEAR_SIGMAS = 5.0
 #: The share of the points that have to lie off it.
 LEAST_OFF_LINE = 0.15
+#: A spread across that is less than this share of the spread along is a straight line, whatever the noise.
+STRAIGHT = 0.03
 MINIMUM_POINTS = 6
 #: A fit has converged when a step lowers chi2 by less than this. The next one would lower it by about the square
 #: of it times 1e-4 (measured); the first one, from z = x_i, does not count.
@@ -119,7 +122,7 @@ def shared_error(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64
     """
     among, groups = pairs[fit.inliers], groups[fit.inliers]
     at = _linearise(fit.H, among.x_i, among)
-    rows = _rows(at, among.x_i)
+    rows = _whitened_rows(at, among.x_i)
     weighted = np.linalg.inv(rows @ rows.mT) @ rows
     in_i, in_j = (root[fit.inliers] for root in roots)
     added = np.zeros((8, 8))
@@ -135,20 +138,39 @@ def shared_error(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64
 
 def _inliers(squared: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Points within the gate, which widens with the typical residual of those that agree so far."""
-    scale = np.median(squared[among]) / MEDIAN_CHI2 if among.any() else 1.0
-    return np.asarray(squared < INLIER_GATE * np.clip(scale, 1.0, WIDEST_SCALE))
+    own = squared[among]
+    scale = np.partition(own, len(own) // 2)[len(own) // 2] / MEDIAN_CHI2 if len(own) else 1.0
+    return np.asarray(squared < INLIER_GATE * min(max(scale, 1.0), WIDEST_SCALE))
 
 
-def _off_line(x: Array, sigma: float) -> int:
-    """How many points (n, 2) lie off the line that most of them fit best."""
+@dataclass(frozen=True)
+class _Spread:
+    """How points lie about the line that most of them fit best.
+
+    `off` counts those off it, `across` and `along` are the RMS spreads of the most.
+    """
+
+    off: int
+    across: float
+    along: float
+
+
+def _spread(x: Array, sigma: float) -> _Spread:
+    """The spread of points (n, 2) about a line, `sigma` being their noise."""
     near = x
     for _ in range(2):
         centre = near.mean(axis=0)
         (xx, xy), (_, yy) = (near - centre).T @ (near - centre)
         angle = 0.5 * np.arctan2(2 * xy, xx - yy)
         across = np.abs((x - centre) @ (-np.sin(angle), np.cos(angle)))
-        near = x[across <= np.partition(across, int(0.8 * len(x)))[int(0.8 * len(x))]]
-    return int(np.count_nonzero(across > COLLINEAR_SIGMAS * sigma))
+        close = across <= np.partition(across, int(0.8 * len(x)))[int(0.8 * len(x))]
+        near = x[close]
+    along = (near - centre) @ (np.cos(angle), np.sin(angle))
+    return _Spread(
+        off=int(np.count_nonzero(across > COLLINEAR_SIGMAS * sigma)),
+        across=float(np.sqrt((across[close] ** 2).mean())),
+        along=float(along.std()),
+    )
 
 
 def _require_points(n: int, of: int) -> None:
@@ -159,9 +181,20 @@ def _require_points(n: int, of: int) -> None:
 
 def _require_spread(pairs: PointPairs, sigma: float) -> None:
     # a few false pairs off a line must not pass for a spread: much of what decides has to be off it
-    least = max(4, LEAST_OFF_LINE * len(pairs))
-    if any(_off_line(x, sigma) < least for x in (pairs.x_i, pairs.x_j)):
-        raise DegenerateGeometry("the tracks lie on one line (the moving robot drove a straight line): let it turn")
+    least = max(4, math.ceil(LEAST_OFF_LINE * len(pairs)))
+    # points on a line in one image are on a line in the other
+    spread = _spread(pairs.x_i, sigma)
+    if spread.off < least:
+        if spread.along < COLLINEAR_SIGMAS * sigma:
+            raise DegenerateGeometry("the markers hardly moved: let the moving robot drive further, and turn")
+        if spread.across < STRAIGHT * spread.along:
+            raise DegenerateGeometry("the tracks lie on one line (the moving robot drove a straight line): let it turn")
+        raise DegenerateGeometry(
+            f"{len(pairs)} points are too few or too noisy for a homography: they spread by "
+            f"{spread.across / sigma:.1f} sigma of their noise across the line that most fit best, and {spread.off} "
+            f"of them lie more than {COLLINEAR_SIGMAS:.0f} sigma off it, where {least} must: record more points, "
+            "spread over the plane, or detect them better"
+        )
 
 
 def _magsac(pairs: PointPairs, sigma: float) -> Array:
@@ -195,16 +228,32 @@ class _Linearised:
         return np.stack([np.stack([b00, b01], -1), np.stack([b10, b11], -1)], -2)
 
 
-def _linearise(H: Array, z: Array, pairs: PointPairs) -> _Linearised:
+def _project(H: Array, z: Array) -> tuple[Array, Array, tuple[Array, ...]]:
+    """pi(H z), x and y (..., n) apart, and the six entries (..., n) of d pi(D z) / dD at D = H, row by row."""
     # component by component: numpy's stacks of 2x2 products cost more than all of this
     h = [[H[..., i, j, None] for j in range(3)] for i in range(3)]
     x, y = z[..., 0], z[..., 1]
     w = 1 / (h[2][0] * x + h[2][1] * y + h[2][2])
     p0 = (h[0][0] * x + h[0][1] * y + h[0][2]) * w
     p1 = (h[1][0] * x + h[1][1] * y + h[1][2]) * w
-    b00, b01, b02 = ((h[0][j] - p0 * h[2][j]) * w for j in range(3))
-    b10, b11, b12 = ((h[1][j] - p1 * h[2][j]) * w for j in range(3))
-    r0, r1 = pairs.x_i[..., 0] - x, pairs.x_i[..., 1] - y
+    b0 = [(h[0][j] - p0 * h[2][j]) * w for j in range(3)]
+    b1 = [(h[1][j] - p1 * h[2][j]) * w for j in range(3)]
+    return p0, p1, (*b0, *b1)
+
+
+def _linearise(H: Array, z: Array, pairs: PointPairs) -> _Linearised:
+    p0, p1, b = _project(H, z)
+    b00, b01, _, b10, b11, _ = b
+    r0, r1 = pairs.x_i[..., 0] - z[..., 0], pairs.x_i[..., 1] - z[..., 1]
+    g0, g1, k = _whitening(b, pairs)
+    e0 = (pairs.x_j[..., 0] - p0 - b00 * r0 - b01 * r1) * g0
+    e1 = (pairs.x_j[..., 1] - p1 - b10 * r0 - b11 * r1 - k * e0) * g1
+    return _Linearised(b, (r0, r1), e0, e1, g0, g1, k)
+
+
+def _whitening(b: tuple[Array, ...], pairs: PointPairs) -> tuple[Array, Array, Array]:
+    """g0, g1, k (..., n): the Cholesky factor's inverse of both images' noise as image j sees it."""
+    b00, b01, _, b10, b11, _ = b
     c_i, c_j = pairs.covariance_i, pairs.covariance_j
     c00, c01, c11 = c_i[..., 0, 0], c_i[..., 0, 1], c_i[..., 1, 1]
     m00, m01 = b00 * c00 + b01 * c01, b00 * c01 + b01 * c11
@@ -213,26 +262,26 @@ def _linearise(H: Array, z: Array, pairs: PointPairs) -> _Linearised:
     s11 = c_j[..., 1, 1] + b10 * (b10 * c00 + 2 * b11 * c01) + b11 * b11 * c11
     g0 = 1 / np.sqrt(s00)
     k = s01 * g0
-    g1 = 1 / np.sqrt(s11 - k * k)
-    e0 = (pairs.x_j[..., 0] - p0 - b00 * r0 - b01 * r1) * g0
-    e1 = (pairs.x_j[..., 1] - p1 - b10 * r0 - b11 * r1 - k * e0) * g1
-    return _Linearised((b00, b01, b02, b10, b11, b12), (r0, r1), e0, e1, g0, g1, k)
+    return g0, 1 / np.sqrt(s11 - k * k), k
 
 
-def _rows(at: _Linearised, z: Array, *, whiten: bool = True) -> Array:
-    """d pi(H exp(h) z) / dh at h = 0, whitened, (..., 8, 2n): first all x, then all y. `lie.SL3_BASIS`'s order."""
-    b00, b01, b02, b10, b11, b12 = at.b
-    if whiten:
-        b00, b01, b02 = b00 * at.g0, b01 * at.g0, b02 * at.g0
-        b10, b11, b12 = (b10 - at.k * b00) * at.g1, (b11 - at.k * b01) * at.g1, (b12 - at.k * b02) * at.g1
+def _rows(b: tuple[Array, ...], z: Array) -> Array:
+    """d pi(H exp(h) z) / dh at h = 0, (..., 8, 2n): first all x, then all y. `lie.SL3_BASIS`'s order."""
     x, y = z[..., 0], z[..., 1]
     n = z.shape[-2]
     rows = np.empty((*z.shape[:-2], 8, 2 * n))
-    for half, u, v, w in ((slice(0, n), b00, b01, b02), (slice(n, None), b10, b11, b12)):
+    for half, (u, v, w) in ((slice(0, n), b[:3]), (slice(n, None), b[3:])):
         vy = v * y
         for index, entry in enumerate((u * y, u, v * x, v, w * x, w * y, u * x - vy, vy - w)):
             rows[..., index, half] = entry
     return rows
+
+
+def _whitened_rows(at: _Linearised, z: Array) -> Array:
+    """`_rows` over the noise."""
+    upper = [entry * at.g0 for entry in at.b[:3]]
+    lower = [(entry - at.k * above) * at.g1 for entry, above in zip(at.b[3:], upper, strict=True)]
+    return _rows((*upper, *lower), z)
 
 
 def _latent_step(at: _Linearised, left: Array, pairs: PointPairs) -> Array:
@@ -278,7 +327,7 @@ def _reprojection(pairs: PointPairs, H: Array, max_iterations: int) -> tuple[Arr
     z = pairs.x_i
     for iteration in range(1, max_iterations + 1):
         at = _linearise(H, z, pairs)
-        rows = _rows(at, z)
+        rows = _whitened_rows(at, z)
         residual = np.concatenate([at.e0, at.e1], axis=-1)
         information = rows @ rows.mT
         gradient = (rows @ residual[..., None])[..., 0]
@@ -291,25 +340,36 @@ def _reprojection(pairs: PointPairs, H: Array, max_iterations: int) -> tuple[Arr
 
 
 def _transfer(pairs: PointPairs, H: Array, max_iterations: int) -> tuple[Array, Array, int]:
-    limit = 1e-4 * pairs.sigma**2
+    H, iterations, b, rows = _least_squares(pairs, H, max_iterations)
+    # unweighted least squares is not efficient: its covariance is the sandwich of the noise it did not weigh
+    normal = rows @ rows.mT
+    g0, g1, k = (part[..., None, :] for part in _whitening(b, pairs))
+    n = pairs.x_i.shape[-2]
+    first, second = rows[..., :n], rows[..., n:]
+    coloured = np.concatenate([first / g0 + second * k, second / g1], axis=-1)
+    noise = coloured @ coloured.mT
+    return H, np.asarray(normal @ np.linalg.solve(noise, normal), float), iterations
+
+
+def least_squares(pairs: PointPairs) -> Array:
+    """The paper's homographies (..., 3, 3) of points without outliers, many at once: "transfer", determinant 1."""
+    return _least_squares(pairs, direct(pairs), 20)[0]
+
+
+def _least_squares(
+    pairs: PointPairs, H: Array, max_iterations: int
+) -> tuple[Array, int, tuple[Array, ...], Array]:
+    limit = 3 * CONVERGED * pairs.sigma**2  # here nothing latent lags behind
     for iteration in range(1, max_iterations + 1):
-        at = _linearise(H, pairs.x_i, pairs)
-        rows = _rows(at, pairs.x_i, whiten=False)
-        residual = np.concatenate([at.e0 / at.g0, at.e1 / at.g1 + at.k * at.e0], axis=-1)
-        normal = rows @ rows.mT
+        p0, p1, b = _project(H, pairs.x_i)
+        rows = _rows(b, pairs.x_i)
+        residual = np.concatenate([pairs.x_j[..., 0] - p0, pairs.x_j[..., 1] - p1], axis=-1)
         gradient = (rows @ residual[..., None])[..., 0]
-        step = _solve(normal, gradient)
+        step = _solve(rows @ rows.mT, gradient)
         H = H + H @ sl3_hat(step)
         if (step * gradient).sum(-1).max() < limit:
             break
-    # unweighted least squares is not efficient: its covariance is the sandwich of the noise it did not weigh
-    n = pairs.x_i.shape[-2]
-    first, second = rows[..., :n], rows[..., n:]
-    coloured = np.concatenate(
-        [first / at.g0[..., None, :] + second * at.k[..., None, :], second / at.g1[..., None, :]], axis=-1
-    )
-    noise = coloured @ coloured.mT
-    return sl3_normalise(H), np.asarray(normal @ np.linalg.solve(noise, normal), float), iteration
+    return sl3_normalise(H), iteration, b, rows
 
 
 def squared_residuals(H: Array, pairs: PointPairs) -> Array:
@@ -326,27 +386,27 @@ def direct(pairs: PointPairs) -> Array:
 
     Hartley, "In Defense of the Eight-Point Algorithm", 1997. Vectorised over leading axes.
     """
-    S_i, S_j = _similarity(pairs.x_i), _similarity(pairs.x_j)
-    u, v = np.moveaxis(pairs.x_i @ S_i[..., :2, :2].mT + S_i[..., None, :2, 2], -1, 0)
-    x, y = np.moveaxis(pairs.x_j @ S_j[..., :2, :2].mT + S_j[..., None, :2, 2], -1, 0)
-    zero, one = np.zeros_like(u), np.ones_like(u)
-    rows = np.concatenate(
-        [
-            np.stack([u, v, one, zero, zero, zero, -x * u, -x * v, -x], axis=-1),
-            np.stack([zero, zero, zero, u, v, one, -y * u, -y * v, -y], axis=-1),
-        ],
-        axis=-2,
-    )
-    H = np.linalg.eigh(rows.mT @ rows)[1][..., 0].reshape(*u.shape[:-1], 3, 3)
+    S_i, (u, v) = _similarity(pairs.x_i)
+    S_j, (x, y) = _similarity(pairs.x_j)
+    n = u.shape[-1]
+    rows = np.zeros((*u.shape[:-1], 8, 2 * n))
+    for half, first, seen in ((slice(0, n), 0, x), (slice(n, None), 3, y)):
+        rows[..., first, half], rows[..., first + 1, half], rows[..., first + 2, half] = u, v, 1.0
+        rows[..., 6, half], rows[..., 7, half] = -seen * u, -seen * v
+    # with both centres at the origin the last entry is not near 0, and may be set to 1
+    h = np.linalg.solve(rows @ rows.mT, rows @ np.concatenate([x, y], axis=-1)[..., None])[..., 0]
+    H = np.concatenate([h, np.ones_like(h[..., :1])], axis=-1).reshape(*u.shape[:-1], 3, 3)
     return sl3_normalise(np.linalg.inv(S_j) @ H @ S_i)
 
 
-def _similarity(x: Array) -> Array:
-    """Moves points (..., n, 2) to the origin and to a spread of one, (..., 3, 3)."""
-    middle = x.mean(axis=-2)
-    scale = np.sqrt(2) / np.sqrt(((x - middle[..., None, :]) ** 2).sum(-1).mean(-1))
-    S = np.zeros((*x.shape[:-2], 3, 3))
-    S[..., 0, 0] = S[..., 1, 1] = scale
-    S[..., :2, 2] = -scale[..., None] * middle
+def _similarity(points: Array) -> tuple[Array, tuple[Array, Array]]:
+    """What moves points (..., n, 2) to the origin and to a spread of one, (..., 3, 3), and the moved x and y."""
+    x, y = points[..., 0], points[..., 1]
+    mean_x, mean_y = x.mean(axis=-1, keepdims=True), y.mean(axis=-1, keepdims=True)
+    x, y = x - mean_x, y - mean_y
+    scale = np.sqrt(2 / (x * x + y * y).mean(axis=-1, keepdims=True))
+    S = np.zeros((*points.shape[:-2], 3, 3))
+    S[..., 0, 0] = S[..., 1, 1] = scale[..., 0]
+    S[..., 0, 2], S[..., 1, 2] = -(scale * mean_x)[..., 0], -(scale * mean_y)[..., 0]
     S[..., 2, 2] = 1.0
-    return S
+    return S, (x * scale, y * scale)

@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 # axes across it (2), the distance (1), and of each mount height, tilt, roll (3 + 3).
 _H, _NORMAL, _D, _MOUNT_I, _MOUNT_J = slice(0, 8), slice(8, 10), 10, slice(11, 14), slice(14, 17)
 
+#: A baseline that is certainly shorter than this share of the plane's distance is none.
+SHORT_BASELINE = 0.2
+
 
 def relative_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount, plane: Plane) -> RelativePose:
     """Eq. (2) on a homography measurement, both SVD solutions beside it, and a first-order covariance.
@@ -54,12 +57,21 @@ def relative_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: M
 def _require_baseline(measurement: HomographyMeasurement, H: Array) -> None:
     """H of a pure rotation is a rotation: v2 and with it eq. (2) are then undetermined."""
     s = np.linalg.svd(H, compute_uv=False)
-    noise = np.sqrt(np.linalg.eigvalsh(np.linalg.inv(measurement.information)).max())
-    if s[0] - s[2] < 3 * noise:
+    baseline = s[0] - s[2]  # in units of the plane's distance d
+    noise = 3 * np.sqrt(np.linalg.eigvalsh(np.linalg.inv(measurement.information)).max())
+    if baseline >= noise:
+        return
+    pair = f"the homography between {measurement.robot_i} and {measurement.robot_j}"
+    if baseline + noise < SHORT_BASELINE:
         raise DegenerateGeometry(
-            f"the homography between {measurement.robot_i} and {measurement.robot_j} is that of a pure rotation, so "
+            f"{pair} is that of a pure rotation, so "
             "that there is no baseline to measure: place the two observers further apart"
         )
+    raise DegenerateGeometry(
+        f"{pair}, made of {measurement.points} points, is too noisy to tell a baseline (it seems "
+        f"{baseline:.2g} of the camera's distance from the marker plane long, give or take {noise:.2g}): record more "
+        "points, spread over the plane, detect them better, or place the observers further apart"
+    )
 
 
 def _root_covariance(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount, plane: Plane) -> Array:

@@ -4,6 +4,7 @@ Each track searches a patch (40x40 by default) centred at x_k + (x_k - x_{k-1});
 start, after a loss, and from time to time for markers that came into view.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -191,13 +192,13 @@ class MarkerTracker:
         """For each track the blob it goes on to: the least total distance, none farther than half a patch."""
         if not predicted or not places:
             return [None] * len(predicted)
-        distance = np.hypot(*(np.array(predicted)[:, None] - np.array(places)[None]).transpose(2, 0, 1))
         gate = self._options.patch / 2
-        near = distance < gate
-        if (near.sum(axis=0) <= 1).all() and (near.sum(axis=1) <= 1).all():  # nothing to decide
-            return [int(row.argmax()) if row.any() else None for row in near]
+        near = [[math.dist(one, place) < gate for place in places] for one in predicted]
+        if all(sum(row) <= 1 for row in near) and all(sum(column) <= 1 for column in zip(*near, strict=True)):
+            return [row.index(True) if any(row) else None for row in near]  # nothing to decide
+        distance = np.hypot(*(np.array(predicted)[:, None] - np.array(places)[None]).transpose(2, 0, 1))
         rows, columns = linear_sum_assignment(np.minimum(distance, gate))
-        chosen = {int(r): int(c) for r, c in zip(rows, columns, strict=True) if near[r, c]}
+        chosen = {int(r): int(c) for r, c in zip(rows, columns, strict=True) if near[r][c]}
         return [chosen.get(row) for row in range(len(predicted))]
 
     def _park(self) -> None:

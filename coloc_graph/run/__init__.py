@@ -4,8 +4,9 @@ A run is one MCAP file that Foxglove opens; docs/run-format.md says what is in i
 `read_true_team` are for evaluation alone.
 """
 
+from coloc_graph.run.index import is_mcap
 from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Stance
-from coloc_graph.run.reader import Run, open_run, read_true_team, read_truth
+from coloc_graph.run.reader import Run, open_run, read_true_team, read_truth, run_id
 from coloc_graph.run.writer import RunWriter, whole_run
 
 __all__ = [
@@ -18,8 +19,10 @@ __all__ = [
     "Run",
     "RunWriter",
     "Stance",
+    "is_mcap",
     "open_run",
     "read_true_team",
     "read_truth",
+    "run_id",
     "whole_run",
 ]

@@ -44,6 +44,12 @@ class Index:
     lost: int | None
 
 
+def is_mcap(path: Path) -> bool:
+    """Whether a file begins as an MCAP file does."""
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC
+
+
 def build_index(path: Path) -> Index:
     """The index of an MCAP file, whole or cut off; RunError where it is damaged or is none."""
     if path.exists() and not path.is_file():

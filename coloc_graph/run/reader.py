@@ -1,5 +1,6 @@
 """`open_run` and the `Run` it gives; `read_truth` and `read_true_team`, which are for evaluation alone."""
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,8 +16,11 @@ from coloc_graph.run.topics import Item, decoded, read_topic, time_span
 from coloc_graph.team import Team
 from coloc_graph.trajectory import Trajectory
 
+#: A run's id is made of at most so many bytes.
+MAX_IDENTIFYING = 1 << 20
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Run:
     """What a team recorded, read when it is asked for; it holds no open file. Truth is out of its reach.
 
@@ -37,6 +41,11 @@ class Run:
     start: float | None
     end: float | None
     _index: Index = field(repr=False)
+
+    def __repr__(self) -> str:
+        seconds = 0.0 if self.start is None or self.end is None else self.end - self.start
+        robots, stances = ", ".join(self.team.names), len(self.stances)
+        return f"Run({str(self.path)!r}, robots {robots}, {stances} stance{'s' * (stances != 1)} in {seconds:.1f} s)"
 
     def images(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Image]:
         """The images of a robot's camera."""
@@ -133,6 +142,18 @@ def read_true_team(path: str | Path) -> Team | None:
     return _read_team(build_index(Path(path)), schemas.TRUE_TEAM_TOPIC)
 
 
+def run_id(path: str | Path) -> str:
+    """What tells a run from every other: the same for its file moved, copied or cut off, whatever the name.
+
+    The SHA-256 of the file up to the end of its second chunk, of 1 MiB at most: the team, and the first data.
+    """
+    index = build_index(Path(path))
+    last = index.chunks[min(1, len(index.chunks) - 1)] if index.chunks else None
+    size = MAX_IDENTIFYING if last is None else min(last.offset + last.length, MAX_IDENTIFYING)
+    with index.path.open("rb") as file:
+        return hashlib.sha256(file.read(size)).hexdigest()
+
+
 def _clamped_ns(seconds: float) -> int:
     """Nanoseconds of a bound, which may lie outside of what a file can hold."""
     if np.isnan(seconds):
@@ -185,8 +206,11 @@ def _cut_off(index: Index) -> list[str]:
         return []
     reach = max(chunk.end for chunk in index.chunks)
     after = schemas.to_seconds(reach - min(chunk.start for chunk in index.chunks))
+    lost = "all that is in it could be read"
+    if index.lost:
+        lost = f"the last {index.lost} byte{'s' * (index.lost != 1)} could not be read"
     return [
-        f"{index.path}: was cut off, the last {index.lost} bytes could not be read; the data reach "
+        f"{index.path}: was cut off, or is still being written; {lost}; the data reach "
         f"{schemas.to_seconds(reach):.3f} s (UTC), {after:.3f} s after they begin"
     ]
 

@@ -225,6 +225,9 @@ def whole_run(
     path = Path(path)
     if path.is_dir():
         raise RunError(f"{path}: is a folder; give the path of a file")
+    if not path.parent.is_dir():
+        what = "is not a folder" if path.parent.exists() else "does not exist"
+        raise RunError(f"{path}: cannot be written, since {path.parent} {what}; make the folder, or give another")
     part = path.with_name(path.name + ".part")
     writer = RunWriter(part, team, image_format=image_format, flush_every=flush_every)
     try:

@@ -18,6 +18,8 @@ from coloc_graph.team import Team
 #: When every simulated run begins [UTC s].
 EPOCH = 1_700_000_000.0
 
+#: Fewer correspondences a stance make no homography; `frontend.homography` asks for as many.
+MINIMUM_POINTS = 6
 #: All stand still for this long [s] before and after the mover's drive; half of it belongs to the stance.
 REST = 0.5
 
@@ -109,8 +111,8 @@ def build_world(
     tracks, 1 by default or 3 where clocks differ. With `stopping` the mover stops and goes on its way at depth
     images. Raises `InputError` where the pair has no common view.
     """
-    if points < 4:
-        raise InputError(f"`points` is {points}; a homography needs at least 4 a stance")
+    if points < MINIMUM_POINTS:
+        raise InputError(f"`points` is {points}; a homography needs at least {MINIMUM_POINTS} a stance")
     if not (np.isfinite(fps) and fps > 0):
         raise InputError(f"`fps` is {fps}; give frames a second, above 0")
     if seed < 0:
