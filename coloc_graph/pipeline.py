@@ -84,7 +84,10 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
     measurements, clock_warnings = share_clock_offsets(_measure(run, options, progress), run.team.clock_sigma)
     poses = tuple(m.relative_pose for m in measurements if m.relative_pose is not None)
     if not poses:
-        raise EstimationError(f"{run.path}: no stance gives a relative pose; {_reasons(measurements)}")
+        unlikely = [f"; {what}" for what in _implausible(run, options, measurements)][:1]
+        raise EstimationError(
+            f"{run.path}: no stance gives a relative pose; {_reasons(measurements)}{''.join(unlikely)}"
+        )
     measured = time.perf_counter()
 
     graph = PoseGraph(run.team.reference, run.team.names, run.stances, poses, run.team.floor)

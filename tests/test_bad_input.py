@@ -82,7 +82,7 @@ def test_the_good_files_of_the_bad_ones_are_good(tmp_path, capsys):
     (tmp_path / "planes.csv").write_text(PLANES + "0,A,0,0.9,0.435889894,0.25\n")
     arguments = ["import", "tracks", "team.toml", "tracks.csv", "--planes", "planes.csv", "--out", "run.mcap"]
     assert main([str(tmp_path / one) if "." in one else one for one in arguments]) == 0
-    assert "16 rows, 1 stances, observers A, B" in capsys.readouterr().out
+    assert "16 rows, 1 stance, observers A, B" in capsys.readouterr().out
 
 
 # --- teams
@@ -226,7 +226,7 @@ def test_collinear_tracks(solve_refused, short, copied, collinear, tmp_path):
 
 
 @pytest.mark.parametrize("how", ["at other instants", "other markers", "one camera blind"])
-def test_markers_that_are_never_in_both_cameras_at_once(solve_refused, short, copied, tmp_path, how):
+def test_markers_that_are_never_in_both_cameras_at_once(solve_refused, short, copied, tmp_path, how, capsys):
     def change(record):
         if not isinstance(record, Detections):
             return record
@@ -237,8 +237,18 @@ def test_markers_that_are_never_in_both_cameras_at_once(solve_refused, short, co
             return dataclasses.replace(record, markers=tuple(f"{one}{record.robot}" for one in record.markers))
         return None if record.robot == "B" else record
 
-    sentence = solve_refused(copied(short, tmp_path / "run.mcap", change=change))
+    run = copied(short, tmp_path / "run.mcap", change=change)
+    sentence = solve_refused(run)
     assert re.search(r"run.mcap: no stance gives a relative pose; at stance 0, A and B: ", sentence), sentence
+    words = {
+        "at other instants": r"at the same instant \(within 5 ms\).*clocks",
+        "other markers": r"no marker name is shared: A saw `C/0A`, `C/1A` and B saw `C/0B`, `C/1B`",
+        "one camera blind": r"never see a marker at the same instant, since A alone saw one",
+    }
+    assert re.search(words[how], sentence), sentence
+    assert main(["info", str(run)]) == 0
+    problem = {"at other instants": "share no instant", "other markers": "no marker name is shared"}
+    assert f"{problem.get(how, 'B recorded neither')}" in capsys.readouterr().out
     assert ":" in sentence.split("A and B: ", 1)[1], "no remedy: " + sentence
 
 
@@ -313,6 +323,38 @@ def test_a_run_cannot_be_written_where_there_is_no_folder(refused, tmp_path):
         assert str(tmp_path / name) in sentence
 
 
+def test_a_run_replaces_nothing_but_a_run_and_that_with_force_only(refused, import_refused, short, tmp_path, capsys):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    (tmp_path / "run.mcap").write_bytes(short.read_bytes())
+    simulate = ["simulate", "single-step", "--points", 20, "--out"]
+    for force in ([], ["--force"]):
+        assert "thesis.tex exists and is not a run; give another name" in refused(
+            *simulate, tmp_path / "thesis.tex", *force
+        )
+    assert "run.mcap is an earlier run; replace it with --force" in refused(*simulate, tmp_path / "run.mcap")
+    assert "run.mcap is an earlier run; replace it with --force" in import_refused()
+    assert main([*map(str, simulate), str(tmp_path / "run.mcap"), "--force"]) == 0
+    assert len(open_run(tmp_path / "run.mcap").stances) == 1
+    capsys.readouterr()
+
+
+def test_a_folder_that_is_missing_is_named(refused, tmp_path):
+    sentence = refused("simulate", "single-step", "--out", tmp_path / "nodir" / "x.mcap")
+    assert "nodir does not exist; make the folder" in sentence and ".part" not in sentence
+
+
+def test_an_earlier_result_that_stays_after_a_failed_solve_is_mentioned(refused, short, copied, tmp_path, capsys):
+    assert main(["solve", str(short), "--out", str(tmp_path / "out")]) == 0
+    capsys.readouterr()
+    copied(short, tmp_path / "empty.mcap", stances=())
+    sentence = refused("solve", tmp_path / "empty.mcap", "--out", tmp_path / "out")
+    assert sentence.endswith(f"; {tmp_path / 'out'} still holds an earlier result")
+
+
+def test_a_result_is_not_compared_with_another_run(refused, result, short):
+    assert re.search(r"short.mcap is not the run that .* was made of", refused("evaluate", result, "--run", short))
+
+
 def test_the_present_folder_as_a_run_is_refused(refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "is a folder" in refused("simulate", "single-step", "--points", 20, "--out", ".")
@@ -329,6 +371,10 @@ def test_the_present_folder_as_a_run_is_refused(refused, tmp_path, monkeypatch):
         (["simulate", "hallway", "--noise", "nan"], r"`noise_px` is nan; give a finite number"),
         (["simulate", "hallway", "--stances", "0"], r"0 stances; give at least 1"),
         (["simulate", "hallway", "--stances", "many"], r"--stances.*see `coloc simulate --help`"),
+        (["simulate", "hallway", "--points", "5"], r"`points` is 5; a homography needs at least 6"),
+        (["simulate", "hallway", "--fps", "30"], r"--fps says nothing at depth tracks; leave it out"),
+        (["simulate", "hallway", "--image-format", "png"], r"--image-format says nothing at depth tracks"),
+        (["simulate", "hallway", "--depth", "images", "--noise", "1"], r"--noise says nothing at depth images"),
         (["simulate", "hallway", "--seed", "-1"], r"`seed` is -1"),
         (["simulate", "hallway", "--depth", "sound"], r"--depth.*see `coloc simulate --help`"),
         (["demo", "--stances", "0"], r"0 stances; give at least 1"),

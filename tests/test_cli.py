@@ -2,16 +2,19 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from coloc_graph._version import __version__
 from coloc_graph.cli import main
+from coloc_graph.pipeline import solve
 from coloc_graph.run import open_run
 
 COLOC = Path(sys.executable).with_name("coloc")
@@ -72,7 +75,8 @@ def test_simulate_solve_info_evaluate_round_trip(call, tmp_path):
     assert "stances simulated: 3 of 3" in err
 
     code, text, err = call("solve", run, "--out", out)
-    assert code == 0 and "3 of 3 measurements used" in text and "error rate" in text
+    assert code == 0 and "3 of 3 measurements used, chi2/dof " in text and "error rate" in text
+    assert re.search(r"predicted 1-sigma at the end: A \d\.\d\d cm, \d\.\d\d deg; B ", text)
     assert "measurements made: 3 of 3" in err and "measurements made" not in text
 
     code, text, err = call("solve", run, "--out", out, "--json", "--method", "chain")
@@ -95,6 +99,7 @@ def test_simulate_solve_info_evaluate_round_trip(call, tmp_path):
     assert (code, err) == (0, "")
     assert info["robots"] == ["A", "B", "C"] and info["stances"] == 3 and info["problems"] == []
     assert info["truth"] == ["A", "B", "C"] and info["topics"]["/stance"] == 3
+    assert info["topics"]["/A/truth"] > 6
 
     code, text, err = call("info", run)
     assert (code, err) == (0, "") and "nothing wrong was found" in text and "/A/detections" in text
@@ -108,8 +113,40 @@ def test_a_run_that_was_moved_is_evaluated_when_it_is_named(call, result, hallwa
         target.mkdir() if path.is_dir() else target.write_bytes(path.read_bytes())
     code, out, err = call("evaluate", moved)
     assert code == 2 and err.startswith("coloc: ") and err.count("\n") == 1 and out == ""
+    assert "give --run RUN" in err
     code, out, err = call("evaluate", moved, "--run", hallway, "--json")
     assert code == 0 and json.loads(out)["ate_m"] > 0
+
+
+def test_without_truth_solve_says_where_the_robots_are_and_how_far_to_trust_it(call, short, copied, tmp_path):
+    run = open_run(copied(short, tmp_path / "run.mcap"))
+    code, text, _ = call("solve", run.path, "--out", tmp_path / "out")
+    head, a, b, last = text.splitlines()
+    assert code == 0 and head.split("  ")[0] == "robot" and "path length" in head
+    estimate = solve(run).estimate
+    for line, robot in ((a, "A"), (b, "B")):
+        T, covariance = estimate.trajectories[robot].T_world_body[-1], estimate.trajectories[robot].covariances[-1]
+        numbers = [float(one) for one in re.findall(r"-?\d+\.\d+", line)]
+        R = T[:2, :2]
+        sigmas = 100 * np.sqrt(np.diag(R @ covariance[3:5, 3:5] @ R.T))
+        heading = np.rad2deg([np.arctan2(T[1, 0], T[0, 0]), np.sqrt(covariance[2, 2])])
+        expected = [100 * T[0, 3], sigmas[0], 100 * T[1, 3], sigmas[1], *heading]
+        np.testing.assert_allclose(numbers[1:], expected, atol=0.051)
+    assert f"{tmp_path / 'out'} holds trajectories" in last
+
+
+def test_of_robots_that_stand_still_the_distance_is_printed(call, tmp_path):
+    run, out = tmp_path / "run.mcap", tmp_path / "out"
+    call("simulate", "single-step", "-l", 0.9, "--points", 60, "--out", run)
+    code, text, _ = call("solve", run, "--out", out)
+    assert code == 0 and re.search(r"A to B +90\.0 cm +(89|90)\.\d cm +\d\.\d\d cm", text), text
+    assert "1 of 1 measurement used" in text
+    code, text, _ = call("evaluate", out)
+    assert code == 0 and "A to B" in text
+    code, text, _ = call("evaluate", out, "--json")
+    (distance,) = json.loads(text)["distances"]
+    assert distance["true_m"] == pytest.approx(0.9) and distance["robots"] == ["A", "B"]
+    assert f"{run}: 1 stance in" in call("info", run)[1]
 
 
 def test_the_scale_may_come_from_the_markers_span(call, short, tmp_path):

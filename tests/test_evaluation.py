@@ -1,5 +1,7 @@
 """Estimate against truth: zeros, known errors, invariances, NEES, and truth that does not cover the estimate."""
 
+import dataclasses
+
 import gtsam
 import numpy as np
 import pytest
@@ -167,3 +169,20 @@ def test_truth_that_begins_late_names_the_stance_and_not_its_place():
 def test_an_estimate_without_its_reference_is_refused(team):
     with pytest.raises(InputError, match="does not hold the reference robot C"):
         align(team, team, "C", on_floor=True)
+
+
+def test_robots_that_stayed_are_measured_by_the_distance_between_them(short_solution):
+    from coloc_graph.results import assess
+
+    assert assess(short_solution)[0].distances == ()
+    trajectories = short_solution.estimate.trajectories
+    still = {
+        robot: dataclasses.replace(one, T_world_body=one.T_world_body[:1].repeat(len(one), 0))
+        for robot, one in trajectories.items()
+    }
+    true = {robot: one.T_world_body.copy() for robot, one in still.items()}
+    true["B"][:, :3, 3] *= 1.1  # A is at the origin
+    (row,) = evaluate(still, true, on_floor=True).distances
+    apart = np.linalg.norm(still["B"].positions[0])
+    assert (row.robot_i, row.robot_j) == ("A", "B")
+    assert row.true == pytest.approx(1.1 * apart) and row.error == pytest.approx(-0.1 * apart)

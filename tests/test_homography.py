@@ -209,3 +209,21 @@ def test_the_order_of_the_points_does_not_matter():
     one, other = fit_homography(pairs), fit_homography(pairs[order])
     assert pytest.approx(one.H, abs=1e-6) == other.H
     assert (one.inliers[order] == other.inliers).all()
+
+
+@pytest.mark.parametrize(("n", "sigma"), [(6, NOISE), (80, 40 * NOISE)])
+def test_too_few_points_and_too_noisy_ones_are_not_called_a_straight_line(n, sigma):
+    rng = np.random.default_rng(2)
+    x = np.linspace(0.9, 1.7, n)
+    uv_i, uv_j, _ = SCENE.seen(np.column_stack([x, 0.1 * np.sin(8 * x), np.full(n, 0.15)]))
+    uv_i, uv_j = (uv + sigma * rng.normal(size=uv.shape) for uv in (uv_i, uv_j))
+    with pytest.raises(DegenerateGeometry, match=rf"{n} points are too few or too noisy .* sigma of their noise"):
+        fit_homography(pairs_of(uv_i, uv_j, 10 * NOISE if n == 6 else sigma))
+
+
+def test_markers_that_stood_still_are_not_called_a_straight_line():
+    rng = np.random.default_rng(2)
+    uv_i, uv_j = (np.repeat(uv, 30, axis=0) for uv in SCENE.pixels(1, rng))
+    uv_i, uv_j = (uv + NOISE * rng.normal(size=uv.shape) for uv in (uv_i, uv_j))
+    with pytest.raises(DegenerateGeometry, match="hardly moved"):
+        fit_homography(pairs_of(uv_i, uv_j, NOISE))

@@ -12,6 +12,7 @@ import pytest
 from coloc_graph import pipeline
 from coloc_graph.errors import ColocError, RunError, TeamError, TracksError
 from coloc_graph.exchange.tracks import ImportSummary, import_tracks
+from coloc_graph.inspection import inspect
 from coloc_graph.lie import floor_pose, se3, so3_exp
 from coloc_graph.run import Motion, Stance, open_run
 from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Team, write_team
@@ -188,7 +189,8 @@ def test_a_robot_that_was_the_mover_is_no_anchor_afterwards(files):
 
 
 def test_a_robot_that_sees_nothing_for_a_stance_still_stands(files):
-    files.bring_in(stances("ABC", "AB", "ABC"), of=team(markers_on=()), moves="stance,robot\n")
+    of = team(names=("A", "B", "C", "D"), markers_on=("D",))
+    files.bring_in(stances("ABC", "AB", "ABC"), of=of, moves="stance,robot\n")
     assert [stance.anchors for stance in open_run(files.out).stances] == [(), ("A", "B", "C"), ("A", "B", "C")]
 
 
@@ -363,14 +365,40 @@ def test_a_hundred_thousand_rows_take_seconds(files):
     assert time.perf_counter() - started < 15  # 2 s where it was written; slower machines may take their time
 
 
-def test_the_examples_of_the_documentation_come_in(tmp_path):
+def test_the_examples_of_the_documentation_come_in_and_are_enough_to_solve(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "import-tracks.md").read_text(encoding="utf-8")
     names = ("TEAM.toml", "TRACKS.csv", "PLANES.csv", "MOVES.csv")
     examples = re.findall(r"```(?:toml|csv)\n(.*?)```", text, re.DOTALL)
     for name, example in zip(names, examples, strict=True):
         (tmp_path / name).write_text(example, encoding="utf-8")
-    # the moves are those of a run of three stances, which the one row of a marker in each image is not
-    (tmp_path / "TRACKS.csv").write_text(examples[1] + "".join(f"{k},{T0 + k},A,led0,9,9,1\n" for k in (1, 2)))
     team, tracks, planes, moves = (tmp_path / name for name in names)
     summary = import_tracks(team, tracks, tmp_path / "run.mcap", planes_path=planes, moves_path=moves)
-    assert (summary.stances, summary.observers) == (3, ("A", "B"))
+    assert (summary.stances, summary.observers, summary.warnings) == (2, ("A", "B"), ())
+    run = open_run(tmp_path / "run.mcap")
+    assert inspect(run) == []
+    solution = pipeline.solve(run)
+    assert solution.warnings == () and solution.estimate.untied == ()
+    # B drove ahead by a step and the two stand 0.72 m apart
+    assert np.linalg.norm(np.diff(solution.estimate.trajectories["B"].positions, axis=0)) == pytest.approx(
+        0.35, abs=0.03
+    )
+    assert np.linalg.norm(solution.estimate.pose("B", 0).translation()) == pytest.approx(0.72, abs=0.03)
+
+
+def test_a_mover_that_is_not_in_the_team_is_named_at_the_import_where_no_plane_is_stated(files):
+    with pytest.raises(TracksError, match=r"tracks.csv: no robot of the team moves .*add the robot .*--planes"):
+        files.bring_in(stances("AB", "AB"), of=team(markers_on=()))
+    assert not files.out.exists()
+
+
+def test_a_gap_in_the_stances_is_told_of_the_tracks_and_not_of_the_moves(files):
+    tracks = stances("AB", "AB").replace("\n1,", "\n2,")
+    with pytest.raises(TracksError, match=r"tracks.csv: has no rows of stance 1 .*moves.csv, line 2.*without gaps"):
+        files.bring_in(tracks, moves="stance,robot\n1,B\n")
+
+
+def test_a_run_goes_into_a_folder_that_is_there_or_the_folder_is_named(files, tmp_path):
+    files.out = tmp_path / "nowhere" / "run.mcap"
+    with pytest.raises(RunError, match=r"run.mcap: cannot be written, since .*nowhere does not exist; make") as refusal:
+        files.bring_in(OK)
+    assert ".part" not in str(refusal.value)

@@ -1,5 +1,6 @@
 """From a run to an estimate: accuracy, repeatability, ignorance of the truth, and runs that are partly bad."""
 
+import dataclasses
 import itertools
 
 import msgspec
@@ -8,9 +9,10 @@ import pytest
 
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.evaluation import align, evaluate
+from coloc_graph.inspection import inspect
 from coloc_graph.lie import floor_pose, se3_inverse
 from coloc_graph.pipeline import METHODS, SolveOptions, solve
-from coloc_graph.run import Detections, Stance, open_run, read_truth, whole_run
+from coloc_graph.run import Detections, Planes, Stance, open_run, read_truth, whole_run
 from coloc_graph.simulation import reference_team
 
 
@@ -109,8 +111,29 @@ def test_a_straight_drive_at_the_end_costs_the_last_pose_alone(hallway, copied, 
 
 def test_nothing_but_straight_drives_is_an_error_with_its_remedy(short, copied, collinear, tmp_path):
     run = spoilt(short, tmp_path / "bad.mcap", copied, collinear, {0, 1, 2})
-    with pytest.raises(EstimationError, match=r"bad.mcap: no stance gives a relative pose; at stance 0, .*turn"):
+    with pytest.raises(EstimationError, match=r"bad.mcap: no stance gives a relative pose; at stance 0, .*turn") as e:
         solve(run)
+    assert str(e.value).endswith("let it turn (the same in 3 of 3 measurements)")
+
+
+def test_of_several_reasons_each_is_counted(hallway, copied, collinear, tmp_path):
+    stances = open_run(hallway).stances
+
+    def change(record):
+        if not isinstance(record, Detections):
+            return record
+        (index,) = [s.index for s in stances if s.start <= record.time <= s.end] or [-1]
+        return (
+            collinear(record)
+            if index < 3
+            else dataclasses.replace(record, markers=tuple(f"{one}{record.robot}" for one in record.markers))
+        )
+
+    with pytest.raises(EstimationError) as refusal:
+        solve(open_run(copied(hallway, tmp_path / "bad.mcap", change=change)))
+    first, second = str(refusal.value).split("; ")[1:]
+    assert "no marker name is shared" in first and first.endswith("(the same in 5 of 8 measurements)")
+    assert "one line" in second and second.endswith("(the same in 3 of 8 measurements)")
 
 
 def test_a_bad_first_stance_ties_nobody_and_says_so(short, copied, collinear, tmp_path):
@@ -132,7 +155,70 @@ def test_mounts_that_are_not_as_stated_are_warned_of(hallway, copied, tmp_path):
         for robot, d in zip(team.robots, (2.0, -2.0, 0.0), strict=True)
     )
     run = open_run(copied(hallway, tmp_path / "tilted.mcap", team=msgspec.structs.replace(team, robots=tilted)))
-    assert any("the measurements disagree" in warning for warning in solve(run).warnings)
+    (warning,) = [one for one in solve(run).warnings if "the measurements disagree" in one]
+    assert "with 24 degrees of freedom" in warning and "less than once in 1 000 000 000 runs" in warning
+
+
+def test_whether_measurements_disagree_depends_on_the_degrees_of_freedom(solutions):
+    from coloc_graph.pipeline import _warnings
+
+    estimate = solutions["smooth"].estimate
+    for dof, chi2, warned in ((1, 10.0, False), (1, 20.0, True), (24, 55.0, False), (600, 1500.0, True)):
+        warnings = _warnings(dataclasses.replace(estimate, chi2=chi2, dof=dof), ())
+        assert (len(warnings) == 1) == warned, (dof, chi2)
+        assert all(f"chi2/dof {chi2 / dof:.1f}" in one and "once in" in one for one in warnings)
+
+
+def with_camera_at(run, copied, to, **mount):
+    team = run.team
+    robots = tuple(
+        msgspec.structs.replace(robot, mount=msgspec.structs.replace(robot.mount, **mount)) for robot in team.robots
+    )
+    return open_run(copied(run.path, to, team=msgspec.structs.replace(team, robots=robots)))
+
+
+@pytest.mark.parametrize(
+    ("mount", "words"),
+    [
+        ({"height": 0.55}, "0.40 m apart, and the team says 0.25 m"),
+        ({"height": 400.0}, "m away from A"),
+        ({"tilt_deg": -30.0}, "above the horizon"),
+    ],
+)
+def test_heights_and_tilts_that_the_markers_contradict_are_warned_of_and_found(short, copied, tmp_path, mount, words):
+    run = with_camera_at(open_run(short), copied, tmp_path / "run.mcap", **mount)
+    try:
+        said = " ".join(solve(run).warnings)
+    except EstimationError as refusal:
+        said = str(refusal)
+    assert "correct heights, tilt or units (metres?) in the team" in said
+    assert "stance 0 (and 1 more alike): " in said and words in said
+    assert [finding.where for finding in inspect(run) if words in finding.what][:1] == ["stance 0"]
+
+
+def test_a_stated_plane_that_the_markers_contradict_is_warned_of(short, copied, tmp_path):
+    run = open_run(short)
+    with whole_run(tmp_path / "run.mcap", run.team) as writer:
+        for stance in run.stances:
+            writer.write(stance)
+            writer.write(Planes(stance.index, stance.start, {stance.observers[0]: (0.0, 0.93969262, 0.34202014, 0.5)}))
+            for robot in stance.observers:
+                for one in run.detections(robot, stance.start, stance.end):
+                    writer.write(one)
+    planes = open_run(tmp_path / "run.mcap")
+    assert any("correct the stated plane" in warning for warning in solve(planes).warnings)
+    assert {f.where for f in inspect(planes) if "correct the stated plane" in f.what} == {
+        f"stance {k}" for k in range(3)
+    }
+
+
+def test_a_healthy_run_is_neither_warned_of_nor_found_fault_with(hallway, solutions):
+    assert solutions["smooth"].warnings == () and inspect(open_run(hallway)) == []
+
+
+def test_a_solution_and_a_run_are_shown_in_a_line(short_solution):
+    assert len(repr(short_solution)) < 400 and "3 of 3 measurements used" in repr(short_solution)
+    assert "robots A, B, C, 3 stances in" in repr(short_solution.run)
 
 
 def test_progress_counts_every_pair(short):
@@ -149,9 +235,9 @@ def test_a_run_without_stances_or_with_one_observer_is_refused(short, copied, tm
         solve(open_run(copied(short, tmp_path / "alone.mcap", stances=alone)))
 
 
-def test_an_unknown_method_is_refused(short):
+def test_an_unknown_method_is_refused_when_it_is_chosen():
     with pytest.raises(InputError, match="no method `guess`; choose one of chain, smooth"):
-        solve(open_run(short), SolveOptions(method="guess"))
+        SolveOptions(method="guess")
 
 
 def test_three_observers_at_once_make_three_measurements_that_agree(tmp_path):

@@ -11,7 +11,8 @@ import pytest
 from coloc_graph.errors import InputError
 from coloc_graph.pipeline import solve
 from coloc_graph.results import MEASUREMENT_COLUMNS, read_result, write_result
-from coloc_graph.run import open_run
+from coloc_graph.run import open_run, run_id
+from coloc_graph.simulation import simulate
 from coloc_graph.team import Team
 
 FILES = {
@@ -186,3 +187,36 @@ def test_what_is_no_result_is_refused_in_words(tmp_path, summary, words):
     with pytest.raises(InputError, match=words) as refusal:
         read_result(tmp_path)
     assert str(tmp_path) in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_a_result_knows_its_run_by_content(short, hallway, short_solution, tmp_path):
+    write_result(short_solution, tmp_path / "out")
+    read = read_result(tmp_path / "out")
+    read.require_run(short)
+    copy, cut = tmp_path / "copy.mcap", tmp_path / "cut.mcap"
+    copy.write_bytes(short.read_bytes())
+    ends = [chunk.offset + chunk.length for chunk in open_run(short)._index.chunks]
+    cut.write_bytes(short.read_bytes()[: ends[1] + 100])
+    read.require_run(copy)
+    read.require_run(cut)
+    with pytest.raises(InputError, match="hallway.mcap is not the run that .*out was made of"):
+        read.require_run(hallway)
+    with pytest.raises(InputError, match=r"no longer at .*gone.mcap; give --run RUN"):
+        read.require_run(tmp_path / "gone.mcap")
+
+
+@pytest.mark.parametrize("scenario", ["single-step", "six-step", "hallway"])
+def test_runs_of_two_seeds_have_two_ids_and_one_of_the_same_seed_has_one(tmp_path, scenario):
+    ids = []
+    for name, seed in (("a", 0), ("b", 1), ("c", 0)):
+        simulate(scenario, tmp_path / name, seed=seed, points=20)
+        ids.append(run_id(tmp_path / name))
+    assert ids[0] == ids[2] != ids[1]
+
+
+def test_a_result_of_a_version_without_ids_is_taken_as_it_is(short, hallway, short_solution, tmp_path):
+    write_result(short_solution, tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    del summary["run_id"]
+    (tmp_path / "out" / "summary.json").write_text(json.dumps(summary))
+    read_result(tmp_path / "out").require_run(hallway)

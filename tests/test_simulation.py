@@ -157,7 +157,7 @@ def test_other_noise_leaves_the_geometry_as_it_was():
 def test_the_truth_is_drawn_from_the_tolerances_that_are_stated():
     spreads = []
     for seed in range(300):
-        world = build_world(single_step(), points=4, imperfections=FAULTY, seed=seed)
+        world = build_world(single_step(), points=6, imperfections=FAULTY, seed=seed)
         for stated, true in zip(world.team.robots, world.true_team.robots, strict=True):
             m, s = true.mount, stated.mount
             assert (s.tilt_deg, s.roll_deg, s.height) == (20.0, 0.0, 0.40)
@@ -175,7 +175,7 @@ def test_the_truth_is_drawn_from_the_tolerances_that_are_stated():
 
 
 def test_the_true_team_is_the_stated_one_where_nothing_is_imperfect():
-    world = build_world(single_step(), points=4)
+    world = build_world(single_step(), points=6)
     assert world.true_team == world.team
 
 

@@ -75,7 +75,7 @@ class Threshold:
 
     levels: float = 35.0
     min_area: int = 2
-    max_area: int = 600
+    max_area: int = 1500
     saturation: int = 250
     elongation: float = 2.5  # longer than this many times its width: blurred
     shot_gain: float = 0.1  # variance in grey levels^2 that one grey level of light adds
@@ -179,9 +179,7 @@ class Detector:
         return spots.centre + corners, spots.covariance, flags, peak, real
 
 
-def _components(
-    light: NDArray[np.uint8] | NDArray[np.float32], level: float
-) -> list[tuple[list[int], list[float]]]:
+def _components(light: NDArray[np.uint8] | NDArray[np.float32], level: float) -> list[tuple[list[int], list[float]]]:
     """Connected pixels above a level: (left, top, width, height, pixels) and the centre of area of each."""
     above = cv2.threshold(light, level, 255, cv2.THRESH_BINARY)[1]
     if above.dtype != np.uint8:

@@ -356,10 +356,8 @@ def least_squares(pairs: PointPairs) -> Array:
     return _least_squares(pairs, direct(pairs), 20)[0]
 
 
-def _least_squares(
-    pairs: PointPairs, H: Array, max_iterations: int
-) -> tuple[Array, int, tuple[Array, ...], Array]:
-    limit = 3 * CONVERGED * pairs.sigma**2  # here nothing latent lags behind
+def _least_squares(pairs: PointPairs, H: Array, max_iterations: int) -> tuple[Array, int, tuple[Array, ...], Array]:
+    limit = 30 * pairs.sigma**2  # what is then left is a fiftieth of the estimate's own sigma (measured)
     for iteration in range(1, max_iterations + 1):
         p0, p1, b = _project(H, pairs.x_i)
         rows = _rows(b, pairs.x_i)

@@ -206,12 +206,11 @@ def _cut_off(index: Index) -> list[str]:
         return []
     reach = max(chunk.end for chunk in index.chunks)
     after = schemas.to_seconds(reach - min(chunk.start for chunk in index.chunks))
-    lost = "all that is in it could be read"
+    what = "was cut off or is still being written, and all that is in it could be read"
     if index.lost:
-        lost = f"the last {index.lost} byte{'s' * (index.lost != 1)} could not be read"
+        what = f"was cut off, the last {index.lost} byte{'s' * (index.lost != 1)} could not be read"
     return [
-        f"{index.path}: was cut off, or is still being written; {lost}; the data reach "
-        f"{schemas.to_seconds(reach):.3f} s (UTC), {after:.3f} s after they begin"
+        f"{index.path}: {what}; the data reach {schemas.to_seconds(reach):.3f} s (UTC), {after:.3f} s after they begin"
     ]
 
 

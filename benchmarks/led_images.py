@@ -1,0 +1,80 @@
+"""Real infrared LEDs with reflections (OSVR): what is found, and what tells a core from a reflection.
+
+    python benchmarks/led_images.py [--data DIR] [--out PICTURE.png]
+
+An LED's core saturates the sensor and is compact; a reflection is dimmer, or drawn out, or much larger.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from coloc_graph.frontend import Blobs, detect_leds
+from coloc_graph.run import Flag
+
+ROOT = Path(__file__).resolve().parents[1]
+#: LED cores that a person sees in each picture [px], read off by eye.
+SEEN = {
+    "0001": "230,126 397,129 326,155 478,168 132,173 503,226 351,246 134,252 449,274 50,284 257,295 533,317 438,330 "
+    "293,351 140,378",
+    "0002": "231,128 397,131 325,155 478,169 132,175 504,228 352,247 135,253 450,276 50,285 257,297 534,319 439,332 "
+    "295,355 140,380",
+    "0003": "231,126 396,129 326,155 478,167 132,173 503,226 351,246 134,252 449,275 50,284 257,295 535,317 438,330 "
+    "294,353 140,378",
+    "0004": "231,128 397,130 327,156 478,169 132,175 504,228 351,246 135,253 450,276 49,284 257,297 534,319 439,332 "
+    "294,355 140,380",
+}
+
+
+def cores(blobs: Blobs) -> np.ndarray:
+    """Which blobs (n,) are LED cores."""
+    bright = ((blobs.flags & Flag.SATURATED) != 0) & ((blobs.flags & (Flag.BLURRED | Flag.CLIPPED)) == 0)
+    return bright & (blobs.area < 3 * np.median(blobs.area[bright]))
+
+
+def main() -> int:
+    """Print the table, draw the picture."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data" / "led_images")
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    paths = sorted(args.data.glob("*.tif")) if args.data.is_dir() else []
+    if not paths:
+        print(f"{args.data}: there are no pictures; give the folder of 0001.tif to 0004.tif with --data", file=sys.stderr)
+        return 2
+    drawn = []
+    for path in paths:
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        blobs = detect_leds(image)
+        core = cores(blobs)
+        seen = np.array([[float(x) for x in place.split(",")] for place in SEEN[path.stem].split()])
+        near = np.linalg.norm(seen[:, None] - blobs.uv[core][None], axis=2) < 6.0
+        print(
+            f"{path.name}: {near.any(axis=1).sum()} of {len(seen)} LED cores found, {(~near.any(axis=0)).sum()} more "
+            f"called a core, {(~core).sum()} other lights told by flag or size"
+        )
+        for missed in seen[~near.any(axis=1)]:
+            print(f"  missed {missed}")
+        for extra in blobs.uv[core][~near.any(axis=0)]:
+            print(f"  called a core: {extra.round(1)}")
+        for uv, is_core, covariance in zip(blobs.uv, core, blobs.covariance, strict=True):
+            colour = (150, 230, 60) if is_core else (0, 140, 255)
+            centre = tuple(int(round(16 * x)) for x in uv)
+            cv2.circle(image, centre, 16 * 17, colour, 1, cv2.LINE_AA, 4)
+            if is_core:
+                sigma = np.sqrt(np.trace(covariance) / 2)
+                place = (int(uv[0]) + 14, int(uv[1]) - 12)
+                cv2.putText(image, f"{sigma:.3f}", place, cv2.FONT_HERSHEY_SIMPLEX, 0.36, colour, 1, cv2.LINE_AA)
+        drawn.append(image)
+    if args.out and len(drawn) >= 4:
+        picture = np.vstack([np.hstack(drawn[:2]), np.hstack(drawn[2:4])])
+        picture = cv2.resize(cv2.convertScaleAbs(picture, alpha=1.25, beta=8), None, fx=0.75, fy=0.75)
+        cv2.imwrite(str(args.out), picture)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
