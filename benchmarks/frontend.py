@@ -22,8 +22,15 @@ import numpy as np
 from monte_carlo import MemoryRun, simulated
 
 from coloc_graph.frontend import (
-    Detector, FrontendOptions, MarkerTracker, PointPairs, TrackerOptions, decompose_with_normal, detect_leds,
-    fit_homography, measure_pair,
+    Detector,
+    FrontendOptions,
+    MarkerTracker,
+    PointPairs,
+    TrackerOptions,
+    decompose_with_normal,
+    detect_leds,
+    fit_homography,
+    measure_pair,
 )  # fmt: skip
 from coloc_graph.frontend.homography import least_squares
 from coloc_graph.frontend.stance import stance_plane

@@ -43,7 +43,7 @@ def main() -> int:
     args = parser.parse_args()
     paths = sorted(args.data.glob("*.tif")) if args.data.is_dir() else []
     if not paths:
-        print(f"{args.data}: there are no pictures; give the folder of 0001.tif to 0004.tif with --data", file=sys.stderr)
+        print(f"{args.data}: no pictures; give the folder of 0001.tif to 0004.tif with --data", file=sys.stderr)
         return 2
     drawn = []
     for path in paths:
@@ -62,7 +62,7 @@ def main() -> int:
             print(f"  called a core: {extra.round(1)}")
         for uv, is_core, covariance in zip(blobs.uv, core, blobs.covariance, strict=True):
             colour = (150, 230, 60) if is_core else (0, 140, 255)
-            centre = tuple(int(round(16 * x)) for x in uv)
+            centre = tuple(round(16 * float(x)) for x in uv)
             cv2.circle(image, centre, 16 * 17, colour, 1, cv2.LINE_AA, 4)
             if is_core:
                 sigma = np.sqrt(np.trace(covariance) / 2)

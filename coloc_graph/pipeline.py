@@ -157,6 +157,7 @@ def _kind(reason: str, *robots: str) -> str:
     """A reason without the numbers and names that differ from stance to stance."""
     for robot in robots:
         reason = re.sub(rf"\b{re.escape(robot)}\b", "?", reason)
+    reason = re.sub(r"`[^`]*`(, `[^`]*`)*", "?", reason)
     return re.sub(r"\d+(\.\d+)?(e[+-]?\d+)?", "?", reason)
 
 

@@ -113,7 +113,7 @@ def test_nothing_but_straight_drives_is_an_error_with_its_remedy(short, copied, 
     run = spoilt(short, tmp_path / "bad.mcap", copied, collinear, {0, 1, 2})
     with pytest.raises(EstimationError, match=r"bad.mcap: no stance gives a relative pose; at stance 0, .*turn") as e:
         solve(run)
-    assert str(e.value).endswith("let it turn (the same in 3 of 3 measurements)")
+    assert "let it turn (the same in 3 of 3 measurements)" in str(e.value)
 
 
 def test_of_several_reasons_each_is_counted(hallway, copied, collinear, tmp_path):
@@ -131,7 +131,7 @@ def test_of_several_reasons_each_is_counted(hallway, copied, collinear, tmp_path
 
     with pytest.raises(EstimationError) as refusal:
         solve(open_run(copied(hallway, tmp_path / "bad.mcap", change=change)))
-    first, second = str(refusal.value).split("; ")[1:]
+    first, second, *_ = str(refusal.value).split("; ")[1:]
     assert "no marker name is shared" in first and first.endswith("(the same in 5 of 8 measurements)")
     assert "one line" in second and second.endswith("(the same in 3 of 8 measurements)")
 
@@ -207,9 +207,8 @@ def test_a_stated_plane_that_the_markers_contradict_is_warned_of(short, copied, 
                     writer.write(one)
     planes = open_run(tmp_path / "run.mcap")
     assert any("correct the stated plane" in warning for warning in solve(planes).warnings)
-    assert {f.where for f in inspect(planes) if "correct the stated plane" in f.what} == {
-        f"stance {k}" for k in range(3)
-    }
+    found = [finding.where for finding in inspect(planes) if "correct the stated plane" in finding.what]
+    assert found == ["stance 0", "stance 1", "stance 2"]
 
 
 def test_a_healthy_run_is_neither_warned_of_nor_found_fault_with(hallway, solutions):

@@ -199,7 +199,7 @@ def test_a_result_knows_its_run_by_content(short, hallway, short_solution, tmp_p
     cut.write_bytes(short.read_bytes()[: ends[1] + 100])
     read.require_run(copy)
     read.require_run(cut)
-    with pytest.raises(InputError, match="hallway.mcap is not the run that .*out was made of"):
+    with pytest.raises(InputError, match=r"hallway.mcap is not the run that .*out was made of"):
         read.require_run(hallway)
     with pytest.raises(InputError, match=r"no longer at .*gone.mcap; give --run RUN"):
         read.require_run(tmp_path / "gone.mcap")

@@ -51,8 +51,8 @@ def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_ga
     first = signal * inner
     total = np.maximum(first.sum(axis=(1, 2)), 1e-9)
     centre = np.stack([(first.sum(axis=1) @ x) / total, (first.sum(axis=2) @ y) / total], axis=1)
-    round_shape = np.maximum(inner.sum(axis=(1, 2)) / (2 * np.pi), 0.6)[:, None, None] * np.eye(2)
-    shape, found = round_shape.copy(), np.ones(n, bool)
+    start = _rough_shape(inner, x, y)
+    shape, found = start.copy(), np.ones(n, bool)
     gain = np.broadcast_to(2 * np.eye(2), (n, 2, 2)).copy()
     total = np.ones(n)
     going = np.arange(n)
@@ -65,7 +65,7 @@ def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_ga
         spread = np.stack([moments[:, 0, 2], moments[:, 1, 1], moments[:, 1, 1], moments[:, 2, 0]], axis=1)
         seen = (spread / inside[:, None]).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None, :]
         # of a Gaussian spot in a Gaussian window their precisions add up, and so what is seen is undone
-        shape[going], gain[going] = _undone(seen, window, round_shape[going])
+        shape[going], gain[going] = _undone(seen, window, start[going])
         step = (gain[going] @ mean[:, :, None])[:, :, 0]
         centre[going] += np.clip(step, -1.0, 1.0)
         going = going[(np.abs(step).max(axis=1) >= CONVERGED) & (total[going] > 0)]
@@ -83,6 +83,17 @@ def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_ga
     covariance = gain @ of_mean @ gain.mT / np.maximum(total**2, 1e-9)[:, None, None]
     found &= (total > 0) & np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(centre).all(axis=1)
     return Spots(centre, covariance, shape, signal, noise, found)
+
+
+def _rough_shape(inner: NDArray[np.bool_], x: Array, y: Array) -> Array:
+    """Second moments (n, 2, 2) of the spots that these pixels are the bright part of."""
+    lit = inner.astype(float)
+    area = np.maximum(lit.sum(axis=(1, 2)), 1.0)[:, None]
+    dx, dy = x - lit.sum(axis=1) @ x[:, None] / area, y - lit.sum(axis=2) @ y[:, None] / area
+    m = _moments(lit, np.ones_like(dx), np.ones_like(dy), dx, dy) / area[:, :, None]
+    moments = np.stack([m[:, 0, 2], m[:, 1, 1], m[:, 1, 1], m[:, 2, 0]], axis=1).reshape(-1, 2, 2)
+    # the part of a Gaussian above a third of its peak has half the moments of the whole
+    return np.asarray(2 * moments + 0.2 * np.eye(2))
 
 
 def _windows(centre: Array, variances: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:

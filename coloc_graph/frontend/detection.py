@@ -31,7 +31,7 @@ MARGIN = 3
 SIZES = (11, 15, 21, 31, 45, 63)
 #: A blob's peak is at least this many times the noise around it.
 LEAST_CONTRAST = 4.0
-#: Two spots touch where the middle is darker than this part of the darker side.
+#: Two spots touch where it is darker between them than this part of the darker one.
 DIP = 0.8
 
 
@@ -75,7 +75,7 @@ class Threshold:
 
     levels: float = 35.0
     min_area: int = 2
-    max_area: int = 1500
+    max_area: int = 1000
     saturation: int = 250
     elongation: float = 2.5  # longer than this many times its width: blurred
     shot_gain: float = 0.1  # variance in grey levels^2 that one grey level of light adds
@@ -166,15 +166,16 @@ class Detector:
         real = spots.found & on_it & (peak >= LEAST_CONTRAST * spots.noise)
 
         short, long, along = axes(spots.shape)
-        # a spot, drawn out or not, is brightest in the middle; two that touch are darker there than to both sides
-        reach = long[:, None] * along
-        middle = at_points(spots.signal, spots.centre)
-        side = np.minimum(*(at_points(spots.signal, spots.centre + sign * reach) for sign in (-1, 1)))
+        # a spot, drawn out or not, has one hump along its long axis; two that touch have a dip between two
+        steps = np.linspace(-1.25, 1.25, 11)
+        points = spots.centre[None] + steps[:, None, None] * (long[:, None] * along)[None]
+        humps = np.array([at_points(spots.signal, place) for place in points])
+        dip = humps[3:8].min(axis=0) < DIP * np.minimum(humps[:5].max(axis=0), humps[6:].max(axis=0))
         flags = np.zeros(len(candidates), np.uint8)
         flags[(inner & (light >= t.saturation)).any(axis=(1, 2))] |= np.uint8(Flag.SATURATED)
         flags[np.array([one.clipped for one in candidates])] |= np.uint8(Flag.CLIPPED)
         flags[long > t.elongation * short] |= np.uint8(Flag.BLURRED)
-        flags[(long > 1.4 * short) & (middle < DIP * side)] |= np.uint8(Flag.MERGED)
+        flags[(long > 1.4 * short) & dip] |= np.uint8(Flag.MERGED)
         corners = np.array([one.corner for one in candidates], float)
         return spots.centre + corners, spots.covariance, flags, peak, real
 

@@ -186,7 +186,10 @@ def _require_spread(pairs: PointPairs, sigma: float) -> None:
     spread = _spread(pairs.x_i, sigma)
     if spread.off < least:
         if spread.along < COLLINEAR_SIGMAS * sigma:
-            raise DegenerateGeometry("the markers hardly moved: let the moving robot drive further, and turn")
+            raise DegenerateGeometry(
+                f"the markers hardly moved (they spread by {spread.along / sigma:.1f} sigma of their noise): "
+                "let the moving robot drive further, and turn, or detect them better"
+            )
         if spread.across < STRAIGHT * spread.along:
             raise DegenerateGeometry("the tracks lie on one line (the moving robot drove a straight line): let it turn")
         raise DegenerateGeometry(
