@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from coloc_graph import pipeline
 from coloc_graph.exchange.tracks import import_tracks
 from coloc_graph.frontend import FrontendOptions, PairMeasurement
-from coloc_graph.frontend.homography import Criterion
+from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.lie import se3, se3_inverse, so3_log
 from coloc_graph.run import Run, open_run
 from coloc_graph.team import Camera, Mount, Robot, Team, write_team

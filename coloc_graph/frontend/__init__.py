@@ -7,9 +7,10 @@ from coloc_graph.frontend.clock_offset import ClockFit, ClockOffset
 from coloc_graph.frontend.correspondence import Correspondences, correspond, pair_by_time
 from coloc_graph.frontend.decomposition import choose_by_normal, decompose_svd, decompose_with_normal, metric_scale
 from coloc_graph.frontend.detection import Blobs, Detector, Threshold, detect_hue, detect_leds, detector_for
-from coloc_graph.frontend.homography import HomographyFit, PointPairs, fit_homography
+from coloc_graph.frontend.homography import HomographyFit, fit_homography
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.plane import distance_from_span, on_plane, plane_from_mount
+from coloc_graph.frontend.refinement import PointPairs, least_squares, refine
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.shared_clock import share_clock_offsets
 from coloc_graph.frontend.stance import FrontendOptions, PairMeasurement, measure_pair
@@ -38,12 +39,14 @@ __all__ = [
     "detector_for",
     "distance_from_span",
     "fit_homography",
+    "least_squares",
     "measure_pair",
     "metric_scale",
     "most_likely_pose",
     "on_plane",
     "pair_by_time",
     "plane_from_mount",
+    "refine",
     "relative_pose",
     "share_clock_offsets",
 ]

@@ -26,13 +26,11 @@ from coloc_graph.frontend.homography import (
     MEDIAN_CHI2,
     MINIMUM_POINTS,
     WIDEST_SCALE,
-    Criterion,
     HomographyFit,
-    PointPairs,
     fit_homography,
-    squared_residuals,
 )
 from coloc_graph.frontend.interpolation import Interpolated, Samples
+from coloc_graph.frontend.refinement import Criterion, PointPairs, squared_residuals
 from coloc_graph.frontend.tracking import Track
 from coloc_graph.lie import SL3_BASIS, sl3_exp
 from coloc_graph.team import Camera

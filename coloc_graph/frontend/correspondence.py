@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend.homography import PointPairs, fit_homography, squared_residuals
+from coloc_graph.frontend.homography import fit_homography
 from coloc_graph.frontend.interpolation import LONGEST_GAP
 from coloc_graph.frontend.plane import on_plane
+from coloc_graph.frontend.refinement import PointPairs, squared_residuals
 from coloc_graph.frontend.tracking import Track
 from coloc_graph.measurements import Plane
 from coloc_graph.team import Camera

@@ -27,9 +27,10 @@ from coloc_graph.frontend.correspondence import (
     span_samples,
 )
 from coloc_graph.frontend.detection import Blobs, detector_for
-from coloc_graph.frontend.homography import Criterion, HomographyFit, fit_homography, shared_error
+from coloc_graph.frontend.homography import HomographyFit, fit_homography, shared_error
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
+from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.measurements import HomographyMeasurement, Plane, RelativePose
