@@ -26,6 +26,7 @@ from coloc_graph.frontend import (
     FrontendOptions,
     MarkerTracker,
     PointPairs,
+    Threshold,
     TrackerOptions,
     decompose_with_normal,
     detect_leds,
@@ -63,7 +64,7 @@ def centres(n: int = 1000) -> dict[str, float]:
     errors, variances, peaks = [], [], []
     for uv in 30 + rng.uniform(-0.5, 0.5, (n, 2)):
         image = render(spots(uv, 1.5, 290.0), size=(61, 61), background=10.0, sensor=sensor, rng=rng)
-        blob = detect_leds(image, threshold=None)
+        blob = detect_leds(image, threshold=Threshold(shot_gain=sensor.shot_gain))
         errors.append(blob.uv[0] - uv)
         variances.append(np.diag(blob.covariance[0]))
         peaks.append(blob.peak[0])

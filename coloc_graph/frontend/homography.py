@@ -112,10 +112,12 @@ def shared_error(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64
 
 
 def _inliers(squared: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Points within the gate, which widens with the typical residual of those that agree so far."""
+    """Points within the gate, which widens where those that agree so far are off by more than noise and chance."""
     own = squared[among]
     scale = np.partition(own, len(own) // 2)[len(own) // 2] / MEDIAN_CHI2 if len(own) else 1.0
-    return np.asarray(squared < INLIER_GATE * min(max(scale, 1.0), WIDEST_SCALE))
+    # a median of n has a relative spread of about 1.4 / sqrt(n); three times that is no longer chance
+    scale = min(scale, WIDEST_SCALE) if scale > 1 + 4.3 / math.sqrt(len(own) + 1) else 1.0
+    return np.asarray(squared < INLIER_GATE * scale)
 
 
 @dataclass(frozen=True)
