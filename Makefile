@@ -28,6 +28,9 @@ unit: $(VENV)/installed-dev
 bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/single_step.py
 	$(BIN)/python benchmarks/hallway.py --seeds 40
+	$(BIN)/python benchmarks/relative_pose.py --outliers
+	$(BIN)/python benchmarks/frontend.py
+	$(BIN)/python benchmarks/clock_offset.py
 ifneq ($(DATA),)
 	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)
 else

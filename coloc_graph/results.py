@@ -34,7 +34,17 @@ from coloc_graph.trajectory import Trajectory
 
 SUMMARY = "summary.json"
 MEASUREMENT_COLUMNS = (
-    *("stance", "robot_i", "robot_j", "points", "inliers", "residual", "time_offset", "overlap_px"),
+    *(
+        "stance",
+        "robot_i",
+        "robot_j",
+        "points",
+        "inliers",
+        "residual",
+        "time_offset",
+        "time_offset_sigma",
+        "overlap_px",
+    ),
     *("normal_error_deg", "solution", "distance", "usable", "why_not"),
 )
 
@@ -175,6 +185,7 @@ def _measurements(solution: Solution) -> str:
                 h.inliers,
                 _cell(h.residual),
                 _cell(h.time_offset),
+                _cell(h.time_offset_sigma),
                 _cell(h.overlap_px),
                 _cell(math.degrees(pose.normal_error)) if pose else "",
                 pose.solution if pose else "",
