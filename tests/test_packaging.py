@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 import subprocess
 import sys
 import tomllib
@@ -169,3 +170,17 @@ def test_every_dependency_has_its_reason():
 def test_no_path_of_one_machine_is_in_the_package():
     for path in MODULES:
         assert not re.search(r"[\"'(\s]/(home|Users|root|work|tmp)/", path.read_text(encoding="utf-8")), path
+
+
+@pytest.mark.parametrize(("version", "platform", "words"), [
+    ((3, 10, 13), "linux", "needs CPython 3.11 to 3.14.*this is 3.10"),
+    ((3, 15, 0), "linux", "needs CPython 3.11 to 3.14.*this is 3.15"),
+    ((3, 12, 0), "win32", "no wheels for Windows"),
+])  # fmt: skip
+def test_an_unsupported_python_or_system_is_told_in_words_before_anything_is_installed(
+    monkeypatch, version, platform, words
+):
+    monkeypatch.setattr(sys, "version_info", version)
+    monkeypatch.setattr(sys, "platform", platform)
+    with pytest.raises(SystemExit, match=words):
+        runpy.run_path(str(ROOT / "setup.py"), run_name="__main__")

@@ -5,6 +5,7 @@ Results go to stdout, everything else to stderr. Nothing heavy is imported befor
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -35,12 +36,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     args = parser().parse_args(arguments)
     try:
-        return int(args.run(args))
+        code = int(args.run(args))
+        sys.stdout.flush()  # here, so that a reader who has gone is noticed here
+        return code
     except ColocError as error:
         print(f"coloc: {error}", file=sys.stderr)
         return 2
     except BrokenPipeError:
-        sys.stderr.close()  # whoever read us has gone; say no more
+        # whoever read us has gone: what is still buffered goes nowhere, without a word at the interpreter's end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
         place = f" {error.filename}" if error.filename else ""
