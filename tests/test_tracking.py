@@ -73,7 +73,7 @@ def test_a_patch_is_searched_where_the_led_would_be_if_it_went_on():
             return super().find(image, box)
 
     lights = moving(9, (60, 60), (12, 7))[:, None]
-    track = tracked(lights, TrackerOptions(patch=40, markers=1), Looking())[0]
+    track = tracked(lights, TrackerOptions(patch=40, markers=1, reacquire_every=10.0), Looking())[0]
     assert boxes[0] is None
     assert len(boxes) == 9
     for k in range(2, 9):

@@ -53,7 +53,7 @@ class TrackerOptions:
 
     patch: int = 40
     patience: int = 3
-    reacquire_every: int = 10
+    reacquire_every: float = 0.25  # s, at which the full frame is searched for markers that came into view
     markers: int = 2  # with fewer live tracks than this the full frame is searched
     still_after: int = 50  # frames after which a light that stands still is parked
 
@@ -90,12 +90,12 @@ class MarkerTracker:
         self._ended: list[_Live] = []
         self._parked: list[_Live] = []
         self._taken: list[tuple[Array, Array, float]] = []
-        self._frame = 0
+        self._searched = -math.inf  # when the full frame was searched last
 
     def step(self, image: Image) -> None:
         """Take in the next image."""
         predicted = [track.predict(image.time) for track in self._live]
-        full = self._search_all()
+        full = self._search_all(image.time)
         found = self._detector.find(image.pixels) if full else self._in_patches(image.pixels, predicted)
         found = [one for one in found if not one.clipped]
         self._advance(image.time, predicted, [one.uv for one in found], found, births=full)
@@ -137,9 +137,9 @@ class MarkerTracker:
         uv, covariance, peak = zip(*samples, strict=True)
         return Track(self.robot, "", np.array(live.times), np.array(uv), np.array(covariance), np.array(peak))
 
-    def _search_all(self) -> bool:
+    def _search_all(self, time: float) -> bool:
         return (
-            self._frame % self._options.reacquire_every == 0
+            not self._searched <= time < self._searched + self._options.reacquire_every
             or len(self._live) < self._options.markers
             or any(track.misses for track in self._live)
         )
@@ -181,12 +181,11 @@ class MarkerTracker:
                 if not self._is_parked(places[index]):
                     self._live.append(_Live())
                     self._extend(self._live[-1], time, places[index], samples[index])
-            if self._frame % self._options.reacquire_every == 0:
-                self._park()
+            self._park()
+            self._searched = time
         if any(track.misses > self._options.patience for track in self._live):
             self._ended += [track for track in self._live if track.misses > self._options.patience]
             self._live = [track for track in self._live if track.misses <= self._options.patience]
-        self._frame += 1
 
     def _assigned(self, predicted: list[tuple[float, float]], places: list[tuple[float, float]]) -> list[int | None]:
         """For each track the blob it goes on to: the least total distance, none farther than half a patch."""
