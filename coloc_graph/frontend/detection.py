@@ -25,10 +25,13 @@ Box = tuple[int, int, int, int]
 BORDER = 20
 #: How far around a box is looked at first [px].
 RIM = 4
+#: A box of at most so many pixels may hold one spot and nothing else.
+LONE = 400
 #: Pixels between a candidate and the border of its window.
 MARGIN = 3
 #: Windows come in these sizes [px], so that many are measured at once.
 SIZES = (11, 15, 21, 31, 45, 63)
+SIZE_FOR = [next(size for size in SIZES if size >= wanted) for wanted in range(SIZES[-1] + 1)]
 #: A blob's peak is at least this many times the noise around it.
 LEAST_CONTRAST = 4.0
 #: Two spots touch where it is darker between them than this part of the darker one.
@@ -54,7 +57,7 @@ class Blobs:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Candidate:
-    """A blob as it was found: its centre of area `uv` [px], and the `window` of light around it.
+    """A blob as it was found: roughly its centre `uv` [px], and the `window` of light around it.
 
     `corner` is the pixel (u, v) of the window's first element; `box` (left, top, width, height) [px in the
     window] is what the blob covers above `level` [grey levels].
@@ -110,7 +113,7 @@ class Detector:
         return np.where(off <= self.tolerance_deg, chroma, 0.0).astype(np.float32)
 
     def find(self, image: Pixels, box: Box | None = None) -> list[Candidate]:
-        """Candidates in an image, or those whose centre of area lies in a box (a pixel more at its border)."""
+        """Candidates in an image, or those whose centre lies in a box (a pixel more at its border)."""
         u0, v0 = (max(box[0] - BORDER, 0), max(box[1] - BORDER, 0)) if box else (0, 0)
         light = self.light(image[v0 : box[3] + BORDER, u0 : box[2] + BORDER] if box else image)
         t = self.threshold
@@ -181,10 +184,18 @@ class Detector:
 
 
 def _components(light: NDArray[np.uint8] | NDArray[np.float32], level: float) -> list[tuple[list[int], list[float]]]:
-    """Connected pixels above a level: (left, top, width, height, pixels) and the centre of area of each."""
+    """Connected pixels above a level: (left, top, width, height, pixels) and roughly the centre of each."""
     above = cv2.threshold(light, level, 255, cv2.THRESH_BINARY)[1]
     if above.dtype != np.uint8:
         above = above.astype(np.uint8)
+    left, top, width, height = cv2.boundingRect(above)
+    if not width:
+        return []
+    if max(width, height) <= 1.5 * min(width, height) + 1 and width * height <= LONE:
+        # most patches hold one compact spot, which needs no labels: two apart would leave the box half empty
+        pixels = cv2.countNonZero(above)
+        if pixels >= 0.6 * width * height:
+            return [([left, top, width, height, pixels], [left + (width - 1) / 2, top + (height - 1) / 2])]
     _, _, stats, centres = cv2.connectedComponentsWithStats(above, connectivity=8, ltype=cv2.CV_16U)
     return list(zip(stats[1:].tolist(), centres[1:].tolist(), strict=True))
 
@@ -212,7 +223,7 @@ def _cut(
     """A candidate with its window: of the least size that holds it with a margin, moved to lie in the image."""
     left, top, width, height = box
     wanted = max(width, height) + 2 * MARGIN
-    size = next((size for size in SIZES if size >= wanted), wanted)
+    size = SIZE_FOR[wanted] if wanted < len(SIZE_FOR) else wanted
     x = max(min(left + (width - size) // 2, light.shape[1] - size), 0)
     y = max(min(top + (height - size) // 2, light.shape[0] - size), 0)
     window = light[y : y + size, x : x + size].copy()
