@@ -7,6 +7,7 @@
     │   └── TracksError       tracks or planes in a CSV
     ├── DegenerateGeometry    the geometry cannot give what is asked, with the remedy
     └── EstimationError       the graph cannot be solved, or the solver's answer did not pass its check
+        └── MeasurementError  a measurement, or a stance, cannot enter the graph
 
 Messages are one sentence: what is wrong, where (file, line, stance, robot), and what to do. They are raised
 deep and caught once, in `cli`, which prints the sentence and ends with exit code 2.
@@ -39,6 +40,10 @@ class DegenerateGeometry(ColocError):
 
 class EstimationError(ColocError):
     """The graph cannot be solved, or the solver's answer did not pass its check."""
+
+
+class MeasurementError(EstimationError):
+    """A measurement, or a stance, cannot enter the graph; the message says which one and why."""
 
 
 class ColocWarning(UserWarning):

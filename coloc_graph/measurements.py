@@ -1,7 +1,8 @@
 """What passes between the front end and the back end; defined once, below both.
 
 Frames: `T_a_b` is the pose of b in a. Covariances are in GTSAM's tangent order, rotation [rad] first, then
-translation [m], in the body frame of the right-hand side: T_true = T_measured exp(xi).
+translation [m], in the body frame of the right-hand side: T_true = T_measured exp(xi). What is known on the floor
+alone has a covariance (3, 3) of the tangent's heading, x and y.
 """
 
 from dataclasses import dataclass
@@ -11,6 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+#: A robot at a stance: a node of the graph.
+Node = tuple[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,3 +85,71 @@ class RelativePose:
     T_ci_cj: gtsam.Pose3
     solution: int
     normal_error: float
+
+    @property
+    def ends(self) -> tuple[Node, Node]:
+        """The two nodes that it relates, i then j."""
+        return (self.robot_i, self.stance), (self.robot_j, self.stance)
+
+    def __str__(self) -> str:
+        return f"relative pose of {self.robot_i} and {self.robot_j} at stance {self.stance}"
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """Where a robot stands whose markers another one at rest sees: the pose of `seen` in `observer`, at `time`.
+
+    `time` [UTC s] is by the observer's clock: a robot that moves during the stance has its pose of the stance then.
+    `covariance` is (3, 3): heading, x, y, since both stand on the floor.
+    """
+
+    stance: int
+    observer: str
+    seen: str
+    time: float
+    T_observer_seen: gtsam.Pose3
+    covariance: Array
+
+    @property
+    def ends(self) -> tuple[Node, Node]:
+        """The two nodes that it relates, observer first."""
+        return (self.observer, self.stance), (self.seen, self.stance)
+
+    @property
+    def T_i_j(self) -> gtsam.Pose3:
+        """The pose of the second end in the first."""
+        return self.T_observer_seen
+
+    def __str__(self) -> str:
+        return f"sighting of {self.seen} by {self.observer} at stance {self.stance}"
+
+
+@dataclass(frozen=True, eq=False)
+class Odometry:
+    """What a robot's wheels say of its way between two stances: its body at `after` in its body at `before`.
+
+    `covariance` is (3, 3): heading, x, y, since wheels know nothing else.
+    """
+
+    robot: str
+    before: int
+    after: int
+    T_before_after: gtsam.Pose3
+    covariance: Array
+
+    @property
+    def ends(self) -> tuple[Node, Node]:
+        """The two nodes that it relates, in the order of time."""
+        return (self.robot, self.before), (self.robot, self.after)
+
+    @property
+    def T_i_j(self) -> gtsam.Pose3:
+        """The pose of the second end in the first."""
+        return self.T_before_after
+
+    def __str__(self) -> str:
+        return f"odometry of {self.robot} from stance {self.before} to {self.after}"
+
+
+#: What ties two nodes of the graph.
+Measurement = RelativePose | Sighting | Odometry

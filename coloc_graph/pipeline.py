@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 from scipy.special import chdtrc
 
-from coloc_graph.backend import Estimate, PoseGraph, chain, smooth
+from coloc_graph.backend import Estimate, Loose, PoseGraph, chain, diagnose, smooth
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.frontend import FrontendOptions, PairMeasurement, measure_pair, share_clock_offsets
 from coloc_graph.frontend.plausibility import implausible
@@ -90,14 +90,17 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
         )
     measured = time.perf_counter()
 
-    graph = PoseGraph(run.team.reference, run.team.names, run.stances, poses, run.team.floor)
-    estimate = chain(graph) if options.method == "chain" else smooth(graph)
-    solved = time.perf_counter()
-    if all(len(trajectory) == 0 or robot == run.team.reference for robot, trajectory in estimate.trajectories.items()):
+    graph = PoseGraph.of(run.team, run.stances, poses)
+    loose = diagnose(graph)
+    if not any(
+        robot != run.team.reference for robot, _ in set(graph.nodes) - {n for part in loose for n in part.nodes}
+    ):
         raise EstimationError(
             f"{run.path}: no measurement ties a robot to the reference {run.team.reference}; "
-            f"{_why_untied(estimate, measurements)}"
+            f"{_why_untied(loose, measurements)}"
         )
+    estimate = chain(graph) if options.method == "chain" else smooth(graph)
+    solved = time.perf_counter()
     return Solution(
         run=run,
         options=options,
@@ -179,12 +182,11 @@ def _implausible(run: Run, options: SolveOptions, measurements: Sequence[PairMea
         yield f"stance {each[0][0]}{f' (and {others} more alike)' if others else ''}: {each[0][1]}"
 
 
-def _why_untied(estimate: Estimate, measurements: tuple[PairMeasurement, ...]) -> str:
+def _why_untied(loose: tuple[Loose, ...], measurements: tuple[PairMeasurement, ...]) -> str:
     refused = [m.homography for m in measurements if m.homography.unusable]
     if refused:
         return f"stance {refused[0].stance}, {refused[0].robot_i} and {refused[0].robot_j}: {refused[0].unusable}"
-    robot, stance = estimate.untied[0]
-    return f"robot {robot} at stance {stance} shares no measurement with a robot whose pose is known"
+    return str(loose[0])
 
 
 def _warnings(estimate: Estimate, measurements: tuple[PairMeasurement, ...]) -> list[str]:

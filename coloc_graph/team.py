@@ -1,4 +1,4 @@
-"""Who the robots are: `Camera`, `Mount`, `Markers`, `Robot`, `Floor`, `Team`, and the file team.toml.
+"""Who the robots are: `Camera`, `Mount`, `Markers`, `Slip`, `Robot`, `Floor`, `Team`, and the file team.toml.
 
 Fields carry the unit a person writes (`tilt_deg`); metres where a name says nothing. Tolerances (`*_sigma*`)
 are one standard deviation: what a simulated truth is drawn from and what the estimators take as a prior.
@@ -212,13 +212,36 @@ class Markers(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         return math.dist(self.positions[0], self.positions[1])
 
 
+#: A looser stay-put constraint than this does what it says in GTSAM; a tighter one fails here or there [m].
+LEAST_SLIP = 1e-3
+
+
+class Slip(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How far a robot that should stay put may slip from one stance to the next: `sigma` [m] and `sigma_deg`."""
+
+    sigma: float
+    sigma_deg: float
+
+    def __post_init__(self) -> None:
+        _finite(self)
+        if self.sigma < LEAST_SLIP or self.sigma_deg <= 0:
+            raise ValueError(
+                f"a slip of {self.sigma} m and {self.sigma_deg} deg is too tight to be solved; give at least "
+                f"{LEAST_SLIP} m and an angle above 0, or leave `slip` out: then the robot stays put exactly"
+            )
+
+
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A body with a camera, its mount, and markers (none on a robot that is never watched)."""
+    """A body with a camera, its mount, and markers (none on a robot that is never watched).
+
+    As an anchor it stays put exactly, or, with a `slip`, within that.
+    """
 
     name: str
     camera: Camera
     mount: Mount
     markers: Markers | None = None
+    slip: Slip | None = None
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", self.name):

@@ -118,7 +118,7 @@ def g2o(solutions, tmp_path_factory):
 def test_g2o_is_what_gtsam_reads(g2o, solutions):
     estimate = solutions["smooth"].estimate
     factors, values = gtsam.readG2o(str(g2o), True)
-    keys = {estimate.graph.key(robot, stance) for robot, stance in estimate.graph.moves}
+    keys = {estimate.graph.key(robot, stance) for robot, stance in estimate.graph.nodes}
     assert values.size() == len(keys) == 9  # 8 stances of a leap-frog: 9 places
     assert factors.size() == len(estimate.graph.relative_poses) == 8
     for at, measured in enumerate(estimate.graph.relative_poses):

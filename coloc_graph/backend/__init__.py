@@ -1,6 +1,7 @@
-"""Measurements to an estimate: the pose graph with stay-put constraints, chained and smoothed (no images).
+"""Measurements to an estimate: the pose graph with stay-put constraints, in batch and as it happens (no images).
 
-`PoseGraph` holds what was measured, `chain` composes it as the paper does, `smooth` optimises it.
+`PoseGraph` holds what was measured, `chain` composes it as the paper does, `smooth` optimises it, `Estimator` keeps
+it optimised while stances come in, `diagnose` says what is not tied and what would tie it.
 """
 
 from coloc_graph.backend.gtsam_version import require_gtsam
@@ -8,8 +9,12 @@ from coloc_graph.backend.gtsam_version import require_gtsam
 require_gtsam()
 
 from coloc_graph.backend.chain import chain  # noqa: E402  after the check, so that its sentence is what one sees
-from coloc_graph.backend.estimate import Estimate  # noqa: E402
+from coloc_graph.backend.diagnosis import Loose, diagnose  # noqa: E402
+from coloc_graph.backend.estimate import Bump, Estimate, Refusal  # noqa: E402
+from coloc_graph.backend.estimator import Estimator  # noqa: E402
 from coloc_graph.backend.graph import PoseGraph, StayPut  # noqa: E402
 from coloc_graph.backend.smooth import smooth  # noqa: E402
 
-__all__ = ["Estimate", "PoseGraph", "StayPut", "chain", "smooth"]
+__all__ = [
+    "Bump", "Estimate", "Estimator", "Loose", "PoseGraph", "Refusal", "StayPut", "chain", "diagnose", "smooth",
+]  # fmt: skip

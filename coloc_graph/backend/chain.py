@@ -1,45 +1,93 @@
 """The paper's composition (section IV): T_world_j = T_world_i * T_i_j, stance after stance."""
 
+import heapq
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.estimate import Estimate, make_estimate
-from coloc_graph.backend.graph import GAUGE_SIGMA, PoseGraph
+from coloc_graph.backend.factors import GAUGE_SIGMA, link_covariance
+from coloc_graph.backend.graph import Link, PoseGraph, StayPut
+from coloc_graph.errors import EstimationError
+from coloc_graph.measurements import RelativePose
 
 Array = NDArray[np.float64]
 
 
-def chain(graph: PoseGraph) -> Estimate:
-    """Compose the relative poses from the reference on, each robot by the first measurement that ties it.
+class Step(NamedTuple):
+    """One composition: the pose of key `to` from that of key `via`, by a link read forwards or backwards."""
 
-    Covariances are propagated to first order. Anchors keep their pose exactly.
+    via: int
+    to: int
+    link: Link
+    forwards: bool
+
+
+def chain(graph: PoseGraph) -> Estimate:
+    """Compose the relative poses from the reference on, each robot by the surest way from there.
+
+    Covariances are propagated to first order. Anchors keep their pose exactly. Sightings and odometry are no part
+    of the paper's chain.
     """
-    poses, covariances = compose(graph)
+    composed = [link for link in graph.links if isinstance(link, RelativePose | StayPut)]
+    steps = spanning_tree(graph, composed)
+    poses = compose(graph, steps)
+    covariances: dict[int, Array] = {graph.reference_key: GAUGE_SIGMA**2 * np.eye(6)}
+    for via, to, link, forwards in steps:
+        if forwards:
+            back = link.T_i_j.inverse().AdjointMap()
+            covariances[to] = back @ covariances[via] @ back.T + link_covariance(link)
+        else:
+            forth = link.T_i_j.AdjointMap()
+            covariances[to] = forth @ (covariances[via] + link_covariance(link)) @ forth.T
     return make_estimate("chain", graph, poses, covariances)
 
 
-def compose(graph: PoseGraph) -> tuple[dict[int, gtsam.Pose3], dict[int, Array]]:
-    """Poses and covariances (6, 6) by key, of all that is tied to the reference."""
-    poses = {graph.reference_key: gtsam.Pose3()}
-    covariances: dict[int, Array] = {graph.reference_key: GAUGE_SIGMA**2 * np.eye(6)}
-    links = [(graph.key(p.robot_i, p.stance), graph.key(p.robot_j, p.stance), p) for p in graph.relative_poses]
-    waiting = links
+def spanning_tree(graph: PoseGraph, links: Sequence[Link]) -> list[Step]:
+    """The surest way from the reference to every pose that links tie to it, nearer poses first (Dijkstra).
+
+    The length of a link is its variance: of the translation, and of the heading at one metre.
+    """
+    neighbours: dict[int, list[tuple[int, int, bool]]] = defaultdict(list)
+    lengths = []
+    for index, link in enumerate(links):
+        i, j = map(graph.places.key, link.ends)
+        neighbours[i].append((j, index, True))
+        neighbours[j].append((i, index, False))
+        C = link_covariance(link)
+        diagonal = C.diagonal()
+        lengths.append(float(diagonal[-3:].sum() + diagonal[2] if len(C) == 6 else diagonal.sum()))
+    steps: list[Step] = []
+    reached: set[int] = set()
+    waiting: list[tuple[float, int, int, int, bool]] = [(0.0, -1, -1, graph.reference_key, True)]
     while waiting:
-        left = []
-        for i, j, measured in waiting:
-            if i in poses and j not in poses:
-                poses[j] = poses[i].compose(measured.T_i_j)
-                back = measured.T_i_j.inverse().AdjointMap()
-                covariances[j] = back @ covariances[i] @ back.T + measured.covariance
-            elif j in poses and i not in poses:
-                T_j_i = measured.T_i_j.inverse()
-                poses[i] = poses[j].compose(T_j_i)
-                forth = measured.T_i_j.AdjointMap()
-                covariances[i] = forth @ (covariances[j] + measured.covariance) @ forth.T
-            elif i not in poses:
-                left.append((i, j, measured))
-        if len(left) == len(waiting):
-            break
-        waiting = left
-    return poses, covariances
+        length, index, via, at, forwards = heapq.heappop(waiting)
+        if at in reached:
+            continue
+        reached.add(at)
+        if index >= 0:
+            steps.append(Step(via, at, links[index], forwards))
+        for to, through, along in neighbours[at]:
+            if to not in reached:
+                heapq.heappush(waiting, (length + lengths[through], through, at, to, along))
+    return steps
+
+
+def compose(graph: PoseGraph, steps: Sequence[Step]) -> dict[int, gtsam.Pose3]:
+    """Poses T_world_body by key, of the reference and wherever the steps lead.
+
+    Raises `EstimationError` where there are measurements and none leads anywhere.
+    """
+    if graph.measurements and not steps:
+        raise EstimationError(
+            f"no measurement ties a robot to the reference {graph.reference} at stance {graph.stances[0].index}: "
+            "measure it there together with another robot"
+        )
+    poses = {graph.reference_key: gtsam.Pose3()}
+    for via, to, link, forwards in steps:
+        poses[to] = poses[via].compose(link.T_i_j if forwards else link.T_i_j.inverse())
+    return poses

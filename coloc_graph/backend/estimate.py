@@ -1,35 +1,71 @@
 """What a method makes of a graph: the poses of all robots at all stances, and what is needed to doubt them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.graph import PoseGraph
+from coloc_graph.backend.factors import Factors
+from coloc_graph.backend.graph import PoseGraph, StayPut
+from coloc_graph.backend.solver import Posterior
 from coloc_graph.errors import EstimationError
+from coloc_graph.measurements import Measurement, Node
 from coloc_graph.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
+class Refusal:
+    """A measurement that was left out, and why, in words."""
+
+    measurement: Measurement
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Bump:
+    """An anchor that did not stay put: what the others say it did, and how many sigmas that is off its stay-put.
+
+    `T_before_after` is its body after in its body before.
+    """
+
+    stay_put: StayPut
+    T_before_after: gtsam.Pose3
+    sigmas: float
+
+    def __str__(self) -> str:
+        stay, moved = self.stay_put, self.T_before_after
+        far, turned = float(np.linalg.norm(moved.translation())), abs(np.rad2deg(moved.rotation().yaw()))
+        return (
+            f"robot {stay.robot} was bumped between stances {stay.before} and {stay.after}, where it should have "
+            f"stayed put: it moved by {100 * far:.1f} cm and turned by {turned:.1f} deg ({self.sigmas:.0f} sigmas); "
+            f"do not name it as an anchor of stance {stay.after}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """Poses of all robots at all stances that are tied to the reference.
 
-    `trajectories` by robot, one pose a stance it observed in. `chi2` with `dof` degrees of freedom says how
+    `trajectories` by robot, one pose a stance at which it is a node. `chi2` with `dof` degrees of freedom says how
     well the measurements agree (dof 0: nothing could contradict). `untied` are the (robot, stance) that no
-    measurement ties to the reference; they have no pose.
+    measurement ties to the reference; they have no pose. `refused` are the measurements that all others contradict,
+    and `bumped` the anchors that did.
     """
 
     method: str
     graph: PoseGraph
     trajectories: Mapping[str, Trajectory]
-    untied: tuple[tuple[str, int], ...] = ()
+    untied: tuple[Node, ...] = ()
     chi2: float = 0.0
     dof: int = 0
     iterations: int = 0
+    refused: tuple[Refusal, ...] = ()
+    bumped: tuple[Bump, ...] = ()
 
     def pose(self, robot: str, stance: int) -> gtsam.Pose3:
         """T_world_body of a robot at a stance; `EstimationError` where it has none."""
@@ -40,12 +76,49 @@ class Estimate:
         """Covariance (6, 6) of that pose: GTSAM's tangent, rotation [rad] first, then translation [m], body frame."""
         return self._at(robot, stance)[1]
 
+    def joint_covariance(self, nodes: Sequence[Node]) -> Array:
+        """Joint covariance (6 n, 6 n) of n (robot, stance), each in its own body's tangent, in the order given.
+
+        Poses that are one place have the same rows. Raises `EstimationError` where one has no pose.
+        """
+        if not nodes:
+            raise EstimationError("name at least one robot and stance to have a covariance")
+        if self.method == "chain":
+            raise EstimationError("a chain has no joint covariances: it uses some measurements only; use `smooth`")
+        for node in nodes:
+            self._at(*node)
+        keys = [self.graph.key(*node) for node in nodes]
+        different = list(dict.fromkeys(keys))
+        joint = self._posterior.joint(different)
+        index = np.concatenate([6 * different.index(key) + np.arange(6) for key in keys])
+        return np.asarray(joint[np.ix_(index, index)])
+
+    @cached_property
+    def _posterior(self) -> Posterior:
+        values = gtsam.Values()
+        for robot, trajectory in self.trajectories.items():
+            assert trajectory.stances is not None
+            for stance, T in zip(trajectory.stances.tolist(), trajectory.T_world_body, strict=True):
+                key = self.graph.key(robot, stance)
+                if not values.exists(key):
+                    values.insert(key, gtsam.Pose3(T))
+        used = self.graph.without(one.measurement for one in self.refused)
+        return Posterior(Factors(self.graph.floor).of_graph(used, values.keys())[0], values)
+
+    @cached_property
+    def _index(self) -> dict[Node, int]:
+        return {
+            (robot, stance): at
+            for robot, trajectory in self.trajectories.items()
+            if trajectory.stances is not None
+            for at, stance in enumerate(trajectory.stances.tolist())
+        }
+
     def _at(self, robot: str, stance: int) -> tuple[Array, Array]:
-        trajectory = self.trajectories.get(robot)
-        if trajectory is not None and trajectory.stances is not None and trajectory.covariances is not None:
-            for index in np.flatnonzero(trajectory.stances == stance):
-                return trajectory.T_world_body[index], trajectory.covariances[index]
-        raise EstimationError(f"robot {robot} has no pose at stance {stance}")
+        at, trajectory = self._index.get((robot, stance)), self.trajectories.get(robot)
+        if at is None or trajectory is None or trajectory.covariances is None:
+            raise EstimationError(f"robot {robot} has no pose at stance {stance}")
+        return trajectory.T_world_body[at], trajectory.covariances[at]
 
 
 def make_estimate(
@@ -57,19 +130,24 @@ def make_estimate(
     chi2: float = 0.0,
     dof: int = 0,
     iterations: int = 0,
+    refused: tuple[Refusal, ...] = (),
+    bumped: tuple[Bump, ...] = (),
 ) -> Estimate:
     """An estimate of poses and covariances (6, 6) by key."""
+    nodes: dict[str, list[int]] = {robot: [] for robot in graph.robots}
+    for robot, stance in graph.nodes:
+        if graph.key(robot, stance) in poses:
+            nodes[robot].append(stance)
     trajectories = {}
-    for robot in graph.robots:
-        at = [s for s in graph.stances if robot in s.observers and graph.key(robot, s.index) in poses]
-        if not at:
-            continue
-        keys = [graph.key(robot, stance.index) for stance in at]
-        trajectories[robot] = Trajectory(
-            robot=robot,
-            times=np.array([stance.start for stance in at]),
-            T_world_body=np.array([poses[key].matrix() for key in keys]),
-            stances=np.array([stance.index for stance in at]),
-            covariances=np.array([covariances[key] for key in keys]),
-        )
-    return Estimate(method, graph, trajectories, graph.untied(poses), chi2, dof, iterations)
+    for robot, stances in nodes.items():
+        if stances:
+            keys = [graph.key(robot, stance) for stance in stances]
+            trajectories[robot] = Trajectory(
+                robot=robot,
+                times=np.array([graph.times[robot, stance] for stance in stances]),
+                T_world_body=np.array([poses[key].matrix() for key in keys]),
+                stances=np.array(stances),
+                covariances=np.array([covariances[key] for key in keys]),
+            )
+    untied = graph.untied(poses)
+    return Estimate(method, graph, trajectories, untied, chi2, dof, iterations, refused, bumped)

@@ -1,128 +1,295 @@
-"""The pose graph of a team: one pose a robot and move, stay-put constraints, relative poses, the floor."""
+"""The pose graph of a team: one pose a robot and move, stay-put constraints, and what was measured between them."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
-import numpy as np
 
-from coloc_graph.errors import EstimationError
-from coloc_graph.measurements import RelativePose
+from coloc_graph.backend.validation import require_valid
+from coloc_graph.errors import EstimationError, MeasurementError
+from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
 from coloc_graph.run import Stance
-from coloc_graph.team import Floor
+from coloc_graph.team import Floor, Slip, Team
 
-#: The world frame is fixed this firmly [rad, m]; far below anything that is measured.
-GAUGE_SIGMA = 1e-6
-#: A floor that is called exactly flat is taken as flat to this much [rad, m].
-LEAST_FLOOR_SIGMA = 1e-5
+#: GTSAM's keys number the robots of a team in one byte.
+MOST_ROBOTS = 255
 
 
 @dataclass(frozen=True)
 class StayPut:
     """The paper's constraint: an anchor's pose at stance `after` is its pose at stance `before`.
 
-    It is enforced exactly: both stances share one variable, since every equality factor of GTSAM 4.3 fails
-    somewhere.
+    Without a `slip` it is enforced exactly: both stances share one variable, since every equality factor of
+    GTSAM 4.3 fails somewhere. With one it is a between-factor on two variables, whose residual tells a bump.
     """
 
     robot: str
     before: int
     after: int
+    slip: Slip | None = None
+
+    @property
+    def ends(self) -> tuple[Node, Node]:
+        """The two nodes that are one place."""
+        return (self.robot, self.before), (self.robot, self.after)
+
+    @property
+    def T_i_j(self) -> gtsam.Pose3:
+        """The pose of the second end in the first."""
+        return gtsam.Pose3()
+
+    def __str__(self) -> str:
+        return f"{self.robot} staying put from stance {self.before} to {self.after}"
 
 
-@dataclass(frozen=True)
+#: What the graph holds between two nodes.
+Link = Measurement | StayPut
+
+
+class Places:
+    """Which variable each robot's pose at each stance is: stance after stance, by counting its moves."""
+
+    def __init__(self, robots: tuple[str, ...], slips: Mapping[str, Slip]) -> None:
+        if len(robots) > MOST_ROBOTS:
+            raise EstimationError(f"a team of {len(robots)} robots is too large: a graph holds {MOST_ROBOTS} at most")
+        self.slips = slips
+        self._numbers = {robot: number for number, robot in enumerate(robots, start=1)}
+        self._moves = dict.fromkeys(robots, 0)
+        self._keys: dict[Node, int] = {}
+
+    def after(self, before: Stance | None, stance: Stance) -> dict[Node, int]:
+        """The keys of all robots at the stance that comes after `before`: who is not its anchor has moved."""
+        keys = {}
+        for robot, number in self._numbers.items():
+            moves = self._moves[robot]
+            if before is not None and (robot in self.slips or not self.stays(robot, before, stance)):
+                moves += 1
+            keys[robot, stance.index] = int(gtsam.mrsymbol(ord("x"), number, moves))
+        return keys
+
+    def accept(self, keys: Mapping[Node, int]) -> None:
+        """Take in a stance's keys, as `after` gave them."""
+        for (robot, _), key in keys.items():
+            self._moves[robot] = gtsam.mrsymbolIndex(key)
+        self._keys.update(keys)
+
+    def forget(self, before: Stance | None, stance: Stance) -> None:
+        """Take the last stance back, which came after `before`."""
+        for robot in self._numbers:
+            del self._keys[robot, stance.index]
+            self._moves[robot] = 0 if before is None else gtsam.mrsymbolIndex(self._keys[robot, before.index])
+
+    @staticmethod
+    def stays(robot: str, before: Stance, after: Stance) -> bool:
+        """Whether a robot's pose of stance `before` is that of `after`: one that was driving has left it."""
+        return robot in after.anchors and robot not in before.movers
+
+    def stay_puts(self, before: Stance, after: Stance) -> Iterator[StayPut]:
+        """The constraints between two stances, of all anchors."""
+        for robot in after.anchors:
+            if self.stays(robot, before, after):
+                yield StayPut(robot, before.index, after.index, self.slips.get(robot))
+
+    def key(self, node: Node) -> int:
+        """GTSAM's key of a node; `KeyError` where there is no such robot or stance."""
+        return self._keys[node]
+
+    def __contains__(self, node: Node) -> bool:
+        return node in self._keys
+
+
+@dataclass(frozen=True, repr=False)
 class PoseGraph:
     """What a team measured, as a graph.
 
-    Nodes are the poses T_world_body of the observers, one a robot and number of its moves. The world frame is
-    where the reference robot stands at the first stance: its body, or, where there is a `floor`, the floor
-    beneath it (the same on a level floor), x along its heading.
+    Nodes are the poses T_world_body of robots at stances: of its observers, of whoever a measurement names, and of
+    anchors whose pose is a node already. Nodes that are one place share one variable (`key`). The world frame is
+    where the reference robot stands at the first stance: its body, or, where there is a `floor`, the floor beneath
+    it (the same on a level floor), x along its heading. `slips` are of the robots that stay put within a tolerance.
+
+    Raises `EstimationError` where there is nothing to solve, and `MeasurementError` where a measurement is not one.
     """
 
     reference: str
     robots: tuple[str, ...]
     stances: tuple[Stance, ...]
-    relative_poses: tuple[RelativePose, ...]
+    measurements: tuple[Measurement, ...]
     floor: Floor | None = None
+    slips: Mapping[str, Slip] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, team: Team, stances: Iterable[Stance], measurements: Iterable[Measurement]) -> "PoseGraph":
+        """The graph of a team."""
+        return cls(team.reference, team.names, tuple(stances), tuple(measurements), team.floor, slips_of(team))
 
     def __post_init__(self) -> None:
         if not self.stances:
             raise EstimationError("there is no stance to estimate: record one in which two robots stand and watch")
+        twice = [after.index for before, after in zip(self.stances, self.stances[1:], strict=False)
+                 if after.index <= before.index]  # fmt: skip
+        if twice:
+            raise MeasurementError(f"stance {twice[0]} is there twice, or out of order; number each stance once")
         first = self.stances[0]
-        if self.reference not in first.observers:
-            raise EstimationError(
-                f"the reference robot {self.reference} does not observe at stance {first.index}, where the world "
-                f"frame is set: name one of {', '.join(first.observers)} as the reference in the team"
-            )
-        for pose in self.relative_poses:
-            for robot in (pose.robot_i, pose.robot_j):
-                if (robot, pose.stance) not in self.moves:
-                    raise EstimationError(
-                        f"a relative pose at stance {pose.stance} names {robot}, which does not observe there"
-                    )
+        require_reference(self.reference, first)
+        for stance in self.stances:
+            require_robots(stance, self.robots)
+        for measured in self.measurements:
+            require_ends(measured, self.places, self.by_index)
+        require_valid(self.measurements, self.floor)
+        _require_one_instant(self.measurements, self.by_index)
 
     @cached_property
-    def moves(self) -> dict[tuple[str, int], int]:
-        """How often a robot has moved before it observed at a stance, by (robot, stance index)."""
-        count = dict.fromkeys(self.robots, 0)
-        moves: dict[tuple[str, int], int] = {}
+    def places(self) -> Places:
+        """Which variable each node is."""
+        places = Places(self.robots, self.slips)
         for before, stance in zip((None, *self.stances), self.stances, strict=False):
-            for robot in self.robots:
-                if before is not None and robot not in stance.anchors:
-                    count[robot] += 1
-            moves |= {(robot, stance.index): count[robot] for robot in stance.observers}
-        return moves
+            places.accept(places.after(before, stance))
+        return places
+
+    @cached_property
+    def by_index(self) -> dict[int, Stance]:
+        """The stances by their number."""
+        return {stance.index: stance for stance in self.stances}
+
+    @cached_property
+    def nodes(self) -> tuple[Node, ...]:
+        """All nodes, in the order of the stances."""
+        named: dict[int, dict[str, None]] = defaultdict(dict)
+        for measured in self.measurements:
+            for robot, index in measured.ends:
+                named[index][robot] = None
+        nodes: list[Node] = []
+        there: set[str] = set()
+        for before, stance in zip((None, *self.stances), self.stances, strict=False):
+            held = [r for r in stance.anchors if before and r in there and Places.stays(r, before, stance)]
+            at = dict.fromkeys([*stance.observers, *named[stance.index], *held])
+            there = set(at)
+            nodes += [(robot, stance.index) for robot in at]
+        return tuple(nodes)
+
+    @property
+    def relative_poses(self) -> tuple[RelativePose, ...]:
+        """The measurements made of homographies."""
+        return tuple(m for m in self.measurements if isinstance(m, RelativePose))
+
+    @cached_property
+    def times(self) -> dict[Node, float]:
+        """When each node's pose was [UTC s]: at the start of the stance, or when a moving robot was sighted."""
+        times = {(robot, index): self.by_index[index].start for robot, index in self.nodes}
+        for measured in self.measurements:
+            if isinstance(measured, Sighting) and measured.seen in self.by_index[measured.stance].movers:
+                times[measured.seen, measured.stance] = measured.time
+        return times
 
     @cached_property
     def stay_puts(self) -> tuple[StayPut, ...]:
         """The constraints, in the order of the stances."""
+        nodes = set(self.nodes)
         return tuple(
-            StayPut(robot, before.index, after.index)
+            stay
             for before, after in zip(self.stances, self.stances[1:], strict=False)
-            for robot in after.anchors
-            if robot in before.observers and robot in after.observers
+            for stay in self.places.stay_puts(before, after)
+            if nodes.issuperset(stay.ends)
         )
+
+    @property
+    def links(self) -> tuple[Link, ...]:
+        """All that holds two variables together: measurements, and stay-put constraints with a slip."""
+        return (*self.measurements, *(stay for stay in self.stay_puts if stay.slip is not None))
 
     def key(self, robot: str, stance: int) -> int:
         """GTSAM's key of a robot's pose at a stance."""
-        return int(gtsam.mrsymbol(ord("x"), self.robots.index(robot) + 1, self.moves[robot, stance]))
+        return self.places.key((robot, stance))
 
     @property
     def reference_key(self) -> int:
         """The key of the pose that defines the world."""
         return self.key(self.reference, self.stances[0].index)
 
-    def factors(self, keys: Iterable[int]) -> gtsam.NonlinearFactorGraph:
-        """The graph over these keys: gauge, floor priors, between-factors of the relative poses among them."""
-        wanted = set(keys)
-        graph = gtsam.NonlinearFactorGraph()
-        tilt, height = GAUGE_SIGMA, GAUGE_SIGMA
-        if self.floor is not None:
-            tilt = max(float(np.deg2rad(self.floor.tilt_sigma_deg)), LEAST_FLOOR_SIGMA)
-            height = max(self.floor.height_sigma, LEAST_FLOOR_SIGMA)
-        gauge = gtsam.noiseModel.Diagonal.Sigmas([tilt, tilt, GAUGE_SIGMA, GAUGE_SIGMA, GAUGE_SIGMA, height])
-        graph.add(gtsam.PriorFactorPose3(self.reference_key, gtsam.Pose3(), gauge))
-        if self.floor is not None:
-            level = gtsam.noiseModel.Isotropic.Sigma(2, tilt)
-            on_floor = gtsam.noiseModel.Diagonal.Precisions(np.array([0.0, 0.0, height**-2]))
-            up = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
-            for key in sorted(wanted - {self.reference_key}):
-                graph.add(gtsam.AttitudeFactorPose3(key, up, level))
-                graph.add(gtsam.PoseTranslationPrior3D(key, np.zeros(3), on_floor))
-        for pose in self.relative_poses:
-            i, j = self.key(pose.robot_i, pose.stance), self.key(pose.robot_j, pose.stance)
-            if i in wanted and j in wanted:
-                noise = gtsam.noiseModel.Gaussian.Covariance(pose.covariance)
-                graph.add(gtsam.BetweenFactorPose3(i, j, pose.T_i_j, noise))
+    def without(self, refused: Iterable[Link]) -> "PoseGraph":
+        """The same nodes with fewer measurements."""
+        out = {id(one) for one in refused}
+        if not out:
+            return self
+        graph = PoseGraph(self.reference, self.robots, self.stances, tuple(m for m in self.measurements
+                          if id(m) not in out), self.floor, self.slips)  # fmt: skip
+        vars(graph).update(nodes=self.nodes, times=self.times)  # a node stays one, and untied, if all it had is refused
         return graph
 
-    def untied(self, known: Iterable[int]) -> tuple[tuple[str, int], ...]:
+    def untied(self, known: Iterable[int]) -> tuple[Node, ...]:
         """The (robot, stance) whose pose is not among these keys, in the order of the stances."""
         keys = set(known)
-        return tuple(
-            (robot, stance.index)
-            for stance in self.stances
-            for robot in stance.observers
-            if self.key(robot, stance.index) not in keys
+        return tuple(node for node in self.nodes if self.places.key(node) not in keys)
+
+    def __repr__(self) -> str:
+        kinds = {"relative pose": RelativePose, "sighting": Sighting, "odometry": Odometry}
+        counts = [f"{sum(isinstance(m, of) for m in self.measurements)} {name}" for name, of in kinds.items()]
+        slipping = sum(stay.slip is not None for stay in self.stay_puts)
+        exact = len(self.stay_puts) - slipping
+        shown = ", ".join(f"{s.robot}@{s.before}={s.robot}@{s.after}" for s in self.stay_puts[:4])
+        more = ", ..." if len(self.stay_puts) > 4 else ""
+        return (
+            f"PoseGraph({len(self.robots)} robots, {len(self.stances)} stances, {', '.join(counts)}, "
+            f"{exact} stay-put exact and {slipping} with a slip{': ' if shown else ''}{shown}{more})"
+        )
+
+
+def slips_of(team: Team) -> dict[str, Slip]:
+    """The robots of a team that stay put within a tolerance, with it."""
+    return {robot.name: robot.slip for robot in team.robots if robot.slip is not None}
+
+
+def require_reference(reference: str, first: Stance) -> None:
+    """Raise `EstimationError` where the reference robot does not stand at the first stance."""
+    if reference not in first.observers:
+        raise EstimationError(
+            f"the reference robot {reference} does not observe at stance {first.index}, where the world "
+            f"frame is set: name one of {', '.join(first.observers)} as the reference in the team"
+        )
+
+
+def require_robots(stance: Stance, robots: tuple[str, ...]) -> None:
+    """Raise `MeasurementError` where a stance names a robot that is not in the team."""
+    for robot in (*stance.observers, *stance.movers, *stance.anchors):
+        if robot not in robots:
+            raise MeasurementError(
+                f"stance {stance.index} names robot {robot}, which is not in the team ({', '.join(robots)})"
+            )
+
+
+def require_ends(measured: Measurement, places: Places, stances: Mapping[int, Stance]) -> None:
+    """Raise `MeasurementError` where a measurement relates what is not there, or a robot to itself."""
+    for robot, index in measured.ends:
+        if (robot, index) not in places:
+            what = f"robot {robot}, which is not in the team" if index in stances else f"stance {index}, which is not"
+            raise MeasurementError(f"the {measured} names {what} there: correct it, or add that first")
+    (robot_i, before), (robot_j, after) = measured.ends
+    if isinstance(measured, Odometry):
+        if before >= after:
+            raise MeasurementError(f"the {measured} does not lead from a stance to a later one")
+        return
+    if robot_i == robot_j:
+        raise MeasurementError(f"the {measured} relates a robot to itself")
+    watching = (robot_i,) if isinstance(measured, Sighting) else (robot_i, robot_j)
+    for robot in watching:
+        if robot not in stances[before].observers:
+            raise MeasurementError(f"the {measured} names {robot}, which does not observe there")
+
+
+def _require_one_instant(measurements: Iterable[Measurement], stances: Mapping[int, Stance]) -> None:
+    """A moving robot has one pose a stance, so that all its sightings there are of one instant."""
+    when: dict[Node, float] = {}
+    for one in measurements:
+        if isinstance(one, Sighting) and one.seen in stances[one.stance].movers:
+            require_instant(one, when.setdefault((one.seen, one.stance), one.time))
+
+
+def require_instant(sighting: Sighting, time: float) -> None:
+    """Raise `MeasurementError` where a moving robot was sighted at another time than its pose of the stance is."""
+    if abs(sighting.time - time) > 1e-3:
+        raise MeasurementError(
+            f"the {sighting} is of another instant than an earlier one ({sighting.time - time:+.3f} s), and the robot "
+            "moves: give the sightings of one instant"
         )

@@ -1,76 +1,233 @@
-"""The pose graph optimised: Levenberg-Marquardt with QR from the chained estimate, and checked afterwards."""
+"""The pose graph optimised in batch: checked before, fitted, and asked afterwards which measurement is wrong."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
+from scipy.special import chdtrc, chdtri
 
-from coloc_graph.backend.chain import compose
-from coloc_graph.backend.estimate import Estimate, make_estimate
-from coloc_graph.backend.graph import PoseGraph
-from coloc_graph.errors import EstimationError
+from coloc_graph.backend.chain import compose, spanning_tree
+from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, agreement, innovation
+from coloc_graph.backend.estimate import Bump, Estimate, Refusal, make_estimate
+from coloc_graph.backend.factors import Factors, rows
+from coloc_graph.backend.graph import Link, PoseGraph, StayPut
+from coloc_graph.backend.solver import Posterior, lm_parameters, optimise, with_stack
+from coloc_graph.measurements import RelativePose, Sighting
+from coloc_graph.team import Slip
 
-Array = NDArray[np.float64]
+#: A fit that noise alone makes this bad less often than this is looked into.
+LEAST_CHANCE_OF_ALL = 1e-4
+#: In larger graphs only the measurements are tested whose residual noise exceeds less often than `LOOKED_INTO`.
+ALL_TESTED, LOOKED_INTO = 500, 0.1
+#: A stay-put constraint is loosened by so much to see whether the others contradict it.
+TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)
+#: A bump must explain this much more chi2 than any wrong measurement to be called one.
+MORE_LIKELY = 1.1
+MOST_BUMPS = 3
+#: Rounds of refusing the worst and taking back what then agrees.
+ROUNDS = 20
 
 
-def smooth(graph: PoseGraph) -> Estimate:
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A graph at its optimum; `links` are the last factors, in that order."""
+
+    graph: PoseGraph
+    factors: gtsam.NonlinearFactorGraph
+    links: tuple[Link, ...]
+    values: gtsam.Values
+    iterations: int
+
+    @property
+    def chi2(self) -> float:
+        return float(2 * self.factors.error(self.values))
+
+    @property
+    def dof(self) -> int:
+        """Rows that weigh, less unknowns."""
+        poses = int(self.values.size())
+        priors = 6 + Factors(self.graph.floor).pose_rows * (poses - 1)
+        return priors + sum(map(rows, self.links)) - 6 * poses
+
+    @property
+    def chance(self) -> float:
+        return float(chdtrc(self.dof, self.chi2)) if self.dof > 0 else 1.0
+
+    def factor(self, index: int) -> gtsam.NonlinearFactor:
+        """The factor of a link, by its index."""
+        return self.factors.at(self.factors.size() - len(self.links) + index)
+
+    def agreements(self, posterior: Posterior, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
+        """How the links of some kinds agree with all others, by index; see `ALL_TESTED`."""
+        found = {}
+        for index, link in enumerate(self.links):
+            if not isinstance(link, kinds):
+                continue
+            factor = self.factor(index)
+            if len(self.links) > ALL_TESTED and 2 * factor.error(self.values) < chdtri(rows(link), LOOKED_INTO):
+                continue
+            found[index] = agreement(factor, self.values, posterior.joint(list(factor.keys())))
+        return found
+
+
+def smooth(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None = None) -> Estimate:
     """The most likely poses given all measurements, the floor and the stay-put constraints.
 
-    Raises `EstimationError` where the optimiser's answer does not pass its check.
+    Where they disagree, and unless `refuse` is False, measurements that all others contradict are refused (graduated
+    non-convexity on the relative poses, everything else taken for true; then each is tested against the rest), and
+    anchors that did not stay put are named and taken to have moved. The search starts from `start`, or from the
+    composition along the surest way. Raises `EstimationError` where the optimiser's answer does not pass its check,
+    or no measurement ties anything to the reference.
     """
-    chained, _ = compose(graph)
-    factors = graph.factors(chained)
-    initial = gtsam.Values()
-    for key, pose in chained.items():
-        initial.insert(key, pose)
-    values, iterations = optimise(factors, initial)
-    covariances = marginals(factors, values)
+    return with_stack(len(graph.nodes), lambda: _smooth(graph, refuse, start))
+
+
+def _smooth(graph: PoseGraph, refuse: bool, start: gtsam.Values | None) -> Estimate:
+    fit = _fit(graph, start)
+    posterior = Posterior(fit.factors, fit.values)
+    refused: tuple[Refusal, ...] = ()
+    bumped: tuple[Bump, ...] = ()
+    if refuse and _is_suspicious(fit, posterior):
+        bumped = _find_bumps(graph)
+        for bump in bumped:
+            graph = _moved(graph, bump.stay_put)
+        refused = _find_wrong(graph)
+        if refused or bumped:
+            fit = _fit(graph.without(one.measurement for one in refused))
+            posterior = Posterior(fit.factors, fit.values)
     return make_estimate(
         "smooth",
         graph,
-        {key: values.atPose3(key) for key in chained},
-        covariances,
-        chi2=2 * factors.error(values),
-        dof=_degrees_of_freedom(graph, factors, len(chained)),
-        iterations=iterations,
+        {int(key): fit.values.atPose3(key) for key in fit.values.keys()},  # noqa: SIM118  GTSAM's own
+        posterior.covariances(),
+        chi2=fit.chi2,
+        dof=fit.dof,
+        iterations=fit.iterations,
+        refused=refused,
+        bumped=bumped,
     )
 
 
-def _degrees_of_freedom(graph: PoseGraph, factors: gtsam.NonlinearFactorGraph, poses: int) -> int:
-    """Rows less unknowns; the height prior has three rows of which one weighs."""
-    rows = sum(
-        1 if isinstance(factors.at(i), gtsam.PoseTranslationPrior3D) else factors.at(i).dim()
-        for i in range(factors.size())
-    )
-    return int(rows - 6 * poses)
+def _fit(graph: PoseGraph, start: gtsam.Values | None = None) -> _Fit:
+    factors_of = Factors(graph.floor)
+    initial = gtsam.Values()
+    # also with a start: what it does not hold is composed, and what nothing ties any more is left out
+    for key, pose in compose(graph, spanning_tree(graph, graph.links)).items():
+        known = start is not None and start.exists(key)
+        initial.insert(key, start.atPose3(key) if start is not None and known else factors_of.start(pose))
+    factors, links = factors_of.of_graph(graph, initial.keys())
+    values, iterations = optimise(factors, initial)
+    return _Fit(graph, factors, links, values, iterations)
 
 
-def optimise(factors: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> tuple[gtsam.Values, int]:
-    """Levenberg-Marquardt with QR; values and iterations, or `EstimationError`.
+def _is_suspicious(fit: _Fit, posterior: Posterior) -> bool:
+    if fit.dof <= 0:
+        return False
+    if fit.chance < LEAST_CHANCE_OF_ALL:
+        return True
+    tested = fit.agreements(posterior, (RelativePose, Sighting, StayPut))
+    return any(one.chance() < LEAST_CHANCE for one in tested.values())
 
-    GTSAM's optimiser returns the initial values without a word when it fails, so the answer is checked: the
-    errors are finite, the error did not rise, and it iterated wherever there was something to gain.
+
+def _scale(tested: Iterable[Agreement]) -> float:
+    """How much larger variances seem to be than stated, by the median measurement; 1 at least.
+
+    What all measurements share, such as mounts that are not as thought, is no reason to refuse a few of them.
     """
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky throws on healthy chains
-    parameters.setRelativeErrorTol(1e-10)
-    parameters.setAbsoluteErrorTol(1e-10)
-    before = factors.error(initial)
-    if not np.isfinite(before):
-        raise EstimationError("the graph's error is not finite at the chained estimate: a measurement holds no number")
-    optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, parameters)
-    values = optimiser.optimize()
-    after = factors.error(values)
-    if not np.isfinite(after) or after > before * (1 + 1e-9) + 1e-9:
-        raise EstimationError(f"the optimiser did not lower the graph's error ({before:.6g} to {after:.6g})")
-    if optimiser.iterations() == 0 and before > 1e-6:
-        raise EstimationError(f"the optimiser gave up at the chained estimate (error {before:.6g})")
-    return values, int(optimiser.iterations())
+    ratios = [one.chi2 / chdtri(one.dof, 0.5) for one in tested if one.dof]
+    return max(1.0, float(np.median(ratios))) if ratios else 1.0
 
 
-def marginals(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> dict[int, Array]:
-    """Covariances (6, 6) of all poses, by one bulk ISAM2 elimination with QR at the optimum."""
-    parameters = gtsam.ISAM2Params()
-    parameters.setFactorization("QR")
-    isam = gtsam.ISAM2(parameters)
-    isam.update(factors, values)
-    return {int(key): np.asarray(isam.marginalCovariance(key)) for key in values.keys()}  # noqa: SIM118  GTSAM's own
+def _find_wrong(graph: PoseGraph) -> tuple[Refusal, ...]:
+    """The measurements that all others contradict."""
+    fit = _fit(graph)
+    doubted = _outliers(fit)
+    # twice the same set ends it, as does the last round
+    for _ in range(ROUNDS):
+        fit = _fit(graph.without(doubted.values()))
+        posterior = Posterior(fit.factors, fit.values)
+        tested = fit.agreements(posterior, (RelativePose, Sighting))
+        scale = _scale(tested.values())
+        worst = min(tested, key=lambda index: tested[index].chance(scale), default=None)
+        again = {key for key, link in doubted.items() if _agrees(fit, posterior, link, scale)}
+        refusing = worst is not None and tested[worst].chance(scale) < LEAST_CHANCE
+        if not again and not refusing:
+            break
+        for key in again:
+            del doubted[key]
+        if worst is not None and refusing:
+            doubted[id(fit.links[worst])] = fit.links[worst]
+    return tuple(
+        Refusal(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
+        for link in graph.measurements
+        if id(link) in doubted
+        for off in [_innovation(fit, posterior, link).sigmas]
+    )
+
+
+def _outliers(fit: _Fit) -> dict[int, Link]:
+    """The relative poses that graduated non-convexity leaves out, by identity; everything else is taken for true.
+
+    Source: Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", 2020.
+    """
+    first = fit.factors.size() - len(fit.links)
+    suspects = [index for index, link in enumerate(fit.links) if isinstance(link, RelativePose)]
+    parameters = gtsam.GncLMParams(lm_parameters())
+    parameters.setKnownInliers(sorted(set(range(fit.factors.size())) - {first + index for index in suspects}))
+    optimiser = gtsam.GncLMOptimizer(fit.factors, fit.values, parameters)
+    optimiser.setInlierCostThresholdsAtProbability(1 - 1e-4)
+    optimiser.optimize()
+    weights = optimiser.getWeights()
+    return {id(fit.links[index]): fit.links[index] for index in suspects if weights[first + index] < 0.5}
+
+
+def _innovation(fit: _Fit, posterior: Posterior, link: Link) -> Agreement:
+    """How a link that is not in the fit agrees with it; 0 of 0 where an end of it has no pose there."""
+    i, j = map(fit.graph.places.key, link.ends)
+    if not (fit.values.exists(i) and fit.values.exists(j)):
+        return Agreement(0.0, 0)
+    factor = Factors(fit.graph.floor).of_link(link, i, j)
+    return innovation(factor, fit.values, posterior.joint(list(factor.keys())))
+
+
+def _agrees(fit: _Fit, posterior: Posterior, link: Link, scale: float) -> bool:
+    """Whether a link that was left out agrees with the rest, or is all that ties one of its ends."""
+    return _innovation(fit, posterior, link).chance(scale) >= LEAST_CHANCE
+
+
+def _find_bumps(graph: PoseGraph) -> tuple[Bump, ...]:
+    """The anchors that did not stay put, the plainest first; none where a wrong measurement explains more."""
+    slips = {robot: graph.slips.get(robot, TEST_SLIP) for robot in graph.robots}
+    loose = replace(graph, slips=slips)
+    bumps: list[Bump] = []
+    for _ in range(MOST_BUMPS):
+        fit = _fit(loose)
+        tested = fit.agreements(Posterior(fit.factors, fit.values), (StayPut, RelativePose, Sighting))
+        stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
+        if not stays:
+            break
+        plainest = max(stays, key=lambda index: stays[index].chi2)
+        others = max((one.chi2 for index, one in tested.items() if index not in stays), default=0.0)
+        by_chance = stays[plainest].chance(_scale(tested.values())) > LEAST_CHANCE
+        if by_chance or stays[plainest].chi2 < MORE_LIKELY * others:
+            break
+        stay = fit.links[plainest]
+        assert isinstance(stay, StayPut)
+        loose = _moved(loose, stay)
+        moved = _fit(loose)
+        before, after = (moved.values.atPose3(loose.places.key(node)) for node in stay.ends)
+        named = replace(stay, slip=graph.slips.get(stay.robot))
+        bumps.append(Bump(named, before.between(after), stays[plainest].sigmas))
+    return tuple(bumps)
+
+
+def _moved(graph: PoseGraph, stay: StayPut) -> PoseGraph:
+    """The graph in which a robot was no anchor at the later of two stances."""
+    stances = tuple(
+        replace(stance, anchors=tuple(robot for robot in stance.anchors if robot != stay.robot))
+        if stance.index == stay.after
+        else stance
+        for stance in graph.stances
+    )
+    return replace(graph, stances=stances)

@@ -1,0 +1,64 @@
+"""Does a measurement agree with all the others? Standardised residuals, and the gate they must pass.
+
+Source: W. Baarda, "A Testing Procedure for Use in Geodetic Networks", 1968.
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+Array = NDArray[np.float64]
+
+#: A measurement that noise alone puts this far off less often than this is refused.
+LEAST_CHANCE = 1e-6
+#: Of a whitened residual, the directions that others check by less than this share of its variance are unchecked.
+LEAST_CHECKED = 1e-3
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far a measurement is from what all others say of it: `chi2` with `dof` degrees of freedom.
+
+    `dof` is 0 where nothing can contradict it.
+    """
+
+    chi2: float
+    dof: int
+
+    def chance(self, scale: float = 1.0) -> float:
+        """How often noise alone does that, where variances are `scale` times what is stated."""
+        return float(chdtrc(self.dof, self.chi2 / scale)) if self.dof else 1.0
+
+    @property
+    def sigmas(self) -> float:
+        """The distance in standard deviations, if all of it lay in one direction."""
+        return float(np.sqrt(self.chi2))
+
+
+def agreement(factor: gtsam.NonlinearFactor, values: gtsam.Values, joint: Array) -> Agreement:
+    """The standardised residual of a between-factor that is in a fit, by the joint covariance (12, 12) of its poses.
+
+    The covariance of a whitened residual e = A x - b after the fit is I - A P A^T: e^T (I - A P A^T)^-1 e is chi2
+    distributed, and is what the sum of squares falls by when the measurement is left out.
+    """
+    A, b = _whitened(factor, values)
+    checked, directions = np.linalg.eigh(np.eye(len(b)) - A @ joint @ A.T)
+    kept = checked > LEAST_CHECKED
+    along = directions.T @ b
+    return Agreement(float((along[kept] ** 2 / checked[kept]).sum()), int(kept.sum()))
+
+
+def innovation(factor: gtsam.NonlinearFactor, values: gtsam.Values, joint: Array) -> Agreement:
+    """The same of a between-factor that is not in the fit: e^T (I + A P A^T)^-1 e."""
+    A, b = _whitened(factor, values)
+    return Agreement(float(b @ np.linalg.solve(np.eye(len(b)) + A @ joint @ A.T, b)), len(b))
+
+
+def _whitened(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> tuple[Array, Array]:
+    """Whitened Jacobian (m, 12) and residual (m,), of the rows that weigh."""
+    A, b = factor.linearize(values).jacobian()
+    weighing = np.abs(A).max(axis=1) > 0
+    return A[weighing], np.asarray(b)[weighing]

@@ -1,0 +1,65 @@
+"""Before solving: which robots at which stances nothing ties to the reference, and what would tie them."""
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+from coloc_graph.backend.chain import spanning_tree
+from coloc_graph.backend.graph import PoseGraph
+from coloc_graph.measurements import Node
+
+
+@dataclass(frozen=True)
+class Loose:
+    """Nodes that hang together and by nothing on the reference, in the order of the stances, and the `remedy`."""
+
+    nodes: tuple[Node, ...]
+    remedy: str
+
+    def __str__(self) -> str:
+        robots = ", ".join(dict.fromkeys(robot for robot, _ in self.nodes))
+        first, last = self.nodes[0][1], self.nodes[-1][1]
+        when = f"stance {first}" if first == last else f"stances {first} to {last}"
+        return f"{robots} at {when}: not tied to the reference; {self.remedy}"
+
+
+def diagnose(graph: PoseGraph) -> tuple[Loose, ...]:
+    """The parts of a graph that nothing ties to the reference, each with what would tie it; () where all is tied."""
+    tied = {graph.reference_key, *(step.to for step in spanning_tree(graph, graph.links))}
+    neighbours: dict[int, list[int]] = defaultdict(list)
+    for link in graph.links:
+        i, j = map(graph.places.key, link.ends)
+        neighbours[i].append(j)
+        neighbours[j].append(i)
+    part: dict[int, int] = {}
+    parts: dict[int, list[Node]] = defaultdict(list)
+    for node in graph.nodes:
+        key = graph.places.key(node)
+        if key in tied:
+            continue
+        if key not in part:
+            _mark(key, len(parts), neighbours, part)
+        parts[part[key]].append(node)
+    return tuple(Loose(tuple(nodes), _remedy(graph, nodes, tied)) for nodes in parts.values())
+
+
+def _mark(start: int, number: int, neighbours: dict[int, list[int]], part: dict[int, int]) -> None:
+    waiting = [start]
+    while waiting:
+        key = waiting.pop()
+        if key not in part:
+            part[key] = number
+            waiting += neighbours[key]
+
+
+def _remedy(graph: PoseGraph, nodes: list[Node], tied: set[int]) -> str:
+    """The nearest thing that was missing: a view shared with a tied robot, else an anchor or odometry into it."""
+    for robot, stance in nodes:
+        known = [r for r, s in graph.nodes if s == stance and graph.places.key((r, s)) in tied]
+        if known:
+            others = " or ".join(known)
+            return f"a relative pose or a sighting between {robot} and {others} at stance {stance} would tie it"
+    robot, stance = nodes[0]
+    before = [s for r, s in graph.nodes if r == robot and s < stance and graph.places.key((r, s)) in tied]
+    if before:
+        return f"odometry of {robot} from stance {before[-1]} to {stance}, or an anchor that stays, would tie it"
+    return f"an anchor that stays put into stance {stance} would tie it"

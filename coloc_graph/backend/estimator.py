@@ -1,0 +1,435 @@
+"""The estimate kept up to date while stances come in: ISAM2 with QR, and a log from which it can be rebuilt."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.backend import checkpoint
+from coloc_graph.backend.chain import compose, spanning_tree
+from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, agreement, innovation
+from coloc_graph.backend.estimate import Estimate, Refusal
+from coloc_graph.backend.factors import Factors
+from coloc_graph.backend.graph import (
+    Link,
+    Places,
+    PoseGraph,
+    require_ends,
+    require_instant,
+    require_reference,
+    require_robots,
+    slips_of,
+)
+from coloc_graph.backend.smooth import smooth
+from coloc_graph.backend.solver import isam_parameters, joint_covariance, optimise, with_stack
+from coloc_graph.backend.validation import require_valid
+from coloc_graph.errors import EstimationError, InputError, MeasurementError
+from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
+from coloc_graph.run import Stance
+from coloc_graph.team import Floor, Slip, Team
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class StanceEstimate:
+    """Where the robots of one stance stand: `poses` T_world_body, and `covariances` (6, 6) in GTSAM's tangent.
+
+    Robots that nothing ties to the reference are `untied`. `refused` is what was refused in this call.
+    """
+
+    stance: int
+    poses: Mapping[str, gtsam.Pose3]
+    covariances: Mapping[str, Array]
+    untied: tuple[str, ...] = ()
+    refused: tuple[Refusal, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Early:
+    """A stance that came before the one it follows, which is `after`."""
+
+    stance: Stance
+    measurements: tuple[Measurement, ...]
+    after: int
+
+
+#: A link and the keys of its ends.
+_Tie = tuple[Link, int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Entering:
+    """What one call puts into the graph: where new poses start, the `ties` that hold them (and odometry), the
+    measurements that are `tested` against them first, and what is `loose` still."""
+
+    start: dict[int, gtsam.Pose3]
+    ties: list[_Tie]
+    tested: list[_Tie]
+    loose: list[Link]
+
+
+def _refusal(link: Link, off: Agreement) -> Refusal:
+    assert isinstance(link, RelativePose | Sighting)
+    return Refusal(link, f"contradicted by the other measurements ({off.sigmas:.0f} sigmas)")
+
+
+class Estimator:
+    """Localises a team while it moves: `add` a stance when it is over, and ask for poses at any time.
+
+    What is no measurement (NaN, a covariance that is none, a robot that is not there) raises `MeasurementError`
+    before anything has changed, and after any exception the estimator is as it was. What all others contradict is
+    left out and listed in `refused`. What nothing ties to the reference waits until something does. Not for several
+    threads at once.
+    """
+
+    def __init__(
+        self, reference: str, robots: Iterable[str], floor: Floor | None = None, slips: Mapping[str, Slip] | None = None
+    ) -> None:
+        self.reference, self.robots, self.floor, self.slips = reference, tuple(robots), floor, dict(slips or {})
+        if reference not in self.robots:
+            raise EstimationError(f"the reference robot {reference} is not one of {', '.join(self.robots)}")
+        self._factors = Factors(floor)
+        self._places = Places(self.robots, self.slips)
+        self._stances: dict[int, Stance] = {}
+        self._log: list[Measurement] = []  # everything that ever came, the refused too
+        self._refused: dict[int, Refusal] = {}  # by the measurement's identity
+        self._early: dict[int, Early] = {}
+        self._loose: list[Link] = []  # what nothing ties to the reference
+        self._instants: dict[Node, float] = {}  # when moving robots were sighted
+        self._tied: set[int] = set()
+        self._isam = gtsam.ISAM2(isam_parameters())
+
+    @classmethod
+    def of(cls, team: Team) -> "Estimator":
+        """The estimator of a team."""
+        return cls(team.reference, team.names, team.floor, slips_of(team))
+
+    @property
+    def stances(self) -> tuple[Stance, ...]:
+        """The stances that are in, in their order."""
+        return tuple(self._stances.values())
+
+    @property
+    def measurements(self) -> tuple[Measurement, ...]:
+        """Every measurement that is in, the refused ones too."""
+        return tuple(self._log)
+
+    @property
+    def refused(self) -> tuple[Refusal, ...]:
+        """What all other measurements contradict."""
+        return tuple(self._refused.values())
+
+    @property
+    def waiting(self) -> tuple[int, ...]:
+        """The stances that came before the one they follow, and wait for it."""
+        return tuple(sorted(self._early))
+
+    @property
+    def graph(self) -> PoseGraph:
+        """Everything that is in, as a graph; `EstimationError` while there is no stance."""
+        return PoseGraph(self.reference, self.robots, self.stances, self.measurements, self.floor, self.slips)
+
+    def __repr__(self) -> str:
+        return (
+            f"Estimator({len(self._stances)} stances, {len(self._log)} measurements, {len(self._refused)} refused, "
+            f"{len(self._tied)} poses tied, {len(self._loose)} links and {len(self._early)} stances waiting)"
+        )
+
+    def pose(self, robot: str, stance: int | None = None) -> gtsam.Pose3:
+        """T_world_body of a robot at a stance, by default the last at which it is tied; `EstimationError` if none."""
+        return self._isam.calculateEstimatePose3(self._tied_key(robot, stance))
+
+    def covariance(self, robot: str, stance: int | None = None) -> Array:
+        """Covariance (6, 6) of that pose: GTSAM's tangent, rotation [rad] first, then translation [m], body frame."""
+        return np.asarray(self._isam.marginalCovariance(self._tied_key(robot, stance)))
+
+    def estimate(self) -> Estimate:
+        """All poses at all stances with their covariances, optimised to the end: what `smooth` makes of the same.
+
+        Raises `EstimationError` while there is no stance.
+        """
+        graph = self.graph
+        kept = graph.without(one.measurement for one in self.refused)
+        values = self._isam.calculateBestEstimate() if self._tied else None
+        return replace(smooth(kept, refuse=False, start=values), graph=graph, refused=self.refused)
+
+    def add(
+        self, stance: Stance, measurements: Iterable[Measurement] = (), *, after: int | None = None
+    ) -> StanceEstimate:
+        """Take in a stance with what was measured in it and on the way to it; where its robots stand comes back.
+
+        `after` is the stance that it follows, since which its anchors have stayed: the one numbered before it unless
+        said otherwise. A stance that comes too early waits for that one, and is then `untied`.
+        """
+        taken = tuple(measurements)
+        follows = stance.index - 1 if after is None else after
+        if stance.index in self._stances or stance.index in self._early:
+            raise MeasurementError(f"stance {stance.index} is in already; add it once, and what comes late by `insert`")
+        require_robots(stance, self.robots)
+        require_valid(taken, self.floor)
+        if not self._stances and after is None:
+            require_reference(self.reference, stance)
+            return self._enter(stance, taken)
+        if follows not in self._stances:
+            self._early[stance.index] = Early(stance, taken, follows)
+            return StanceEstimate(stance.index, {}, {}, stance.observers)
+        last = next(reversed(self._stances))
+        if follows != last:
+            raise MeasurementError(
+                f"stance {stance.index} is said to follow stance {follows}, which stance {last} follows: number the "
+                "stances in the order of time"
+            )
+        estimate = self._enter(stance, taken)
+        while early := self._next_early():
+            del self._early[early.stance.index]  # one that cannot enter is not tried again
+            later = self._enter(early.stance, early.measurements)
+            estimate = replace(later, refused=(*estimate.refused, *later.refused))
+        return estimate
+
+    def _next_early(self) -> Early | None:
+        last = next(reversed(self._stances))
+        return next((early for early in self._early.values() if early.after == last), None)
+
+    def insert(self, *measurements: Measurement) -> StanceEstimate:
+        """Take in measurements that come late, of stances that are in; the last stance's poses come back."""
+        if not self._stances:
+            raise MeasurementError("there is no stance that a measurement could belong to: add one first")
+        require_valid(measurements, self.floor)
+        return self._enter(None, measurements)
+
+    def revoke(self, measurement: Measurement) -> StanceEstimate:
+        """Take a measurement out again, as if it had never come; the last stance's poses come back.
+
+        What was refused because it contradicted this one is taken back.
+        """
+        if not any(one is measurement for one in self._log):
+            raise EstimationError(f"the {measurement} is not in, so that it cannot be taken out")
+        log, refused = self._log, dict(self._refused)
+        self._log = [one for one in log if one is not measurement]
+        self._refused.pop(id(measurement), None)
+        try:
+            self._rebuild()
+        except Exception:
+            self._log, self._refused = log, refused
+            self._rebuild()
+            raise
+        return self._at(next(reversed(self._stances.values())), ())
+
+    def save(self, path: str | Path) -> None:
+        """Write a checkpoint, whole or not at all, from which `resume` goes on."""
+        numbers = {id(one): number for number, one in enumerate(self._log)}
+        checkpoint.write(
+            checkpoint.Checkpoint(
+                reference=self.reference,
+                robots=self.robots,
+                floor=self.floor,
+                slips=self.slips,
+                stances=self.stances,
+                measurements=self.measurements,
+                refused={numbers[key]: one.reason for key, one in self._refused.items()},
+                early=tuple((one.stance, one.measurements, one.after) for one in self._early.values()),
+            ),
+            Path(path),
+        )
+
+    @classmethod
+    def resume(cls, path: str | Path) -> "Estimator":
+        """The estimator of a checkpoint, as it was; `InputError` where the file is none."""
+        saved = checkpoint.read(Path(path))
+        estimator = cls(saved.reference, saved.robots, saved.floor, saved.slips)
+        before = None
+        for stance in saved.stances:
+            estimator._places.accept(estimator._places.after(before, stance))
+            estimator._stances[stance.index] = before = stance
+        try:
+            estimator._instants = estimator._checked(saved.measurements)
+        except MeasurementError as error:
+            raise InputError(f"{path}: is a damaged checkpoint ({error}); solve the run again") from error
+        estimator._log = list(saved.measurements)
+        for number, reason in saved.refused.items():
+            estimator._refused[id(saved.measurements[number])] = Refusal(saved.measurements[number], reason)
+        estimator._early = {stance.index: Early(stance, taken, after) for stance, taken, after in saved.early}
+        if saved.stances:
+            estimator._rebuild()
+        return estimator
+
+    def _enter(self, stance: Stance | None, taken: tuple[Measurement, ...]) -> StanceEstimate:
+        before = next(reversed(self._stances.values()), None)
+        links: list[Link] = [*self._loose, *taken]
+        if stance is not None:
+            if before is not None:
+                self._require_anchor(stance, taken)
+                links += [stay for stay in self._places.stay_puts(before, stance) if stay.slip is not None]
+            self._places.accept(self._places.after(before, stance))
+            self._stances[stance.index] = stance
+        try:
+            instants = self._checked(taken)
+            entering = self._entering(links)
+            refused = self._update(entering)
+        except Exception:
+            if stance is not None:
+                self._places.forget(before, stance)
+                del self._stances[stance.index]
+            raise
+        self._log += taken
+        self._instants |= instants
+        self._refused |= {id(one.measurement): one for one in refused}
+        self._loose = entering.loose
+        self._tied |= entering.start.keys()
+        return self._at(next(reversed(self._stances.values())), refused)
+
+    def _require_anchor(self, stance: Stance, taken: tuple[Measurement, ...]) -> None:
+        if not stance.anchors and not any(isinstance(one, Odometry) and one.after == stance.index for one in taken):
+            raise MeasurementError(
+                f"stance {stance.index} has no anchor and no odometry into it, so that nothing ties it to the stances "
+                "before: name the robot that stayed put"
+            )
+
+    def _checked(self, taken: Iterable[Measurement]) -> dict[Node, float]:
+        """When moving robots were sighted; raises where a measurement relates what is not there."""
+        instants: dict[Node, float] = {}
+        for measured in taken:
+            require_ends(measured, self._places, self._stances)
+            if isinstance(measured, Sighting) and measured.seen in self._stances[measured.stance].movers:
+                node = (measured.seen, measured.stance)
+                require_instant(measured, self._instants.get(node, instants.setdefault(node, measured.time)))
+        return instants
+
+    def _entering(self, links: list[Link]) -> "_Entering":
+        """What hangs on the poses that are tied, what does not yet, and where new poses start."""
+        start: dict[int, gtsam.Pose3] = {}
+        if not self._tied:
+            start[self._places.key((self.reference, next(iter(self._stances))))] = gtsam.Pose3()
+        ties: list[_Tie] = []
+        tested: list[_Tie] = []
+        # wheels first: they are seldom wrong by much, so that what they predict can refuse a wrong homography
+        left = sorted(links, key=lambda link: isinstance(link, RelativePose | Sighting))
+        while left:
+            still: list[Link] = []
+            for link in left:
+                i, j = self._keys(link)
+                has_i, has_j = (key in self._tied or key in start for key in (i, j))
+                if i != j and not has_i and not has_j:
+                    still.append(link)
+                elif i != j and has_i and has_j and isinstance(link, RelativePose | Sighting):
+                    tested.append((link, i, j))
+                elif i != j:
+                    if not has_j:
+                        start[j] = self._factors.start(self._pose_of(i, start).compose(link.T_i_j))
+                    elif not has_i:
+                        start[i] = self._factors.start(self._pose_of(j, start).compose(link.T_i_j.inverse()))
+                    ties.append((link, i, j))
+            if len(still) == len(left):
+                break
+            left = still
+        return _Entering(start, ties, tested, left)
+
+    def _pose_of(self, key: int, start: Mapping[int, gtsam.Pose3]) -> gtsam.Pose3:
+        pose = start.get(key)
+        return self._isam.calculateEstimatePose3(key) if pose is None else pose
+
+    def _update(self, entering: "_Entering") -> tuple[Refusal, ...]:
+        """Put poses and links into ISAM2, without those that all others contradict; all of it or nothing."""
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for key, pose in entering.start.items():
+            is_reference = not self._tied and not values.size()
+            values.insert(key, pose)
+            for factor in (self._factors.gauge(key),) if is_reference else self._factors.of_pose(key):
+                factors.add(factor)
+        for link, i, j in entering.ties:
+            factors.add(self._factors.of_link(link, i, j))
+        try:
+            if factors.size():
+                self._isam.update(factors, values)
+            refused = self._enter_tested(entering.tested) if entering.tested else ()
+            for key in entering.start:
+                if not np.isfinite(self._isam.calculateEstimatePose3(key).translation()).all():
+                    raise EstimationError("a pose came out as not finite")
+        except Exception as failure:
+            self._rebuild()
+            raise EstimationError(f"the graph cannot take this in, and is as it was: {failure}") from failure
+        return refused
+
+    def _enter_tested(self, tested: "list[_Tie]") -> tuple[Refusal, ...]:
+        """Refuse what contradicts what is known before it enters, then what contradicts the others that entered."""
+        refused = []
+        passed = []
+        factors = gtsam.NonlinearFactorGraph()
+        for tie in tested:
+            off = self._agreement(*tie, inside=False)
+            if off.chance() < LEAST_CHANCE:
+                refused.append(_refusal(tie[0], off))
+            else:
+                passed.append(tie)
+                factors.add(self._factors.of_link(*tie))
+        if not passed:
+            return tuple(refused)
+        indices = list(self._isam.update(factors, gtsam.Values()).getNewFactorsIndices())
+        # among several that agree with a vague prediction one can still contradict the others
+        while len(passed) > 1:
+            among = [self._agreement(*tie) for tie in passed]
+            worst = min(range(len(passed)), key=lambda n: among[n].chance())
+            if among[worst].chance() >= LEAST_CHANCE:
+                break
+            refused.append(_refusal(passed.pop(worst)[0], among[worst]))
+            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [indices.pop(worst)])
+        return tuple(refused)
+
+    def _agreement(self, link: Link, i: int, j: int, *, inside: bool = True) -> Agreement:
+        values = gtsam.Values()
+        for key in (i, j):
+            values.insert(key, self._isam.calculateEstimatePose3(key))
+        factor, joint = self._factors.of_link(link, i, j), joint_covariance(self._isam, [i, j])
+        return (agreement if inside else innovation)(factor, values, joint)
+
+    def _rebuild(self) -> None:
+        """ISAM2 anew from the log: after a failure, a revocation, and from a checkpoint."""
+        graph = self.graph
+        kept = graph.without(one.measurement for one in self.refused)
+        steps = spanning_tree(kept, kept.links)
+        initial = gtsam.Values()
+        poses = compose(kept, steps) if steps else {kept.reference_key: gtsam.Pose3()}
+        for key, pose in poses.items():
+            initial.insert(key, self._factors.start(pose))
+        factors, links = self._factors.of_graph(kept, poses)
+        values, _ = with_stack(len(poses), lambda: optimise(factors, initial))
+        self._isam = gtsam.ISAM2(isam_parameters())
+        self._isam.update(factors, values)
+        self._tied = set(poses)
+        inside = set(map(id, links))
+        self._loose = [link for link in kept.links if id(link) not in inside and len(set(self._keys(link))) == 2]
+        for refusal in self.refused:
+            link = refusal.measurement
+            i, j = self._keys(link)
+            if {i, j} <= self._tied and self._agreement(link, i, j, inside=False).chance() >= LEAST_CHANCE:
+                back = gtsam.NonlinearFactorGraph()
+                back.add(self._factors.of_link(link, i, j))
+                self._isam.update(back, gtsam.Values())
+                del self._refused[id(link)]
+
+    def _keys(self, link: Link) -> tuple[int, int]:
+        i, j = map(self._places.key, link.ends)
+        return i, j
+
+    def _tied_key(self, robot: str, stance: int | None) -> int:
+        if robot not in self.robots:
+            raise EstimationError(f"robot {robot} is not in the team ({', '.join(self.robots)})")
+        for index in reversed(self._stances) if stance is None else (stance,):
+            if index in self._stances and (key := self._places.key((robot, index))) in self._tied:
+                return key
+        raise EstimationError(f"robot {robot} has no pose{'' if stance is None else f' at stance {stance}'}")
+
+    def _at(self, stance: Stance, refused: tuple[Refusal, ...]) -> StanceEstimate:
+        keys = {robot: self._places.key((robot, stance.index)) for robot in self.robots}
+        tied = {robot: key for robot, key in keys.items() if key in self._tied}
+        return StanceEstimate(
+            stance.index,
+            {robot: self._isam.calculateEstimatePose3(key) for robot, key in tied.items()},
+            {robot: np.asarray(self._isam.marginalCovariance(key)) for robot, key in tied.items()},
+            tuple(robot for robot in stance.observers if robot not in tied),
+            refused,
+        )

@@ -1,0 +1,110 @@
+"""The numerical work: Levenberg-Marquardt with QR, its answer checked, and covariances from the same QR."""
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import EstimationError
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+#: GTSAM walks its trees by recursion: a chain of more than this many poses gets a stack of its own.
+DEEP = 3000
+#: That stack [bytes]: at 8 MiB a chain of 50,000 poses ends the process. Only what is used of it takes memory.
+STACK = 1 << 30
+
+
+def with_stack(poses: int, work: Callable[[], T]) -> T:
+    """The result of `work`, done where a graph of so many poses does not overflow the stack."""
+    if poses <= DEEP:
+        return work()
+    results: list[T] = []
+    failures: list[BaseException] = []
+
+    def body() -> None:
+        try:
+            results.append(work())
+        except BaseException as failure:  # handed to the caller
+            failures.append(failure)
+
+    before = threading.stack_size(STACK)
+    try:
+        thread = threading.Thread(target=body)
+        thread.start()
+    finally:
+        threading.stack_size(before)
+    thread.join()
+    if failures:
+        raise failures[0]
+    return results[0]
+
+
+def lm_parameters() -> gtsam.LevenbergMarquardtParams:
+    """QR, since Cholesky throws on healthy chains, and down to rounding."""
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setLinearSolverType("MULTIFRONTAL_QR")
+    parameters.setRelativeErrorTol(1e-10)
+    parameters.setAbsoluteErrorTol(1e-10)
+    # our information reaches 1e12, of which GTSAM's bound of 1e5 is no damping: with wrong measurements it gave up
+    parameters.setlambdaUpperBound(1e15)
+    return parameters
+
+
+def isam_parameters() -> gtsam.ISAM2Params:
+    """QR for the same reason; what moved by more than 0.01 [rad, m] is linearised anew."""
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")
+    parameters.relinearizeSkip = 1
+    parameters.setRelinearizeThreshold(0.01)
+    return parameters
+
+
+def optimise(factors: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> tuple[gtsam.Values, int]:
+    """Levenberg-Marquardt with QR; values and iterations, or `EstimationError`.
+
+    GTSAM's optimiser returns the initial values without a word when it fails, so the answer is checked: the
+    errors are finite, the error did not rise, and it iterated wherever there was something to gain.
+    """
+    before = factors.error(initial)
+    if not np.isfinite(before):
+        raise EstimationError("the graph's error is not finite where the search starts: a measurement holds no number")
+    optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, lm_parameters())
+    values = optimiser.optimize()
+    after = factors.error(values)
+    if not np.isfinite(after) or after > before * (1 + 1e-9) + 1e-9:
+        raise EstimationError(f"the optimiser did not lower the graph's error ({before:.6g} to {after:.6g})")
+    if optimiser.iterations() == 0 and before > 1e-6:
+        raise EstimationError(f"the optimiser gave up where the search starts (error {before:.6g})")
+    return values, int(optimiser.iterations())
+
+
+class Posterior:
+    """Covariances of poses at the optimum, by one ISAM2 elimination with QR (GTSAM's `Marginals` knows no QR)."""
+
+    def __init__(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        self.values = values
+        self._isam = gtsam.ISAM2(isam_parameters())
+        self._isam.update(factors, values)
+
+    def covariance(self, key: int) -> Array:
+        """Covariance (6, 6) of one pose: rotation first, body frame."""
+        return np.asarray(self._isam.marginalCovariance(key))
+
+    def covariances(self) -> dict[int, Array]:
+        """The covariances (6, 6) of all poses, by key."""
+        return {int(key): self.covariance(key) for key in self.values.keys()}  # noqa: SIM118  GTSAM's own
+
+    def joint(self, keys: Sequence[int]) -> Array:
+        """Joint covariance (6 n, 6 n) of n different poses, in the order given."""
+        return joint_covariance(self._isam, keys)
+
+
+def joint_covariance(isam: gtsam.ISAM2, keys: Sequence[int]) -> Array:
+    """Joint covariance (6 n, 6 n) of n different poses, in the order given."""
+    joint = isam.jointMarginalCovariance(list(keys))
+    return np.block([[joint.at(a, b) for b in keys] for a in keys])

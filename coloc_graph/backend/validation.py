@@ -1,0 +1,84 @@
+"""What cannot be a measurement is refused before it comes near a solver: GTSAM believes anything.
+
+A NaN spoils an ISAM2 for good, and 1e150 comes back as NaN poses with finite covariances.
+"""
+
+from collections.abc import Sequence
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import MeasurementError
+from coloc_graph.measurements import Measurement, RelativePose
+from coloc_graph.team import Floor
+
+Array = NDArray[np.float64]
+
+#: No robot is further from another than this [m], no deviation is larger [m, rad].
+FARTHEST = 1e6
+#: No deviation is smaller than this [m, rad]: a covariance of zero is a claim that nothing supports.
+LEAST_SIGMA = 1e-9
+#: How far a rotation may be from one, and a covariance from symmetric (of its largest entry).
+ROUNDING = 1e-6
+
+
+def require_valid(measurements: Sequence[Measurement], floor: Floor | None) -> None:
+    """Raise `MeasurementError`, naming the first measurement that is none and why; all are checked at once."""
+    for size, group in groupby(sorted(measurements, key=_size), key=_size):
+        alike = list(group)
+        if size == 3 and floor is None:
+            raise MeasurementError(
+                f"the {alike[0]} holds on a floor only, and the team has none: give the team a [floor]"
+            )
+        for check in (_why_not_poses, _why_not_covariances):
+            found = check(alike)
+            if found is not None:
+                index, why = found
+                raise MeasurementError(f"the {alike[index]} {why}")
+
+
+def _size(measured: Measurement) -> int:
+    return 6 if isinstance(measured, RelativePose) else 3
+
+
+def _why_not_poses(measurements: Sequence[Measurement]) -> tuple[int, str] | None:
+    T = np.array([m.T_i_j.matrix() for m in measurements])
+    finite = np.isfinite(T).all(axis=(1, 2))
+    if not finite.all():
+        return int(np.argmin(finite)), "is not finite: a pose holds no number"
+    far = np.abs(T[:, :3, 3]).max(axis=1)
+    if far.max() > FARTHEST:
+        return int(np.argmax(far)), f"is {far.max():.3g} m away, which no robot is"
+    R = T[:, :3, :3]
+    off = np.abs(R.mT @ R - np.eye(3)).max(axis=(1, 2))
+    if off.max() > ROUNDING:
+        return int(np.argmax(off)), f"is no rigid motion: R^T R is off the identity by {off.max():.2g}"
+    flipped = np.linalg.det(R) < 0
+    if flipped.any():
+        return int(np.argmax(flipped)), "is no rigid motion but a reflection"
+    return None
+
+
+def _why_not_covariances(measurements: Sequence[Measurement]) -> tuple[int, str] | None:
+    size = _size(measurements[0])
+    for index, measured in enumerate(measurements):
+        if np.shape(measured.covariance) != (size, size):
+            return index, f"has a covariance of shape {np.shape(measured.covariance)}; give ({size}, {size})"
+    C = np.array([m.covariance for m in measurements], float)
+    finite = np.isfinite(C).all(axis=(1, 2))
+    if not finite.all():
+        return int(np.argmin(finite)), "has a covariance that is not finite"
+    largest = np.abs(C).max(axis=(1, 2))
+    if largest.max() > FARTHEST**2:
+        return int(np.argmax(largest)), f"has a covariance of {largest.max():.3g}, which says nothing"
+    uneven = np.abs(C - C.mT).max(axis=(1, 2)) > ROUNDING * largest
+    if uneven.any():
+        return int(np.argmax(uneven)), "has a covariance that is not symmetric"
+    try:
+        pivots = np.linalg.cholesky(C).diagonal(axis1=1, axis2=2).min(axis=1)
+    except np.linalg.LinAlgError:
+        pivots = np.sqrt(np.linalg.eigvalsh(C)[:, 0].clip(min=0))
+    if pivots.min() < LEAST_SIGMA:
+        return int(np.argmin(pivots)), "has a covariance that is not positive definite: it knows something exactly"
+    return None
