@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.lie import floor_pose, se3_inverse, yaw
+from coloc_graph.lie import floor_pose, se3_inverse, so3_exp, so3_log, yaw
 from coloc_graph.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
+#: True poses further apart in time than this are not joined [s].
+LONGEST_TRUTH_GAP = 0.25
 #: A robot that got no further than this stayed where it was [m].
 STAYED = 0.05
 #: Tangent components of a pose on the floor: heading, x, y.
@@ -129,15 +131,16 @@ def evaluate(estimated: Mapping[str, Trajectory], true: Mapping[str, Array], *, 
                 estimated=float(np.linalg.norm(estimated[j].positions[-1] - estimated[i].positions[-1])),
             )
             for i, j in itertools.combinations([row.robot for row in rows if row.true_length <= STAYED], 2)
+            if estimated[i].times[-1] == estimated[j].times[-1]  # not where one drove by
         ),
     )
 
 
 def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory) -> Array:
-    """The true poses (n, 4, 4) at an estimate's times: the latest at or before each.
+    """The true poses (n, 4, 4) at an estimate's times: the latest at or before each, or between two that are near.
 
-    Robots stand while they observe, so that nothing needs interpolating. Raises `InputError` where there is no
-    truth at a time.
+    Robots stand while they observe, and truth may be sparse then; while they move it is followed from sample to
+    sample, at most `LONGEST_TRUTH_GAP` apart. Raises `InputError` where there is no truth at a time.
     """
     true = truth.get(estimated.robot)
     if true is None or not len(true):
@@ -149,7 +152,17 @@ def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory) -> Array:
         raise InputError(
             f"the truth of robot {estimated.robot} begins after stance {stance}; record it from the first stance on"
         )
-    return true.T_world_body[index]
+    T_world_body = true.T_world_body[index].copy()
+    after = np.minimum(index + 1, len(true) - 1)
+    gap = true.times[after] - true.times[index]
+    share = np.clip((estimated.times - true.times[index]) / np.where(gap > 0, gap, 1.0), 0, 1)
+    share = np.where((gap > 0) & (gap <= LONGEST_TRUTH_GAP), share, 0.0)[:, None]
+    ahead = true.T_world_body[after]
+    turn = so3_log(T_world_body[:, :3, :3].mT @ ahead[:, :3, :3])
+    moved = share[:, 0] > 0
+    T_world_body[moved, :3, :3] = (T_world_body[:, :3, :3] @ so3_exp(share * turn))[moved]
+    T_world_body[:, :3, 3] += share * (ahead[:, :3, 3] - T_world_body[:, :3, 3])
+    return T_world_body
 
 
 def nees_of(estimated: Trajectory, T_true: Array, components: list[int]) -> Array:

@@ -10,10 +10,18 @@ from typing import Literal, get_args
 
 from scipy.special import chdtrc
 
-from coloc_graph.backend import Estimate, Loose, PoseGraph, chain, diagnose, smooth
+from coloc_graph.backend import Estimate, Loose, PoseGraph, chain, diagnose, replay, smooth
 from coloc_graph.errors import EstimationError, InputError
-from coloc_graph.frontend import FrontendOptions, PairMeasurement, measure_pair, share_clock_offsets
+from coloc_graph.frontend import (
+    FrontendOptions,
+    PairMeasurement,
+    WheelTrack,
+    measure_pair,
+    share_clock_offsets,
+    sight_movers,
+)
 from coloc_graph.frontend.plausibility import implausible
+from coloc_graph.measurements import Measurement, RelativePose
 from coloc_graph.run import Run
 
 Method = Literal["chain", "smooth"]
@@ -33,15 +41,20 @@ class SolveOptions:
     """Everything that a result depends on besides the run.
 
     `chain` is the paper: homographies by least squares in one image, eq. (2), composition. `smooth` takes
-    maximum-likelihood homographies and relative poses into a pose graph.
+    maximum-likelihood homographies and relative poses into a pose graph, with `odometry` and where the movers are
+    seen. `incremental` feeds the graph to an estimator stance by stance, as a team in the field would.
     """
 
     method: Method = "smooth"
     frontend: FrontendOptions | None = None
+    odometry: bool = True
+    incremental: bool = False
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise InputError(f"there is no method `{self.method}`; choose one of {', '.join(METHODS)}")
+        if self.incremental and self.method == "chain":
+            raise InputError("a chain is composed, and never incremental: leave out `incremental`, or use smooth")
 
     def resolved(self) -> "SolveOptions":
         """With the front end that belongs to the method, where none is chosen."""
@@ -53,7 +66,10 @@ class SolveOptions:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution:
-    """A result: the estimate, every measurement it was made of or that was refused, and how long it took [s]."""
+    """A result: the estimate, every measurement it was made of or that was refused, and how long it took [s].
+
+    `seconds_updates` are of each stance of an incremental estimate, () of one in batch.
+    """
 
     run: Run
     options: SolveOptions
@@ -62,11 +78,22 @@ class Solution:
     warnings: tuple[str, ...]
     seconds_frontend: float
     seconds_backend: float
+    seconds_updates: tuple[float, ...] = ()
+
+    def why_not(self, measured: PairMeasurement) -> str | None:
+        """Why a measurement is not in the estimate, in words; None where it is."""
+        if measured.homography.unusable is not None:
+            return measured.homography.unusable
+        return next((r.reason for r in self.estimate.refused if r.measurement is measured.relative_pose), None)
+
+    @property
+    def used(self) -> int:
+        """How many of the measurements are in the estimate."""
+        return sum(self.why_not(measured) is None for measured in self.measurements)
 
     def __repr__(self) -> str:
-        used = sum(m.relative_pose is not None for m in self.measurements)
         return (
-            f"Solution({self.run!r}, {self.options.method}, {used} of {len(self.measurements)} measurements used, "
+            f"Solution({self.run!r}, {self.options.method}, {self.used} of {len(self.measurements)} measurements used, "
             f"{len(self.warnings)} warnings)"
         )
 
@@ -82,7 +109,7 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
     started = time.perf_counter()
 
     measurements, clock_warnings = share_clock_offsets(_measure(run, options, progress), run.team.clock_sigma)
-    poses = tuple(m.relative_pose for m in measurements if m.relative_pose is not None)
+    poses = [m.relative_pose for m in measurements if m.relative_pose is not None]
     if not poses:
         unlikely = [f"; {what}" for what in _implausible(run, options, measurements)][:1]
         raise EstimationError(
@@ -90,7 +117,7 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
         )
     measured = time.perf_counter()
 
-    graph = PoseGraph.of(run.team, run.stances, poses)
+    graph = PoseGraph.of(run.team, run.stances, [*poses, *_motions(run, options, measurements, poses)])
     loose = diagnose(graph)
     if not any(
         robot != run.team.reference for robot, _ in set(graph.nodes) - {n for part in loose for n in part.nodes}
@@ -99,7 +126,11 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
             f"{run.path}: no measurement ties a robot to the reference {run.team.reference}; "
             f"{_why_untied(loose, measurements)}"
         )
-    estimate = chain(graph) if options.method == "chain" else smooth(graph)
+    updates: tuple[float, ...] = ()
+    if options.incremental:
+        estimate, updates = replay(graph)
+    else:
+        estimate = chain(graph) if options.method == "chain" else smooth(graph)
     solved = time.perf_counter()
     return Solution(
         run=run,
@@ -110,10 +141,11 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
             *run.warnings,
             *clock_warnings,
             *_implausible(run, options, measurements),
-            *_warnings(estimate, measurements),
+            *_warnings(estimate, loose, measurements),
         ),
         seconds_frontend=measured - started,
         seconds_backend=solved - measured,
+        seconds_updates=updates,
     )
 
 
@@ -136,6 +168,29 @@ def _measure(run: Run, options: SolveOptions, progress: Progress | None) -> tupl
         if progress is not None:
             progress(done, len(pairs))
     return tuple(measurements)
+
+
+def _motions(
+    run: Run, options: SolveOptions, measurements: Sequence[PairMeasurement], poses: Sequence[RelativePose]
+) -> list[Measurement]:
+    """Where the movers were seen, and what the wheels say of each robot's way from one pose to its next."""
+    if options.method == "chain" or run.team.floor is None:
+        return []  # the paper's chain takes neither, and wheels know the floor alone
+    wheels = {robot: WheelTrack(robot, list(run.odometry(robot))) for robot in run.team.names}
+    sightings = sight_movers(run, measurements, wheels)
+    if not options.odometry:
+        return list(sightings)
+    graph = PoseGraph.of(run.team, run.stances, [*poses, *sightings])
+    ways: list[Measurement] = []
+    last: dict[str, int] = {}
+    for robot, stance in graph.nodes:
+        before = last.get(robot)
+        last[robot] = stance
+        if before is not None and graph.key(robot, before) != graph.key(robot, stance):
+            start, end = graph.times[robot, before], graph.times[robot, stance]
+            way = wheels[robot].between(before, stance, start, end, run.team.clock_sigma)
+            ways += [] if way is None else [way]
+    return [*sightings, *ways]
 
 
 def _reasons(measurements: Sequence[PairMeasurement]) -> str:
@@ -189,21 +244,18 @@ def _why_untied(loose: tuple[Loose, ...], measurements: tuple[PairMeasurement, .
     return str(loose[0])
 
 
-def _warnings(estimate: Estimate, measurements: tuple[PairMeasurement, ...]) -> list[str]:
+def _warnings(estimate: Estimate, loose: Sequence[Loose], measurements: Sequence[PairMeasurement]) -> list[str]:
     warnings = [
         f"stance {m.homography.stance}: {m.homography.robot_i} and {m.homography.robot_j} not used: "
         f"{m.homography.unusable}"
         for m in measurements
         if m.homography.unusable
     ]
-    if estimate.untied:
-        robot, stance = estimate.untied[0]
-        several = len(estimate.untied) > 1
-        warnings.append(
-            f"{len(estimate.untied)} {'poses are' if several else 'pose is'} not tied to the reference, from robot "
-            f"{robot} at stance {stance} on, and {'are' if several else 'is'} left out: a measurement there, or an "
-            f"anchor that stays, would tie {'them' if several else 'it'}"
-        )
+    warnings += [f"{part} (left out of the result)" for part in loose[:REASONS_NAMED]]
+    if len(loose) > REASONS_NAMED:
+        warnings.append(f"{len(loose) - REASONS_NAMED} more groups of poses are not tied to the reference")
+    warnings += [f"the {one.measurement} is not used: it is {one.reason}" for one in estimate.refused]
+    warnings += [str(bump) for bump in estimate.bumped]
     chance = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
     if chance < LEAST_CHANCE:
         warnings.append(

@@ -1,6 +1,6 @@
 """A result on disk: written whole or not at all, and read back.
 
-DIR holds summary.json, trajectories/<robot>.tum (and .cov.csv), graph.g2o, measurements.csv, config.toml and
+DIR holds summary.json, trajectories/<robot>.tum (and .cov.csv), graph.g2o, graph.dot, measurements.csv, config.toml and
 report.html. The same run, options and version give the same bytes, except for `seconds` in summary.json.
 """
 
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from coloc_graph._version import __version__
 from coloc_graph.errors import InputError
 from coloc_graph.evaluation import Accuracy, align, evaluate
+from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import write_g2o
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.pipeline import Solution
@@ -99,6 +100,7 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
         for robot, trajectory in solution.estimate.trajectories.items():
             write_tum(trajectory, part / "trajectories" / f"{robot}.tum")
         write_g2o(solution.estimate, part / "graph.g2o")
+        (part / "graph.dot").write_text(to_dot(solution.estimate.graph), encoding="utf-8")
         (part / "measurements.csv").write_text(_measurements(solution), encoding="utf-8")
         (part / "config.toml").write_text(tomli_w.dumps(_config(solution)), encoding="utf-8")
         (part / "report.html").write_text(render_report(solution, accuracy, true), encoding="utf-8")
@@ -120,21 +122,22 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
 def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
     """What summary.json says; numbers that do not exist are null."""
     estimate = solution.estimate
-    refused = [m.homography for m in solution.measurements if m.homography.unusable]
     summary: dict[str, Any] = {
         "version": __version__,
         "method": estimate.method,
         "robots": list(estimate.trajectories),
         "stances": len(solution.run.stances),
-        "measurements": {"used": len(solution.measurements) - len(refused), "rejected": len(refused)},
+        "measurements": {"used": solution.used, "rejected": len(solution.measurements) - solution.used},
         "chi2": estimate.chi2,
         "dof": estimate.dof,
         "iterations": estimate.iterations,
         "untied": [list(one) for one in estimate.untied],
+        "bumped": [[one.stay_put.robot, one.stay_put.before, one.stay_put.after] for one in estimate.bumped],
         "warnings": list(solution.warnings),
         "seconds": {
             "frontend": round(solution.seconds_frontend, 3),
             "backend": round(solution.seconds_backend, 3),
+            **({"updates": [round(one, 6) for one in solution.seconds_updates]} if solution.seconds_updates else {}),
             "total": round(solution.seconds_frontend + solution.seconds_backend, 3),
         },
     }
@@ -175,7 +178,7 @@ def _measurements(solution: Solution) -> str:
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(MEASUREMENT_COLUMNS)
     for measured in solution.measurements:
-        h, pose = measured.homography, measured.relative_pose
+        h, pose, why_not = measured.homography, measured.relative_pose, solution.why_not(measured)
         rows.writerow(
             [
                 h.stance,
@@ -190,8 +193,8 @@ def _measurements(solution: Solution) -> str:
                 _cell(math.degrees(pose.normal_error)) if pose else "",
                 pose.solution if pose else "",
                 _cell(float(np.linalg.norm(pose.T_i_j.translation()))) if pose else "",
-                "yes" if pose else "no",
-                h.unusable or "",
+                "no" if why_not else "yes",
+                why_not or "",
             ]
         )
     return text.getvalue()

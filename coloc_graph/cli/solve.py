@@ -17,12 +17,15 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         default="heights",
         help="the plane's distance from the heights of camera and markers, or from the markers' span",
     )
+    command.add_argument("--incremental", action="store_true", help="feed it stance by stance, as in the field")
+    command.add_argument("--without-odometry", action="store_true", help="leave out what the wheels say")
     command.add_argument("--json", action="store_true", help="print the summary as JSON")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Solve, write, print."""
+    import statistics
     from dataclasses import replace
 
     from coloc_graph.cli.accuracy import print_accuracy, print_last_poses, print_promised
@@ -32,7 +35,9 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.run import open_run
 
     require_place(args.out)  # before the work, not after it
-    options = SolveOptions(method=args.method).resolved()
+    options = SolveOptions(
+        method=args.method, odometry=not args.without_odometry, incremental=args.incremental
+    ).resolved()
     assert options.frontend is not None
     options = replace(options, frontend=replace(options.frontend, scale=args.scale))
     try:
@@ -53,10 +58,12 @@ def run(args: argparse.Namespace) -> int:
     else:
         print_accuracy(accuracy)
         print_promised(estimate.trajectories)
-    used = sum(m.relative_pose is not None for m in solution.measurements)
+    if solution.seconds_updates:
+        median, longest = 1000 * statistics.median(solution.seconds_updates), 1000 * max(solution.seconds_updates)
+        print(f"a stance entered in {median:.1f} ms (median; at most {longest:.1f} ms)")
     agreement = f", chi2/dof {estimate.chi2 / estimate.dof:.2f}" if estimate.dof > 0 else ""
     print(
-        f"{used} of {counted(len(solution.measurements), 'measurement')} used{agreement}; "
+        f"{solution.used} of {counted(len(solution.measurements), 'measurement')} used{agreement}; "
         f"{args.out} holds trajectories, measurements.csv and report.html"
     )
     return 0

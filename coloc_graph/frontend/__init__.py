@@ -13,8 +13,10 @@ from coloc_graph.frontend.plane import distance_from_span, on_plane, plane_from_
 from coloc_graph.frontend.refinement import PointPairs, least_squares, refine
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.shared_clock import share_clock_offsets
-from coloc_graph.frontend.stance import FrontendOptions, PairMeasurement, measure_pair
+from coloc_graph.frontend.sighting import sight
+from coloc_graph.frontend.stance import FrontendOptions, PairMeasurement, measure_pair, sight_movers
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
+from coloc_graph.frontend.wheels import WheelTrack
 
 __all__ = [
     "Blobs",
@@ -30,6 +32,7 @@ __all__ = [
     "Threshold",
     "Track",
     "TrackerOptions",
+    "WheelTrack",
     "choose_by_normal",
     "correspond",
     "decompose_svd",
@@ -49,4 +52,6 @@ __all__ = [
     "refine",
     "relative_pose",
     "share_clock_offsets",
+    "sight",
+    "sight_movers",
 ]

@@ -1,7 +1,7 @@
 """One stance of a run: from its images or detections to the homography between two observers."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
@@ -32,8 +32,10 @@ from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
 from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.frontend.relative_pose import relative_pose
+from coloc_graph.frontend.sighting import sight
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
-from coloc_graph.measurements import HomographyMeasurement, Plane, RelativePose
+from coloc_graph.frontend.wheels import WheelTrack
+from coloc_graph.measurements import HomographyMeasurement, Plane, RelativePose, Sighting
 from coloc_graph.run import Detections, Flag, Run, Stance
 from coloc_graph.team import Camera, Markers
 
@@ -66,8 +68,9 @@ class PairMeasurement:
     """What one pair of observers measured in one stance, with what it was made of.
 
     Where `homography.unusable` says why, `relative_pose` is None; `correspondences` is None where there are
-    none. Where clocks are not said to agree, `offset_evidence` is what this stance alone knows of their offset
-    (None: nothing), and `at_offset` measures once more with an offset that is known from elsewhere.
+    none. `tracks` are those of the movers' markers in both cameras, None where it did not come to that. Where clocks
+    are not said to agree, `offset_evidence` is what this stance alone knows of their offset (None: nothing), and
+    `at_offset` measures once more with an offset that is known from elsewhere.
     """
 
     homography: HomographyMeasurement
@@ -75,6 +78,7 @@ class PairMeasurement:
     correspondences: Correspondences | None
     offset_evidence: ClockOffset | None = None
     at_offset: "Callable[[ClockOffset], PairMeasurement] | None" = None
+    tracks: tuple[list[Track], list[Track]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +174,7 @@ def _measured(
     # without the floor: the graph knows it, and must not count it twice
     make_pose = relative_pose if seen.options.pose == "eq2" else most_likely_pose
     pose = make_pose(measurement, robot_i.mount, robot_j.mount, plane)
-    return PairMeasurement(measurement, pose, found)
+    return PairMeasurement(measurement, pose, found, tracks=(seen.tracks_i, seen.tracks_j))
 
 
 def stance_markers(run: Run, stance: Stance) -> Markers | None:
@@ -201,6 +205,38 @@ def stance_plane(run: Run, stance: Stance, robot: str) -> Plane:
             "no robot with markers moves, and no plane is stated: name the movers, or state the plane"
         )
     return plane_from_mount(run.team[robot].mount, markers, run.team.floor)
+
+
+def sight_movers(run: Run, measured: Iterable[PairMeasurement], wheels: Mapping[str, WheelTrack]) -> list[Sighting]:
+    """Where the moving robots were, by the observer that saw each best in each stance; nothing without a floor.
+
+    `measured` are all pairs of a run. A robot whose markers cannot be told apart, or are never seen at once, is not
+    in the list; tracks without names are followed where one robot moves alone.
+    """
+    stances = {stance.index: stance for stance in run.stances}
+    best: dict[tuple[int, str], Sighting] = {}
+    done: set[tuple[int, str]] = set()
+    for one in measured:
+        h = one.homography
+        stance = stances[h.stance]
+        if one.tracks is None or run.team.floor is None or stance.index in run.planes:
+            continue
+        for observer, tracks in zip((h.robot_i, h.robot_j), one.tracks, strict=True):
+            if (stance.index, observer) in done:
+                continue
+            done.add((stance.index, observer))
+            try:
+                plane = stance_plane(run, stance, observer)
+            except DegenerateGeometry:  # a camera below the markers, which the homography's refusal names
+                continue
+            for mover in stance.movers:
+                if len(stance.movers) > 1 and not any(track.marker for track in tracks):
+                    continue
+                seen = sight(stance, run.team[observer], run.team[mover], tracks, plane, wheels.get(mover))
+                before = best.get((stance.index, mover))
+                if seen is not None and (before is None or np.trace(seen.covariance) < np.trace(before.covariance)):
+                    best[stance.index, mover] = seen
+    return list(best.values())
 
 
 def stance_tracks(run: Run, stance: Stance, robot: str, options: FrontendOptions) -> list[Track]:

@@ -64,7 +64,7 @@ def render_report(solution: Solution, accuracy: Accuracy | None, truth: Truth | 
         _warnings_section(solution.warnings),
         _figures_section(solution, truth),
         _used_section(solution),
-        _measurements_section(solution.measurements),
+        _measurements_section(solution),
         f"<footer>coloc-graph {escape(__version__)}. Metres, degrees and pixels; the world is the reference robot's "
         "body at its first stance.</footer>",
     ]
@@ -88,7 +88,7 @@ def _headline(solution: Solution) -> str:
 
 
 def _counts(solution: Solution) -> tuple[int, int]:
-    refused = sum(m.homography.unusable is not None for m in solution.measurements)
+    refused = len(solution.measurements) - solution.used
     return len(solution.measurements) - refused, refused
 
 
@@ -221,16 +221,17 @@ def _flat(prefix: str, options: dict[str, Any]) -> Iterator[tuple[str, str]]:
             yield prefix + key, DASH if value is None else str(value)
 
 
-def _measurements_section(measurements: Sequence[PairMeasurement]) -> str:
+def _measurements_section(solution: Solution) -> str:
+    measurements = solution.measurements
     head = ["Stance", "Pair", "Points", "Inliers", "Residual", "Overlap [px]", "Normal error [°]", "Usable, or why not"]
-    table = _table(head, map(_measurement_row, measurements), [1, 7])
+    table = _table(head, (_measurement_row(one, solution.why_not(one)) for one in measurements), [1, 7])
     return (
         f"<h2>Measurements</h2>\n<details>\n<summary>{_many(len(measurements), 'measured pair')}</summary>\n"
         f"{table}\n</details>"
     )
 
 
-def _measurement_row(measured: PairMeasurement) -> list[str]:
+def _measurement_row(measured: PairMeasurement, why_not: str | None) -> list[str]:
     h, pose = measured.homography, measured.relative_pose
     return [
         str(h.stance),
@@ -240,5 +241,5 @@ def _measurement_row(measured: PairMeasurement) -> list[str]:
         _number(h.residual, 2),
         _number(h.overlap_px, 0),
         _number(math.degrees(pose.normal_error) if pose else None, 2),
-        "yes" if h.unusable is None else f'<span class="bad">{escape(h.unusable)}</span>',
+        "yes" if why_not is None else f'<span class="bad">{escape(why_not)}</span>',
     ]

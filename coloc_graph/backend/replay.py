@@ -1,0 +1,28 @@
+"""A whole graph, fed to an estimator stance by stance as it would have come in."""
+
+import time
+from collections import defaultdict
+
+from coloc_graph.backend.estimate import Estimate
+from coloc_graph.backend.estimator import Estimator
+from coloc_graph.backend.graph import PoseGraph
+from coloc_graph.measurements import Measurement
+
+
+def replay(graph: PoseGraph) -> tuple[Estimate, tuple[float, ...]]:
+    """The estimate at the end, and how long each stance took to enter [s].
+
+    A stance without an anchor, which an estimator refuses, raises `MeasurementError`.
+    """
+    by_stance: dict[int, list[Measurement]] = defaultdict(list)
+    for measured in graph.measurements:
+        by_stance[max(stance for _, stance in measured.ends)].append(measured)
+    estimator = Estimator(graph.reference, graph.robots, graph.floor, graph.slips)
+    seconds = []
+    before = None
+    for stance in graph.stances:
+        started = time.perf_counter()
+        estimator.add(stance, by_stance[stance.index], after=before)
+        seconds.append(time.perf_counter() - started)
+        before = stance.index
+    return estimator.estimate(), tuple(seconds)

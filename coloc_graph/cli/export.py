@@ -1,0 +1,35 @@
+"""coloc export g2o|tum|dot DIR --out PATH."""
+
+import argparse
+
+
+def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """The command's arguments."""
+    command = commands.add_parser("export", help="a result in other people's formats")
+    command.add_argument("format", choices=("g2o", "tum", "dot"), help="g2o and dot are a file, tum a file a robot")
+    command.add_argument("result", metavar="DIR", help="the folder that `coloc solve --out` wrote")
+    command.add_argument("--out", required=True, metavar="PATH", help="the file; for tum the folder")
+    command.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Copy what `solve` wrote, where nothing is yet."""
+    import shutil
+    from pathlib import Path
+
+    from coloc_graph.errors import InputError
+    from coloc_graph.results import read_result
+
+    result, out = read_result(args.result), Path(args.out)
+    if out.exists():
+        raise InputError(f"{out} exists; give another path, or remove it")
+    source = result.path / ("trajectories" if args.format == "tum" else f"graph.{args.format}")
+    if not source.exists():
+        raise InputError(f"{result.path} does not hold {source.name}; solve the run again with this version")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if args.format == "tum":
+        shutil.copytree(source, out)
+    else:
+        shutil.copyfile(source, out)
+    print(f"wrote {out}")
+    return 0

@@ -1,0 +1,38 @@
+"""A pose graph as a drawing: Graphviz's dot, one box a place, stay-put constraints visible as such."""
+
+from collections import defaultdict
+
+from coloc_graph.backend import PoseGraph, StayPut
+from coloc_graph.measurements import Node, Odometry, RelativePose
+
+#: Colours that colour-blind readers tell apart (Okabe and Ito).
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+
+
+def to_dot(graph: PoseGraph) -> str:
+    """The graph in the dot language; draw it with `dot -Tsvg`, or `neato` for large ones.
+
+    A box is one variable, named by all stances at which it holds; a double border is a robot that stayed put
+    exactly. Dashed edges are stay-put constraints with a slip, dotted ones odometry, thin ones sightings.
+    """
+    places: dict[int, list[Node]] = defaultdict(list)
+    for node in graph.nodes:
+        places[graph.places.key(node)].append(node)
+    ids = {key: f"n{number}" for number, key in enumerate(places)}
+    lines = ["graph poses {", "  node [shape=box, style=rounded, fontname=Helvetica];"]
+    for key, nodes in places.items():
+        label = " = ".join(f"{robot}@{stance}" for robot, stance in nodes)
+        colour = _COLOURS[graph.robots.index(nodes[0][0]) % len(_COLOURS)]
+        borders = 2 if len(nodes) > 1 else 1
+        world = ", penwidth=3" if key == graph.reference_key else ""
+        lines.append(f'  {ids[key]} [label="{label}", color="{colour}", peripheries={borders}{world}];')
+    for link in graph.links:
+        i, j = (ids[graph.places.key(node)] for node in link.ends)
+        if isinstance(link, RelativePose):
+            style = f'label="H {link.stance}"'
+        elif isinstance(link, StayPut):
+            style = 'label="stay put", style=dashed'
+        else:
+            style = "style=dotted" if isinstance(link, Odometry) else "penwidth=0.5"
+        lines.append(f"  {i} -- {j} [{style}];")
+    return "\n".join([*lines, "}"]) + "\n"

@@ -1,0 +1,159 @@
+"""Where a robot stands whose two markers a camera at rest sees: position and heading, with a covariance."""
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.frontend.correspondence import pair_by_time
+from coloc_graph.frontend.relative_pose import mounted, turned_normal
+from coloc_graph.frontend.tracking import Track
+from coloc_graph.frontend.wheels import WheelTrack
+from coloc_graph.lie import floor_pose, so3_exp
+from coloc_graph.measurements import Plane, Sighting
+from coloc_graph.run import Stance
+from coloc_graph.team import Markers, Robot
+
+Array = NDArray[np.float64]
+
+#: Two markers further apart or nearer than this share of their span are not a robot's.
+SPAN_TOLERANCE = 0.35
+#: A track without a name must see the robot drive this far for its wheels to tell front from back [m].
+LEAST_WAY = 0.1
+
+
+def sight(
+    stance: Stance,
+    observer: Robot,
+    seen: Robot,
+    tracks: Sequence[Track],
+    plane: Plane,
+    wheels: WheelTrack | None = None,
+    at: float | None = None,
+) -> Sighting | None:
+    """Where `seen` stands in `observer`, at the instant at which it is seen best, or nearest to `at` [s].
+
+    `plane` is that of the markers, made from the observer's mount. Of tracks without names the robot's `wheels` tell
+    which marker is which, by the way it drove. None where two markers are never seen at once, or cannot be told apart.
+    """
+    markers = seen.markers
+    if markers is None or len(markers.positions) < 2 or not plane.d_from_mount or not plane.normal_from_mount:
+        return None
+    pair = _marker_tracks(seen, tracks, observer, plane, wheels)
+    if pair is None:
+        return None
+    shared = pair_by_time(pair[0].times, pair[1].times)
+    uv = np.stack([pair[0].uv[shared[:, 0]], pair[1].uv[shared[:, 1]]], axis=1)
+    times = pair[0].times[shared[:, 0]]
+    places = _on_floor(observer, plane, uv, np.zeros((len(uv), 6)))
+    span = np.linalg.norm(places[:, 1] - places[:, 0], axis=1)
+    length = np.linalg.norm(np.diff(markers.p_body[:2, :2], axis=0))
+    with np.errstate(invalid="ignore"):
+        good = np.flatnonzero(np.abs(span / length - 1) < SPAN_TOLERANCE)
+    if not len(good):
+        return None
+    # nearest is seen best: of a point on the floor the error grows with the square of the distance
+    cost = np.linalg.norm(places[good], axis=2).max(axis=1) if at is None else np.abs(times[good] - at)
+    best = int(good[np.argmin(cost)])
+    noise = np.stack([pair[0].covariance[shared[best, 0]], pair[1].covariance[shared[best, 1]]])
+    pose, covariance = _pose(observer, markers, plane, uv[best], noise)
+    T_observer_seen = gtsam.Pose3(floor_pose(pose[1], pose[2], pose[0]))
+    return Sighting(stance.index, observer.name, seen.name, float(times[best]), T_observer_seen, covariance)
+
+
+def _marker_tracks(
+    seen: Robot, tracks: Sequence[Track], observer: Robot, plane: Plane, wheels: WheelTrack | None
+) -> tuple[Track, Track] | None:
+    """The tracks of the robot's first and second marker."""
+    named = {track.marker: track for track in tracks}
+    first, second = (named.get(f"{seen.name}/{n}") for n in range(2))
+    if first is not None and second is not None:
+        return first, second
+    if any(named) or len(tracks) != 2 or wheels is None or not len(wheels):
+        return None
+    ahead = _drives_ahead(seen, tracks[0], tracks[1], observer, plane, wheels)
+    if ahead is None:
+        return None
+    return (tracks[0], tracks[1]) if ahead else (tracks[1], tracks[0])
+
+
+def _drives_ahead(
+    seen: Robot, first: Track, second: Track, observer: Robot, plane: Plane, wheels: WheelTrack
+) -> bool | None:
+    """Whether two tracks, taken for the robot's markers in order, make it head the way its wheels drove it.
+
+    The way that was seen is laid over the way that was driven; that turns the odometry frame into the observer's.
+    """
+    assert seen.markers is not None
+    shared = pair_by_time(first.times, second.times)
+    if len(shared) < 2:
+        return None
+    uv = np.stack([first.uv[shared[:, 0]], second.uv[shared[:, 1]]], axis=1)
+    places = _on_floor(observer, plane, uv, np.zeros((len(uv), 6)))
+    finite = np.isfinite(places).all(axis=(1, 2))
+    if finite.sum() < 2:
+        return None
+    middle, driven = places[finite].mean(axis=1), wheels.pose_at(first.times[shared[finite, 0]])
+    a, b = middle - middle.mean(axis=0), driven[:, :2] - driven[:, :2].mean(axis=0)
+    if np.linalg.norm(np.ptp(b, axis=0)) < LEAST_WAY:
+        return None
+    turn = np.arctan2((b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0]).sum(), (a * b).sum())
+    arm, model = places[finite, 1] - places[finite, 0], np.diff(seen.markers.p_body[:2, :2], axis=0)[0]
+    heading = np.arctan2(arm[:, 1], arm[:, 0]) - np.arctan2(model[1], model[0])
+    agreement = float(np.cos(heading - driven[:, 2] - turn).mean())
+    return None if abs(agreement) < 0.5 else agreement > 0
+
+
+def _on_floor(observer: Robot, plane: Plane, uv: Array, errors: Array) -> Array:
+    """Places (n, m, 2) [m] on the marker plane, in the observer's body, of pixels (n, m, 2).
+
+    `errors` (n, 6) are of the normal about two axes across it [rad], of d [m], and of the mount: height, tilt, roll.
+    """
+    n, m, _ = uv.shape
+    T_body_camera = mounted(observer.mount, errors[:, 3:])
+    N = turned_normal(plane, observer.mount, T_body_camera)
+    across = np.linalg.svd(plane.N[None])[2][1:]
+    N = (so3_exp(errors[:, :2] @ across) @ N[..., None])[..., 0]
+    d = plane.d + errors[:, 2] + errors[:, 3]
+    x = observer.camera.normalise(uv.reshape(-1, 2)).reshape(n, m, 2)
+    rays = np.concatenate([x, np.ones((n, m, 1))], axis=2)
+    along = np.einsum("nmk,nk->nm", rays, N)
+    p_camera = rays * (d[:, None] / np.where(along > 1e-6, along, np.nan))[..., None]
+    p_body = np.einsum("nij,nmj->nmi", T_body_camera[:, :3, :3], p_camera) + T_body_camera[:, None, :3, 3]
+    return np.asarray(p_body[..., :2])
+
+
+def _pose(observer: Robot, markers: Markers, plane: Plane, uv: Array, noise: Array) -> tuple[Array, Array]:
+    """Heading, x, y (3,) of a body whose first two markers are seen at pixels (2, 2), and their covariance (3, 3).
+
+    The heading is that of the line through both, the place that of their middle.
+    """
+    root = np.zeros((10, 10))
+    bias = observer.camera.bias_px**2 * np.eye(2)
+    root[:2, :2], root[2:4, 2:4] = (np.linalg.cholesky(C + bias) for C in noise)
+    mount = observer.mount
+    root[4:, 4:] = np.diag(
+        [
+            plane.normal_sigma,
+            plane.normal_sigma,
+            plane.d_sigma,
+            mount.height_sigma,
+            *np.deg2rad([mount.tilt_sigma_deg, mount.roll_sigma_deg]),
+        ]
+    )
+    step = 0.1
+    errors = np.concatenate([np.zeros((1, 10)), step * root.T, -step * root.T])
+    places = _on_floor(observer, plane, uv + errors[:, :4].reshape(-1, 2, 2), errors[:, 4:])
+    model = markers.p_body[:2, :2]
+    arm, of_model = places[:, 1] - places[:, 0], model[1] - model[0]
+    heading = np.arctan2(arm[:, 1], arm[:, 0]) - np.arctan2(of_model[1], of_model[0])
+    c, s = np.cos(heading), np.sin(heading)
+    mx, my = model.mean(axis=0)
+    xy = places.mean(axis=1) - np.stack([c * mx - s * my, s * mx + c * my], axis=1)
+    # differences in the tangent of the first pose: heading, then x and y in its own axes
+    turned = (heading - heading[0] + np.pi) % (2 * np.pi) - np.pi
+    off = xy - xy[0]
+    xi = np.stack([turned, c[0] * off[:, 0] + s[0] * off[:, 1], -s[0] * off[:, 0] + c[0] * off[:, 1]], axis=1)
+    columns = (xi[1:11] - xi[11:]) / (2 * step)
+    return np.array([heading[0], *xy[0]]), columns.T @ columns
