@@ -121,7 +121,7 @@ def test_a_run_that_was_moved_is_evaluated_when_it_is_named(call, result, hallwa
 def test_without_truth_solve_says_where_the_robots_are_and_how_far_to_trust_it(call, short, copied, tmp_path):
     run = open_run(copied(short, tmp_path / "run.mcap"))
     code, text, _ = call("solve", run.path, "--out", tmp_path / "out")
-    head, a, b, last = text.splitlines()
+    head, a, b, _, last = text.splitlines()
     assert code == 0 and head.split("  ")[0] == "robot" and "path length" in head
     estimate = solve(run).estimate
     for line, robot in ((a, "A"), (b, "B")):

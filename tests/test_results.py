@@ -21,6 +21,9 @@ FILES = {
     "trajectories/A.cov.csv",
     "trajectories/B.tum",
     "trajectories/B.cov.csv",
+    "trajectories/C.tum",
+    "trajectories/C.cov.csv",
+    "graph.dot",
     "graph.g2o",
     "measurements.csv",
     "config.toml",
@@ -39,7 +42,7 @@ def test_a_result_has_every_file_of_the_design(result):
 
 def test_the_summary_has_every_key_of_the_design(result):
     summary = json.loads((result / "summary.json").read_text())
-    assert summary["method"] == "smooth" and summary["robots"] == ["A", "B"] and summary["stances"] == 8
+    assert summary["method"] == "smooth" and summary["robots"] == ["A", "B", "C"] and summary["stances"] == 8
     assert summary["measurements"] == {"used": 8, "rejected": 0}
     assert set(summary["seconds"]) == {"frontend", "backend", "total"}
     assert all(seconds >= 0 for seconds in summary["seconds"].values())

@@ -1,7 +1,6 @@
 """An estimator on disk, as JSON: what it was given, from which it can be rebuilt. No pickle."""
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,9 +18,18 @@ FORMAT = "coloc-graph-checkpoint-1"
 
 
 @dataclass(frozen=True, eq=False)
+class Early:
+    """A stance that came before the one it follows, which is `after`."""
+
+    stance: Stance
+    measurements: tuple[Measurement, ...]
+    after: int
+
+
+@dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """What an estimator is made of; `refused` are reasons by the number of the measurement, `early` are stances that
-    wait, each with its measurements and the stance that it follows."""
+    """What an estimator is made of; `refused` are reasons by the number of the measurement, `early` are the
+    stances that wait."""
 
     reference: str
     robots: tuple[str, ...]
@@ -30,7 +38,7 @@ class Checkpoint:
     stances: tuple[Stance, ...]
     measurements: tuple[Measurement, ...]
     refused: dict[int, str]
-    early: tuple[tuple[Stance, tuple[Measurement, ...], int], ...]
+    early: tuple[Early, ...]
 
 
 class _Measured(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -75,7 +83,7 @@ def write(saved: Checkpoint, path: Path) -> None:
         stances=list(saved.stances),
         measurements=[_of(one) for one in saved.measurements],
         refused=saved.refused,
-        early=[_Early(stance, [_of(one) for one in taken], after) for stance, taken, after in saved.early],
+        early=[_Early(one.stance, [_of(m) for m in one.measurements], one.after) for one in saved.early],
     )
     part = path.with_name(path.name + ".part")
     try:
@@ -102,11 +110,10 @@ def read(path: Path) -> Checkpoint:
             stances=tuple(file.stances),
             measurements=tuple(_to(one) for one in file.measurements),
             refused=file.refused,
-            early=tuple((one.stance, tuple(map(_to, one.measurements)), one.after) for one in file.early),
+            early=tuple(Early(one.stance, tuple(map(_to, one.measurements)), one.after) for one in file.early),
         )
-        _check(saved.measurements, saved.floor)
-        for _, taken, _ in saved.early:
-            _check(taken, saved.floor)
+        for taken in (saved.measurements, *(one.measurements for one in saved.early)):
+            require_valid(taken, saved.floor)
         if not all(0 <= number < len(saved.measurements) for number in saved.refused):
             raise ValueError("a measurement that is not there is refused")
     except OSError as error:
@@ -114,10 +121,6 @@ def read(path: Path) -> Checkpoint:
     except (msgspec.DecodeError, ValueError, EstimationError) as error:
         raise InputError(f"{path}: is not a checkpoint, or a damaged one ({error}); solve the run again") from error
     return saved
-
-
-def _check(measurements: Sequence[Measurement], floor: Floor | None) -> None:
-    require_valid(measurements, floor)
 
 
 def _of(measured: Measurement) -> _Measured:

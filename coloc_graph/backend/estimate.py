@@ -121,6 +121,20 @@ class Estimate:
         return trajectory.T_world_body[at], trajectory.covariances[at]
 
 
+@dataclass(frozen=True, eq=False)
+class StanceEstimate:
+    """Where the robots of one stance stand: `poses` T_world_body, and `covariances` (6, 6) in GTSAM's tangent.
+
+    Robots that nothing ties to the reference are `untied`. `refused` is what was refused in this call.
+    """
+
+    stance: int
+    poses: Mapping[str, gtsam.Pose3]
+    covariances: Mapping[str, Array]
+    untied: tuple[str, ...] = ()
+    refused: tuple[Refusal, ...] = ()
+
+
 def make_estimate(
     method: str,
     graph: PoseGraph,

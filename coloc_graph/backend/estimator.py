@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend import checkpoint
 from coloc_graph.backend.chain import compose, spanning_tree
+from coloc_graph.backend.checkpoint import Early
 from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, agreement, innovation
-from coloc_graph.backend.estimate import Estimate, Refusal
+from coloc_graph.backend.estimate import Estimate, Refusal, StanceEstimate
 from coloc_graph.backend.factors import Factors
 from coloc_graph.backend.graph import (
     Link,
@@ -32,29 +33,6 @@ from coloc_graph.run import Stance
 from coloc_graph.team import Floor, Slip, Team
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class StanceEstimate:
-    """Where the robots of one stance stand: `poses` T_world_body, and `covariances` (6, 6) in GTSAM's tangent.
-
-    Robots that nothing ties to the reference are `untied`. `refused` is what was refused in this call.
-    """
-
-    stance: int
-    poses: Mapping[str, gtsam.Pose3]
-    covariances: Mapping[str, Array]
-    untied: tuple[str, ...] = ()
-    refused: tuple[Refusal, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class Early:
-    """A stance that came before the one it follows, which is `after`."""
-
-    stance: Stance
-    measurements: tuple[Measurement, ...]
-    after: int
 
 
 #: A link and the keys of its ends.
@@ -231,7 +209,7 @@ class Estimator:
                 stances=self.stances,
                 measurements=self.measurements,
                 refused={numbers[key]: one.reason for key, one in self._refused.items()},
-                early=tuple((one.stance, one.measurements, one.after) for one in self._early.values()),
+                early=tuple(self._early.values()),
             ),
             Path(path),
         )
@@ -252,7 +230,7 @@ class Estimator:
         estimator._log = list(saved.measurements)
         for number, reason in saved.refused.items():
             estimator._refused[id(saved.measurements[number])] = Refusal(saved.measurements[number], reason)
-        estimator._early = {stance.index: Early(stance, taken, after) for stance, taken, after in saved.early}
+        estimator._early = {one.stance.index: one for one in saved.early}
         if saved.stances:
             estimator._rebuild()
         return estimator

@@ -1,0 +1,244 @@
+"""The pose graph in batch: any team, wrong measurements found, bumped anchors named, covariances that tell the truth."""
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from teams import FLOOR, ate, graph_of_team, planar_nees, team_of
+
+from coloc_graph.backend import PoseGraph, chain, diagnose, smooth
+from coloc_graph.backend.factors import Factors
+from coloc_graph.backend.solver import Posterior
+from coloc_graph.errors import EstimationError
+from coloc_graph.lie import floor_pose
+from coloc_graph.measurements import Odometry, RelativePose, Sighting
+from coloc_graph.run import Stance
+from coloc_graph.team import Slip
+
+
+@pytest.fixture(scope="module")
+def six():
+    """A team of six with wrong relative poses, and its estimate."""
+    team = team_of(6, 20, seed=1, wrong=0.1)
+    return team, smooth(graph_of_team(team))
+
+
+def test_every_robot_has_a_pose_at_every_stance_whatever_its_role():
+    team = team_of(5, 9)
+    estimate = smooth(graph_of_team(team))
+    assert set(estimate.graph.nodes) == {(robot, k) for robot in team.robots for k in range(9)}
+    assert not estimate.untied and all(len(one) == 9 for one in estimate.trajectories.values())
+    drivers = {stance.movers[0] for stance in team.stances}
+    assert drivers == set(team.robots)
+    # a driver's pose is of the instant at which it was sighted
+    driver = team.stances[2].movers[0]
+    (seen,) = [m for m in team.measurements if isinstance(m, Sighting) and m.stance == 2]
+    assert estimate.trajectories[driver].times[2] == seen.time
+    for stay in estimate.graph.stay_puts:
+        assert np.array_equal(estimate.pose(*stay.ends[0]).matrix(), estimate.pose(*stay.ends[1]).matrix())
+
+
+@pytest.mark.parametrize("robots", [3, 6])
+def test_nees_over_200_seeds_is_inside_its_interval(robots):
+    nees, fits = [], []
+    for seed in range(200):
+        team = team_of(robots, 5, seed=seed)
+        estimate = smooth(graph_of_team(team))
+        last = max(estimate.graph.nodes, key=lambda node: (node[1], node[0]))
+        nees.append(planar_nees(estimate, team, last))
+        fits.append((estimate.chi2, estimate.dof))
+    low, high = chi2.ppf([0.025, 0.975], 3 * len(nees))
+    assert low < sum(nees) < high
+    total, dof = np.sum(fits, axis=0)
+    low, high = chi2.ppf([0.025, 0.975], dof)
+    assert low < total < high
+
+
+def test_wrong_homographies_in_a_loopy_team_are_all_found_and_no_right_one_is_refused(six):
+    team, estimate = six
+    assert len(team.wrong) >= 8
+    assert {id(r.measurement) for r in estimate.refused} == set(map(id, team.wrong))
+    assert all("contradicted" in r.reason and "sigmas" in r.reason for r in estimate.refused)
+    # what remains is a fit as good as any
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], estimate.dof)
+    assert low < estimate.chi2 < high
+    assert ate(estimate, team) < 1.3 * ate(smooth(graph_of_team(team_of(6, 20, seed=1))), team)
+
+
+def test_without_refusing_wrong_homographies_spoil_it(six):
+    """The tests above can fail: the same measurements taken at face value."""
+    team, estimate = six
+    assert ate(smooth(graph_of_team(team), refuse=False), team) > 10 * ate(estimate, team)
+
+
+def three(seed, **options):
+    return team_of(3, 12, seed=seed, rotating=False, sightings=False, **options)
+
+
+def test_in_a_chain_of_three_odometry_contradicts_a_wrong_homography():
+    team = three(3)
+    (wrong,) = [m for m in team.measurements if isinstance(m, RelativePose) and m.stance == 6]
+    T = gtsam.Pose3(floor_pose(0.05, 0.06, 0.1)).compose(wrong.T_i_j)
+    bad = RelativePose(6, wrong.robot_i, wrong.robot_j, T, wrong.covariance, T, 0, 0.0)
+    made = [bad if m is wrong else m for m in team.measurements]
+    estimate = smooth(graph_of_team(team, made))
+    assert [r.measurement for r in estimate.refused] == [bad]
+    # nothing can contradict it without the wheels, and then nothing is refused
+    alone = smooth(graph_of_team(team, [m for m in made if isinstance(m, RelativePose)]))
+    assert not alone.refused
+    assert ate(estimate, team) < 0.5 * ate(alone, team)
+
+
+def test_a_bumped_anchor_is_found_and_named_and_no_homography_is_blamed():
+    team = three(5)
+    bump = floor_pose(0.06, -0.05, 0.12)
+    # B observes at stances 5 and 6; from 6 on everything B measured is from where it was pushed to
+    (robot,) = team.stances[6].anchors
+    made = []
+    for m in team.measurements:
+        (i, a), (j, b) = m.ends
+        if isinstance(m, RelativePose) and m.stance == 6:
+            T = m.T_i_j
+            T = gtsam.Pose3(bump).inverse().compose(T) if i == robot else T.compose(gtsam.Pose3(bump))
+            m = RelativePose(6, i, j, T, m.covariance, T, 0, 0.0)
+        elif isinstance(m, Odometry) and m.robot == robot and a == 6:
+            m = Odometry(robot, a, b, gtsam.Pose3(bump).inverse().compose(m.T_before_after), m.covariance)
+        made.append(m)
+    estimate = smooth(graph_of_team(team, made))
+    (found,) = estimate.bumped
+    assert (found.stay_put.robot, found.stay_put.before, found.stay_put.after) == (robot, 5, 6)
+    assert not estimate.refused
+    np.testing.assert_allclose(found.T_before_after.translation()[:2], bump[:2, 3], atol=0.03)
+    assert f"robot {robot} was bumped between stances 5 and 6" in str(found)
+    # before and after are two places now
+    assert not estimate.pose(robot, 5).equals(estimate.pose(robot, 6), 0.02)
+
+
+def test_a_healthy_team_has_neither_bumps_nor_refusals():
+    for seed in range(5):
+        estimate = smooth(graph_of_team(three(seed)))
+        assert estimate.bumped == () and estimate.refused == ()
+
+
+def test_a_slip_is_a_constraint_of_its_own_and_widens_the_covariance():
+    team = three(2)
+    exact = smooth(graph_of_team(team))
+    graph = PoseGraph("A", team.robots, team.stances, team.measurements, FLOOR, {"B": Slip(sigma=0.02, sigma_deg=1.0)})
+    loose = smooth(graph)
+    slipping = [stay for stay in graph.stay_puts if stay.slip]
+    assert slipping and {stay.robot for stay in slipping} == {"B"}
+    assert "with a slip" in repr(graph) and "exact" in repr(graph)
+    first = slipping[0]
+    assert graph.key("B", first.before) != graph.key("B", first.after)
+    off = loose.pose("B", first.before).between(loose.pose("B", first.after)).translation()
+    assert 0 < np.linalg.norm(off) < 0.05
+    last = team.stances[-1].index
+    assert loose.covariance("B", last)[3, 3] > exact.covariance("B", last)[3, 3]
+
+
+def test_joint_covariances_hold_the_single_ones_and_say_how_poses_move_together():
+    team = team_of(4, 8)
+    estimate = smooth(graph_of_team(team))
+    nodes = [("B", 5), ("C", 7), ("A", 7)]
+    joint = estimate.joint_covariance(nodes)
+    assert joint.shape == (18, 18) and np.linalg.eigvalsh(joint).min() > 0
+    for n, node in enumerate(nodes):
+        block = joint[6 * n : 6 * n + 6, 6 * n : 6 * n + 6]
+        np.testing.assert_allclose(block, estimate.covariance(*node), rtol=1e-6, atol=1e-12)
+    # against the whole graph's information, inverted at once
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    keys = {estimate.graph.key(*node): estimate.pose(*node) for node in estimate.graph.nodes}
+    for key, pose in keys.items():
+        values.insert(key, pose)
+    factors, _ = Factors(FLOOR).of_graph(estimate.graph, keys)
+    marginals = gtsam.Marginals(factors, values)
+    wanted = [estimate.graph.key(*node) for node in nodes]
+    theirs = marginals.jointMarginalCovariance(wanted)
+    dense = np.block([[theirs.at(a, b) for b in wanted] for a in wanted])
+    np.testing.assert_allclose(joint, dense, rtol=1e-4, atol=1e-4 * np.abs(dense).max())
+    # one place named twice has the same rows
+    (stay, *_) = [s for s in estimate.graph.stay_puts if s.before > 0]
+    twice = estimate.joint_covariance(list(stay.ends))
+    assert np.array_equal(twice[:6, :6], twice[6:, :6])
+
+
+def test_all_covariances_in_bulk_are_those_one_by_one():
+    estimate = smooth(graph_of_team(team_of(4, 8)))
+    posterior: Posterior = estimate._posterior
+    for node in estimate.graph.nodes:
+        key = estimate.graph.key(*node)
+        np.testing.assert_allclose(posterior.covariance(key), estimate.covariance(*node), rtol=1e-6, atol=1e-14)
+
+
+def straight(count, sigmas):
+    stances = tuple(
+        Stance(k, 10.0 * k, 10.0 * k + 5, ("A", "B") if k % 2 == 0 else ("B", "A"), (), ("AB"[k % 2],) if k else ())
+        for k in range(count)
+    )
+    C = np.diag(np.square(sigmas))
+    T = gtsam.Pose3(floor_pose(1, 0, 0))
+    made = tuple(RelativePose(s.index, *s.observers, T, C, T, 0, 0.0) for s in stances)
+    return PoseGraph("A", ("A", "B"), stances, made)
+
+
+@pytest.mark.parametrize("finer", [1, 100])
+def test_a_straight_chain_of_1000_steps_is_solved(finer):
+    estimate = smooth(straight(1000, np.array([0.02] * 3 + [0.002] * 3) / finer))
+    last = estimate.graph.stances[-1]
+    np.testing.assert_allclose(estimate.pose(last.observers[1], 999).translation(), [1000, 0, 0], atol=1e-5)
+    C = estimate.covariance(last.observers[1], 999)
+    expected = (0.02**2 * sum(k**2 for k in range(1000)) + 1000 * 0.002**2) / finer**2
+    assert C[4, 4] == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_long_chain_does_not_end_the_process():
+    """Recursion: 20,000 poses are too deep for a thread of 512 KiB, in which this is run."""
+    import threading
+
+    found = []
+    before = threading.stack_size(1 << 19)
+    try:
+        thread = threading.Thread(target=lambda: found.append(smooth(straight(20_000, [1e-3] * 6))))
+        thread.start()
+    finally:
+        threading.stack_size(before)
+    thread.join()
+    assert found[0].pose("A", 19_999).x() == pytest.approx(20_000, abs=1e-3)
+
+
+def test_chained_and_smoothed_agree_without_redundancy_with_any_roles():
+    team = team_of(4, 10, floor=None, neighbours=1)
+    first = {}
+    for m in team.measurements:  # of each place the first measurement only: a tree
+        (i, a), (j, b) = m.ends
+        graph = graph_of_team(team, ())
+        first.setdefault(frozenset([graph.key(i, a), graph.key(j, b)]), m)
+    made, reached = [], {graph.reference_key}
+    for ends, m in first.items():
+        if len(ends - reached) == 1:
+            made.append(m)
+            reached |= ends
+    graph = graph_of_team(team, made)
+    a, b = chain(graph), smooth(graph)
+    for node in graph.nodes:
+        if node not in a.untied:
+            np.testing.assert_allclose(a.pose(*node).matrix(), b.pose(*node).matrix(), rtol=0, atol=1e-9)
+
+
+def test_what_is_not_tied_is_diagnosed_before_solving_with_what_would_tie_it():
+    team = team_of(6, 4, odometry=False, sightings=False)
+    apart = {"E", "F"}
+    made = [m for m in team.measurements if {r for r, _ in m.ends} <= apart or not {r for r, _ in m.ends} & apart]
+    parts = diagnose(graph_of_team(team, made))
+    assert parts and {robot for part in parts for robot, _ in part.nodes} <= apart
+    assert any("relative pose or a sighting between" in part.remedy for part in parts)
+    assert diagnose(graph_of_team(team_of(6, 4))) == ()
+    tied = {node for node in graph_of_team(team, made).nodes} - {n for part in parts for n in part.nodes}
+    estimate = smooth(graph_of_team(team, made))
+    assert set(estimate.untied).isdisjoint(tied)
+
+
+def test_a_team_that_nothing_connects_is_refused_in_words():
+    team = team_of(4, 1, sightings=False)
+    with pytest.raises(EstimationError, match="no measurement ties a robot to the reference A at stance 0"):
+        smooth(graph_of_team(team, [m for m in team.measurements if "A" not in {r for r, _ in m.ends}]))
