@@ -99,7 +99,9 @@ def test_a_straight_drive_in_the_middle_is_a_warning_and_what_hung_on_it_is_unti
     # at stance 3 B is the anchor and A has moved: from there on nothing ties A, and with it anything
     assert solution.estimate.untied[0] == ("A", 3)
     assert {stance for _, stance in solution.estimate.untied} == set(range(3, 8))
-    assert any(re.match(r"A.* at stances 3 to 7: not tied to the reference; .*A.* would tie", w) for w in solution.warnings)
+    assert any(
+        re.match(r"A.* at stances 3 to 7: not tied to the reference; .*A.* would tie", w) for w in solution.warnings
+    )
     # what came before is as if nothing had happened
     for robot, whole in solutions[method].estimate.trajectories.items():
         part = solution.estimate.trajectories[robot]

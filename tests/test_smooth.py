@@ -1,4 +1,4 @@
-"""The pose graph in batch: any team, wrong measurements found, bumped anchors named, covariances that tell the truth."""
+"""The pose graph in batch: any team, wrong measurements found, bumped anchors named, covariances that are true."""
 
 import gtsam
 import numpy as np
@@ -233,7 +233,7 @@ def test_what_is_not_tied_is_diagnosed_before_solving_with_what_would_tie_it():
     assert parts and {robot for part in parts for robot, _ in part.nodes} <= apart
     assert any("relative pose or a sighting between" in part.remedy for part in parts)
     assert diagnose(graph_of_team(team_of(6, 4))) == ()
-    tied = {node for node in graph_of_team(team, made).nodes} - {n for part in parts for n in part.nodes}
+    tied = set(graph_of_team(team, made).nodes) - {n for part in parts for n in part.nodes}
     estimate = smooth(graph_of_team(team, made))
     assert set(estimate.untied).isdisjoint(tied)
 

@@ -1,7 +1,7 @@
 """The estimate kept up to date while stances come in: ISAM2 with QR, and a log from which it can be rebuilt."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -12,6 +12,7 @@ from coloc_graph.backend import checkpoint
 from coloc_graph.backend.chain import compose, spanning_tree
 from coloc_graph.backend.checkpoint import Early
 from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, agreement, innovation
+from coloc_graph.backend.entering import Entering, Sorter, Tie
 from coloc_graph.backend.estimate import Estimate, Refusal, StanceEstimate
 from coloc_graph.backend.factors import Factors
 from coloc_graph.backend.graph import (
@@ -33,21 +34,6 @@ from coloc_graph.run import Stance
 from coloc_graph.team import Floor, Slip, Team
 
 Array = NDArray[np.float64]
-
-
-#: A link and the keys of its ends.
-_Tie = tuple[Link, int, int]
-
-
-@dataclass(frozen=True, eq=False)
-class _Entering:
-    """What one call puts into the graph: where new poses start, the `ties` that hold them (and odometry), the
-    measurements that are `tested` against them first, and what is `loose` still."""
-
-    start: dict[int, gtsam.Pose3]
-    ties: list[_Tie]
-    tested: list[_Tie]
-    loose: list[Link]
 
 
 def _refusal(link: Link, off: Agreement) -> Refusal:
@@ -186,16 +172,20 @@ class Estimator:
         """
         if not any(one is measurement for one in self._log):
             raise EstimationError(f"the {measurement} is not in, so that it cannot be taken out")
-        log, refused = self._log, dict(self._refused)
+        log, refused = self._log, self._refused
+        again = [one.measurement for key, one in refused.items() if key != id(measurement)]
         self._log = [one for one in log if one is not measurement]
-        self._refused.pop(id(measurement), None)
         try:
             self._rebuild()
+            entering = self._entering([*self._loose, *again])
+            self._refused = {id(one.measurement): one for one in self._update(entering)}
         except Exception:
             self._log, self._refused = log, refused
             self._rebuild()
             raise
-        return self._at(next(reversed(self._stances.values())), ())
+        self._loose = entering.loose
+        self._tied |= entering.start.keys()
+        return self._at(next(reversed(self._stances.values())), self.refused)
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint, whole or not at all, from which `resume` goes on."""
@@ -277,40 +267,11 @@ class Estimator:
                 require_instant(measured, self._instants.get(node, instants.setdefault(node, measured.time)))
         return instants
 
-    def _entering(self, links: list[Link]) -> "_Entering":
-        """What hangs on the poses that are tied, what does not yet, and where new poses start."""
-        start: dict[int, gtsam.Pose3] = {}
-        if not self._tied:
-            start[self._places.key((self.reference, next(iter(self._stances))))] = gtsam.Pose3()
-        ties: list[_Tie] = []
-        tested: list[_Tie] = []
-        # wheels first: they are seldom wrong by much, so that what they predict can refuse a wrong homography
-        left = sorted(links, key=lambda link: isinstance(link, RelativePose | Sighting))
-        while left:
-            still: list[Link] = []
-            for link in left:
-                i, j = self._keys(link)
-                has_i, has_j = (key in self._tied or key in start for key in (i, j))
-                if i != j and not has_i and not has_j:
-                    still.append(link)
-                elif i != j and has_i and has_j and isinstance(link, RelativePose | Sighting):
-                    tested.append((link, i, j))
-                elif i != j:
-                    if not has_j:
-                        start[j] = self._factors.start(self._pose_of(i, start).compose(link.T_i_j))
-                    elif not has_i:
-                        start[i] = self._factors.start(self._pose_of(j, start).compose(link.T_i_j.inverse()))
-                    ties.append((link, i, j))
-            if len(still) == len(left):
-                break
-            left = still
-        return _Entering(start, ties, tested, left)
+    def _entering(self, links: list[Link]) -> Entering:
+        reference = self._places.key((self.reference, next(iter(self._stances))))
+        return Sorter(self._factors, self._keys, self._tied, reference, self._isam.calculateEstimatePose3).sort(links)
 
-    def _pose_of(self, key: int, start: Mapping[int, gtsam.Pose3]) -> gtsam.Pose3:
-        pose = start.get(key)
-        return self._isam.calculateEstimatePose3(key) if pose is None else pose
-
-    def _update(self, entering: "_Entering") -> tuple[Refusal, ...]:
+    def _update(self, entering: Entering) -> tuple[Refusal, ...]:
         """Put poses and links into ISAM2, without those that all others contradict; all of it or nothing."""
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for key, pose in entering.start.items():
@@ -318,44 +279,47 @@ class Estimator:
             values.insert(key, pose)
             for factor in (self._factors.gauge(key),) if is_reference else self._factors.of_pose(key):
                 factors.add(factor)
-        for link, i, j in entering.ties:
+        first = factors.size() + len(entering.ties)
+        for link, i, j in (*entering.ties, *entering.near):
             factors.add(self._factors.of_link(link, i, j))
         try:
-            if factors.size():
-                self._isam.update(factors, values)
-            refused = self._enter_tested(entering.tested) if entering.tested else ()
+            indices = self._isam.update(factors, values).getNewFactorsIndices() if factors.size() else []
+            inside = dict(zip(indices[first:], entering.near, strict=True))
+            refused = self._enter_far(entering.far, inside) + self._take_out(inside)
             for key in entering.start:
                 if not np.isfinite(self._isam.calculateEstimatePose3(key).translation()).all():
                     raise EstimationError("a pose came out as not finite")
         except Exception as failure:
             self._rebuild()
             raise EstimationError(f"the graph cannot take this in, and is as it was: {failure}") from failure
-        return refused
+        return tuple(refused)
 
-    def _enter_tested(self, tested: "list[_Tie]") -> tuple[Refusal, ...]:
-        """Refuse what contradicts what is known before it enters, then what contradicts the others that entered."""
-        refused = []
-        passed = []
-        factors = gtsam.NonlinearFactorGraph()
-        for tie in tested:
+    def _enter_far(self, far: list[Tie], inside: dict[int, Tie]) -> list[Refusal]:
+        """Put in what does not contradict what is known, and note it as `inside`; what does is refused."""
+        refused, factors, passed = [], gtsam.NonlinearFactorGraph(), []
+        for tie in far:
             off = self._agreement(*tie, inside=False)
             if off.chance() < LEAST_CHANCE:
                 refused.append(_refusal(tie[0], off))
             else:
                 passed.append(tie)
                 factors.add(self._factors.of_link(*tie))
-        if not passed:
-            return tuple(refused)
-        indices = list(self._isam.update(factors, gtsam.Values()).getNewFactorsIndices())
-        # among several that agree with a vague prediction one can still contradict the others
-        while len(passed) > 1:
-            among = [self._agreement(*tie) for tie in passed]
-            worst = min(range(len(passed)), key=lambda n: among[n].chance())
+        if passed:
+            indices = self._isam.update(factors, gtsam.Values()).getNewFactorsIndices()
+            inside |= zip(indices, passed, strict=True)
+        return refused
+
+    def _take_out(self, inside: dict[int, Tie]) -> list[Refusal]:
+        """Take out what all others contradict, the worst first."""
+        refused = []
+        while inside:
+            among = {index: self._agreement(*tie) for index, tie in inside.items()}
+            worst = min(among, key=lambda index: among[index].chance())
             if among[worst].chance() >= LEAST_CHANCE:
                 break
-            refused.append(_refusal(passed.pop(worst)[0], among[worst]))
-            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [indices.pop(worst)])
-        return tuple(refused)
+            refused.append(_refusal(inside.pop(worst)[0], among[worst]))
+            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [worst])
+        return refused
 
     def _agreement(self, link: Link, i: int, j: int, *, inside: bool = True) -> Agreement:
         values = gtsam.Values()
@@ -365,7 +329,7 @@ class Estimator:
         return (agreement if inside else innovation)(factor, values, joint)
 
     def _rebuild(self) -> None:
-        """ISAM2 anew from the log: after a failure, a revocation, and from a checkpoint."""
+        """ISAM2 anew from the log without what was refused: after a failure, a revocation, and from a checkpoint."""
         graph = self.graph
         kept = graph.without(one.measurement for one in self.refused)
         steps = spanning_tree(kept, kept.links)
@@ -380,14 +344,6 @@ class Estimator:
         self._tied = set(poses)
         inside = set(map(id, links))
         self._loose = [link for link in kept.links if id(link) not in inside and len(set(self._keys(link))) == 2]
-        for refusal in self.refused:
-            link = refusal.measurement
-            i, j = self._keys(link)
-            if {i, j} <= self._tied and self._agreement(link, i, j, inside=False).chance() >= LEAST_CHANCE:
-                back = gtsam.NonlinearFactorGraph()
-                back.add(self._factors.of_link(link, i, j))
-                self._isam.update(back, gtsam.Values())
-                del self._refused[id(link)]
 
     def _keys(self, link: Link) -> tuple[int, int]:
         i, j = map(self._places.key, link.ends)
