@@ -7,6 +7,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from coloc_graph.backend import checkpoint
 from coloc_graph.backend.chain import compose, spanning_tree
@@ -34,6 +35,9 @@ from coloc_graph.run import Stance
 from coloc_graph.team import Floor, Slip, Team
 
 Array = NDArray[np.float64]
+
+#: With less chi2 than this in all that enters, nothing of it is refused, of however few degrees of freedom.
+CLEAR = float(chdtri(1, LEAST_CHANCE))
 
 
 def _refusal(link: Link, off: Agreement) -> Refusal:
@@ -283,9 +287,13 @@ class Estimator:
         for link, i, j in (*entering.ties, *entering.near):
             factors.add(self._factors.of_link(link, i, j))
         try:
+            # what the error rises by is at most what the new factors have before anything moves to please them
+            clear = not entering.near or 2 * factors.error(self._with_known(values, entering)) < CLEAR
             indices = self._isam.update(factors, values).getNewFactorsIndices() if factors.size() else []
             inside = dict(zip(indices[first:], entering.near, strict=True))
-            refused = self._enter_far(entering.far, inside) + self._take_out(inside)
+            refused = self._enter_far(entering.far, inside)
+            if entering.far or not clear:
+                refused += self._take_out(inside)
             for key in entering.start:
                 if not np.isfinite(self._isam.calculateEstimatePose3(key).translation()).all():
                     raise EstimationError("a pose came out as not finite")
@@ -293,6 +301,15 @@ class Estimator:
             self._rebuild()
             raise EstimationError(f"the graph cannot take this in, and is as it was: {failure}") from failure
         return tuple(refused)
+
+    def _with_known(self, new: gtsam.Values, entering: Entering) -> gtsam.Values:
+        """New poses where they start, and those that are tied to them where they are."""
+        values = gtsam.Values(new)
+        for _, *ends in (*entering.ties, *entering.near):
+            for key in ends:
+                if not values.exists(key):
+                    values.insert(key, self._isam.calculateEstimatePose3(key))
+        return values
 
     def _enter_far(self, far: list[Tie], inside: dict[int, Tie]) -> list[Refusal]:
         """Put in what does not contradict what is known, and note it as `inside`; what does is refused."""
