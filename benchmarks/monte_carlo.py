@@ -14,8 +14,9 @@ from scipy.stats import chi2
 
 from coloc_graph.evaluation import Accuracy, align, evaluate
 from coloc_graph.pipeline import Solution, SolveOptions, solve
-from coloc_graph.run import Detections, Planes
+from coloc_graph.run import Detections, OdometrySample, Planes
 from coloc_graph.simulation import EPOCH, World, build_world, observe, scenario
+from coloc_graph.simulation.wheels import odometry
 from coloc_graph.simulation.world import stream
 from coloc_graph.trajectory import Trajectory
 
@@ -35,6 +36,7 @@ class MemoryRun:
         for k in range(len(world.stances)):
             for tracks in observe(world, k):
                 self._detections[tracks.robot] += tracks.records()
+        self._world = world
 
     def has_detections(self, robot: str) -> bool:
         """As `Run`."""
@@ -44,10 +46,19 @@ class MemoryRun:
         """As `Run`."""
         return (one for one in self._detections[robot] if start <= one.time <= end)
 
+    def odometry(self, robot: str) -> Iterator[OdometrySample]:
+        """As `Run`."""
+        world = self._world
+        moves = [(start, end) for mover, start, end in world.moves if mover == robot]
+        wheels = odometry(world.paths[robot], moves, stream(world.seed, "wheels", world.team.names.index(robot)))
+        late = float(world.clock(robot, 0.0))
+        return iter(wheels.records(robot, EPOCH, world.stances[-1].end, late))
+
 
 def truth_of(world: World) -> dict[str, Trajectory]:
-    """The truth at the beginning of each stance, as the run's file would hold it."""
-    times = np.array([EPOCH, *(stance.start for stance in world.stances)])
+    """The truth at the beginning of each stance and at each capture."""
+    captured = [capture.times for captures in world.captures for capture in captures]
+    times = np.unique(np.concatenate([[EPOCH], [stance.start for stance in world.stances], *captured]))
     return {robot: Trajectory(robot, times, path.pose_at(times)) for robot, path in world.paths.items()}
 
 

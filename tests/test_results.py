@@ -47,7 +47,7 @@ def test_the_summary_has_every_key_of_the_design(result):
     assert set(summary["seconds"]) == {"frontend", "backend", "total"}
     assert all(seconds >= 0 for seconds in summary["seconds"].values())
     accuracy = summary["accuracy"]
-    assert set(accuracy["length_error_percent"]) == {"A", "B"}
+    assert set(accuracy["length_error_percent"]) == {"A", "B", "C"}
     for key in ("ate_m", "end_position_error_m", "heading_error_deg", "anees"):
         assert isinstance(accuracy[key], float), key
 
