@@ -84,15 +84,15 @@ def bare_batch(team, keyed, reference, covariances):
     bare.gauge(factors, reference)
     for measured, i, j in sorted(keyed, key=lambda one: isinstance(one[0], Odometry)):
         if j not in poses:
-            poses[j] = poses[i].compose(measured.T_i_j)
+            poses[j] = bare.start(poses[i].compose(measured.T_i_j))
             bare.pose(factors, j)
         elif i not in poses:
-            poses[i] = poses[j].compose(measured.T_i_j.inverse())
+            poses[i] = bare.start(poses[j].compose(measured.T_i_j.inverse()))
             bare.pose(factors, i)
         bare.between(factors, i, j, measured)
     for key, pose in poses.items():
-        values.insert(key, bare.start(pose))
-    result = gtsam.LevenbergMarquardtOptimizer(factors, values, lm_parameters()).optimize()
+        values.insert(key, pose)
+    result = gtsam.LevenbergMarquardtOptimizer(factors, values, lm_parameters(values.size())).optimize()
     if covariances:
         isam = gtsam.ISAM2(isam_parameters())
         isam.update(factors, result)

@@ -92,7 +92,9 @@ def test_a_g2o_that_is_not_there_is_one_sentence(tmp_path):
 def test_a_planar_graph_is_solved(tmp_path):
     path = tmp_path / "square.g2o"
     turn = f"EDGE_SE2 {{}} {{}} 1 0 {np.pi / 2} 1 0 0 1 0 1"
-    path.write_text("\n".join([*(V2.format(k) for k in range(4)), *(turn.format(k, (k + 1) % 4) for k in range(4))]))
+    near = ("0 0 0", "0.8 0.1 1.4", "1.2 0.9 3.0", "0.1 1.1 -1.5")
+    edges = [turn.format(k, (k + 1) % 4) for k in range(4)]
+    path.write_text("\n".join([*(f"VERTEX_SE2 {k} {at}" for k, at in enumerate(near)), *edges]))
     read = read_g2o(path)
     values, _ = optimise(read.factors, read.values)
     corners = [values.atPose2(k).translation() for k in range(4)]
@@ -118,9 +120,8 @@ def _first(factors):
 
 def test_dot_shows_places_and_who_stayed_put():
     team = team_of(4, 6)
-    graph = PoseGraph(
-        "A", team.robots, team.stances, team.measurements, team.floor, {"C": Slip(sigma=0.01, sigma_deg=1)}
-    )
+    slips = {"C": Slip(sigma=0.01, sigma_deg=1)}
+    graph = PoseGraph("A", team.robots, team.stances, team.measurements, team.floor, slips)
     text = to_dot(graph)
     assert text.startswith("graph poses {") and text.rstrip().endswith("}")
     exact = [s for s in graph.stay_puts if s.slip is None]
@@ -132,14 +133,8 @@ def test_dot_shows_places_and_who_stayed_put():
 
 @pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
 def test_graphviz_draws_it():
-    drawn = subprocess.run(
-        ["dot", "-Tsvg"],
-        input=to_dot(graph_of_team(team_of(4, 6))),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    )
+    text = to_dot(graph_of_team(team_of(4, 6)))
+    drawn = subprocess.run(["dot", "-Tsvg"], input=text, capture_output=True, text=True, timeout=60, check=True)
     assert "A@0 = A@1" in drawn.stdout
 
 

@@ -2,7 +2,7 @@
 
 import heapq
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import gtsam
@@ -77,8 +77,10 @@ def spanning_tree(graph: PoseGraph, links: Sequence[Link]) -> list[Step]:
     return steps
 
 
-def compose(graph: PoseGraph, steps: Sequence[Step]) -> dict[int, gtsam.Pose3]:
-    """Poses T_world_body by key, of the reference and wherever the steps lead.
+def compose(
+    graph: PoseGraph, steps: Sequence[Step], place: Callable[[gtsam.Pose3], gtsam.Pose3] = lambda pose: pose
+) -> dict[int, gtsam.Pose3]:
+    """Poses T_world_body by key, of the reference and wherever the steps lead, each put where `place` says.
 
     Raises `EstimationError` where there are measurements and none leads anywhere.
     """
@@ -89,5 +91,5 @@ def compose(graph: PoseGraph, steps: Sequence[Step]) -> dict[int, gtsam.Pose3]:
         )
     poses = {graph.reference_key: gtsam.Pose3()}
     for via, to, link, forwards in steps:
-        poses[to] = poses[via].compose(link.T_i_j if forwards else link.T_i_j.inverse())
+        poses[to] = place(poses[via].compose(link.T_i_j if forwards else link.T_i_j.inverse()))
     return poses

@@ -351,9 +351,9 @@ class Estimator:
         kept = graph.without(one.measurement for one in self.refused)
         steps = spanning_tree(kept, kept.links)
         initial = gtsam.Values()
-        poses = compose(kept, steps) if steps else {kept.reference_key: gtsam.Pose3()}
+        poses = compose(kept, steps, self._factors.start) if steps else {kept.reference_key: gtsam.Pose3()}
         for key, pose in poses.items():
-            initial.insert(key, self._factors.start(pose))
+            initial.insert(key, pose)
         factors, links = self._factors.of_graph(kept, poses)
         values, _ = with_stack(len(poses), lambda: optimise(factors, initial))
         self._isam = gtsam.ISAM2(isam_parameters())

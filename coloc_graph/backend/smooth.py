@@ -113,9 +113,8 @@ def _fit(graph: PoseGraph, start: gtsam.Values | None = None) -> _Fit:
     factors_of = Factors(graph.floor)
     initial = gtsam.Values()
     # also with a start: what it does not hold is composed, and what nothing ties any more is left out
-    for key, pose in compose(graph, spanning_tree(graph, graph.links)).items():
-        known = start is not None and start.exists(key)
-        initial.insert(key, start.atPose3(key) if start is not None and known else factors_of.start(pose))
+    for key, pose in compose(graph, spanning_tree(graph, graph.links), factors_of.start).items():
+        initial.insert(key, start.atPose3(key) if start is not None and start.exists(key) else pose)
     factors, links = factors_of.of_graph(graph, initial.keys())
     values, iterations = optimise(factors, initial)
     return _Fit(graph, factors, links, values, iterations)
@@ -173,7 +172,7 @@ def _outliers(fit: _Fit) -> dict[int, Link]:
     """
     first = fit.factors.size() - len(fit.links)
     suspects = [index for index, link in enumerate(fit.links) if isinstance(link, RelativePose)]
-    parameters = gtsam.GncLMParams(lm_parameters())
+    parameters = gtsam.GncLMParams(lm_parameters(fit.values.size()))
     parameters.setKnownInliers(sorted(set(range(fit.factors.size())) - {first + index for index in suspects}))
     optimiser = gtsam.GncLMOptimizer(fit.factors, fit.values, parameters)
     optimiser.setInlierCostThresholdsAtProbability(1 - 1e-4)

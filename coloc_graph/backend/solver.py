@@ -18,6 +18,13 @@ DEEP = 3000
 #: That stack [bytes]: at 8 MiB a chain of 50,000 poses ends the process. Only what is used of it takes memory.
 STACK = 1 << 30
 
+#: A search that goes on for longer is not going to end. With less error than this there is none to begin.
+MOST_ITERATIONS, NOTHING_TO_GAIN = 500, 1e-9
+
+#: Over more poses than this, kilometres on a floor, each iteration gains a little for hundreds of them: there the
+#: search ends where one gains less than `NOISE` a pose in half chi2, of which a pose has about 3.
+LONG, NOISE = 2000, 1e-6
+
 #: A pose of ours is linearised anew where it has turned by more than this [rad], or shifted by that [m]. Errors of
 #: linearisation come from turns; a far pose shifts by centimetres whenever the heading of an early one changes by
 #: 1e-4 rad, and with GTSAM's single threshold of 0.01 the whole chain is then redone at every step.
@@ -49,14 +56,15 @@ def with_stack(poses: int, work: Callable[[], T]) -> T:
     return results[0]
 
 
-def lm_parameters() -> gtsam.LevenbergMarquardtParams:
-    """QR, since Cholesky throws on healthy chains, and down to rounding."""
+def lm_parameters(poses: int) -> gtsam.LevenbergMarquardtParams:
+    """QR, since Cholesky throws on healthy chains, and down to rounding; in `LONG` runs to far below what is noise."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
     parameters.setRelativeErrorTol(1e-10)
-    parameters.setAbsoluteErrorTol(1e-10)
+    parameters.setAbsoluteErrorTol(1e-10 if poses <= LONG else NOISE * poses)
     # our information reaches 1e12, of which GTSAM's bound of 1e5 is no damping: with wrong measurements it gave up
     parameters.setlambdaUpperBound(1e15)
+    parameters.setMaxIterations(MOST_ITERATIONS)
     return parameters
 
 
@@ -78,11 +86,15 @@ def optimise(factors: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> tupl
     errors are finite, the error did not rise, and it iterated wherever there was something to gain.
     """
     before = factors.error(initial)
+    if before < NOTHING_TO_GAIN:
+        return initial, 0  # nothing contradicts anything; LM would only try out its dampings
     if not np.isfinite(before):
         raise EstimationError("the graph's error is not finite where the search starts: a measurement holds no number")
-    optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, lm_parameters())
+    optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, lm_parameters(initial.size()))
     values = optimiser.optimize()
     after = factors.error(values)
+    if optimiser.iterations() >= MOST_ITERATIONS:
+        raise EstimationError(f"the optimiser did not converge in {MOST_ITERATIONS} iterations (error {after:.6g})")
     if not np.isfinite(after) or after > before * (1 + 1e-9) + 1e-9:
         raise EstimationError(f"the optimiser did not lower the graph's error ({before:.6g} to {after:.6g})")
     if (
