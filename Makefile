@@ -1,12 +1,14 @@
 # make demo   a virtual environment, the package, and the main job: render, solve, show
 # make test   the same environment: lint, format, types, tests
-# make bench  the benchmarks behind the figures in the README; DATA=DIR for that on the stereo pairs of a chessboard
+# make bench  the benchmarks behind the figures in the README; DATA=DIR for that on the stereo pairs of a chessboard,
+#             GRAPHS=DIR for those on the pose graphs sphere2500 and M3500
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 DATA ?=
+GRAPHS ?=
 
 .PHONY: demo test lint types unit bench clean
 
@@ -31,6 +33,7 @@ bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/relative_pose.py --outliers
 	$(BIN)/python benchmarks/frontend.py
 	$(BIN)/python benchmarks/clock_offset.py
+	$(BIN)/python benchmarks/backend.py $(if $(GRAPHS),--data $(GRAPHS))
 ifneq ($(DATA),)
 	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)
 else

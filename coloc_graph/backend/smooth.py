@@ -19,7 +19,7 @@ from coloc_graph.team import Slip
 #: A fit that noise alone makes this bad less often than this is looked into.
 LEAST_CHANCE_OF_ALL = 1e-4
 #: In larger graphs only the measurements are tested whose residual noise exceeds less often than `LOOKED_INTO`.
-ALL_TESTED, LOOKED_INTO = 500, 0.1
+ALL_TESTED, LOOKED_INTO = 500, 1e-3
 #: A stay-put constraint is loosened by so much to see whether the others contradict it.
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)
 #: A bump must explain this much more chi2 than any wrong measurement to be called one.

@@ -21,9 +21,10 @@ STACK = 1 << 30
 #: A search that goes on for longer is not going to end. With less error than this there is none to begin.
 MOST_ITERATIONS, NOTHING_TO_GAIN = 500, 1e-9
 
-#: Over more poses than this, kilometres on a floor, each iteration gains a little for hundreds of them: there the
-#: search ends where one gains less than `NOISE` a pose in half chi2, of which a pose has about 3.
-LONG, NOISE = 2000, 1e-6
+#: Over more poses than this each iteration gains a little for hundreds of them, since GTSAM's between-factors leave
+#: the derivative of the logarithm out: there the search ends where one gains less than `NOISE` a pose in half chi2,
+#: of which a pose has about 3.
+LONG, NOISE = 2000, 1e-5
 
 #: A pose of ours is linearised anew where it has turned by more than this [rad], or shifted by that [m]. Errors of
 #: linearisation come from turns; a far pose shifts by centimetres whenever the heading of an early one changes by

@@ -12,6 +12,7 @@ from matplotlib.patches import Circle, ConnectionPatch, FancyArrowPatch, Rectang
 
 from coloc_graph.backend import Estimate
 from coloc_graph.lie import floor_pose, yaw
+from coloc_graph.measurements import Odometry
 from coloc_graph.report.drawing import (
     GREY,
     INK,
@@ -215,7 +216,9 @@ def _write_text(figure: Figure, estimate: Estimate, truth: Truth | None) -> None
     title = [count, *way, f"{stances} stance{'s' * (stances != 1)}", "no GPS"]
     figure.text(0.03, 0.915, "  ·  ".join(title), size=20, weight="bold")
     small: dict[str, Any] = {"size": 10, "color": GREY}
-    figure.text(0.97, 0.9, "from cameras and LED markers alone", ha="right", **small)
+    wheels = any(isinstance(one, Odometry) for one in estimate.graph.measurements)
+    by = "from cameras, LED markers and wheels" if wheels else "from cameras and LED markers alone"
+    figure.text(0.97, 0.9, by, ha="right", **small)
     figure.text(0.03, 0.02, "While one stays put, the other leaps ahead; their cameras watch a third.", **small)
     if trajectories:
         cross = ", + truth" if truth else ""
