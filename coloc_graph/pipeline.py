@@ -129,6 +129,8 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
     updates: tuple[float, ...] = ()
     if options.incremental:
         estimate, updates = replay(graph)
+        if estimate.refused:  # or was it that an anchor was pushed? An estimator looks at one stance at a time
+            estimate = replace(estimate, bumped=smooth(graph).bumped)
     else:
         estimate = chain(graph) if options.method == "chain" else smooth(graph)
     solved = time.perf_counter()

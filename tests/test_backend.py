@@ -280,6 +280,16 @@ def test_optimise_refuses_what_is_not_a_number_and_solves_what_is():
     np.testing.assert_allclose(values.atPose3(1).matrix(), floor_pose(1, 2, 0.3), atol=1e-6)
 
 
+def test_a_search_that_starts_at_the_optimum_has_not_given_up():
+    """Two priors that disagree: the error stays, and no iteration can gain anything."""
+    factors, values = one_factor(floor_pose(1, 2, 0.3), 0.01)
+    factors.add(gtsam.PriorFactorPose3(1, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 0.01)))
+    first, _ = optimise(factors, values)
+    second, _ = optimise(factors, first)
+    assert factors.error(first) > 100
+    assert second.atPose3(1).equals(first.atPose3(1), 1e-4)
+
+
 def test_a_measurement_that_is_not_a_number_does_not_come_back_as_an_estimate():
     bad = floor_pose(1, 0, 0)
     bad[1, 3] = np.nan

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from coloc_graph.errors import InputError
-from coloc_graph.evaluation import PLANAR, RobotAccuracy, align, evaluate, nees_of
+from coloc_graph.evaluation import PLANAR, RobotAccuracy, align, evaluate, nees_of, true_poses
 from coloc_graph.lie import floor_pose, rotation_x, se3, so3_exp
 from coloc_graph.trajectory import Trajectory
 
@@ -186,3 +186,14 @@ def test_robots_that_stayed_are_measured_by_the_distance_between_them(short_solu
     apart = np.linalg.norm(still["B"].positions[0])
     assert (row.robot_i, row.robot_j) == ("A", "B")
     assert row.true == pytest.approx(1.1 * apart) and row.error == pytest.approx(-0.1 * apart)
+
+
+def test_the_truth_of_a_robot_that_drives_is_followed_between_its_samples():
+    times = np.array([0.0, 1.0, 1.1, 1.2, 9.0])
+    poses = floor_pose([0, 0, 0.02, 0.06, 0.5], [0, 0, 0, 0.02, 0.5], [0, 0, 0.1, 0.3, 0])
+    truth = {"A": Trajectory("A", times, poses)}
+    asked = Trajectory("A", np.array([0.5, 1.05, 1.15, 1.2, 5.0, 99.0]), np.tile(np.eye(4), (6, 1, 1)))
+    found = true_poses(truth, asked)
+    # between samples that are near: half way, by the shortest turn; between others it stood at the earlier one
+    expected = floor_pose([0, 0.01, 0.04, 0.06, 0.06, 0.5], [0, 0, 0.01, 0.02, 0.02, 0.5], [0, 0.05, 0.2, 0.3, 0.3, 0])
+    np.testing.assert_allclose(found, expected, atol=1e-12)

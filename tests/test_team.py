@@ -6,7 +6,8 @@ import pytest
 from msgspec.structs import replace
 
 from coloc_graph.errors import TeamError
-from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Team, read_team, write_team
+from coloc_graph.simulation import reference_team
+from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Slip, Team, read_team, write_team
 
 LENSES = [
     (),
@@ -235,3 +236,18 @@ def test_yaw_comes_before_tilt_so_that_a_turned_camera_keeps_its_horizon():
     R = Mount(height=0.4, yaw_deg=70, tilt_deg=20).R_body_camera
     assert R[2, 0] == pytest.approx(0, abs=1e-15)
     assert R[2, 2] == pytest.approx(-np.sin(np.deg2rad(20)))
+
+
+@pytest.mark.parametrize(("sigma", "degrees"), [(0.0005, 0.2), (0.0, 0.2), (0.01, 0.0), (float("nan"), 1.0)])
+def test_a_slip_that_is_too_tight_to_be_solved_is_refused(tmp_path, sigma, degrees):
+    path = tmp_path / "team.toml"
+    team = reference_team()
+    slipping = replace(team.robots[0], slip=Slip(sigma=0.002, sigma_deg=0.3))
+    write_team(replace(team, robots=(slipping, *team.robots[1:])), path)
+    assert read_team(path).robots[0].slip == Slip(sigma=0.002, sigma_deg=0.3)
+    assert read_team(path).robots[1].slip is None
+    text = path.read_text().replace("sigma = 0.002", f"sigma = {sigma}")
+    text = text.replace("sigma_deg = 0.3", f"sigma_deg = {degrees}")
+    path.write_text(text)
+    with pytest.raises(TeamError, match=r"slip|sigma.*finite"):
+        read_team(path)
