@@ -68,6 +68,10 @@ def measured_team(
         T[:3, :3] = T[:3, :3] @ tilt_rotation(*(tilt * rng.standard_normal(2)))
         return T
 
+    def mixed(root: Array) -> Array:
+        root = root @ (np.eye(len(root)) + 0.3 * rng.standard_normal(root.shape))
+        return np.asarray(root @ root.T)
+
     def noisy(T_i_j: Array, C: Array) -> gtsam.Pose3:
         xi = np.zeros(6)
         drawn = np.linalg.cholesky(C) @ rng.standard_normal(len(C))
@@ -84,7 +88,7 @@ def measured_team(
     when: list[Stance] = []
     made: list[Measurement] = []
     bad: list[RelativePose] = []
-    wheels, seen = np.diag(np.square(WHEELS)), np.diag(np.square(SEEN))
+    wheels, seen = (mixed(np.diag(sigmas)) for sigmas in (WHEELS, SEEN))
     for k in range(stances):
         driver = names[(robots - 1 + k) % robots] if rotating else names[-1]
         moved = {names[(robots - 2 + k) % robots]} if rotating else {names[(k + 1) % 2]}
@@ -109,8 +113,7 @@ def measured_team(
             made.append(Sighting(k, observers[0], driver, 10.0 * k + 2, T_i_j, seen))
         for n, i in enumerate(observers):
             for j in observers[n + 1 : n + 1 + neighbours]:
-                root = np.diag(RELATIVE) @ (np.eye(6) + 0.3 * rng.standard_normal((6, 6)))
-                C = root @ root.T
+                C = mixed(np.diag(RELATIVE))
                 T_i_j = noisy(se3_inverse(at[i]) @ at[j], C)
                 is_wrong = astray.uniform() < wrong
                 if is_wrong:
