@@ -19,7 +19,7 @@ def to_dot(graph: PoseGraph) -> str:
     for node in graph.nodes:
         places[graph.places.key(node)].append(node)
     ids = {key: f"n{number}" for number, key in enumerate(places)}
-    lines = ["graph poses {", "  node [shape=box, style=rounded, fontname=Helvetica];"]
+    lines = ["graph poses {", "  node [shape=box, style=rounded, fontname=Helvetica];", "  edge [fontname=Helvetica];"]
     for key, nodes in places.items():
         label = " = ".join(f"{robot}@{stance}" for robot, stance in nodes)
         colour = _COLOURS[graph.robots.index(nodes[0][0]) % len(_COLOURS)]
