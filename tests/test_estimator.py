@@ -97,6 +97,17 @@ def test_stances_out_of_order_wait_for_the_one_they_follow(team):
     assert largest_difference(estimator.estimate(), batch, batch.graph.nodes) < 1e-6
 
 
+@pytest.mark.parametrize("order", [[1, 0], [2, 1, 0], [3, 2, 0, 1]])
+def test_stances_that_come_before_the_first_wait_for_it(team, order):
+    """None of them may become the world's origin for having come first."""
+    estimator = Estimator("A", team.robots, team.floor)
+    for index in [*order, *range(len(order), 12)]:
+        estimator.add(team.stances[index], of_stance(team, index))
+    assert estimator.waiting == () and [s.index for s in estimator.stances] == list(range(12))
+    batch = smooth(graph_of_team(team))
+    assert largest_difference(estimator.estimate(), batch, batch.graph.nodes) < 1e-6
+
+
 def test_what_nothing_ties_waits_until_something_does():
     made = team_of(6, 6, seed=2, odometry=False, sightings=False)
     apart = {"E", "F"}

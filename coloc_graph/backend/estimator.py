@@ -139,14 +139,14 @@ class Estimator:
             raise MeasurementError(f"stance {stance.index} is in already; add it once, and what comes late by `insert`")
         require_robots(stance, self.robots)
         require_valid(taken, self.floor)
-        if not self._stances and after is None:
+        # the first stance is the one that has no anchors: nobody can have stayed since another
+        is_first = not self._stances and after is None and not stance.anchors
+        if is_first:
             require_reference(self.reference, stance)
-            return self._enter(stance, taken)
-        if follows not in self._stances:
+        elif follows not in self._stances:
             self._early[stance.index] = Early(stance, taken, follows)
             return StanceEstimate(stance.index, {}, {}, stance.observers)
-        last = next(reversed(self._stances))
-        if follows != last:
+        elif follows != (last := next(reversed(self._stances))):
             raise MeasurementError(
                 f"stance {stance.index} is said to follow stance {follows}, which stance {last} follows: number the "
                 "stances in the order of time"

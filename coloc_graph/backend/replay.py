@@ -2,6 +2,7 @@
 
 import time
 from collections import defaultdict
+from dataclasses import replace
 
 from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.estimator import Estimator
@@ -22,7 +23,9 @@ def replay(graph: PoseGraph) -> tuple[Estimate, tuple[float, ...]]:
     before = None
     for stance in graph.stances:
         started = time.perf_counter()
-        estimator.add(stance, by_stance[stance.index], after=before)
+        # before the first nobody can have stayed, whatever it says
+        here = replace(stance, anchors=()) if before is None else stance
+        estimator.add(here, by_stance[stance.index], after=before)
         seconds.append(time.perf_counter() - started)
         before = stance.index
     return estimator.estimate(), tuple(seconds)
