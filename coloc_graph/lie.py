@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+_IDENTITY: Array = np.eye(3)
 
 
 def rotation_x(angle: float) -> Array:
@@ -37,6 +38,11 @@ def hat(v: ArrayLike) -> Array:
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
     return out
+
+
+def across(N: ArrayLike) -> Array:
+    """Two unit vectors (2, 3) across a unit vector (3,), and across each other."""
+    return np.asarray(np.linalg.svd(np.asarray(N, float)[None])[2][1:])
 
 
 def closest_rotation(M: ArrayLike) -> Array:
@@ -182,6 +188,10 @@ def sl3_vee(D: ArrayLike) -> Array:
     )  # fmt: skip
 
 
+# ad of each basis element, laid so that h @ _SL3_AD is ad(h)
+_SL3_AD: Array = np.stack([sl3_vee(G @ SL3_BASIS - SL3_BASIS @ G).T for G in SL3_BASIS], axis=1)
+
+
 def sl3_normalise(H: ArrayLike) -> Array:
     """Homographies (..., 3, 3) scaled to determinant 1 (the real cube root keeps the sign right)."""
     H = np.asarray(H, float)
@@ -205,15 +215,63 @@ def sl3_exp(h: ArrayLike) -> Array:
 
 
 def sl3_log(H: ArrayLike) -> Array:
-    """Coordinates (..., 8) of homographies (..., 3, 3) near the identity (determinant 1, off by less than 0.5)."""
-    E = np.asarray(H, float) - np.eye(3)
-    power, total = E, E
-    for n in range(2, 40):
-        power = -power @ E
-        total = total + power / n
-        if np.abs(power).max() < 1e-17:
-            break
-    return sl3_vee(total)
+    """Coordinates (..., 8) of homographies (..., 3, 3) with determinant 1; NaN where there is no real logarithm.
+
+    log E = 2 artanh((E - 1)(E + 1)^-1), after square roots (Denman and Beavers, 1976) have brought E near the identity.
+    """
+    E = np.asarray(H, float)
+    Z, roots = _cayley(E), 0
+    size = np.abs(Z).max(initial=0.0)
+    while not size < 0.2:
+        if roots == 8:
+            return np.full((*E.shape[:-2], 8), np.nan)
+        E, roots = _square_root(E), roots + 1
+        Z = _cayley(E)
+        size = np.abs(Z).max(initial=0.0)
+    # Z + Z^3 / 3 + Z^5 / 5 + ..., of which the terms below 1e-17 are left out
+    terms = math.ceil(17 / -math.log10(max(3 * size, 1e-17) ** 2))
+    square = Z @ Z
+    series = np.broadcast_to(np.eye(3) / (2 * terms + 1), E.shape)
+    for n in range(2 * terms - 1, 0, -2):
+        series = _IDENTITY / n + square @ series
+    logarithm: Array = np.asarray(Z @ series * 2.0 ** (1 + roots), np.float64)
+    return sl3_vee(logarithm)
+
+
+def _square_root(E: Array) -> Array:
+    with np.errstate(all="ignore"):
+        Y, W = E, np.broadcast_to(_IDENTITY, E.shape)
+        for _ in range(12):
+            Y, W = (Y + _inverse(W)) / 2, (W + _inverse(Y)) / 2
+        return Y
+
+
+def _cayley(E: Array) -> Array:
+    return np.asarray((E - _IDENTITY) @ _inverse(E + _IDENTITY))
+
+
+def _inverse(M: Array) -> Array:
+    """Inverses (..., 3, 3), not finite where there is none."""
+    try:
+        return np.asarray(np.linalg.inv(M), float)
+    except np.linalg.LinAlgError:
+        return np.full_like(M, np.nan)
+
+
+def sl3_adjoint(H: ArrayLike) -> Array:
+    """The adjoint (8, 8) of a homography (3, 3): H exp(h) H^-1 = exp(Ad h)."""
+    H = np.asarray(H, float)
+    return np.asarray(sl3_vee(H @ SL3_BASIS @ np.linalg.inv(H)).T)
+
+
+def sl3_log_derivative(h: ArrayLike) -> Array:
+    """How the coordinates (8,) of exp(h) exp(x) change with x at 0, (8, 8): the inverse right Jacobian of SL(3)."""
+    ad = np.asarray(h, float) @ _SL3_AD
+    square = ad @ ad
+    one = np.eye(8)
+    return np.asarray(
+        one + ad / 2 + square @ (one / 12 - square @ (one / 720 - square @ (one / 30240 - square / 1209600)))
+    )
 
 
 def se3_exp(xi: ArrayLike) -> Array:

@@ -43,8 +43,9 @@ class HomographyMeasurement:
     `unusable` is None, or why this is not a measurement, in words; the numbers then mean nothing.
 
     What i's clock calls t, j's calls t + `time_offset` [s]; `time_offset_sigma` [s] is its standard deviation, which
-    `information` contains (both 0 where the clocks are said to agree). `warning` is None, or what about the
-    measurement is weaker than it looks, in words.
+    `information` contains (both 0 where the clocks are said to agree); `by_time_offset` (8,) is what the true
+    homography is off by, in those coordinates, for each second that the true offset is larger. `warning` is None, or
+    what about the measurement is weaker than it looks, in words.
     """
 
     stance: int
@@ -60,6 +61,7 @@ class HomographyMeasurement:
     time_offset: float = 0.0
     unusable: str | None = None
     time_offset_sigma: float = 0.0
+    by_time_offset: Array | None = None
     warning: str | None = None
 
     @property
@@ -69,12 +71,31 @@ class HomographyMeasurement:
 
 
 @dataclass(frozen=True, eq=False)
+class MarkerSpan:
+    """Two markers of `mover`, a known span apart, at n instants at which both observers of a pair saw both.
+
+    `x_i` (n, 2, 2) are the rays (x, y, 1) to both in camera i, by what both images say alike; `covariance`
+    (n, 2, 2, 2) is theirs. They hold for the homography as it was measured: by `by_h` (n, 2, 2, 8) they change with
+    its coordinates h, and at the true h they are independent of its error. `shared` (n, 2, 2, q) is a square root of
+    the covariance of what all rays to one marker share besides.
+    """
+
+    mover: str
+    x_i: Array
+    covariance: Array
+    by_h: Array
+    shared: Array
+
+
+@dataclass(frozen=True, eq=False)
 class RelativePose:
     """The pose of observer j's body in observer i's body, made of one homography measurement.
 
     `covariance` is (6, 6). `T_ci_cj` is the same between the cameras. `solution` names which of the two SVD
     solutions agrees with the known normal, `normal_error` [rad] is the angle between that solution's normal
-    and the known one.
+    and the known one. `homography` is what it was made of, with the marker `plane` in camera i as it was thought to
+    be, the `movers` whose markers these were, and their `spans`: from these the joint estimate finds the mounts along
+    with the poses.
     """
 
     stance: int
@@ -85,6 +106,10 @@ class RelativePose:
     T_ci_cj: gtsam.Pose3
     solution: int
     normal_error: float
+    homography: HomographyMeasurement | None = None
+    plane: Plane | None = None
+    spans: tuple[MarkerSpan, ...] = ()
+    movers: tuple[str, ...] = ()
 
     @property
     def ends(self) -> tuple[Node, Node]:
@@ -100,7 +125,8 @@ class Sighting:
     """Where a robot stands whose markers another one at rest sees: the pose of `seen` in `observer`, at `time`.
 
     `time` [UTC s] is by the observer's clock: a robot that moves during the stance has its pose of the stance then.
-    `covariance` is (3, 3): heading, x, y, since both stand on the floor.
+    `covariance` is (3, 3): heading, x, y, since both stand on the floor. `x_markers` (2, 2) are the rays (x, y, 1) to
+    its first two markers, with `x_covariance` (2, 2, 2): what it was made of, from which the joint estimate goes on.
     """
 
     stance: int
@@ -109,6 +135,8 @@ class Sighting:
     time: float
     T_observer_seen: gtsam.Pose3
     covariance: Array
+    x_markers: Array | None = None
+    x_covariance: Array | None = None
 
     @property
     def ends(self) -> tuple[Node, Node]:

@@ -6,15 +6,16 @@ import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import get_args
 
 from scipy.special import chdtrc
 
-from coloc_graph.backend import Estimate, Loose, PoseGraph, chain, diagnose, replay, smooth
+from coloc_graph.backend import Estimate, Loose, Method, PoseGraph, chain, diagnose, joint, loosened, replay, smooth
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.frontend import (
     FrontendOptions,
     PairMeasurement,
+    Scale,
     WheelTrack,
     measure_pair,
     share_clock_offsets,
@@ -24,9 +25,12 @@ from coloc_graph.frontend.plausibility import implausible
 from coloc_graph.measurements import Measurement, RelativePose
 from coloc_graph.run import Run
 
-Method = Literal["chain", "smooth"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
+BATCH = {"chain": chain, "smooth": smooth, "joint": joint}
+
+#: Where the scale comes from the markers' span alone, the heights of cameras are known no better than this [m].
+UNKNOWN_HEIGHT = 0.1
 #: Measurements that noise alone lets disagree less often than this are warned of.
 LEAST_CHANCE = 1e-4
 #: So many kinds of reasons are named where every measurement is refused.
@@ -42,10 +46,11 @@ class SolveOptions:
 
     `chain` is the paper: homographies by least squares in one image, eq. (2), composition. `smooth` takes
     maximum-likelihood homographies and relative poses into a pose graph, with `odometry` and where the movers are
-    seen. `incremental` feeds the graph to an estimator stance by stance, as a team in the field would.
+    seen. `joint` takes the homographies themselves, and calibrates mounts, markers and clocks along with the poses.
+    `incremental` feeds the graph to an estimator stance by stance, as a team in the field would.
     """
 
-    method: Method = "smooth"
+    method: Method = "joint"
     frontend: FrontendOptions | None = None
     odometry: bool = True
     incremental: bool = False
@@ -54,7 +59,7 @@ class SolveOptions:
         if self.method not in METHODS:
             raise InputError(f"there is no method `{self.method}`; choose one of {', '.join(METHODS)}")
         if self.incremental and self.method == "chain":
-            raise InputError("a chain is composed, and never incremental: leave out `incremental`, or use smooth")
+            raise InputError("a chain is composed, and never incremental: leave out `incremental`, or use joint")
 
     def resolved(self) -> "SolveOptions":
         """With the front end that belongs to the method, where none is chosen."""
@@ -126,13 +131,16 @@ def solve(run: Run, options: SolveOptions | None = None, progress: Progress | No
             f"{run.path}: no measurement ties a robot to the reference {run.team.reference}; "
             f"{_why_untied(loose, measurements)}"
         )
+    assert options.frontend is not None
+    if options.method == "joint" and options.frontend.scale == "span":
+        graph = replace(graph, rigs=loosened(graph.rigs, UNKNOWN_HEIGHT))
     updates: tuple[float, ...] = ()
     if options.incremental:
-        estimate, updates = replay(graph)
+        estimate, updates = replay(graph, options.method)
         if estimate.refused:  # or was it that an anchor was pushed? An estimator looks at one stance at a time
-            estimate = replace(estimate, bumped=smooth(graph).bumped)
+            estimate = replace(estimate, bumped=BATCH[options.method](graph).bumped)
     else:
-        estimate = chain(graph) if options.method == "chain" else smooth(graph)
+        estimate = BATCH[options.method](graph)
     solved = time.perf_counter()
     return Solution(
         run=run,
@@ -163,10 +171,13 @@ def _require_observers(run: Run) -> None:
 
 def _measure(run: Run, options: SolveOptions, progress: Progress | None) -> tuple[PairMeasurement, ...]:
     assert options.frontend is not None
+    # a joint estimate takes the scale from the spans by itself, and the heights for a start
+    scale: Scale = "heights" if options.method == "joint" else options.frontend.scale
+    frontend = replace(options.frontend, scale=scale)
     pairs = [(stance, *pair) for stance in run.stances for pair in itertools.combinations(stance.observers, 2)]
     measurements = []
     for done, (stance, robot_i, robot_j) in enumerate(pairs, start=1):
-        measurements.append(measure_pair(run, stance, robot_i, robot_j, options.frontend))
+        measurements.append(measure_pair(run, stance, robot_i, robot_j, frontend))
         if progress is not None:
             progress(done, len(pairs))
     return tuple(measurements)
@@ -258,6 +269,10 @@ def _warnings(estimate: Estimate, loose: Sequence[Loose], measurements: Sequence
         warnings.append(f"{len(loose) - REASONS_NAMED} more groups of poses are not tied to the reference")
     warnings += [f"the {one.measurement} is not used: it is {one.reason}" for one in estimate.refused]
     warnings += [str(bump) for bump in estimate.bumped]
+    warnings += [
+        f"{row} is {row.sigmas:.1f} sigmas off what the team says: measure it again, or state it so"
+        for row in estimate.calibration.far
+    ]
     chance = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
     if chance < LEAST_CHANCE:
         warnings.append(

@@ -1,7 +1,8 @@
 """A result on disk: written whole or not at all, and read back.
 
-DIR holds summary.json, trajectories/<robot>.tum (and .cov.csv), graph.g2o, graph.dot, measurements.csv, config.toml and
-report.html. The same run, options and version give the same bytes, except for `seconds` in summary.json.
+DIR holds summary.json, trajectories/<robot>.tum (and .cov.csv), graph.g2o, graph.dot, measurements.csv, config.toml,
+report.html, and, of a joint estimate, team.toml: the team with its mounts and markers as they turned out. The same run,
+options and version give the same bytes, except for `seconds` in summary.json.
 """
 
 import csv
@@ -30,7 +31,7 @@ from coloc_graph.exchange.g2o import write_g2o
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.pipeline import Solution
 from coloc_graph.run import read_truth, run_id
-from coloc_graph.team import without_none
+from coloc_graph.team import without_none, write_team
 from coloc_graph.trajectory import Trajectory
 
 SUMMARY = "summary.json"
@@ -102,6 +103,8 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
         write_g2o(solution.estimate, part / "graph.g2o")
         (part / "graph.dot").write_text(to_dot(solution.estimate.graph), encoding="utf-8")
         (part / "measurements.csv").write_text(_measurements(solution), encoding="utf-8")
+        if solution.estimate.calibration.rows:
+            write_team(solution.estimate.calibration.of_team(solution.run.team), part / "team.toml")
         (part / "config.toml").write_text(tomli_w.dumps(_config(solution)), encoding="utf-8")
         (part / "report.html").write_text(render_report(solution, accuracy, true), encoding="utf-8")
         run_path = os.path.relpath(solution.run.path.absolute(), out.absolute())
@@ -133,6 +136,7 @@ def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
         "iterations": estimate.iterations,
         "untied": [list(one) for one in estimate.untied],
         "bumped": [[one.stay_put.robot, one.stay_put.before, one.stay_put.after] for one in estimate.bumped],
+        "calibration": [dataclasses.asdict(row) for row in estimate.calibration.rows],
         "warnings": list(solution.warnings),
         "seconds": {
             "frontend": round(solution.seconds_frontend, 3),

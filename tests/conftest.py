@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from coloc_graph.pipeline import SolveOptions, solve
+from coloc_graph.pipeline import METHODS, SolveOptions, solve
 from coloc_graph.results import write_result
 from coloc_graph.run import RunWriter, open_run, read_true_team, read_truth
 from coloc_graph.simulation import simulate
@@ -70,7 +70,7 @@ def short(tmp_path_factory):
 @pytest.fixture(scope="session")
 def solutions(hallway):
     """The solutions of the hallway by method."""
-    return {method: solve(open_run(hallway), SolveOptions(method=method)) for method in ("chain", "smooth")}
+    return {method: solve(open_run(hallway), SolveOptions(method=method)) for method in METHODS}
 
 
 @pytest.fixture(scope="session")
@@ -83,7 +83,7 @@ def short_solution(short):
 def result(solutions, hallway):
     """A result on disk beside the hallway; tests read it and leave it alone."""
     out = hallway.parent / "result"
-    write_result(solutions["smooth"], out)
+    write_result(solutions["joint"], out)
     return out
 
 

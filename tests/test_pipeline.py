@@ -115,7 +115,7 @@ def test_wheels_bridge_a_stance_without_a_homography_with_the_sigma_that_wheels_
     hallway, solutions, copied, collinear, tmp_path
 ):
     solution = solve(spoilt(hallway, tmp_path / "bad.mcap", copied, collinear, {3}))
-    whole = solutions["smooth"].estimate
+    whole = solutions["joint"].estimate
     assert not solution.estimate.untied
     ratio = solution.estimate.covariance("A", 3)[3, 3] / whole.covariance("A", 3)[3, 3]
     assert ratio > 1.5
@@ -178,7 +178,7 @@ def test_mounts_that_are_not_as_stated_are_warned_of(hallway, copied, tmp_path):
         for robot, d in zip(team.robots, (2.0, -2.0, 0.0), strict=True)
     )
     run = open_run(copied(hallway, tmp_path / "tilted.mcap", team=msgspec.structs.replace(team, robots=tilted)))
-    options = SolveOptions(odometry=False)
+    options = SolveOptions("smooth", odometry=False)
     (warning,) = [one for one in solve(run, options).warnings if "the measurements disagree" in one]
     assert "with 24 degrees of freedom" in warning and "less than once in 1 000 000 000 runs" in warning
 
@@ -297,8 +297,8 @@ def test_three_observers_at_once_make_three_measurements_that_agree(tmp_path):
     solution = solve(open_run(tmp_path / "three.mcap"))
     pairs = {(m.homography.robot_i, m.homography.robot_j) for m in solution.measurements}
     assert pairs == set(itertools.combinations("ABC", 2))
-    # rows: the gauge's 6, the floor's 3 for B and for C, 6 for each measurement; unknowns: 6 for each robot
-    assert solution.estimate.dof == 6 + 2 * 3 + 3 * 6 - 3 * 6
+    # rows: the gauge's 6, the floor's 3 for B and for C, 8 for each homography; unknowns: 6 for each robot
+    assert solution.estimate.dof == 6 + 2 * 3 + 3 * 8 - 3 * 6
     for robot, T in poses.items():
         sigma = np.sqrt(np.diag(solution.estimate.covariance(robot, 0))[3:5])
         off = solution.estimate.pose(robot, 0).matrix()[:2, 3] - T[:2, 3]

@@ -42,7 +42,7 @@ def test_a_result_has_every_file_of_the_design(result):
 
 def test_the_summary_has_every_key_of_the_design(result):
     summary = json.loads((result / "summary.json").read_text())
-    assert summary["method"] == "smooth" and summary["robots"] == ["A", "B", "C"] and summary["stances"] == 8
+    assert summary["method"] == "joint" and summary["robots"] == ["A", "B", "C"] and summary["stances"] == 8
     assert summary["measurements"] == {"used": 8, "rejected": 0}
     assert set(summary["seconds"]) == {"frontend", "backend", "total"}
     assert all(seconds >= 0 for seconds in summary["seconds"].values())
@@ -64,10 +64,10 @@ def test_measurements_are_one_row_a_homography(result, solutions):
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == MEASUREMENT_COLUMNS
     assert [(row["stance"], row["robot_i"], row["robot_j"]) for row in rows] == [
-        (str(s.index), *s.observers) for s in solutions["smooth"].run.stances
+        (str(s.index), *s.observers) for s in solutions["joint"].run.stances
     ]
     assert {row["usable"] for row in rows} == {"yes"}
-    for row, measured in zip(rows, solutions["smooth"].measurements, strict=True):
+    for row, measured in zip(rows, solutions["joint"].measurements, strict=True):
         assert int(row["inliers"]) == measured.homography.inliers <= int(row["points"])
         distance = np.linalg.norm(measured.relative_pose.T_i_j.translation())
         assert float(row["distance"]) == pytest.approx(distance)
@@ -75,9 +75,9 @@ def test_measurements_are_one_row_a_homography(result, solutions):
 
 def test_the_config_says_everything_that_was_used(result, solutions):
     config = tomllib.loads((result / "config.toml").read_text())
-    assert config["options"]["method"] == "smooth"
+    assert config["options"]["method"] == "joint"
     assert config["options"]["frontend"]["criterion"] == "reprojection"
-    assert msgspec.convert(config["team"], Team) == solutions["smooth"].run.team
+    assert msgspec.convert(config["team"], Team) == solutions["joint"].run.team
 
 
 def test_the_same_input_gives_the_same_bytes_but_for_the_seconds(short, tmp_path):
@@ -93,9 +93,9 @@ def test_the_same_input_gives_the_same_bytes_but_for_the_seconds(short, tmp_path
 
 def test_a_result_reads_back(result, solutions, hallway):
     read = read_result(result)
-    assert read.summary["method"] == "smooth"
+    assert read.summary["method"] == "joint"
     assert read.run_path.samefile(hallway)
-    for robot, trajectory in solutions["smooth"].estimate.trajectories.items():
+    for robot, trajectory in solutions["joint"].estimate.trajectories.items():
         again = read.trajectories[robot]
         for name in ("times", "stances", "covariances", "positions"):
             assert np.array_equal(getattr(again, name), getattr(trajectory, name)), name
@@ -112,7 +112,7 @@ def test_a_result_and_its_run_may_be_moved_together(short, short_solution, tmp_p
 
 def test_an_earlier_result_is_replaced_whole(short_solution, solutions, tmp_path):
     out = tmp_path / "out"
-    write_result(solutions["smooth"], out)
+    write_result(solutions["joint"], out)
     (out / "trajectories" / "Z.tum").write_text("of an earlier team")
     write_result(short_solution, out)
     assert set(contents(out)) == FILES

@@ -8,15 +8,17 @@ from coloc_graph.backend.gtsam_version import require_gtsam
 
 require_gtsam()
 
+from coloc_graph.backend.batch import joint, smooth  # noqa: E402
+from coloc_graph.backend.calibration import Calibration, loosened  # noqa: E402
 from coloc_graph.backend.chain import chain  # noqa: E402  after the check, so that its sentence is what one sees
 from coloc_graph.backend.diagnosis import Loose, diagnose  # noqa: E402
 from coloc_graph.backend.estimate import Bump, Estimate, Refusal, StanceEstimate  # noqa: E402
 from coloc_graph.backend.estimator import Estimator  # noqa: E402
+from coloc_graph.backend.factors import Method  # noqa: E402
 from coloc_graph.backend.graph import PoseGraph, StayPut  # noqa: E402
 from coloc_graph.backend.replay import replay  # noqa: E402
-from coloc_graph.backend.smooth import smooth  # noqa: E402
 
 __all__ = [
-    "Bump", "Estimate", "Estimator", "Loose", "PoseGraph", "Refusal", "StanceEstimate", "StayPut", "chain",
-    "diagnose", "replay", "smooth",
+    "Bump", "Calibration", "Estimate", "Estimator", "Loose", "Method", "PoseGraph", "Refusal", "StanceEstimate",
+    "StayPut", "chain", "diagnose", "joint", "loosened", "replay", "smooth",
 ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 import heapq
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import gtsam
@@ -44,7 +44,10 @@ def chain(graph: PoseGraph) -> Estimate:
         else:
             forth = link.T_i_j.AdjointMap()
             covariances[to] = forth @ (covariances[via] + link_covariance(link)) @ forth.T
-    return make_estimate("chain", graph, poses, covariances)
+    values = gtsam.Values()
+    for key, pose in poses.items():
+        values.insert(key, pose)
+    return make_estimate("chain", graph, values, covariances)
 
 
 def spanning_tree(graph: PoseGraph, links: Sequence[Link]) -> list[Step]:
@@ -78,9 +81,16 @@ def spanning_tree(graph: PoseGraph, links: Sequence[Link]) -> list[Step]:
 
 
 def compose(
-    graph: PoseGraph, steps: Sequence[Step], place: Callable[[gtsam.Pose3], gtsam.Pose3] = lambda pose: pose
+    graph: PoseGraph,
+    steps: Sequence[Step],
+    place: Callable[[gtsam.Pose3], gtsam.Pose3] = lambda pose: pose,
+    expected: Callable[[Link], gtsam.Pose3] = lambda link: link.T_i_j,
+    known: Mapping[int, gtsam.Pose3] | None = None,
 ) -> dict[int, gtsam.Pose3]:
     """Poses T_world_body by key, of the reference and wherever the steps lead, each put where `place` says.
+
+    `expected` is the pose of a link's second end in its first: as it was measured, by default. Poses that are `known`
+    stay what they are.
 
     Raises `EstimationError` where there are measurements and none leads anywhere.
     """
@@ -89,7 +99,12 @@ def compose(
             f"no measurement ties a robot to the reference {graph.reference} at stance {graph.stances[0].index}: "
             "measure it there together with another robot"
         )
-    poses = {graph.reference_key: gtsam.Pose3()}
+    known = known or {}
+    poses = {graph.reference_key: known.get(graph.reference_key, gtsam.Pose3())}
     for via, to, link, forwards in steps:
-        poses[to] = place(poses[via].compose(link.T_i_j if forwards else link.T_i_j.inverse()))
+        if to in known:
+            poses[to] = known[to]
+            continue
+        T_i_j = expected(link)
+        poses[to] = place(poses[via].compose(T_i_j if forwards else T_i_j.inverse()))
     return poses

@@ -3,18 +3,30 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import gtsam
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError
-from coloc_graph.measurements import Measurement, Odometry, RelativePose, Sighting
+from coloc_graph.measurements import (
+    HomographyMeasurement,
+    MarkerSpan,
+    Measurement,
+    Odometry,
+    Plane,
+    RelativePose,
+    Sighting,
+)
 from coloc_graph.run import Stance
-from coloc_graph.team import Floor, Slip
+from coloc_graph.team import Floor, Robot, Slip
 
-FORMAT = "coloc-graph-checkpoint-1"
+S = TypeVar("S", bound=msgspec.Struct)
+
+FORMAT = "coloc-graph-checkpoint-2"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +47,55 @@ class Checkpoint:
     robots: tuple[str, ...]
     floor: Floor | None
     slips: dict[str, Slip]
+    rigs: dict[str, Robot]
     stances: tuple[Stance, ...]
     measurements: tuple[Measurement, ...]
     refused: dict[int, str]
     early: tuple[Early, ...]
+
+
+class _Array(msgspec.Struct, forbid_unknown_fields=True):
+    """An array of float64, little-endian, in the order of C."""
+
+    shape: tuple[int, ...]
+    data: bytes
+
+
+class _Plane(msgspec.Struct, forbid_unknown_fields=True):
+    """`measurements.Plane`."""
+
+    N: _Array
+    d: float
+    normal_sigma: float
+    d_sigma: float
+    normal_from_mount: bool
+    d_from_mount: bool
+
+
+class _Span(msgspec.Struct, forbid_unknown_fields=True):
+    """`measurements.MarkerSpan`."""
+
+    mover: str
+    x_i: _Array
+    covariance: _Array
+    by_h: _Array
+    shared: _Array
+
+
+class _Homography(msgspec.Struct, forbid_unknown_fields=True):
+    """`measurements.HomographyMeasurement`, of a stance and a pair that the relative pose names."""
+
+    H_j_i: _Array
+    information: _Array
+    points: int
+    inliers: int
+    chi2: float
+    dof: int
+    overlap_px: float
+    time_offset: float
+    time_offset_sigma: float
+    by_time_offset: _Array | None
+    warning: str | None
 
 
 class _Measured(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -52,6 +109,12 @@ class _Measured(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     T_ci_cj: list[list[float]] = []
     solution: int = 0
     normal_error: float = 0.0
+    homography: _Homography | None = None
+    plane: _Plane | None = None
+    movers: tuple[str, ...] = ()
+    spans: list[_Span] = []
+    x_markers: _Array | None = None
+    x_covariance: _Array | None = None
 
 
 class _Early(msgspec.Struct, forbid_unknown_fields=True):
@@ -66,6 +129,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     robots: tuple[str, ...]
     floor: Floor | None
     slips: dict[str, Slip]
+    rigs: dict[str, Robot]
     stances: list[Stance]
     measurements: list[_Measured]
     refused: dict[int, str]
@@ -80,6 +144,7 @@ def write(saved: Checkpoint, path: Path) -> None:
         robots=saved.robots,
         floor=saved.floor,
         slips=saved.slips,
+        rigs=saved.rigs,
         stances=list(saved.stances),
         measurements=[_of(one) for one in saved.measurements],
         refused=saved.refused,
@@ -107,6 +172,7 @@ def read(path: Path) -> Checkpoint:
             robots=file.robots,
             floor=file.floor,
             slips=file.slips,
+            rigs=file.rigs,
             stances=tuple(file.stances),
             measurements=tuple(_to(one) for one in file.measurements),
             refused=file.refused,
@@ -128,10 +194,39 @@ def _of(measured: Measurement) -> _Measured:
     out = _Measured(kind, measured.ends, measured.T_i_j.matrix().tolist(), np.asarray(measured.covariance).tolist())
     if isinstance(measured, Sighting):
         out.time = measured.time
+        out.x_markers, out.x_covariance = _array(measured.x_markers), _array(measured.x_covariance)
     elif isinstance(measured, RelativePose):
         out.T_ci_cj, out.solution = measured.T_ci_cj.matrix().tolist(), measured.solution
-        out.normal_error = measured.normal_error
+        out.normal_error, out.movers = measured.normal_error, measured.movers
+        out.homography = None if measured.homography is None else _fields(measured.homography, _Homography)
+        out.plane = None if measured.plane is None else _fields(measured.plane, _Plane)
+        out.spans = [_fields(one, _Span) for one in measured.spans]
     return out
+
+
+def _fields(one: Any, kind: type[S]) -> S:
+    """Those of its fields that the struct has, arrays as bytes."""
+    values = {name: getattr(one, name) for name in kind.__struct_fields__}
+    return kind(**{name: _array(value) if isinstance(value, np.ndarray) else value for name, value in values.items()})
+
+
+def _values(one: msgspec.Struct) -> dict[str, Any]:
+    """The fields of a struct, bytes as arrays."""
+    values = {name: getattr(one, name) for name in one.__struct_fields__}
+    return {name: _numbers(value) if isinstance(value, _Array) else value for name, value in values.items()}
+
+
+def _array(array: NDArray[np.float64] | None) -> _Array | None:
+    return None if array is None else _Array(array.shape, np.ascontiguousarray(array, "<f8").tobytes())
+
+
+def _numbers(array: _Array | None) -> NDArray[np.float64] | None:
+    if array is None:
+        return None
+    numbers = np.frombuffer(array.data, "<f8").reshape(array.shape).astype(np.float64)
+    if not np.isfinite(numbers).all():
+        raise ValueError("an array holds what is not a number")
+    return numbers
 
 
 def _to(one: _Measured) -> Measurement:
@@ -140,11 +235,30 @@ def _to(one: _Measured) -> Measurement:
     if one.kind == "odometry":
         return Odometry(robot_i, before, after, T_i_j, covariance)
     if one.kind == "sighting":
-        return Sighting(before, robot_i, robot_j, one.time, T_i_j, covariance)
+        seen = _numbers(one.x_markers), _numbers(one.x_covariance)
+        return Sighting(before, robot_i, robot_j, one.time, T_i_j, covariance, *seen)
     if one.kind == "relative_pose":
-        T_ci_cj = _pose(one.T_ci_cj)
-        return RelativePose(before, robot_i, robot_j, T_i_j, covariance, T_ci_cj, one.solution, one.normal_error)
+        return RelativePose(
+            stance=before,
+            robot_i=robot_i,
+            robot_j=robot_j,
+            T_i_j=T_i_j,
+            covariance=covariance,
+            T_ci_cj=_pose(one.T_ci_cj),
+            solution=one.solution,
+            normal_error=one.normal_error,
+            homography=_homography(one, before, robot_i, robot_j),
+            plane=None if one.plane is None else Plane(**_values(one.plane)),
+            spans=tuple(MarkerSpan(**_values(span)) for span in one.spans),
+            movers=one.movers,
+        )
     raise ValueError(f"there is no kind of measurement `{one.kind}`")
+
+
+def _homography(one: _Measured, stance: int, robot_i: str, robot_j: str) -> HomographyMeasurement | None:
+    if one.homography is None:
+        return None
+    return HomographyMeasurement(stance, robot_i, robot_j, **_values(one.homography))
 
 
 def _pose(rows: list[list[float]]) -> gtsam.Pose3:

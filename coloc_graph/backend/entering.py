@@ -5,13 +5,17 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from coloc_graph.backend.factors import Factors
 from coloc_graph.backend.graph import Link
-from coloc_graph.measurements import RelativePose, Sighting
+from coloc_graph.measurements import Odometry, RelativePose, Sighting
 
-#: What is no further than this from where it is expected is taken in at once and tested then [m, rad].
-NEAR = 0.05
+Array = NDArray[np.float64]
+
+#: What is no further than this from where it is expected [m, rad], or than so many sigmas of the wheels that expect it
+#: there, is taken in at once and tested then.
+NEAR, SIGMAS = 0.05, 4.0
 
 #: A link and the keys of its ends.
 Tie = tuple[Link, int, int]
@@ -31,7 +35,8 @@ class Entering:
 
 
 class Sorter:
-    """Sorts links by what is `tied` to the reference; `ends` gives their keys, `known` the poses of tied keys."""
+    """Sorts links by what is `tied` to the reference; `ends` gives their keys, `known` the poses of tied keys, and
+    `errors` what calibration variables are thought to be."""
 
     def __init__(
         self,
@@ -40,8 +45,10 @@ class Sorter:
         tied: Set[int],
         reference: int,
         known: Callable[[int], gtsam.Pose3],
+        errors: Callable[[int], Array],
     ) -> None:
         self._factors, self._ends, self._tied, self._reference, self._known = factors, ends, tied, reference, known
+        self._errors = errors
 
     def sort(self, links: list[Link]) -> Entering:
         """What hangs on the poses that are tied, what does not yet, and where new poses start."""
@@ -51,7 +58,7 @@ class Sorter:
         ties: list[Tie] = []
         near: list[Tie] = []
         far: list[Tie] = []
-        rough: set[int] = set()  # started by wheels alone
+        rough: dict[int, float] = {}  # started by wheels alone, with their sigma
         # wheels first: they are seldom wrong by much, so that what they predict can refuse a wrong homography
         left = sorted(links, key=lambda link: isinstance(link, RelativePose | Sighting))
         while left:
@@ -59,6 +66,8 @@ class Sorter:
             for link in left:
                 i, j = self._ends(link)
                 has_i, has_j = (key in self._tied or key in start for key in (i, j))
+                is_new = i not in self._tied or j not in self._tied
+                T_i_j = self._factors.expected(link, self._errors) if is_new else link.T_i_j
                 tested = isinstance(link, RelativePose | Sighting)
                 if i == j:
                     continue
@@ -66,31 +75,37 @@ class Sorter:
                     still.append(link)
                 elif has_i and has_j and tested:
                     # a pose that starts where a homography says is not moved by it, nor linearised anew
-                    is_near = self._refine(link, i, j, start, rough)
+                    is_near = self._refine(T_i_j, i, j, start, rough)
                     (near if is_near else far).append((link, i, j))
                 else:
                     if not has_j:
-                        start[j] = self._factors.start(self._pose_of(i, start).compose(link.T_i_j))
+                        start[j] = self._factors.start(self._pose_of(i, start).compose(T_i_j))
                     elif not has_i:
-                        start[i] = self._factors.start(self._pose_of(j, start).compose(link.T_i_j.inverse()))
-                    rough |= {key for key, had in ((i, has_i), (j, has_j)) if not had and not tested}
+                        start[i] = self._factors.start(self._pose_of(j, start).compose(T_i_j.inverse()))
+                    if isinstance(link, Odometry):
+                        sigma = float(np.sqrt(np.diagonal(link.covariance).max()))
+                        rough |= {key: sigma for key, had in ((i, has_i), (j, has_j)) if not had}
                     ties.append((link, i, j))
             if len(still) == len(left):
                 break
             left = still
         return Entering(start, ties, near, far, left)
 
-    def _refine(self, link: Link, i: int, j: int, start: dict[int, gtsam.Pose3], rough: set[int]) -> bool:
+    def _refine(
+        self, T_i_j: gtsam.Pose3, i: int, j: int, start: dict[int, gtsam.Pose3], rough: dict[int, float]
+    ) -> bool:
         """Whether a measurement is near what is expected; a new pose that wheels alone placed then starts by it."""
         T_world_i, T_world_j = self._pose_of(i, start), self._pose_of(j, start)
-        off = T_world_i.between(T_world_j).between(link.T_i_j)
-        if np.abs(off.translation()).max() > NEAR or abs(off.rotation().yaw()) > NEAR:
+        off = T_world_i.between(T_world_j).between(T_i_j)
+        near = max(NEAR, SIGMAS * max(rough.get(i, 0.0), rough.get(j, 0.0)))
+        if np.abs(off.translation()).max() > near or abs(off.rotation().yaw()) > near:
             return False
         if j in rough:
-            start[j] = self._factors.start(T_world_i.compose(link.T_i_j))
+            start[j] = self._factors.start(T_world_i.compose(T_i_j))
         elif i in rough:
-            start[i] = self._factors.start(T_world_j.compose(link.T_i_j.inverse()))
-        rough -= {i, j}
+            start[i] = self._factors.start(T_world_j.compose(T_i_j.inverse()))
+        for key in (i, j):
+            rough.pop(key, None)
         return True
 
     def _pose_of(self, key: int, start: Mapping[int, gtsam.Pose3]) -> gtsam.Pose3:

@@ -1,14 +1,15 @@
 """What a method makes of a graph: the poses of all robots at all stances, and what is needed to doubt them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.factors import Factors
+from coloc_graph.backend.calibration import Calibration, Variables
+from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.graph import PoseGraph, StayPut
 from coloc_graph.backend.solver import Posterior
 from coloc_graph.errors import EstimationError
@@ -54,10 +55,10 @@ class Estimate:
     `trajectories` by robot, one pose a stance at which it is a node. `chi2` with `dof` degrees of freedom says how
     well the measurements agree (dof 0: nothing could contradict). `untied` are the (robot, stance) that no
     measurement ties to the reference; they have no pose. `refused` are the measurements that all others contradict,
-    and `bumped` the anchors that did.
+    and `bumped` the anchors that did. `calibration` is what a joint estimate found of mounts, markers and clocks.
     """
 
-    method: str
+    method: Method
     graph: PoseGraph
     trajectories: Mapping[str, Trajectory]
     untied: tuple[Node, ...] = ()
@@ -66,6 +67,7 @@ class Estimate:
     iterations: int = 0
     refused: tuple[Refusal, ...] = ()
     bumped: tuple[Bump, ...] = ()
+    calibration: Calibration = field(default_factory=Calibration)
 
     def pose(self, robot: str, stance: int) -> gtsam.Pose3:
         """T_world_body of a robot at a stance; `EstimationError` where it has none."""
@@ -103,7 +105,10 @@ class Estimate:
                 if not values.exists(key):
                     values.insert(key, gtsam.Pose3(T))
         used = self.graph.without(one.measurement for one in self.refused)
-        return Posterior(Factors(self.graph.floor).of_graph(used, values.keys())[0], values)
+        factors = Factors(self.graph.floor, self.calibration.variables).of_graph(used, values.keys())[0]
+        for key, errors in self.calibration.values.items():
+            values.insert(key, errors)
+        return Posterior(factors, values)
 
     @cached_property
     def _index(self) -> dict[Node, int]:
@@ -136,18 +141,20 @@ class StanceEstimate:
 
 
 def make_estimate(
-    method: str,
+    method: Method,
     graph: PoseGraph,
-    poses: Mapping[int, gtsam.Pose3],
+    values: gtsam.Values,
     covariances: Mapping[int, Array],
     *,
+    variables: Variables | None = None,
     chi2: float = 0.0,
     dof: int = 0,
     iterations: int = 0,
     refused: tuple[Refusal, ...] = (),
     bumped: tuple[Bump, ...] = (),
 ) -> Estimate:
-    """An estimate of poses and covariances (6, 6) by key."""
+    """An estimate of values, and of their covariances by key."""
+    poses, errors = {key: values.atPose3(key) for key in poses_in(values)}, calibrations_in(values)
     nodes: dict[str, list[int]] = {robot: [] for robot in graph.robots}
     for robot, stance in graph.nodes:
         if graph.key(robot, stance) in poses:
@@ -164,4 +171,5 @@ def make_estimate(
                 covariances=np.array([covariances[key] for key in keys]),
             )
     untied = graph.untied(poses)
-    return Estimate(method, graph, trajectories, untied, chi2, dof, iterations, refused, bumped)
+    calibration = Calibration(variables, errors, {key: covariances[key] for key in errors})
+    return Estimate(method, graph, trajectories, untied, chi2, dof, iterations, refused, bumped, calibration)

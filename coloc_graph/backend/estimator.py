@@ -7,15 +7,15 @@ from pathlib import Path
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from coloc_graph.backend import checkpoint
-from coloc_graph.backend.chain import compose, spanning_tree
+from coloc_graph.backend.batch import joint, smooth
+from coloc_graph.backend.calibration import Variables
 from coloc_graph.backend.checkpoint import Early
-from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, agreement, innovation
-from coloc_graph.backend.entering import Entering, Sorter, Tie
+from coloc_graph.backend.consistency import Agreement
+from coloc_graph.backend.entering import Entering, Sorter
 from coloc_graph.backend.estimate import Estimate, Refusal, StanceEstimate
-from coloc_graph.backend.factors import Factors
+from coloc_graph.backend.factors import Factors, Method, require_rigs
 from coloc_graph.backend.graph import (
     Link,
     Places,
@@ -26,18 +26,14 @@ from coloc_graph.backend.graph import (
     require_robots,
     slips_of,
 )
-from coloc_graph.backend.smooth import smooth
-from coloc_graph.backend.solver import isam_parameters, joint_covariance, optimise, with_stack
+from coloc_graph.backend.live_graph import LiveGraph, rebuilt
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError, MeasurementError
 from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
 from coloc_graph.run import Stance
-from coloc_graph.team import Floor, Slip, Team
+from coloc_graph.team import Floor, Robot, Slip, Team
 
 Array = NDArray[np.float64]
-
-#: With less chi2 than this in all that enters, nothing of it is refused, of however few degrees of freedom.
-CLEAR = float(chdtri(1, LEAST_CHANCE))
 
 
 def _refusal(link: Link, off: Agreement) -> Refusal:
@@ -50,17 +46,24 @@ class Estimator:
 
     What is no measurement (NaN, a covariance that is none, a robot that is not there) raises `MeasurementError`
     before anything has changed, and after any exception the estimator is as it was. What all others contradict is
-    left out and listed in `refused`. What nothing ties to the reference waits until something does. Not for several
-    threads at once.
+    left out and listed in `refused`. What nothing ties to the reference waits until something does. With the `rigs` of
+    the robots it calibrates their mounts along with the poses, as `joint` does. Not for several threads at once.
     """
 
     def __init__(
-        self, reference: str, robots: Iterable[str], floor: Floor | None = None, slips: Mapping[str, Slip] | None = None
+        self,
+        reference: str,
+        robots: Iterable[str],
+        floor: Floor | None = None,
+        slips: Mapping[str, Slip] | None = None,
+        rigs: Mapping[str, Robot] | None = None,
     ) -> None:
         self.reference, self.robots, self.floor, self.slips = reference, tuple(robots), floor, dict(slips or {})
+        self.rigs = dict(rigs or {})
         if reference not in self.robots:
             raise EstimationError(f"the reference robot {reference} is not one of {', '.join(self.robots)}")
-        self._factors = Factors(floor)
+        if self.rigs:
+            require_rigs(self.robots, self.rigs)
         self._places = Places(self.robots, self.slips)
         self._stances: dict[int, Stance] = {}
         self._log: list[Measurement] = []  # everything that ever came, the refused too
@@ -68,13 +71,21 @@ class Estimator:
         self._early: dict[int, Early] = {}
         self._loose: list[Link] = []  # what nothing ties to the reference
         self._instants: dict[Node, float] = {}  # when moving robots were sighted
-        self._tied: set[int] = set()
-        self._isam = gtsam.ISAM2(isam_parameters())
+        self._live = LiveGraph(self._new_factors())
 
     @classmethod
-    def of(cls, team: Team) -> "Estimator":
-        """The estimator of a team."""
-        return cls(team.reference, team.names, team.floor, slips_of(team))
+    def of(cls, team: Team, method: Method = "joint") -> "Estimator":
+        """The estimator of a team: with its mounts to be calibrated, or of poses alone (`smooth`)."""
+        rigs = {robot.name: robot for robot in team.robots} if method == "joint" else None
+        return cls(team.reference, team.names, team.floor, slips_of(team), rigs)
+
+    @property
+    def method(self) -> Method:
+        """Whether mounts are calibrated along (`joint`) or taken as stated (`smooth`)."""
+        return "joint" if self.rigs else "smooth"
+
+    def _new_factors(self) -> Factors:
+        return Factors(self.floor, Variables(self.robots, self.rigs) if self.rigs else None)
 
     @property
     def stances(self) -> tuple[Stance, ...]:
@@ -99,31 +110,34 @@ class Estimator:
     @property
     def graph(self) -> PoseGraph:
         """Everything that is in, as a graph; `EstimationError` while there is no stance."""
-        return PoseGraph(self.reference, self.robots, self.stances, self.measurements, self.floor, self.slips)
+        return PoseGraph(
+            self.reference, self.robots, self.stances, self.measurements, self.floor, self.slips, self.rigs
+        )
 
     def __repr__(self) -> str:
         return (
             f"Estimator({len(self._stances)} stances, {len(self._log)} measurements, {len(self._refused)} refused, "
-            f"{len(self._tied)} poses tied, {len(self._loose)} links and {len(self._early)} stances waiting)"
+            f"{len(self._live.tied)} poses tied, {len(self._loose)} links and {len(self._early)} stances waiting)"
         )
 
     def pose(self, robot: str, stance: int | None = None) -> gtsam.Pose3:
         """T_world_body of a robot at a stance, by default the last at which it is tied; `EstimationError` if none."""
-        return self._isam.calculateEstimatePose3(self._tied_key(robot, stance))
+        return self._live.pose(self._tied_key(robot, stance))
 
     def covariance(self, robot: str, stance: int | None = None) -> Array:
         """Covariance (6, 6) of that pose: GTSAM's tangent, rotation [rad] first, then translation [m], body frame."""
-        return np.asarray(self._isam.marginalCovariance(self._tied_key(robot, stance)))
+        return self._live.covariance(self._tied_key(robot, stance))
 
     def estimate(self) -> Estimate:
-        """All poses at all stances with their covariances, optimised to the end: what `smooth` makes of the same.
+        """All poses at all stances with their covariances, optimised to the end: what the method makes of it in batch.
 
         Raises `EstimationError` while there is no stance.
         """
         graph = self.graph
         kept = graph.without(one.measurement for one in self.refused)
-        values = self._isam.calculateBestEstimate() if self._tied else None
-        return replace(smooth(kept, refuse=False, start=values), graph=graph, refused=self.refused)
+        values = self._live.values() if self._live.tied else None
+        optimised = joint if self.rigs else smooth
+        return replace(optimised(kept, refuse=False, start=values), graph=graph, refused=self.refused)
 
     def add(
         self, stance: Stance, measurements: Iterable[Measurement] = (), *, after: int | None = None
@@ -188,7 +202,6 @@ class Estimator:
             self._rebuild()
             raise
         self._loose = entering.loose
-        self._tied |= entering.start.keys()
         return self._at(next(reversed(self._stances.values())), self.refused)
 
     def save(self, path: str | Path) -> None:
@@ -200,6 +213,7 @@ class Estimator:
                 robots=self.robots,
                 floor=self.floor,
                 slips=self.slips,
+                rigs=self.rigs,
                 stances=self.stances,
                 measurements=self.measurements,
                 refused={numbers[key]: one.reason for key, one in self._refused.items()},
@@ -212,7 +226,7 @@ class Estimator:
     def resume(cls, path: str | Path) -> "Estimator":
         """The estimator of a checkpoint, as it was; `InputError` where the file is none."""
         saved = checkpoint.read(Path(path))
-        estimator = cls(saved.reference, saved.robots, saved.floor, saved.slips)
+        estimator = cls(saved.reference, saved.robots, saved.floor, saved.slips, saved.rigs)
         before = None
         for stance in saved.stances:
             estimator._places.accept(estimator._places.after(before, stance))
@@ -251,7 +265,6 @@ class Estimator:
         self._instants |= instants
         self._refused |= {id(one.measurement): one for one in refused}
         self._loose = entering.loose
-        self._tied |= entering.start.keys()
         return self._at(next(reversed(self._stances.values())), refused)
 
     def _require_anchor(self, stance: Stance, taken: tuple[Measurement, ...]) -> None:
@@ -273,92 +286,21 @@ class Estimator:
 
     def _entering(self, links: list[Link]) -> Entering:
         reference = self._places.key((self.reference, next(iter(self._stances))))
-        return Sorter(self._factors, self._keys, self._tied, reference, self._isam.calculateEstimatePose3).sort(links)
+        live = self._live
+        return Sorter(live.factors_of, self._keys, live.tied, reference, live.pose, live.errors).sort(links)
 
     def _update(self, entering: Entering) -> tuple[Refusal, ...]:
-        """Put poses and links into ISAM2, without those that all others contradict; all of it or nothing."""
-        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for key, pose in entering.start.items():
-            is_reference = not self._tied and not values.size()
-            values.insert(key, pose)
-            for factor in (self._factors.gauge(key),) if is_reference else self._factors.of_pose(key):
-                factors.add(factor)
-        first = factors.size() + len(entering.ties)
-        for link, i, j in (*entering.ties, *entering.near):
-            factors.add(self._factors.of_link(link, i, j))
+        """Put poses and links into the graph, without those that all others contradict; all of it or nothing."""
         try:
-            # what the error rises by is at most what the new factors have before anything moves to please them
-            clear = not entering.near or 2 * factors.error(self._with_known(values, entering)) < CLEAR
-            indices = self._isam.update(factors, values).getNewFactorsIndices() if factors.size() else []
-            inside = dict(zip(indices[first:], entering.near, strict=True))
-            refused = self._enter_far(entering.far, inside)
-            if entering.far or not clear:
-                refused += self._take_out(inside)
-            for key in entering.start:
-                if not np.isfinite(self._isam.calculateEstimatePose3(key).translation()).all():
-                    raise EstimationError("a pose came out as not finite")
+            return tuple(_refusal(link, off) for link, off in self._live.enter(entering))
         except Exception as failure:
             self._rebuild()
             raise EstimationError(f"the graph cannot take this in, and is as it was: {failure}") from failure
-        return tuple(refused)
-
-    def _with_known(self, new: gtsam.Values, entering: Entering) -> gtsam.Values:
-        """New poses where they start, and those that are tied to them where they are."""
-        values = gtsam.Values(new)
-        for _, *ends in (*entering.ties, *entering.near):
-            for key in ends:
-                if not values.exists(key):
-                    values.insert(key, self._isam.calculateEstimatePose3(key))
-        return values
-
-    def _enter_far(self, far: list[Tie], inside: dict[int, Tie]) -> list[Refusal]:
-        """Put in what does not contradict what is known, and note it as `inside`; what does is refused."""
-        refused, factors, passed = [], gtsam.NonlinearFactorGraph(), []
-        for tie in far:
-            off = self._agreement(*tie, inside=False)
-            if off.chance() < LEAST_CHANCE:
-                refused.append(_refusal(tie[0], off))
-            else:
-                passed.append(tie)
-                factors.add(self._factors.of_link(*tie))
-        if passed:
-            indices = self._isam.update(factors, gtsam.Values()).getNewFactorsIndices()
-            inside |= zip(indices, passed, strict=True)
-        return refused
-
-    def _take_out(self, inside: dict[int, Tie]) -> list[Refusal]:
-        """Take out what all others contradict, the worst first."""
-        refused = []
-        while inside:
-            among = {index: self._agreement(*tie) for index, tie in inside.items()}
-            worst = min(among, key=lambda index: among[index].chance())
-            if among[worst].chance() >= LEAST_CHANCE:
-                break
-            refused.append(_refusal(inside.pop(worst)[0], among[worst]))
-            self._isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [worst])
-        return refused
-
-    def _agreement(self, link: Link, i: int, j: int, *, inside: bool = True) -> Agreement:
-        values = gtsam.Values()
-        for key in (i, j):
-            values.insert(key, self._isam.calculateEstimatePose3(key))
-        factor, joint = self._factors.of_link(link, i, j), joint_covariance(self._isam, [i, j])
-        return (agreement if inside else innovation)(factor, values, joint)
 
     def _rebuild(self) -> None:
-        """ISAM2 anew from the log without what was refused: after a failure, a revocation, and from a checkpoint."""
-        graph = self.graph
-        kept = graph.without(one.measurement for one in self.refused)
-        steps = spanning_tree(kept, kept.links)
-        initial = gtsam.Values()
-        poses = compose(kept, steps, self._factors.start) if steps else {kept.reference_key: gtsam.Pose3()}
-        for key, pose in poses.items():
-            initial.insert(key, pose)
-        factors, links = self._factors.of_graph(kept, poses)
-        values, _ = with_stack(len(poses), lambda: optimise(factors, initial))
-        self._isam = gtsam.ISAM2(isam_parameters())
-        self._isam.update(factors, values)
-        self._tied = set(poses)
+        """The graph anew from the log without what was refused: after a failure, a revocation, from a checkpoint."""
+        kept = self.graph.without(one.measurement for one in self.refused)
+        self._live, links = rebuilt(kept, self._new_factors())
         inside = set(map(id, links))
         self._loose = [link for link in kept.links if id(link) not in inside and len(set(self._keys(link))) == 2]
 
@@ -370,17 +312,17 @@ class Estimator:
         if robot not in self.robots:
             raise EstimationError(f"robot {robot} is not in the team ({', '.join(self.robots)})")
         for index in reversed(self._stances) if stance is None else (stance,):
-            if index in self._stances and (key := self._places.key((robot, index))) in self._tied:
+            if index in self._stances and (key := self._places.key((robot, index))) in self._live.tied:
                 return key
         raise EstimationError(f"robot {robot} has no pose{'' if stance is None else f' at stance {stance}'}")
 
     def _at(self, stance: Stance, refused: tuple[Refusal, ...]) -> StanceEstimate:
         keys = {robot: self._places.key((robot, stance.index)) for robot in self.robots}
-        tied = {robot: key for robot, key in keys.items() if key in self._tied}
+        tied = {robot: key for robot, key in keys.items() if key in self._live.tied}
         return StanceEstimate(
             stance.index,
-            {robot: self._isam.calculateEstimatePose3(key) for robot, key in tied.items()},
-            {robot: np.asarray(self._isam.marginalCovariance(key)) for robot, key in tied.items()},
+            {robot: self._live.pose(key) for robot, key in tied.items()},
+            {robot: self._live.covariance(key) for robot, key in tied.items()},
             tuple(robot for robot in stance.observers if robot not in tied),
             refused,
         )

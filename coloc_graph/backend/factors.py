@@ -1,14 +1,18 @@
-"""GTSAM's factors of what a graph holds: gauge, floor priors, between-factors."""
+"""GTSAM's factors of what a graph holds: gauge, floor priors, links; as poses alone, or jointly with the mounts."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from typing import Literal
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.calibration import Variables, is_calibration
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
-from coloc_graph.measurements import RelativePose
-from coloc_graph.team import Floor
+from coloc_graph.backend.homography_factor import homography_factor, markers_factor, related, sighted
+from coloc_graph.errors import EstimationError
+from coloc_graph.measurements import RelativePose, Sighting
+from coloc_graph.team import Floor, Robot
 
 Array = NDArray[np.float64]
 
@@ -17,16 +21,54 @@ GAUGE_SIGMA = 1e-6
 #: A floor that is called exactly flat is taken as flat to this much [rad, m].
 LEAST_FLOOR_SIGMA = 1e-5
 #: A floor that tilts a body raises it, too: by the tilt times this [m].
-BODY_LENGTH = 0.25
+BODY_LENGTH = 0.05
 _UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 _ORIGIN = np.zeros(3)
 
 
-class Factors:
-    """Makes the factors of a team on its floor; noise models that many share are made once."""
+#: What is unknown: the poses (`smooth`; `chain` composes the same), or mounts and the like with them (`joint`).
+Method = Literal["chain", "smooth", "joint"]
 
-    def __init__(self, floor: Floor | None) -> None:
-        self.floor = floor
+
+def factors_for(method: Method, graph: PoseGraph, known: gtsam.Values | None = None) -> "Factors":
+    """What makes the factors of a graph for a method; mounts may be `known` to be elsewhere than stated."""
+    if method != "joint":
+        return Factors(graph.floor)
+    variables = Variables(graph.robots, graph.rigs)
+    if known is not None:
+        variables.anchors |= calibrations_in(known)
+    return Factors(graph.floor, variables)
+
+
+def poses_in(values: gtsam.Values) -> list[int]:
+    """The keys of poses among all."""
+    return [key for key in map(int, values.keys()) if not is_calibration(key)]
+
+
+def calibrations_in(values: gtsam.Values) -> dict[int, Array]:
+    """The calibration variables among all."""
+    return {key: values.atVector(key) for key in map(int, values.keys()) if is_calibration(key)}
+
+
+def require_rigs(robots: Iterable[str], rigs: Mapping[str, Robot]) -> None:
+    """Raise `EstimationError` where the mounts of a team are not known."""
+    for robot in robots:
+        if robot not in rigs:
+            raise EstimationError(
+                f"the mount of robot {robot} is not known, so that it cannot be calibrated: make the graph of a team "
+                "(`PoseGraph.of`), or use smooth"
+            )
+
+
+class Factors:
+    """Makes the factors of a team on its floor; noise models that many share are made once.
+
+    With `variables` links are taken for what the cameras saw wherever that is known (`homography_factor`), and mounts
+    and the like are variables; else every link is a between-factor.
+    """
+
+    def __init__(self, floor: Floor | None, variables: Variables | None = None) -> None:
+        self.floor, self.variables = floor, variables
         tilt, height = GAUGE_SIGMA, GAUGE_SIGMA
         if floor is not None:
             tilt = max(float(np.deg2rad(floor.tilt_sigma_deg)), LEAST_FLOOR_SIGMA)
@@ -36,10 +78,26 @@ class Factors:
         self._level = gtsam.noiseModel.Isotropic.Sigma(2, tilt)
         self._on_floor = gtsam.noiseModel.Diagonal.Precisions(np.array([0.0, 0.0, height**-2]))
 
-    @property
-    def pose_rows(self) -> int:
-        """How many rows the priors of one pose weigh."""
-        return 0 if self.floor is None else 3
+    def dof(self, values: gtsam.Values, links: Iterable[tuple[Link, gtsam.NonlinearFactor]]) -> int:
+        """Rows that weigh, less unknowns, of links and their factors; calibration variables have as many priors as
+        unknowns."""
+        poses = len(poses_in(values))
+        priors = 6 + (0 if self.floor is None else 3) * (poses - 1)
+        return priors + sum(self.rows(link, factor) for link, factor in links) - 6 * poses
+
+    def rows(self, link: Link, factor: gtsam.NonlinearFactor) -> int:
+        """How many numbers a link measures, of its factor."""
+        if self._as_seen(link):
+            return int(factor.dim())
+        return 6 if isinstance(link, RelativePose | StayPut) else 3
+
+    def _as_seen(self, link: Link) -> bool:
+        """Whether a link is taken for what the cameras saw."""
+        if self.variables is None:
+            return False
+        if isinstance(link, Sighting):
+            return link.x_markers is not None and self.floor is not None
+        return isinstance(link, RelativePose) and link.homography is not None and link.plane is not None
 
     def gauge(self, key: int) -> gtsam.NonlinearFactor:
         """The prior of the pose that defines the world."""
@@ -56,8 +114,22 @@ class Factors:
         )
 
     def of_link(self, link: Link, i: int, j: int) -> gtsam.NonlinearFactor:
-        """The between-factor of two keys."""
+        """The factor of a link on the keys of its two poses, and of the calibration variables that it needs."""
+        if self.variables is not None and self._as_seen(link):
+            if isinstance(link, Sighting):
+                return markers_factor(link, i, j, self.variables)
+            assert isinstance(link, RelativePose)
+            return homography_factor(link, i, j, self.variables, self.floor is not None)
         return gtsam.BetweenFactorPose3(i, j, link.T_i_j, _noise(link))
+
+    def expected(self, link: Link, errors: Callable[[int], Array]) -> gtsam.Pose3:
+        """The pose of a link's second end in its first, with calibration variables at `errors` of their keys."""
+        if self.variables is not None and self.floor is not None and self._as_seen(link):
+            if isinstance(link, Sighting):
+                return sighted(link, self.variables, errors)
+            assert isinstance(link, RelativePose)
+            return related(link, homography_factor(link, 0, 1, self.variables, True), errors)
+        return link.T_i_j
 
     def of_graph(self, graph: PoseGraph, keys: Iterable[int]) -> tuple[gtsam.NonlinearFactorGraph, tuple[Link, ...]]:
         """The factors over these keys, and the links among them; the links' factors come last, in that order."""
@@ -68,14 +140,37 @@ class Factors:
         for key in sorted(wanted - {reference}):
             for factor in self.of_pose(key):
                 factors.add(factor)
-        links = []
+        links, made = [], []
         key_of = graph.places.key
         for link in graph.links:
             i, j = map(key_of, link.ends)
             if i in wanted and j in wanted and i != j:
-                factors.add(self.of_link(link, i, j))
+                made.append(self.of_link(link, i, j))
                 links.append(link)
+        for key in self.calibrated:
+            factors.add(self.calibration_prior(key))
+        for factor in made:
+            factors.add(factor)
         return factors, tuple(links)
+
+    @property
+    def calibrated(self) -> tuple[int, ...]:
+        """The calibration variables that the factors made so far have asked for."""
+        return () if self.variables is None else tuple(sorted(self.variables.sigmas))
+
+    def nominal(self, key: int) -> Array:
+        """Where the search for one of them starts: as stated."""
+        assert self.variables is not None
+        return self.variables.start(key)
+
+    def is_anchored(self, values: gtsam.Values) -> bool:
+        """Whether the factors were made for mounts as they turned out to be."""
+        return self.variables is None or self.variables.is_anchored(calibrations_in(values))
+
+    def calibration_prior(self, key: int) -> gtsam.NonlinearFactor:
+        """What is stated of one of them."""
+        assert self.variables is not None
+        return self.variables.prior(key)
 
     def start(self, pose: gtsam.Pose3) -> gtsam.Pose3:
         """Where to start the search for a pose: on the floor, where there is one.
@@ -95,11 +190,6 @@ def link_covariance(link: Link) -> Array:
         turn = np.deg2rad(link.slip.sigma_deg)
         return np.diag(np.square([turn, turn, turn, link.slip.sigma, link.slip.sigma, link.slip.sigma]))
     return link.covariance
-
-
-def rows(link: Link) -> int:
-    """How many numbers a link measures."""
-    return 6 if isinstance(link, RelativePose | StayPut) else 3
 
 
 def _noise(link: Link) -> gtsam.noiseModel.Gaussian:

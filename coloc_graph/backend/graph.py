@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import gtsam
@@ -11,7 +11,7 @@ from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, MeasurementError
 from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
 from coloc_graph.run import Stance
-from coloc_graph.team import Floor, Slip, Team
+from coloc_graph.team import Floor, Robot, Slip, Team
 
 #: GTSAM's keys number the robots of a team in one byte.
 MOST_ROBOTS = 255
@@ -108,6 +108,7 @@ class PoseGraph:
     anchors whose pose is a node already. Nodes that are one place share one variable (`key`). The world frame is
     where the reference robot stands at the first stance: its body, or, where there is a `floor`, the floor beneath
     it (the same on a level floor), x along its heading. `slips` are of the robots that stay put within a tolerance.
+    `rigs` are the robots as the team describes them, with mounts and markers: what the joint estimate calibrates.
 
     Raises `EstimationError` where there is nothing to solve, and `MeasurementError` where a measurement is not one.
     """
@@ -118,11 +119,13 @@ class PoseGraph:
     measurements: tuple[Measurement, ...]
     floor: Floor | None = None
     slips: Mapping[str, Slip] = field(default_factory=dict)
+    rigs: Mapping[str, Robot] = field(default_factory=dict)
 
     @classmethod
     def of(cls, team: Team, stances: Iterable[Stance], measurements: Iterable[Measurement]) -> "PoseGraph":
         """The graph of a team."""
-        return cls(team.reference, team.names, tuple(stances), tuple(measurements), team.floor, slips_of(team))
+        rigs = {robot.name: robot for robot in team.robots}
+        return cls(team.reference, team.names, tuple(stances), tuple(measurements), team.floor, slips_of(team), rigs)
 
     def __post_init__(self) -> None:
         if not self.stances:
@@ -208,13 +211,20 @@ class PoseGraph:
         """The key of the pose that defines the world."""
         return self.key(self.reference, self.stances[0].index)
 
+    def up_to(self, stances: int) -> "PoseGraph":
+        """The graph of the first so many stances, one at least, with what was measured in them."""
+        first = self.stances[: max(stances, 1)]
+        within = {stance.index for stance in first}
+        measured = tuple(m for m in self.measurements if all(index in within for _, index in m.ends))
+        return replace(self, stances=first, measurements=measured)
+
     def without(self, refused: Iterable[Link]) -> "PoseGraph":
         """The same nodes with fewer measurements."""
         out = {id(one) for one in refused}
         if not out:
             return self
         graph = PoseGraph(self.reference, self.robots, self.stances, tuple(m for m in self.measurements
-                          if id(m) not in out), self.floor, self.slips)  # fmt: skip
+                          if id(m) not in out), self.floor, self.slips, self.rigs)  # fmt: skip
         vars(graph).update(nodes=self.nodes, times=self.times)  # a node stays one, and untied, if all it had is refused
         return graph
 

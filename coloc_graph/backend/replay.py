@@ -6,19 +6,22 @@ from dataclasses import replace
 
 from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.estimator import Estimator
+from coloc_graph.backend.factors import Method
 from coloc_graph.backend.graph import PoseGraph
 from coloc_graph.measurements import Measurement
 
 
-def replay(graph: PoseGraph) -> tuple[Estimate, tuple[float, ...]]:
-    """The estimate at the end, and how long each stance took to enter [s].
+def replay(graph: PoseGraph, method: Method = "smooth") -> tuple[Estimate, tuple[float, ...]]:
+    """The estimate at the end by `smooth` or `joint`, and how long each stance took to enter [s].
 
     A stance without an anchor, which an estimator refuses, raises `MeasurementError`.
     """
     by_stance: dict[int, list[Measurement]] = defaultdict(list)
     for measured in graph.measurements:
         by_stance[max(stance for _, stance in measured.ends)].append(measured)
-    estimator = Estimator(graph.reference, graph.robots, graph.floor, graph.slips)
+    estimator = Estimator(
+        graph.reference, graph.robots, graph.floor, graph.slips, graph.rigs if method == "joint" else None
+    )
     seconds = []
     before = None
     for stance in graph.stances:

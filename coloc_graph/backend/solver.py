@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.calibration import SIZES
 from coloc_graph.errors import EstimationError
 
 Array = NDArray[np.float64]
@@ -31,6 +32,11 @@ LONG, NOISE = 2000, 1e-5
 #: 1e-4 rad, and with GTSAM's single threshold of 0.01 the whole chain is then redone at every step (with turns of
 #: 0.01 from stance 2,600 on).
 TURNED, SHIFTED = 0.03, 1e9
+#: Where mounts are calibrated, also where it has tilted by this [rad]: a homography's residual grows with the square of
+#: a tilt times that of distance over height, and half a milliradian is then a fifth of its noise.
+TILTED = 5e-4
+#: A calibration variable is linearised anew where it has changed by more than this [m, rad, relative, s].
+CALIBRATED = 3e-4
 
 
 def with_stack(poses: int, work: Callable[[], T]) -> T:
@@ -70,13 +76,16 @@ def lm_parameters(poses: int) -> gtsam.LevenbergMarquardtParams:
     return parameters
 
 
-def isam_parameters() -> gtsam.ISAM2Params:
-    """QR for the same reason, and what is linearised anew: of keys whose character is x, as our poses' is."""
+def isam_parameters(*, calibrates: bool = False) -> gtsam.ISAM2Params:
+    """QR for the same reason, and what is linearised anew: by the kind of key, as that of poses is x."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     parameters.relinearizeSkip = 1
+    tilted = TILTED if calibrates else TURNED
     thresholds = gtsam.ISAM2ThresholdMap()
-    thresholds.insert(("x", np.array([TURNED] * 3 + [SHIFTED] * 3)))
+    thresholds.insert(("x", np.array([tilted, tilted, TURNED] + [SHIFTED] * 3)))
+    for kind, size in SIZES.items():
+        thresholds.insert((chr(kind), np.full(size, CALIBRATED)))
     parameters.setRelinearizeThreshold(thresholds)
     return parameters
 
@@ -126,23 +135,19 @@ class Posterior:
         self._isam.update(factors, values)
 
     def covariance(self, key: int) -> Array:
-        """Covariance (6, 6) of one pose: rotation first, body frame."""
+        """Covariance of one variable: of a pose (6, 6), rotation first, body frame."""
         return np.asarray(self._isam.marginalCovariance(key))
 
     def covariances(self) -> dict[int, Array]:
-        """The covariances (6, 6) of all poses, by key."""
+        """The covariances of all variables, by key."""
         return {int(key): self.covariance(key) for key in self.values.keys()}  # noqa: SIM118  GTSAM's own
 
     def joint(self, keys: Sequence[int]) -> Array:
-        """Joint covariance (6 n, 6 n) of n different poses, in the order given."""
+        """Joint covariance of different variables, in the order given: (6 n, 6 n) of n poses."""
         return joint_covariance(self._isam, keys)
 
 
 def joint_covariance(isam: gtsam.ISAM2, keys: Sequence[int]) -> Array:
-    """Joint covariance (6 n, 6 n) of n different poses, in the order given."""
+    """Joint covariance of different variables, in the order given: (6 n, 6 n) of n poses."""
     joint = isam.jointMarginalCovariance(list(keys))
-    out = np.empty((6 * len(keys), 6 * len(keys)))
-    for m, a in enumerate(keys):
-        for n, b in enumerate(keys):
-            out[6 * m : 6 * m + 6, 6 * n : 6 * n + 6] = joint.at(a, b)
-    return out
+    return np.block([[joint.at(a, b) for b in keys] for a in keys])

@@ -8,6 +8,7 @@ from coloc_graph.cli.printing import counted, print_table
 from coloc_graph.evaluation import Accuracy
 
 if TYPE_CHECKING:
+    from coloc_graph.backend import Calibration
     from coloc_graph.trajectory import Trajectory
 
 
@@ -47,6 +48,28 @@ def print_accuracy(accuracy: Accuracy) -> None:
                 for row in accuracy.distances
             ],
         )
+
+
+def print_calibration(calibration: "Calibration") -> None:
+    """What was stated with a tolerance, and what it turned out to be, each with its sigma."""
+
+    def value(number: float, sigma: float, unit: str) -> str:
+        if unit == "m":
+            return f"{1000 * number:.1f} +- {1000 * sigma:.2f} mm"
+        return f"{number:.2f} +- {sigma:.3f} {unit}"
+
+    rows = [
+        [
+            row.robot,
+            row.what,
+            value(row.stated, row.stated_sigma, row.unit),
+            value(row.found, row.found_sigma, row.unit),
+            f"{row.sigmas:.1f} sigma",
+        ]
+        for row in calibration.rows
+    ]
+    if rows:
+        print_table(["robot", "what", "stated", "found", "off by"], rows)
 
 
 def print_promised(trajectories: "Mapping[str, Trajectory]") -> None:

@@ -10,7 +10,12 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command = commands.add_parser("solve", help="estimate the poses of a run")
     command.add_argument("run_path", metavar="RUN", help="the run (.mcap)")
     command.add_argument("--out", required=True, metavar="DIR", help="folder for the result")
-    command.add_argument("--method", choices=("chain", "smooth"), default="smooth", help="chain is the paper's")
+    command.add_argument(
+        "--method",
+        choices=("chain", "smooth", "joint"),
+        default="joint",
+        help="chain is the paper's, joint calibrates mounts along",
+    )
     command.add_argument(
         "--scale",
         choices=("heights", "span"),
@@ -28,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     import statistics
     from dataclasses import replace
 
-    from coloc_graph.cli.accuracy import print_accuracy, print_last_poses, print_promised
+    from coloc_graph.cli.accuracy import print_accuracy, print_calibration, print_last_poses, print_promised
     from coloc_graph.errors import ColocError
     from coloc_graph.pipeline import SolveOptions, solve
     from coloc_graph.results import holds_result, require_place, summarise, write_result
@@ -58,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         print_accuracy(accuracy)
         print_promised(estimate.trajectories)
+    print_calibration(estimate.calibration)
     if solution.seconds_updates:
         median, longest = 1000 * statistics.median(solution.seconds_updates), 1000 * max(solution.seconds_updates)
         print(f"a stance entered in {median:.1f} ms (median; at most {longest:.1f} ms)")

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend import Method
 from coloc_graph.errors import EstimationError
-from coloc_graph.pipeline import Method, SolveOptions, solve
+from coloc_graph.pipeline import SolveOptions, solve
 from coloc_graph.results import assess
 from coloc_graph.run import open_run
 from coloc_graph.simulation import simulate

@@ -14,7 +14,7 @@ from coloc_graph.frontend.refinement import PointPairs, least_squares, refine
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.shared_clock import share_clock_offsets
 from coloc_graph.frontend.sighting import sight
-from coloc_graph.frontend.stance import FrontendOptions, PairMeasurement, measure_pair, sight_movers
+from coloc_graph.frontend.stance import FrontendOptions, PairMeasurement, Scale, measure_pair, sight_movers
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.frontend.wheels import WheelTrack
 
@@ -29,6 +29,7 @@ __all__ = [
     "MarkerTracker",
     "PairMeasurement",
     "PointPairs",
+    "Scale",
     "Threshold",
     "Track",
     "TrackerOptions",

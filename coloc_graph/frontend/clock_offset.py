@@ -67,8 +67,9 @@ class ClockFit:
     """A homography fitted together with the offset of the clocks.
 
     `fit.information` is that of H alone, with the offset's uncertainty in it; `information` (9, 9) that of H and
-    the offset [s]. `found` has camera j's points at the instants of camera i's. `offset` is what stance and prior
-    know together, `evidence` what the stance alone does: None where it knows nothing.
+    the offset [s]; H changes by `by_offset` (8,) where the offset grows by 1 s. `found` has camera j's points at the
+    instants of camera i's. `offset` is what stance and prior know together, `evidence` what the stance alone does: None
+    where it knows nothing.
     """
 
     fit: HomographyFit
@@ -76,6 +77,7 @@ class ClockFit:
     information: Array
     offset: ClockOffset
     evidence: ClockOffset | None
+    by_offset: Array
 
 
 def fit_with_offset(
@@ -125,11 +127,11 @@ def fit_at_offset(
                 break
         chi2 = system.chi2
         information = system.by_H * _scale(chi2, fit.dof)
-        by_offset = np.linalg.solve(system.by_H, system.by_H_offset)
+        by_offset = np.asarray(np.linalg.solve(system.by_H, system.by_H_offset), float)
     else:
         information = fit.information
         A, v = system.A.reshape(-1, 8), system.slope.ravel()
-        by_offset = np.linalg.lstsq(A, v, rcond=None)[0]
+        by_offset = np.asarray(np.linalg.lstsq(A, v, rcond=None)[0], float)
     squared = squared_residuals(H, found.pairs)
     own = np.linalg.inv(information)
     marginal = np.asarray(np.linalg.inv(own + offset.sigma**2 * np.outer(by_offset, by_offset)), float)
@@ -138,7 +140,7 @@ def fit_at_offset(
     joint[:8, 8] = joint[8, :8] = -information @ by_offset
     joint[8, 8] = by_offset @ information @ by_offset + 1 / offset.sigma**2
     whole = HomographyFit(H, marginal, fit.inliers, squared, chi2, fit.dof, iterations)
-    return ClockFit(whole, found, joint, offset, evidence)
+    return ClockFit(whole, found, joint, offset, evidence, by_offset)
 
 
 def fuse(evidence: Sequence[ClockOffset], prior: ClockOffset) -> tuple[ClockOffset, float]:

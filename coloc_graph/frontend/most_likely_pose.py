@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.relative_pose import mounted, relative_pose, turned_normal
 from coloc_graph.lie import (
+    across,
     floor_pose,
     se3,
     se3_exp,
@@ -122,13 +123,13 @@ def _mount_sigmas(mount: Mount) -> list[float]:
 def _free(start: RelativePose, mount_i: Mount, mount_j: Mount, plane: Plane) -> _Model:
     """Unknowns: the pose's tangent (6), the normal across itself (2), d (1), both mounts (3 + 3)."""
     T_start = start.T_i_j.matrix()
-    across = np.linalg.svd(plane.N[None])[2][1:]
+    sides = across(plane.N)
 
     def build(u: Array) -> tuple[Array, Array, Array, Array]:
         T_i_j = T_start @ se3_exp(u[:, :6])
         T_bi_ci, T_bj_cj = mounted(mount_i, u[:, 9:12]), mounted(mount_j, u[:, 12:15])
         N = turned_normal(plane, mount_i, T_bi_ci)
-        N = (so3_exp(u[:, 6:8] @ across) @ N[..., None])[..., 0]
+        N = (so3_exp(u[:, 6:8] @ sides) @ N[..., None])[..., 0]
         d = plane.d + u[:, 8] + (u[:, 9] if plane.d_from_mount else 0.0)
         return T_i_j, se3_inverse(T_bi_ci) @ T_i_j @ T_bj_cj, N, d
 

@@ -65,6 +65,12 @@ class Linearised:
         b00, b01, _, b10, b11, _ = self.b
         return np.stack([np.stack([b00, b01], -1), np.stack([b10, b11], -1)], -2)
 
+    @property
+    def residual_j(self) -> Array:
+        """What image j says of each point less what the homography says where image i saw it, (..., n, 2)."""
+        e0 = self.e0 / self.g0
+        return np.stack([e0, self.e1 / self.g1 + self.k * self.e0], -1)
+
 
 def _project(H: Array, z: Array) -> tuple[Array, Array, tuple[Array, ...]]:
     """pi(H z), x and y (..., n) apart, and the six entries (..., n) of d pi(D z) / dD at D = H, row by row."""
@@ -114,6 +120,12 @@ def _rows(b: tuple[Array, ...], z: Array) -> Array:
         for index, entry in enumerate((u * y, u, v * x, v, w * x, w * y, u * x - vy, vy - w)):
             rows[..., index, half] = entry
     return rows
+
+
+def point_rows(at: Linearised, z: Array) -> Array:
+    """d pi(H exp(h) z) / dh at h = 0, (n, 2, 8), at each of n points."""
+    n = z.shape[-2]
+    return np.moveaxis(_rows(at.b, z).reshape(8, 2, n), 0, -1).swapaxes(0, 1)
 
 
 def whitened_rows(at: Linearised, z: Array) -> Array:

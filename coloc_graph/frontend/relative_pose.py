@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.decomposition import choose_by_normal, decompose_svd, decompose_with_normal, metric_scale
-from coloc_graph.lie import rotation_z, se3, se3_inverse, sl3_exp, so3_exp, so3_log
+from coloc_graph.lie import across, rotation_z, se3, se3_inverse, sl3_exp, so3_exp, so3_log
 from coloc_graph.measurements import HomographyMeasurement, Plane, RelativePose
 from coloc_graph.team import R_BODY_OPTICAL, Mount
 
@@ -90,8 +90,8 @@ def _poses(unknowns: Array, H: Array, mount_i: Mount, mount_j: Mount, plane: Pla
     """T_i_j and T_ci_cj, (m, 4, 4) each, for errors (m, 17) of the unknowns."""
     T_bi_ci, T_bj_cj = mounted(mount_i, unknowns[:, _MOUNT_I]), mounted(mount_j, unknowns[:, _MOUNT_J])
     N = turned_normal(plane, mount_i, T_bi_ci)
-    across = np.linalg.svd(plane.N[None])[2][1:]
-    N = (so3_exp(unknowns[:, _NORMAL] @ across) @ N[..., None])[..., 0]
+    sides = across(plane.N)
+    N = (so3_exp(unknowns[:, _NORMAL] @ sides) @ N[..., None])[..., 0]
     d = plane.d + unknowns[:, _D] + (unknowns[:, _MOUNT_I][:, 0] if plane.d_from_mount else 0.0)
     R_cj_ci, t_cj_ci = decompose_with_normal(H @ sl3_exp(unknowns[:, _H]), N, d)
     T_ci_cj = se3_inverse(se3(R_cj_ci, t_cj_ci))

@@ -6,11 +6,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.frontend.correspondence import pair_by_time
+from coloc_graph.frontend.correspondence import pair_by_time, per_pixel
 from coloc_graph.frontend.relative_pose import mounted, turned_normal
 from coloc_graph.frontend.tracking import Track
 from coloc_graph.frontend.wheels import WheelTrack
-from coloc_graph.lie import floor_pose, so3_exp
+from coloc_graph.lie import across, floor_pose, so3_exp
 from coloc_graph.measurements import Plane, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.team import Markers, Robot
@@ -59,7 +59,18 @@ def sight(
     noise = np.stack([pair[0].covariance[shared[best, 0]], pair[1].covariance[shared[best, 1]]])
     pose, covariance = _pose(observer, markers, plane, uv[best], noise)
     T_observer_seen = gtsam.Pose3(floor_pose(pose[1], pose[2], pose[0]))
-    return Sighting(stance.index, observer.name, seen.name, float(times[best]), T_observer_seen, covariance)
+    bias = observer.camera.bias_px**2 * np.eye(2)
+    J = per_pixel(uv[best], observer.camera)
+    return Sighting(
+        stance=stance.index,
+        observer=observer.name,
+        seen=seen.name,
+        time=float(times[best]),
+        T_observer_seen=T_observer_seen,
+        covariance=covariance,
+        x_markers=observer.camera.normalise(uv[best]),
+        x_covariance=J @ (noise + bias) @ J.mT,
+    )
 
 
 def _marker_tracks(
@@ -113,8 +124,8 @@ def _on_floor(observer: Robot, plane: Plane, uv: Array, errors: Array) -> Array:
     n, m, _ = uv.shape
     T_body_camera = mounted(observer.mount, errors[:, 3:])
     N = turned_normal(plane, observer.mount, T_body_camera)
-    across = np.linalg.svd(plane.N[None])[2][1:]
-    N = (so3_exp(errors[:, :2] @ across) @ N[..., None])[..., 0]
+    sides = across(plane.N)
+    N = (so3_exp(errors[:, :2] @ sides) @ N[..., None])[..., 0]
     d = plane.d + errors[:, 2] + errors[:, 3]
     x = observer.camera.normalise(uv.reshape(-1, 2)).reshape(n, m, 2)
     rays = np.concatenate([x, np.ones((n, m, 1))], axis=2)

@@ -33,9 +33,10 @@ from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
 from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.sighting import sight
+from coloc_graph.frontend.spans import marker_span
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.frontend.wheels import WheelTrack
-from coloc_graph.measurements import HomographyMeasurement, Plane, RelativePose, Sighting
+from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose, Sighting
 from coloc_graph.run import Detections, Flag, Run, Stance
 from coloc_graph.team import Camera, Markers
 
@@ -51,6 +52,10 @@ NOT_OBSERVABLE = (
 )
 
 
+#: Where the plane's distance comes from.
+Scale = Literal["heights", "span"]
+
+
 @dataclass(frozen=True)
 class FrontendOptions:
     """How measurements are made. `scale` is where the plane's distance comes from: the stated heights of
@@ -59,7 +64,7 @@ class FrontendOptions:
 
     criterion: Criterion = "reprojection"
     pose: Literal["eq2", "ml"] = "ml"
-    scale: Literal["heights", "span"] = "heights"
+    scale: Scale = "heights"
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
 
 
@@ -143,14 +148,18 @@ def _measure_at_offset(seen: _Seen, tracks: PairedTracks, offset: ClockOffset) -
 
 def _measured_or_why(seen: _Seen, clock: ClockFit) -> PairMeasurement:
     try:
-        return _measured(seen, clock.found, clock.fit, clock.offset)
+        return _measured(seen, clock.found, clock.fit, clock.offset, clock.by_offset)
     except DegenerateGeometry as why:
         unusable = _unusable(seen.stance, seen.robot_i, seen.robot_j, clock.found, str(why))
         return PairMeasurement(unusable, None, clock.found)
 
 
 def _measured(
-    seen: _Seen, found: Correspondences, fit: HomographyFit, offset: ClockOffset | None = None
+    seen: _Seen,
+    found: Correspondences,
+    fit: HomographyFit,
+    offset: ClockOffset | None = None,
+    by_offset: Array | None = None,
 ) -> PairMeasurement:
     """The measurement that a fit is; raises `DegenerateGeometry` where it is none."""
     robot_i, robot_j, plane = seen.run.team[seen.robot_i], seen.run.team[seen.robot_j], seen.plane
@@ -167,6 +176,7 @@ def _measured(
             measurement,
             time_offset=offset.value,
             time_offset_sigma=offset.sigma,
+            by_time_offset=by_offset,
             warning=NOT_OBSERVABLE if offset.sigma > LEAST_OBSERVED * said else None,
         )
     if seen.options.scale == "span":
@@ -174,7 +184,32 @@ def _measured(
     # without the floor: the graph knows it, and must not count it twice
     make_pose = relative_pose if seen.options.pose == "eq2" else most_likely_pose
     pose = make_pose(measurement, robot_i.mount, robot_j.mount, plane)
+    marked = tuple(name for name in seen.stance.movers if seen.run.team[name].markers is not None)
+    pose = replace(pose, homography=measurement, plane=seen.plane, movers=marked, spans=_spans(seen, found, fit))
     return PairMeasurement(measurement, pose, found, tracks=(seen.tracks_i, seen.tracks_j))
+
+
+def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[MarkerSpan, ...]:
+    """The spans of the movers whose two markers can be told from all others; () where the plane is stated."""
+    if not (seen.plane.normal_from_mount and seen.plane.d_from_mount):
+        return ()
+    robot, movers = seen.run.team[seen.robot_i], seen.stance.movers
+    bias = _bias_root(found.uv_i, robot.camera)
+    bias = bias if robot.camera.bias_px > 0 else bias[..., :0]
+    named = {track.marker: number for number, track in enumerate(seen.tracks_i) if track.marker}
+    made = []
+    for mover in movers:
+        markers = seen.run.team[mover].markers
+        if markers is None or markers.span is None:
+            continue
+        tracks = tuple(named[marker] for n in range(2) if (marker := f"{mover}/{n}") in named)
+        if not named and len(movers) == 1:
+            bound = span_samples(seen.tracks_i, robot.camera, seen.plane, markers.span)
+            tracks = bound[0][:2] if len(bound) == 1 else ()
+        if len(tracks) == 2:
+            one = marker_span(mover, tracks, found, fit, bias)
+            made += [] if one is None else [one]
+    return tuple(made)
 
 
 def stance_markers(run: Run, stance: Stance) -> Markers | None:

@@ -62,6 +62,7 @@ def render_report(solution: Solution, accuracy: Accuracy | None, truth: Truth | 
         _verdict(solution, accuracy),
         _accuracy_section(accuracy) if accuracy is not None else "",
         _warnings_section(solution.warnings),
+        _calibration_section(solution),
         _figures_section(solution, truth),
         _used_section(solution),
         _measurements_section(solution),
@@ -165,6 +166,31 @@ def _accuracy_section(accuracy: Accuracy) -> str:
             f"(NEES per degree of freedom, {_many(accuracy.nees_poses, 'pose')}; 1 is honest)."
         )
     return f'<h2>Accuracy</h2>\n{_table(head, rows, [0], foot)}\n<p class="soft">{note}</p>'
+
+
+def _calibration_section(solution: Solution) -> str:
+    """What was stated with a tolerance, and what it turned out to be."""
+    rows = solution.estimate.calibration.rows
+    if not rows:
+        return ""
+
+    def value(number: float, sigma: float, unit: str) -> str:
+        number, sigma, unit, digits = (1000 * number, 1000 * sigma, "mm", 2) if unit == "m" else (number, sigma, "°", 3)
+        return f"{number:.{digits}f} ± {sigma:.{digits}f} {unit}"
+
+    head = ["Robot", "What", "Stated", "Found", "Off by (σ of what was stated)"]
+    cells = [
+        [
+            escape(row.robot),
+            escape(row.what),
+            value(row.stated, row.stated_sigma, row.unit),
+            value(row.found, row.found_sigma, row.unit),
+            f'<span class="bad">{row.sigmas:.1f}</span>' if row in solution.estimate.calibration.far
+            else f"{row.sigmas:.1f}",
+        ]
+        for row in rows
+    ]  # fmt: skip
+    return f"<h2>Calibration</h2>\n{_table(head, cells, [0, 1])}"
 
 
 def _warnings_section(warnings: Sequence[str]) -> str:

@@ -1,20 +1,26 @@
-"""The pose graph optimised in batch: checked before, fitted, and asked afterwards which measurement is wrong."""
+"""The graph optimised in batch: checked before, fitted, and asked afterwards which measurement is wrong.
+
+`smooth` takes poses alone for unknown, `joint` the mounts, markers and clocks of the team with them.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
 from coloc_graph.backend.chain import compose, spanning_tree
 from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, agreement, innovation
 from coloc_graph.backend.estimate import Bump, Estimate, Refusal, make_estimate
-from coloc_graph.backend.factors import Factors, rows
+from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in, require_rigs
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.solver import Posterior, lm_parameters, optimise, with_stack
 from coloc_graph.measurements import RelativePose, Sighting
 from coloc_graph.team import Slip
+
+Array = NDArray[np.float64]
 
 #: A fit that noise alone makes this bad less often than this is looked into.
 LEAST_CHANCE_OF_ALL = 1e-4
@@ -25,6 +31,10 @@ TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)
 #: A bump must explain this much more chi2 than any wrong measurement to be called one.
 MORE_LIKELY = 1.1
 MOST_BUMPS = 3
+#: Of a run of so many stances the mounts are found in the first part of this many.
+LONG_RUN, PART = 80, 3
+#: Rounds of finding the mounts and taking spans apart there; mounts 3 degrees off take two.
+MOST_ANCHORINGS = 4
 #: Rounds of refusing the worst and taking back what then agrees.
 ROUNDS = 20
 
@@ -34,6 +44,7 @@ class _Fit:
     """A graph at its optimum; `links` are the last factors, in that order."""
 
     graph: PoseGraph
+    factors_of: Factors
     factors: gtsam.NonlinearFactorGraph
     links: tuple[Link, ...]
     values: gtsam.Values
@@ -46,9 +57,7 @@ class _Fit:
     @property
     def dof(self) -> int:
         """Rows that weigh, less unknowns."""
-        poses = int(self.values.size())
-        priors = 6 + Factors(self.graph.floor).pose_rows * (poses - 1)
-        return priors + sum(map(rows, self.links)) - 6 * poses
+        return self.factors_of.dof(self.values, [(link, self.factor(n)) for n, link in enumerate(self.links)])
 
     @property
     def chance(self) -> float:
@@ -65,7 +74,9 @@ class _Fit:
             if not isinstance(link, kinds):
                 continue
             factor = self.factor(index)
-            if len(self.links) > ALL_TESTED and 2 * factor.error(self.values) < chdtri(rows(link), LOOKED_INTO):
+            if len(self.links) > ALL_TESTED and 2 * factor.error(self.values) < chdtri(
+                self.factors_of.rows(link, factor), LOOKED_INTO
+            ):
                 continue
             found[index] = agreement(factor, self.values, posterior.joint(list(factor.keys())))
         return found
@@ -80,27 +91,39 @@ def smooth(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None 
     composition along the surest way. Raises `EstimationError` where the optimiser's answer does not pass its check,
     or no measurement ties anything to the reference.
     """
-    return with_stack(len(graph.nodes), lambda: _smooth(graph, refuse, start))
+    return with_stack(len(graph.nodes), lambda: _optimised("smooth", graph, refuse, start))
 
 
-def _smooth(graph: PoseGraph, refuse: bool, start: gtsam.Values | None) -> Estimate:
-    fit = _fit(graph, start)
+def joint(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None = None) -> Estimate:
+    """The most likely poses, mounts, markers and clocks together, given what the cameras saw.
+
+    Each homography is a factor on two poses and two mounts; mounts and markers have what the team states of them as
+    priors, and what is stated without a tolerance is taken for exact. Otherwise as `smooth`; raises `EstimationError`
+    also where the graph does not know the robots' mounts (`PoseGraph.rigs`).
+    """
+    require_rigs(graph.robots, graph.rigs)
+    return with_stack(len(graph.nodes), lambda: _optimised("joint", graph, refuse, start))
+
+
+def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Values | None) -> Estimate:
+    fit = _fit(method, graph, start)
     posterior = Posterior(fit.factors, fit.values)
     refused: tuple[Refusal, ...] = ()
     bumped: tuple[Bump, ...] = ()
     if refuse and _is_suspicious(fit, posterior):
-        bumped = _find_bumps(graph)
+        bumped = _find_bumps(method, graph)
         for bump in bumped:
             graph = _moved(graph, bump.stay_put)
-        refused = _find_wrong(graph)
+        refused = _find_wrong(method, graph)
         if refused or bumped:
-            fit = _fit(graph.without(one.measurement for one in refused))
+            fit = _fit(method, graph.without(one.measurement for one in refused))
             posterior = Posterior(fit.factors, fit.values)
     return make_estimate(
-        "smooth",
+        method,
         graph,
-        {int(key): fit.values.atPose3(key) for key in fit.values.keys()},  # noqa: SIM118  GTSAM's own
+        fit.values,
         posterior.covariances(),
+        variables=fit.factors_of.variables,
         chi2=fit.chi2,
         dof=fit.dof,
         iterations=fit.iterations,
@@ -109,15 +132,51 @@ def _smooth(graph: PoseGraph, refuse: bool, start: gtsam.Values | None) -> Estim
     )
 
 
-def _fit(graph: PoseGraph, start: gtsam.Values | None = None) -> _Fit:
-    factors_of = Factors(graph.floor)
-    initial = gtsam.Values()
+def _fit(method: Method, graph: PoseGraph, start: gtsam.Values | None = None) -> _Fit:
+    if method == "joint" and start is None:
+        start = _mounts_first(graph)
+    factors_of = factors_for(method, graph, start)
+    mounts = {} if start is None else calibrations_in(start)
+
+    def errors(key: int) -> Array:
+        return mounts.get(key, factors_of.nominal(key))
+
+    def expected(link: Link) -> gtsam.Pose3:
+        return factors_of.expected(link, errors) if mounts else link.T_i_j
+
     # also with a start: what it does not hold is composed, and what nothing ties any more is left out
-    for key, pose in compose(graph, spanning_tree(graph, graph.links), factors_of.start).items():
-        initial.insert(key, start.atPose3(key) if start is not None and start.exists(key) else pose)
-    factors, links = factors_of.of_graph(graph, initial.keys())
-    values, iterations = optimise(factors, initial)
-    return _Fit(graph, factors, links, values, iterations)
+    known = {} if start is None else {key: start.atPose3(key) for key in poses_in(start)}
+    values = gtsam.Values()
+    for key, pose in compose(graph, spanning_tree(graph, graph.links), factors_of.start, expected, known).items():
+        values.insert(key, pose)
+    iterations = 0
+    for _ in range(MOST_ANCHORINGS):
+        factors, links = factors_of.of_graph(graph, poses_in(values))
+        for key in factors_of.calibrated:
+            if not values.exists(key):
+                values.insert(key, errors(key))
+        values, used = optimise(factors, values)
+        iterations += used
+        # spans were taken apart for mounts as stated: once more where they turned out to be elsewhere
+        if factors_of.is_anchored(values):
+            break
+        factors_of = factors_for(method, graph, values)
+    return _Fit(graph, factors_of, factors, links, values, iterations)
+
+
+def _mounts_first(graph: PoseGraph) -> gtsam.Values | None:
+    """The mounts as a part of a long run has them, to compose all of it by; None where it is short.
+
+    With mounts a degree off each step is composed half a degree wrong, a hundred of them are a circle the wrong way
+    round, and no search in the poses of a whole run unbends that.
+    """
+    part = graph.up_to(len(graph.stances) // PART)
+    if len(graph.stances) < LONG_RUN or not spanning_tree(part, part.links):
+        return None
+    known = gtsam.Values()
+    for key, errors in calibrations_in(_fit("joint", part).values).items():
+        known.insert(key, errors)
+    return known
 
 
 def _is_suspicious(fit: _Fit, posterior: Posterior) -> bool:
@@ -138,13 +197,13 @@ def _scale(tested: Iterable[Agreement]) -> float:
     return max(1.0, float(np.median(ratios))) if ratios else 1.0
 
 
-def _find_wrong(graph: PoseGraph) -> tuple[Refusal, ...]:
+def _find_wrong(method: Method, graph: PoseGraph) -> tuple[Refusal, ...]:
     """The measurements that all others contradict."""
-    fit = _fit(graph)
-    doubted = _outliers(fit)
+    # poses alone for a start: GTSAM's optimiser copies its factors, which those that are Python cannot be
+    doubted = _outliers(_fit("smooth", graph))
     # twice the same set ends it, as does the last round
     for _ in range(ROUNDS):
-        fit = _fit(graph.without(doubted.values()))
+        fit = _fit(method, graph.without(doubted.values()))
         posterior = Posterior(fit.factors, fit.values)
         tested = fit.agreements(posterior, (RelativePose, Sighting))
         scale = _scale(tested.values())
@@ -184,9 +243,9 @@ def _outliers(fit: _Fit) -> dict[int, Link]:
 def _innovation(fit: _Fit, posterior: Posterior, link: Link) -> Agreement:
     """How a link that is not in the fit agrees with it; 0 of 0 where an end of it has no pose there."""
     i, j = map(fit.graph.places.key, link.ends)
-    if not (fit.values.exists(i) and fit.values.exists(j)):
+    factor = fit.factors_of.of_link(link, i, j)
+    if not all(map(fit.values.exists, factor.keys())):
         return Agreement(0.0, 0)
-    factor = Factors(fit.graph.floor).of_link(link, i, j)
     return innovation(factor, fit.values, posterior.joint(list(factor.keys())))
 
 
@@ -195,13 +254,13 @@ def _agrees(fit: _Fit, posterior: Posterior, link: Link, scale: float) -> bool:
     return _innovation(fit, posterior, link).chance(scale) >= LEAST_CHANCE
 
 
-def _find_bumps(graph: PoseGraph) -> tuple[Bump, ...]:
+def _find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
     """The anchors that did not stay put, the plainest first; none where a wrong measurement explains more."""
     slips = {robot: graph.slips.get(robot, TEST_SLIP) for robot in graph.robots}
     loose = replace(graph, slips=slips)
     bumps: list[Bump] = []
     for _ in range(MOST_BUMPS):
-        fit = _fit(loose)
+        fit = _fit(method, loose)
         tested = fit.agreements(Posterior(fit.factors, fit.values), (StayPut, RelativePose, Sighting))
         stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
         if not stays:
@@ -214,7 +273,7 @@ def _find_bumps(graph: PoseGraph) -> tuple[Bump, ...]:
         stay = fit.links[plainest]
         assert isinstance(stay, StayPut)
         loose = _moved(loose, stay)
-        moved = _fit(loose)
+        moved = _fit(method, loose)
         before, after = (moved.values.atPose3(loose.places.key(node)) for node in stay.ends)
         named = replace(stay, slip=graph.slips.get(stay.robot))
         bumps.append(Bump(named, before.between(after), stays[plainest].sigmas))

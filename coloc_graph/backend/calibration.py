@@ -1,0 +1,282 @@
+"""What a team carries and states with a tolerance, as variables: mounts, markers, clocks, stated planes."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from msgspec.structs import replace as with_fields
+from numpy.typing import NDArray
+
+from coloc_graph.measurements import RelativePose
+from coloc_graph.team import Markers, Mount, Robot, Team
+
+Array = NDArray[np.float64]
+
+#: What is stated with a tolerance, and called exact in one of its numbers, is exact to this [m, rad, relative].
+LEAST_SIGMA = 1e-6
+#: A tilt that is known to this much is where spans can be taken apart for good [rad].
+ANCHORED = float(np.deg2rad(0.25))
+#: A calibration further than this from what is stated is warned of [its sigma].
+FAR = 3.0
+
+#: Of mounts: height [m], tilt, roll [rad]. Of markers: span (relative), height [m]. Of the clocks of a pair: offset
+#: [s]. Of a plane: across it twice [rad], distance (relative).
+MOUNT, MARKERS, CLOCKS, PLANE = (ord(letter) for letter in "mkop")
+SIZES = {MOUNT: 3, MARKERS: 2, CLOCKS: 1, PLANE: 3}
+
+
+class Variables:
+    """The calibration variables of a team: their keys, and their standard deviations before anything is measured.
+
+    Each is an error (n,), of what is stated. What is stated without a tolerance is exact, and no variable.
+    """
+
+    def __init__(self, robots: tuple[str, ...], rigs: Mapping[str, Robot]) -> None:
+        self.rigs = rigs
+        self._numbers = {robot: number for number, robot in enumerate(robots, start=1)}
+        self._names = {number: robot for robot, number in self._numbers.items()}
+        self.sigmas: dict[int, Array] = {}
+        self.anchors: dict[int, Array] = {}
+
+    def mount(self, robot: str) -> int | None:
+        """The key of a robot's mount."""
+        m = self.rigs[robot].mount
+        return self._key(MOUNT, robot, 0, [m.height_sigma, *np.deg2rad([m.tilt_sigma_deg, m.roll_sigma_deg])])
+
+    def anchor(self, robot: str) -> tuple[Array, float]:
+        """What a robot's mount is thought to be off by where spans are taken apart, and how well its tilts are known
+        there [rad]: as stated, or as `anchors` have it."""
+        m = self.rigs[robot].mount
+        key = self.mount(robot)
+        if key in self.anchors:
+            return self.anchors[key], ANCHORED
+        return np.zeros(3), float(np.deg2rad(max(m.tilt_sigma_deg, m.roll_sigma_deg)))
+
+    def is_anchored(self, values: Mapping[int, Array]) -> bool:
+        """Whether all mounts are thought to be where they turn out to be, as nearly as it matters."""
+        return all(
+            np.abs((found - self.anchors.get(key, np.zeros(3)))[1:]).max() < ANCHORED
+            for key, found in values.items()
+            if self.is_mount(key)
+        )
+
+    def markers(self, robot: str) -> int | None:
+        """The key of a robot's markers."""
+        markers = self.rigs[robot].markers
+        assert markers is not None
+        relative = markers.span_sigma / markers.span if markers.span else 0.0
+        return self._key(MARKERS, robot, 0, [relative, markers.height_sigma])
+
+    def clocks(self, robot_i: str, robot_j: str, sigma: float) -> tuple[int | None, float]:
+        """The key of what is left of the offset of two clocks, and its sign for this order of them."""
+        first, second = sorted((robot_i, robot_j), key=self._numbers.__getitem__)
+        return self._key(CLOCKS, first, self._numbers[second], [sigma]), 1.0 if first == robot_i else -1.0
+
+    def plane(self, robot: str, stance: int, sigmas: Array) -> int | None:
+        """The key of a plane that was stated for a stance."""
+        return self._key(PLANE, robot, stance, sigmas.tolist())
+
+    def _key(self, kind: int, robot: str, index: int, sigmas: list[float]) -> int | None:
+        if not any(sigmas):
+            return None
+        key = int(gtsam.mrsymbol(kind, self._numbers[robot], index))
+        self.sigmas[key] = np.maximum(sigmas, LEAST_SIGMA)
+        return key
+
+    def prior(self, key: int) -> gtsam.NonlinearFactor:
+        """What is stated of a variable."""
+        sigmas = self.sigmas[key]
+        return gtsam.PriorFactorVector(key, np.zeros(len(sigmas)), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+    def start(self, key: int) -> Array:
+        """Where the search for a variable starts: as stated."""
+        return np.zeros(len(self.sigmas[key]))
+
+    def is_mount(self, key: int) -> bool:
+        """Whether a key is a mount's."""
+        return bool(gtsam.mrsymbolChr(key) == MOUNT)
+
+    def robot(self, key: int) -> str:
+        """Whose mount or markers a key is."""
+        return self._names[gtsam.mrsymbolLabel(key)]
+
+
+def is_calibration(key: int) -> bool:
+    """Whether a key is a calibration variable's, and not a pose's."""
+    return gtsam.mrsymbolChr(key) in SIZES
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedMount:
+    """A mount as it was stated and as it turned out: `errors` (3,) of height [m], tilt and roll [rad], `covariance`."""
+
+    key: int
+    robot: str
+    stated: Mount
+    errors: Array
+    covariance: Array
+
+    @property
+    def mount(self) -> Mount:
+        """The mount as it turned out, with what is left of its tolerances."""
+        sigmas = np.sqrt(self.covariance.diagonal())
+        (height, tilt, roll), (d_height, d_tilt, d_roll) = self.errors.tolist(), sigmas.tolist()
+        return with_fields(
+            self.stated,
+            height=self.stated.height + height,
+            tilt_deg=self.stated.tilt_deg + float(np.rad2deg(tilt)),
+            roll_deg=self.stated.roll_deg + float(np.rad2deg(roll)),
+            height_sigma=d_height,
+            tilt_sigma_deg=float(np.rad2deg(d_tilt)),
+            roll_sigma_deg=float(np.rad2deg(d_roll)),
+        )
+
+    @property
+    def rows(self) -> tuple["Row", ...]:
+        """Height, tilt and roll, one after the other."""
+        stated, found = self.stated, self.mount
+        return (
+            Row(self.robot, "height", "m", stated.height, stated.height_sigma, found.height, found.height_sigma),
+            Row(
+                self.robot, "tilt", "deg", stated.tilt_deg, stated.tilt_sigma_deg, found.tilt_deg, found.tilt_sigma_deg
+            ),
+            Row(
+                self.robot, "roll", "deg", stated.roll_deg, stated.roll_sigma_deg, found.roll_deg, found.roll_sigma_deg
+            ),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedMarkers:
+    """Markers as they were stated and as they turned out: `errors` (2,) of span (relative) and height [m]."""
+
+    key: int
+    robot: str
+    stated: Markers
+    errors: Array
+    covariance: Array
+
+    @property
+    def markers(self) -> Markers:
+        """The markers as they turned out, with what is left of their tolerances."""
+        longer, higher = self.errors.tolist()
+        d_span, d_height = np.sqrt(self.covariance.diagonal()).tolist()
+        s = self.stated
+        return with_fields(
+            s,
+            height=s.height + higher,
+            positions=tuple((x * (1 + longer), y * (1 + longer)) for x, y in s.positions),
+            span_sigma=(s.span or 0.0) * d_span,
+            height_sigma=d_height,
+        )
+
+    @property
+    def rows(self) -> tuple["Row", ...]:
+        """Span, where there is one, and height."""
+        s, f = self.stated, self.markers
+        rows = [Row(self.robot, "markers' height", "m", s.height, s.height_sigma, f.height, f.height_sigma)]
+        if s.span and f.span:
+            rows.insert(0, Row(self.robot, "span", "m", s.span, s.span_sigma, f.span, f.span_sigma))
+        return tuple(rows)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number as stated and as it turned out, each with its standard deviation, in `unit`."""
+
+    robot: str
+    what: str
+    unit: str
+    stated: float
+    stated_sigma: float
+    found: float
+    found_sigma: float
+
+    @property
+    def sigmas(self) -> float:
+        """How far it is from what was stated, in what that is known to; 0 where it was called exact."""
+        return abs(self.found - self.stated) / self.stated_sigma if self.stated_sigma else 0.0
+
+    def __str__(self) -> str:
+        digits = 4 if self.unit == "m" else 2
+        return (
+            f"{self.robot}: {self.what} {self.found:.{digits}f} +- {self.found_sigma:.{digits}f} {self.unit} "
+            f"(stated {self.stated:.{digits}f} +- {self.stated_sigma:.{digits}f})"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """All that was calibrated along with the poses: the variables' `values` and `covariances`, by key."""
+
+    variables: Variables | None = None
+    values: Mapping[int, Array] = field(default_factory=dict)
+    covariances: Mapping[int, Array] = field(default_factory=dict)
+
+    @cached_property
+    def mounts(self) -> dict[str, CalibratedMount]:
+        """By robot, those that were stated with a tolerance."""
+        return {
+            robot: CalibratedMount(key, robot, rig.mount, self.values[key], self.covariances[key])
+            for key, robot, rig in self._of(MOUNT)
+        }
+
+    @cached_property
+    def markers(self) -> dict[str, CalibratedMarkers]:
+        """By robot, those that were stated with a tolerance."""
+        return {
+            robot: CalibratedMarkers(key, robot, rig.markers, self.values[key], self.covariances[key])
+            for key, robot, rig in self._of(MARKERS)
+            if rig.markers is not None
+        }
+
+    def _of(self, kind: int) -> Iterable[tuple[int, str, Robot]]:
+        for key in sorted(self.values):
+            if self.variables is not None and gtsam.mrsymbolChr(key) == kind:
+                robot = self.variables.robot(key)
+                yield key, robot, self.variables.rigs[robot]
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """Every number of mounts and markers that had a tolerance."""
+        rows = [row for mount in self.mounts.values() for row in mount.rows]
+        rows += [row for markers in self.markers.values() for row in markers.rows]
+        return tuple(row for row in rows if row.stated_sigma > 0)
+
+    def of_team(self, team: Team) -> Team:
+        """The team with mounts and markers as they turned out, and with what is left of their tolerances."""
+        robots = []
+        for robot in team.robots:
+            mount, markers = self.mounts.get(robot.name), self.markers.get(robot.name)
+            robots.append(
+                with_fields(
+                    robot,
+                    mount=robot.mount if mount is None else mount.mount,
+                    markers=robot.markers if markers is None else markers.markers,
+                )
+            )
+        return with_fields(team, robots=tuple(robots))
+
+    @property
+    def far(self) -> tuple[Row, ...]:
+        """What is further from what was stated than its tolerance explains."""
+        return tuple(row for row in self.rows if row.sigmas > FAR)
+
+
+def sigmas_of_plane(measured: RelativePose) -> Array:
+    """Standard deviations (3,) of a stated plane: across it twice [rad], and of its distance (relative)."""
+    assert measured.plane is not None
+    turn = measured.plane.normal_sigma
+    return np.array([turn, turn, measured.plane.d_sigma / measured.plane.d])
+
+
+def loosened(rigs: Mapping[str, Robot], height_sigma: float) -> dict[str, Robot]:
+    """The same robots with mounts whose heights are known no better than that [m]."""
+    return {
+        name: with_fields(
+            robot, mount=with_fields(robot.mount, height_sigma=max(robot.mount.height_sigma, height_sigma))
+        )
+        for name, robot in rigs.items()
+    }

@@ -1,0 +1,192 @@
+"""The graph inside an estimator: ISAM2 with QR, what enters it, and what all others contradict taken out again."""
+
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from coloc_graph.backend.calibration import ANCHORED, is_calibration
+from coloc_graph.backend.chain import compose, spanning_tree
+from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, agreement, innovation
+from coloc_graph.backend.entering import Entering
+from coloc_graph.backend.factors import Factors
+from coloc_graph.backend.graph import Link, PoseGraph
+from coloc_graph.backend.solver import CALIBRATED, isam_parameters, joint_covariance, optimise, with_stack
+from coloc_graph.errors import EstimationError
+
+Array = NDArray[np.float64]
+
+#: With less chi2 than this in all that enters, nothing of it is refused, of however few degrees of freedom.
+CLEAR = float(chdtri(1, LEAST_CHANCE))
+#: So many steps at most lead to the optimum when something enters: a first stance with mounts a degree off takes 4.
+MOST_STEPS = 10
+
+
+class Entered(NamedTuple):
+    """A link and the factor that it is."""
+
+    link: Link
+    factor: gtsam.NonlinearFactor
+
+
+class LiveGraph:
+    """Poses that are `tied` to the reference, and calibration variables, kept optimised while links come in.
+
+    Not transactional: after an exception it is to be thrown away, and `rebuilt`.
+    """
+
+    def __init__(self, factors_of: Factors) -> None:
+        self.factors_of = factors_of
+        self.tied: set[int] = set()
+        self._calibrated: dict[int, Array] = {}  # calibration variables, where all was last linearised
+        self.isam = gtsam.ISAM2(isam_parameters(calibrates=factors_of.variables is not None))
+
+    def pose(self, key: int) -> gtsam.Pose3:
+        """T_world_body of a tied key."""
+        return self.isam.calculateEstimatePose3(key)
+
+    def covariance(self, key: int) -> Array:
+        """Its covariance (6, 6)."""
+        return np.asarray(self.isam.marginalCovariance(key))
+
+    def errors(self, key: int) -> Array:
+        """What a calibration variable is thought to be: as stated, as long as nothing asks for it."""
+        if key in self._calibrated:
+            return np.asarray(self.isam.calculateEstimateVector(key))
+        return self.factors_of.nominal(key)
+
+    def values(self) -> gtsam.Values:
+        """Everything, with all changes carried out."""
+        return self.isam.calculateBestEstimate()
+
+    def enter(self, entering: Entering) -> list[tuple[Link, Agreement]]:
+        """Put poses and links in; what all others contradict is left out, and comes back."""
+        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for key, pose in entering.start.items():
+            is_reference = not self.tied and not values.size()
+            values.insert(key, pose)
+            for factor in (self.factors_of.gauge(key),) if is_reference else self.factors_of.of_pose(key):
+                factors.add(factor)
+        made = [self.factors_of.of_link(*tie) for tie in (*entering.ties, *entering.near)]
+        far = {id(tie): self.factors_of.of_link(*tie) for tie in entering.far}
+        self._new_variables([*made, *far.values()], factors, values)
+        first = factors.size() + len(entering.ties)
+        for factor in made:
+            factors.add(factor)
+        # what the error rises by is at most what the new factors have before anything moves to please them
+        clear = not entering.near or 2 * factors.error(self._with_known(values, factors)) < CLEAR
+        indices = self._into_isam(factors, values) if factors.size() else []
+        inside = {index: Entered(tie[0], self.isam.getFactorsUnsafe().at(index))
+                  for index, tie in zip(indices[first:], entering.near, strict=True)}  # fmt: skip
+        refused = self._enter_far([Entered(tie[0], far[id(tie)]) for tie in entering.far], inside)
+        if entering.far or not clear:
+            refused += self._take_out(inside)
+        for key in entering.start:
+            if not np.isfinite(self.isam.calculateEstimatePose3(key).translation()).all():
+                raise EstimationError("a pose came out as not finite")
+        self.tied |= entering.start.keys()
+        self._anchor()
+        return refused
+
+    def _anchor(self) -> None:
+        """Once a mount's tilts are known well enough, spans that come in are taken apart for it as it is."""
+        variables = self.factors_of.variables
+        if variables is None:
+            return
+        for key in self._calibrated:
+            if variables.is_mount(key) and (
+                key in variables.anchors or np.sqrt(self.covariance(key).diagonal()[1:].max()) < ANCHORED
+            ):
+                variables.anchors[key] = self.errors(key)
+
+    def _new_variables(
+        self, made: list[gtsam.NonlinearFactor], factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> None:
+        """The calibration variables that factors ask for and that are not in yet: added with their priors."""
+        for key in sorted({key for factor in made for key in factor.keys()[2:]} - self._calibrated.keys()):
+            self._calibrated[key] = self.factors_of.nominal(key)
+            values.insert(key, self._calibrated[key])
+            factors.add(self.factors_of.calibration_prior(key))
+
+    def _into_isam(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> list[int]:
+        """Put factors in and optimise; their indices.
+
+        Where mounts turn out otherwise than thought, everything is linearised anew until they stay: poses shift with
+        them, and that far one step does not lead to the optimum.
+        """
+        indices = list(self.isam.update(factors, values).getNewFactorsIndices())
+        for _ in range(MOST_STEPS):
+            now = {key: self.errors(key) for key in self._calibrated}
+            if all(np.abs(now[key] - before).max() < CALIBRATED for key, before in self._calibrated.items()):
+                break
+            again = gtsam.ISAM2UpdateParams()
+            again.force_relinearize = True
+            self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), again)
+            self._calibrated = now
+        return indices
+
+    def _known(self, key: int) -> gtsam.Pose3 | Array:
+        return self.errors(key) if is_calibration(key) else self.isam.calculateEstimatePose3(key)
+
+    def _with_known(self, new: gtsam.Values, factors: gtsam.NonlinearFactorGraph) -> gtsam.Values:
+        """New variables where they start, and all others that factors are on where they are."""
+        values = gtsam.Values(new)
+        for key in map(int, factors.keyVector()):
+            if not values.exists(key):
+                values.insert(key, self._known(key))
+        return values
+
+    def _enter_far(self, far: list[Entered], inside: dict[int, Entered]) -> list[tuple[Link, Agreement]]:
+        """Put in what does not contradict what is known, and note it as `inside`; what does is refused."""
+        refused: list[tuple[Link, Agreement]] = []
+        passed: list[Entered] = []
+        factors = gtsam.NonlinearFactorGraph()
+        for one in far:
+            off = self._agreement(one, inside=False)
+            if off.chance() < LEAST_CHANCE:
+                refused.append((one.link, off))
+            else:
+                passed.append(one)
+                factors.add(one.factor)
+        if passed:
+            inside |= zip(self._into_isam(factors, gtsam.Values()), passed, strict=True)
+        return refused
+
+    def _take_out(self, inside: dict[int, Entered]) -> list[tuple[Link, Agreement]]:
+        """Take out what all others contradict, the worst first."""
+        refused: list[tuple[Link, Agreement]] = []
+        while inside:
+            among = {index: self._agreement(one) for index, one in inside.items()}
+            worst = min(among, key=lambda index: among[index].chance())
+            if among[worst].chance() >= LEAST_CHANCE:
+                break
+            refused.append((inside.pop(worst).link, among[worst]))
+            self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [worst])
+        return refused
+
+    def _agreement(self, one: Entered, *, inside: bool = True) -> Agreement:
+        values = gtsam.Values()
+        keys = list(map(int, one.factor.keys()))
+        for key in keys:
+            values.insert(key, self._known(key))
+        return (agreement if inside else innovation)(one.factor, values, joint_covariance(self.isam, keys))
+
+
+def rebuilt(graph: PoseGraph, factors_of: Factors) -> tuple[LiveGraph, tuple[Link, ...]]:
+    """A live graph of everything in a graph that is tied to the reference, at its optimum, and the links that are."""
+    live = LiveGraph(factors_of)
+    steps = spanning_tree(graph, graph.links)
+    initial = gtsam.Values()
+    poses = compose(graph, steps, factors_of.start) if steps else {graph.reference_key: gtsam.Pose3()}
+    for key, pose in poses.items():
+        initial.insert(key, pose)
+    factors, links = factors_of.of_graph(graph, poses)
+    for key in factors_of.calibrated:
+        initial.insert(key, factors_of.nominal(key))
+    values, _ = with_stack(len(poses), lambda: optimise(factors, initial))
+    live.isam.update(factors, values)
+    live.tied = set(poses)
+    live._calibrated = {key: values.atVector(key) for key in factors_of.calibrated}
+    return live, links

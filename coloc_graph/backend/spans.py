@@ -1,0 +1,111 @@
+"""Known spans of markers on a plane: a measurement of the plane's tilts and distance, and where its scale comes from.
+
+Of n instants three sums count, those that tell most about two tilts and the distance; which these are is decided at a
+plane that is nearly right, and then stays, so that the residual is a function of the plane alone.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.lie import across
+from coloc_graph.measurements import MarkerSpan
+
+Array = NDArray[np.float64]
+
+#: Rays that meet the plane at less than this sine, or than so many sigmas of its normal, say nothing of it.
+GRAZING, SIGMAS = 0.02, 3.0
+#: A normal that is known to this much tells noise in a length from its own error [rad].
+KNOWN = 5e-3
+#: So many instants at least make a span.
+FEWEST = 4
+
+
+def spans_on_plane(x_i: Array, n: Array) -> tuple[Array, Array, Array, Array]:
+    """Distances (k,) [m] on the plane n . X = 1 (n = N / d, (3,) [1/m]) of pairs of rays (x, y, 1), `x_i` (k, 2, 2).
+
+    With their derivatives by n (k, 3), the rays' ends X (k, 2, 3), and unit vectors (k, 3) from first to second.
+    Rays that do not meet the plane are taken to meet it far away.
+    """
+    rays = np.concatenate([x_i, np.ones((*x_i.shape[:-1], 1))], axis=-1)
+    X = rays / np.maximum(rays @ n, 1e-3 * math.sqrt(n @ n))[..., None]
+    arm = X[:, 1] - X[:, 0]
+    lengths = np.sqrt((arm * arm).sum(-1))
+    u = arm / lengths[:, None]
+    # dX/dn = -X X^T
+    along = (X @ u[:, :, None])[..., 0]
+    return lengths, along[:, :1] * X[:, 0] - along[:, 1:] * X[:, 1], X, u
+
+
+def _by_rays(X: Array, u: Array, n: Array) -> Array:
+    """How the distances change with x_i, (k, 2, 2)."""
+    along = X @ u[:, :, None]
+    by_x = X[..., 2:] * (u[:, None, :2] - along * n[:2])
+    return np.asarray(by_x * np.array([-1.0, 1.0])[:, None])
+
+
+def _lengthening(X: Array, u: Array, n: Array, covariance: Array) -> Array:
+    """What noise adds to the distances (k,), since across their line it makes each longer: (tr S - u^T S u) / 2 length,
+    with S the covariance of the line from one marker to the other."""
+    J = X[..., 2, None, None] * (np.eye(3)[:, :2] - X[..., None] * n[:2])
+    S = (J @ covariance @ J.mT).sum(axis=1)
+    arm = np.sqrt(((X[:, 1] - X[:, 0]) ** 2).sum(-1))
+    return np.asarray((np.trace(S, axis1=1, axis2=2) - np.einsum("ka,kab,kb->k", u, S, u)) / (2 * arm))
+
+
+@dataclass(frozen=True, eq=False)
+class SpanModel:
+    """The spans of one mover as a residual (m,) of covariance 1, m = 0 or 3: a function of the plane, the span and the
+    homography.
+
+    `weights` (m, k) @ (lengths - `noise` - span) + `by_h` (m, 8) @ h, at the k instants whose rays are clear of the
+    horizon. `noise` (k,) is what noise adds to each length.
+    """
+
+    mover: str
+    x_i: Array
+    noise: Array
+    weights: Array
+    by_h: Array
+
+    @classmethod
+    def near(cls, span: MarkerSpan, n: Array, normal_sigma: float, length: float) -> "SpanModel":
+        """That of a span of this `length` [m] about the plane n . X = 1 in camera i, whose normal is known to so much
+        [rad]."""
+        N = n / np.linalg.norm(n)
+        sine = (span.x_i @ N[:2] + N[2]) / np.sqrt(1 + (span.x_i**2).sum(-1))
+        clear = (sine > max(GRAZING, SIGMAS * normal_sigma)).all(axis=1)
+        if clear.sum() < FEWEST:
+            return cls(span.mover, span.x_i[:0], np.empty(0), np.empty((0, 0)), np.empty((0, 8)))
+        x_i, covariance = span.x_i[clear], span.covariance[clear]
+        lengths, by_n, X, u = spans_on_plane(x_i, n)
+        by_x = _by_rays(X, u, n)
+        if normal_sigma < KNOWN:
+            # weigh each length at the nearest rays that have it right: noise that makes a length longer would make
+            # its weight smaller, which over hundreds of instants is a bias of a tenth of a sigma
+            variance = np.einsum("nmk,nmkl,nml->n", by_x, covariance, by_x)
+            toward = np.einsum("nmkl,nml->nmk", covariance, by_x) * ((lengths - length) / variance)[:, None, None]
+            _, by_n, X, u = spans_on_plane(x_i - toward, n)
+            by_x = _by_rays(X, u, n)
+        sigma = np.sqrt(np.einsum("nmk,nmkl,nml->n", by_x, covariance, by_x))
+        J = np.stack([by_n @ side for side in (*across(N), N)], axis=1) / sigma[:, None]
+        weights = np.linalg.qr(J)[0].T / sigma
+        # what all rays to one marker share, and is no noise that averages out
+        shared = np.einsum("an,nmk,nmkq->amq", weights, by_x, span.shared[clear]).reshape(len(weights), -1)
+        weights = np.linalg.solve(np.linalg.cholesky(np.eye(len(weights)) + shared @ shared.T), weights)
+        return cls(
+            span.mover,
+            x_i,
+            _lengthening(X, u, n, covariance),
+            np.asarray(weights, float),
+            np.asarray(np.einsum("an,nmk,nmkh->ah", weights, by_x, span.by_h[clear]), float),
+        )
+
+    def at(self, n: Array, span: float) -> tuple[Array, Array, Array]:
+        """The residual (m,) but for h, and its derivatives by n (m, 3) and by the span (m,)."""
+        if not len(self.weights):
+            return np.empty(0), np.empty((0, 3)), np.empty(0)
+        lengths, by_n, _, _ = spans_on_plane(self.x_i, n)
+        return self.weights @ (lengths - self.noise - span), self.weights @ by_n, -self.weights.sum(axis=1)

@@ -1,0 +1,53 @@
+"""Two markers of a robot at the same instants in both images: what the joint estimate takes scale and tilt from."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.frontend.correspondence import Correspondences
+from coloc_graph.frontend.homography import HomographyFit
+from coloc_graph.frontend.refinement import PointPairs, linearise, point_rows
+from coloc_graph.measurements import MarkerSpan
+
+Array = NDArray[np.float64]
+
+
+def marker_span(
+    mover: str, tracks: tuple[int, int], found: Correspondences, fit: HomographyFit, bias: Array
+) -> MarkerSpan | None:
+    """The span of a mover's markers, which are camera i's `tracks`; None where no instant shows both.
+
+    `bias` (n, 2, q) is the square root of the covariance of what all points of one track share in camera i.
+    """
+    both = _same_instants(found, fit, tracks)
+    if not len(both):
+        return None
+    x, C, by_h = _from_both_images(found.pairs[both.ravel()], fit)
+    return MarkerSpan(
+        mover, x.reshape(-1, 2, 2), C.reshape(-1, 2, 2, 2), by_h.reshape(-1, 2, 2, 8), np.ascontiguousarray(bias[both])
+    )
+
+
+def _same_instants(found: Correspondences, fit: HomographyFit, tracks: Sequence[int]) -> NDArray[np.int64]:
+    """Which points (n, 2) are the two tracks' at the same instants."""
+    first, second = (np.flatnonzero(fit.inliers & (found.markers == track)) for track in tracks)
+    _, a, b = np.intersect1d(found.times[first], found.times[second], return_indices=True)
+    return np.stack([first[a], second[b]], axis=1)
+
+
+def _from_both_images(pairs: PointPairs, fit: HomographyFit) -> tuple[Array, Array, Array]:
+    """Where points are in image i by both images, x (n, 2), covariance (n, 2, 2), and what h adds to x (n, 2, 8).
+
+    The homography's own error comes from what the two images say differently, and this from what they say alike: at
+    the true h the two are independent.
+    """
+    C_i, C_j = pairs.covariance_i, pairs.covariance_j
+    if fit.dof > 0 and fit.chi2 > fit.dof + 3 * np.sqrt(2 * fit.dof):  # as the fit did with its information
+        C_i, C_j = C_i * (fit.chi2 / fit.dof), C_j * (fit.chi2 / fit.dof)
+    at = linearise(fit.H, pairs.x_i, pairs)
+    B = at.by_z
+    gain = C_i @ B.mT @ np.linalg.inv(C_j + B @ C_i @ B.mT)
+    x = pairs.x_i + (gain @ at.residual_j[..., None])[..., 0]
+    C = C_i - gain @ B @ C_i
+    return x, (C + C.mT) / 2, -gain @ point_rows(at, pairs.x_i)
