@@ -13,7 +13,7 @@ from coloc_graph import pipeline
 from coloc_graph.errors import ColocError, RunError, TeamError, TracksError
 from coloc_graph.exchange.tracks import ImportSummary, import_tracks
 from coloc_graph.inspection import inspect
-from coloc_graph.lie import floor_pose, se3, so3_exp
+from coloc_graph.lie import floor_pose, se3, se3_inverse, so3_exp, so3_log
 from coloc_graph.run import Motion, Stance, open_run
 from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Team, write_team
 
@@ -114,6 +114,37 @@ def test_stated_planes_give_the_pose_of_cameras_off_the_floor_exactly(files):
     assert run.planes[0].planes["A"] == pytest.approx((*N, d), abs=1e-12)
     solution = pipeline.solve(run, pipeline.SolveOptions(method="chain"))
     np.testing.assert_allclose(solution.estimate.pose("B", 0).matrix(), T_WORLD_B, atol=1e-6)
+
+
+def test_planes_that_are_stated_with_sigmas_are_found_along_with_the_pose(files):
+    """Eight boards before two cameras that never moved; each is stated 2 deg and 3 % off, and said to be."""
+    rng = np.random.default_rng(1)
+    T_world_c = MOUNT.T_body_camera
+    tracks, planes = [], "stance,robot,nx,ny,nz,d,normal_sigma_deg,d_sigma\n"
+    for k in range(8):
+        T_world_plane = se3(so3_exp(rng.normal((0.0, -0.3, 0.0), 0.25)), np.array([1.4, 0.0, 0.2]))
+        x, y = np.meshgrid(np.linspace(-0.25, 0.25, 4), np.linspace(-0.25, 0.25, 4))
+        flat = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+        points = flat @ T_world_plane[:3, :3].T + T_world_plane[:3, 3]
+        N = T_world_c[:3, :3].T @ T_world_plane[:3, 2]
+        d = N @ (T_world_c[:3, :3].T @ (T_world_plane[:3, 3] - T_world_c[:3, 3]))
+        off = so3_exp(np.deg2rad(2.0) * rng.normal(size=3)) @ (N * np.sign(d))
+        stated = (*off, abs(d) * (1 + 0.03 * rng.normal()), 2.0, 0.03 * abs(d))
+        planes += f"{k},A," + ",".join(f"{value:.12f}" for value in stated) + "\n"
+        for robot, T in (("A", T_world_c), ("B", T_WORLD_B @ T_world_c)):
+            tracks += rows(k, robot, seen(T, points), T0 + 10 * k)
+    files.bring_in(HEADER + "".join(tracks), planes=planes, moves=MOVES, of=team(markers_on=()))
+    run = open_run(files.out)
+    normal_sigma, d_sigma = run.planes[3].sigmas["A"]
+    assert normal_sigma == pytest.approx(np.deg2rad(2.0)) and 0.02 < d_sigma / run.planes[3].planes["A"][3] < 0.04
+
+    estimate = pipeline.solve(run).estimate
+    T = se3_inverse(T_WORLD_B) @ estimate.pose("B", 0).matrix()
+    shift, turn = np.linalg.norm(T[:3, 3]), np.linalg.norm(so3_log(T[:3, :3]))
+    # the tilts come out of the homographies by themselves, the scale from eight distances
+    length = np.linalg.norm(T_WORLD_B[:3, 3])
+    assert turn < 1e-3 and shift < 3 * 0.03 / np.sqrt(8) * length and len(estimate.calibration.values) == 8
+    assert estimate.chi2 / estimate.dof < 2
 
 
 def test_what_is_read_back_is_what_was_given(files):
@@ -263,7 +294,11 @@ BAD = {
     "not UTF-8": ({"tracks": HEADER.encode() + b"0,1,A,\xff,9,9\n"}, "line 2: is not UTF-8 text"),
     "UTF-16": ({"tracks": OK.encode("utf-16")}, "line 1: is not UTF-8 text; save the tracks as CSV in UTF-8"),
     "open quote": ({"tracks": HEADER + '0,1,A,"x,9,9\n'}, "line 2: is not CSV"),
-    "planes header": ({"planes": "stance,robot,n\n"}, "planes.csv, line 1: the header is .* `stance,robot,nx,ny,nz,d`"),
+    "planes header": ({"planes": "stance,robot,n\n"}, r"line 1: the header is .* `stance,robot,nx,ny,nz,d\[,normal"),
+    "planes sigma": (
+        {"planes": PLANES[:-1] + ",normal_sigma_deg,d_sigma\n0,A,0,0,1,1,-1,0\n"},
+        "`normal_sigma_deg` is -1",
+    ),
     "planes only a header": ({"planes": PLANES}, "planes.csv: has a header and no rows"),
     "normal not unit": (
         {"planes": PLANES + "0,A,0,0,1.002,1\n"},

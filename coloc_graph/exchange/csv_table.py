@@ -83,20 +83,20 @@ def first(wrong: NDArray[np.bool_]) -> int | None:
     return int(wrong.argmax()) if wrong.any() else None
 
 
-def read_table(path: Path, what: str, header: Sequence[str], *, optional: str | None = None) -> Table:
-    """The table in a UTF-8 CSV file with exactly this header, and perhaps one `optional` column after it.
+def read_table(path: Path, what: str, header: Sequence[str], *, optional: Sequence[str] = ()) -> Table:
+    """The table in a UTF-8 CSV file with exactly this header, and perhaps the `optional` columns after it.
 
     Blank lines, spaces around cells, a byte order mark and Windows line ends are accepted. Raises `TracksError`
     for a file that cannot be read or decoded, is empty, or whose header or a row has other columns; `what`
     names the kind of file in the sentence.
     """
-    expected = ",".join(header) + (f"[,{optional}]" if optional else "")
+    expected = ",".join(header) + (f"[,{','.join(optional)}]" if optional else "")
     rows, lines = _rows(path, _text(path, what))
     if not rows:
         raise TracksError(f"{path}: is empty; begin it with the header {expected}")
     found = rows.pop(0)
     line = lines.pop(0)
-    if found not in ([*header], [*header, optional]):
+    if found not in ([*header], [*header, *optional]):
         raise TracksError(f"{path}, line {line}: the header is {_quoted(','.join(found))}; it must be `{expected}`")
     for row, at in zip(rows, lines, strict=True):
         if len(row) != len(found):

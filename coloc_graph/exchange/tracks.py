@@ -17,7 +17,7 @@ from coloc_graph.team import Team, read_team
 Array = NDArray[np.float64]
 
 TRACKS_HEADER = ("stance", "time", "robot", "marker", "u", "v")
-PLANES_HEADER = ("stance", "robot", "nx", "ny", "nz", "d")
+PLANES_HEADER, PLANES_SIGMAS = ("stance", "robot", "nx", "ny", "nz", "d"), ("normal_sigma_deg", "d_sigma")
 MOVES_HEADER = ("stance", "robot")
 
 #: A run counts nanoseconds in 63 bits; later times are milliseconds or nanoseconds given as seconds [s].
@@ -68,7 +68,8 @@ def import_tracks(
     `tracks_path` has the columns stance, time [UTC s], robot (whose camera saw it), marker (any name; the same
     name in two cameras is the same marker), u, v [px], and perhaps sigma [px], one standard deviation an axis
     (`Camera.noise_px` where there is none). `planes_path` has stance, robot, nx, ny, nz, d: the marker plane
-    N . X = d in that robot's camera frame, N a unit normal from the camera to the plane, d > 0 [m].
+    N . X = d in that robot's camera frame, N a unit normal from the camera to the plane, d > 0 [m]; and perhaps
+    normal_sigma_deg, d_sigma [m]: how well that is known, from which the joint estimate goes on.
     `moves_path` has stance, robot: this robot moved since the stance before; observers that are not listed
     stayed put. Without it all observers are taken to have stayed put, with a warning.
 
@@ -105,7 +106,7 @@ def _require_other_file(out: Path, *inputs: str | Path | None) -> None:
 
 
 def _read_tracks(path: Path, team: Team) -> _Tracks:
-    table = read_table(path, "tracks", TRACKS_HEADER, optional="sigma")
+    table = read_table(path, "tracks", TRACKS_HEADER, optional=("sigma",))
     if not len(table):
         raise TracksError(f"{path}: has a header and no rows; add one row for each marker in each image")
     robot = table.robots(team)
@@ -226,9 +227,17 @@ def _no_stance(stance: int, tracks: _Tracks) -> str:
     return f"there is no stance {stance} in {tracks.table.path}"
 
 
-def _read_planes(path: Path, team: Team, tracks: _Tracks) -> dict[int, dict[str, tuple[float, float, float, float]]]:
+@dataclass(frozen=True)
+class _Plane:
+    """N . X = d, and its standard deviations: of the normal [rad] and of d [m], None where none are given."""
+
+    plane: tuple[float, float, float, float]
+    sigmas: tuple[float, float] | None
+
+
+def _read_planes(path: Path, team: Team, tracks: _Tracks) -> dict[int, dict[str, _Plane]]:
     """The planes by stance and robot; normals are made exactly unit."""
-    table = read_table(path, "planes", PLANES_HEADER)
+    table = read_table(path, "planes", PLANES_HEADER, optional=PLANES_SIGMAS)
     if not len(table):
         raise TracksError(
             f"{path}: has a header and no rows; add one row for each stance and observer, or leave it out"
@@ -248,15 +257,28 @@ def _read_planes(path: Path, team: Team, tracks: _Tracks) -> dict[int, dict[str,
             f"`d` is {table.columns['d'][row]}; give the distance from the camera to the plane in metres, above 0, "
             "with the normal pointing from the camera to the plane",
         )
-    planes: dict[int, dict[str, tuple[float, float, float, float]]] = {}
+    sigmas = _plane_sigmas(table)
+    planes: dict[int, dict[str, _Plane]] = {}
     for row, (stance, place) in enumerate(zip(stances.tolist(), places.tolist(), strict=True)):
         robot = team.names[place]
         _require_seen_in_front(table, row, tracks, stance, place, N[row], team)
         if robot in planes.setdefault(stance, {}):
             raise table.error(row, f"the plane of robot `{robot}` at stance {stance} is there twice; state it once")
         nx, ny, nz = (N[row] / length[row]).tolist()
-        planes[stance][robot] = (nx, ny, nz, float(d[row]))
+        planes[stance][robot] = _Plane((nx, ny, nz, float(d[row])), None if sigmas is None else sigmas[row])
     return planes
+
+
+def _plane_sigmas(table: Table) -> list[tuple[float, float]] | None:
+    if PLANES_SIGMAS[0] not in table.columns:
+        return None
+    given = [table.numbers(name) for name in PLANES_SIGMAS]
+    for name, values in zip(PLANES_SIGMAS, given, strict=True):
+        row = first(values < 0)
+        if row is not None:
+            what = f"`{name}` is {table.columns[name][row]}; give a standard deviation, 0 for what is exact"
+            raise table.error(row, what)
+    return list(zip(np.deg2rad(given[0]).tolist(), given[1].tolist(), strict=True))
 
 
 def _require_seen_in_front(
@@ -298,9 +320,7 @@ def _stances(
     return stances
 
 
-def _require_planes(
-    path: Path, stances: list[Stance], planes: Mapping[int, dict[str, tuple[float, float, float, float]]]
-) -> None:
+def _require_planes(path: Path, stances: list[Stance], planes: Mapping[int, dict[str, _Plane]]) -> None:
     """`TracksError` where no stance has a marker plane: no mover of the team carries markers, and none is stated."""
     if planes or any(stance.movers for stance in stances):
         return
@@ -314,7 +334,7 @@ def _write(
     writer: RunWriter,
     tracks: _Tracks,
     stances: list[Stance],
-    planes: Mapping[int, dict[str, tuple[float, float, float, float]]],
+    planes: Mapping[int, dict[str, _Plane]],
     moved: Mapping[int, tuple[str, ...]],
     progress: Callable[[int, int], None] | None,
 ) -> None:
@@ -326,7 +346,9 @@ def _write(
             writer.write(Motion(robot, stance.start, False))
         writer.write(stance)
         if stance.index in planes:
-            writer.write(Planes(stance.index, stance.start, planes[stance.index]))
+            here = planes[stance.index]
+            sigmas = {robot: one.sigmas for robot, one in here.items() if one.sigmas is not None}
+            writer.write(Planes(stance.index, stance.start, {robot: one.plane for robot, one in here.items()}, sigmas))
         for detections in _detections(tracks, stance.index, writer.team):
             writer.write(detections)
             done += len(detections.uv)

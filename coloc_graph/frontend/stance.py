@@ -233,7 +233,8 @@ def stance_plane(run: Run, stance: Stance, robot: str) -> Plane:
     stated = run.planes.get(stance.index)
     if stated is not None and robot in stated.planes:
         *normal, d = stated.planes[robot]
-        return Plane(N=np.array(normal), d=d)
+        normal_sigma, d_sigma = stated.sigmas.get(robot, (0.0, 0.0))
+        return Plane(N=np.array(normal), d=d, normal_sigma=normal_sigma, d_sigma=d_sigma)
     markers = stance_markers(run, stance)
     if markers is None:
         raise DegenerateGeometry(

@@ -81,7 +81,7 @@ def decode_stance(ns: int, data: memoryview) -> Stance:
 def decode_planes(ns: int, data: memoryview) -> Planes:
     """The marker planes of one stance."""
     wire = _json(data, schemas.PlanesWire)
-    planes = Planes(wire.stance, schemas.to_seconds(ns), wire.planes)
+    planes = Planes(wire.stance, schemas.to_seconds(ns), wire.planes, wire.sigmas)
     try:
         check_planes(planes, f"the planes of stance {planes.stance}")
     except RunError as error:

@@ -150,7 +150,8 @@ def check_stance(stance: Stance, where: str) -> None:
 def _planes(record: Planes) -> schemas.PlanesWire:
     check_planes(record, f"the planes of stance {record.stance}")
     planes = {robot: _four(plane) for robot, plane in record.planes.items()}
-    return schemas.PlanesWire(stance=int(record.stance), planes=planes)
+    sigmas = {robot: (float(normal), float(d)) for robot, (normal, d) in record.sigmas.items()}
+    return schemas.PlanesWire(stance=int(record.stance), planes=planes, sigmas=sigmas)
 
 
 def _four(plane: Any) -> tuple[float, float, float, float]:
@@ -166,6 +167,10 @@ def check_planes(planes: Planes, where: str) -> None:
             raise RunError(f"{where}: that of `{robot}` is not four finite numbers; give (nx, ny, nz, d)")
         if abs(np.linalg.norm(values[:3]) - 1) > 1e-3 or values[3] <= 0:
             raise RunError(f"{where}: that of `{robot}` needs a unit normal and d > 0; give (nx, ny, nz, d)")
+    for robot, sigmas in planes.sigmas.items():
+        values = np.asarray(sigmas, float)
+        if robot not in planes.planes or values.shape != (2,) or not (np.isfinite(values) & (values >= 0)).all():
+            raise RunError(f"{where}: the sigmas of `{robot}` are not those of a plane; give two numbers, 0 or above")
 
 
 def _image(record: Image, image_format: ImageFormat) -> bytes:

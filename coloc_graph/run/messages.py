@@ -91,9 +91,11 @@ class Stance:
 class Planes:
     """The marker plane of one stance as stated, where it is not the mounts': per robot unit normal and distance.
 
-    `planes` maps an observer to (nx, ny, nz, d): N . X = d in that robot's camera frame, d > 0 [m].
+    `planes` maps an observer to (nx, ny, nz, d): N . X = d in that robot's camera frame, d > 0 [m]. `sigmas` maps it to
+    the standard deviations of the normal [rad] and of d [m], where the plane is not exact.
     """
 
     stance: int
     time: float
     planes: dict[str, tuple[float, float, float, float]] = field(default_factory=dict)
+    sigmas: dict[str, tuple[float, float]] = field(default_factory=dict)

@@ -71,10 +71,11 @@ class StanceWire(Wire, frozen=True):
 
 
 class PlanesWire(Wire, frozen=True):
-    """Per observer (nx, ny, nz, d) with N . X = d in its camera frame, d > 0 [m]."""
+    """Per observer (nx, ny, nz, d) with N . X = d in its camera frame, d > 0 [m]; sigmas of the normal [rad], d [m]."""
 
     stance: int
     planes: dict[str, tuple[float, float, float, float]]
+    sigmas: dict[str, tuple[float, float]] = {}
 
 
 #: What the last part of `/<robot>/...` may be, with the schemas a message of it can have.
