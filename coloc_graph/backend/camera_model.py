@@ -146,7 +146,7 @@ class HomographyModel:
         if level is not None:
             near = zip(spans, self._lengths, strict=True)
             self.spans = tuple(SpanModel.near(one, level.n, tilt_sigma, length) for one, length in near)
-        self._H_inverse = np.linalg.inv(measured.H_j_i)
+        self._H_inverse: Array = np.asarray(np.linalg.inv(measured.H_j_i), float)
         b = measured.by_time_offset
         self._by_offset = np.zeros(8) if b is None else b
         # with the offset as a variable of its own the information is that at the right offset
@@ -187,12 +187,8 @@ class HomographyModel:
         if i is None or j is None:
             return None
         H = j.P @ i.P_inverse
-        E = self._H_inverse @ H
-        scale = np.linalg.det(E)
-        if not scale > 1e-9:
-            return None
-        h = sl3_log(E / np.cbrt(scale))
-        if not np.isfinite(h).all():
+        h = _off(self._H_inverse, H)
+        if h is None:
             return None
         e = self._by_h @ (h - offset * self._by_offset)
         at_spans = []
@@ -232,6 +228,16 @@ class HomographyModel:
 
     def _errors(self, markers: tuple[Array, ...]) -> list[Array]:
         return [markers[self.movers.index(one.mover)] for one in self.spans]
+
+
+def _off(H_measured_inverse: Array, H: Array) -> Array | None:
+    """The coordinates (8,) of a homography in those of the measured one; None where it is beyond all bounds."""
+    E = H_measured_inverse @ H
+    scale = np.linalg.det(E)
+    if not scale > 1e-9:
+        return None
+    h = sl3_log(E / np.cbrt(scale))
+    return h if np.isfinite(h).all() else None
 
 
 def _inverse(T: Array) -> Array:
@@ -282,12 +288,8 @@ class StatedPlaneModel:
         T_bj_bi = _inverse(T_world_j) @ T_world_i
         T_cj_ci = T_cj_bj @ T_bj_bi @ T_bi_ci
         H = T_cj_ci[:3, :3] + np.outer(T_cj_ci[:3, 3], n)
-        E = H_inverse @ H
-        scale = np.linalg.det(E)
-        if not scale > 1e-9:
-            return None
-        h = sl3_log(E / np.cbrt(scale))
-        if not np.isfinite(h).all():
+        h = _off(H_inverse, H)
+        if h is None:
             return None
         by_h = root @ sl3_log_derivative(h)
         back = np.linalg.inv(H)
