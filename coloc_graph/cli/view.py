@@ -1,0 +1,66 @@
+"""coloc view RUN|DIR."""
+
+import argparse
+
+
+def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """The command's arguments."""
+    command = commands.add_parser(
+        "view",
+        help="see a result, or a run that is solved for it, in the browser",
+        description="See a result, or a run that is solved for it, in the browser: robots, graph, covariances, and what "
+        "is behind each edge. Ctrl-C ends it.",
+    )
+    command.add_argument("path", metavar="RUN|DIR", help="a run (.mcap), or a result of `coloc solve`")
+    command.add_argument("--run", dest="run_path", metavar="RUN", help="the run of a result, if it is no longer there")
+    command.add_argument("--compare", metavar="DIR2", help="another result of the same run, beside the first")
+    command.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
+    command.add_argument("--port", type=int, default=8080)
+    command.add_argument("--no-browser", action="store_true", help="do not open a browser")
+    command.add_argument("--dark", action="store_true", help="dark colours")
+    command.add_argument(
+        "--export", metavar="HTML", help="write what is shown to one page that needs no server, and end"
+    )
+    command.add_argument("--png", metavar="PNG", help="write a picture of it, and end; needs Chromium")
+    command.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make the scene, show it."""
+    import sys
+    import webbrowser
+
+    from coloc_graph.cli.printing import progress, warn
+    from coloc_graph.run import open_run
+    from coloc_graph.viewer import Viewer, is_run, scene_of_result, scene_of_run, with_other
+    from coloc_graph.viewer.app import missing_images
+    from coloc_graph.viewer.browser import write_png
+    from coloc_graph.viewer.server import is_loopback, require_free
+
+    writes = bool(args.export or args.png)
+    port = 0 if writes else args.port
+    require_free(args.host, port)  # before the work, not after it
+    if is_run(args.path):
+        with progress("measurements made") as report:
+            scene = scene_of_run(open_run(args.path), report)
+    else:
+        scene = scene_of_result(args.path, args.run_path)
+    if args.compare:
+        scene = with_other(scene, args.compare)
+    warn([note for note in [missing_images(scene)] if note])
+    if not is_loopback(args.host) and not writes:
+        warn([f"whoever reaches {args.host} can see and steer this viewer: it has no password"])
+    with Viewer(scene, host="127.0.0.1" if writes else args.host, port=port, dark=args.dark) as viewer:
+        if args.export:
+            viewer.export(args.export)
+            print(args.export)
+        if args.png:
+            write_png(viewer, args.png)
+            print(args.png)
+        if writes:
+            return 0
+        print(f"{viewer.url} (Ctrl-C ends it)", flush=True)
+        if not args.no_browser and sys.stdout.isatty():
+            webbrowser.open(viewer.url)
+        viewer.wait_closed()
+    return 0

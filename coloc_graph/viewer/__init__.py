@@ -1,0 +1,14 @@
+"""The viewer: the team, its graph and its doubt in a browser. `Scene` is what is shown, `Viewer` shows it.
+
+`scene`, `sources`, `motion`, `frame`, `plots`, `inspect` and `live` are numpy alone; the other modules know viser.
+"""
+
+from coloc_graph.viewer.app import Viewer
+from coloc_graph.viewer.live import LiveStance
+from coloc_graph.viewer.scene import Edges, Layer, Scene
+from coloc_graph.viewer.sources import is_run, scene_of_estimate, scene_of_result, scene_of_run, with_other
+
+__all__ = [
+    "Edges", "Layer", "LiveStance", "Scene", "Viewer", "is_run", "scene_of_estimate", "scene_of_result", "scene_of_run",
+    "with_other",
+]  # fmt: skip

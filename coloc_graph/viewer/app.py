@@ -1,0 +1,369 @@
+"""The viewer: a server, a panel, and one thread that computes what is shown and alone touches the handles."""
+
+import itertools
+import threading
+import time
+import traceback
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+
+from coloc_graph.errors import ColocError
+from coloc_graph.frontend import PairMeasurement, measure_pair
+from coloc_graph.viewer import inspect
+from coloc_graph.viewer.frame import NO_LINES, Frame, Lines, ViewState, frame_of, pick
+from coloc_graph.viewer.handles import GraphView, Image, initial_camera
+from coloc_graph.viewer.live import LiveScene, LiveStance
+from coloc_graph.viewer.panel import NOBODY, Panel
+from coloc_graph.viewer.scene import Scene
+from coloc_graph.viewer.server import start_server, stop_server, url_of
+from coloc_graph.viewer.worker import Failure, Worker
+
+#: Frames are at least this far apart, so that the server comes to send them; what rests is shown whole after [s].
+BETWEEN_FRAMES, UNTIL_REST = 0.03, 0.35
+#: Live stances are put together at most this often [s].
+BETWEEN_GROWTHS = 0.25
+
+
+class Viewer:
+    """Shows a scene to browsers until it is closed; a context manager.
+
+    Callbacks and `publish` only leave a note and wake the render thread. Raises `InputError` where it cannot listen.
+    """
+
+    def __init__(self, scene: Scene, *, host: str = "127.0.0.1", port: int = 8080, dark: bool = False) -> None:
+        self._scene = scene
+        self.server = start_server(host, port, scene.title or "coloc")
+        self.url = url_of(host, self.server.get_port())
+        self._asked: deque[tuple[str, float]] = deque()
+        self._news: deque[Scene | LiveStance] = deque()
+        self._changed = threading.Condition()
+        self._awake, self._ending = True, False
+        self._idle = threading.Event()
+        self._time = scene.middle(len(scene) - 1)
+        self._moved_at = 0.0
+        self._picked: tuple[str, int] | None = None
+        self._followed: tuple[str, Any] | None = None
+        self._images: dict[str, Image | None] = {}
+        self._ways: tuple[Lines, Lines] = (NO_LINES, NO_LINES)
+        self._measured: dict[tuple[int, str, str], PairMeasurement] = {}
+        self._live = LiveScene(scene)
+        self._grown_at = 0.0
+        self._told: set[str] = set()
+        self._note = missing_images(scene)
+        self.frame: Frame | None = None
+        self.frame_seconds = 0.0
+        try:
+            compares = any(layer.aside for layer in scene.layers)
+            self.panel = Panel(self.server, scene, self._ask, fitting_sigma(scene), compares=compares)
+            self.panel.dark.value = dark
+            self.view = GraphView(self.server, scene, dark)
+            self._dark = False
+            initial_camera(self.server, scene)
+            self.server.scene.on_click()(self._clicked)
+        except BaseException:
+            stop_server(self.server)
+            raise
+        self._worker = Worker(self._wake)
+        self._thread = threading.Thread(target=self._run, name="viewer-render", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> "Viewer":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the threads and the server."""
+        if self._ending:
+            return
+        with self._changed:
+            self._ending = True
+            self._changed.notify()
+        self._thread.join(timeout=10)
+        self._worker.close()
+        stop_server(self.server)
+
+    def publish(self, news: Scene | LiveStance) -> None:
+        """Show a stance that has just entered, or another scene of the same robots. Costs the caller no work."""
+        self._news.append(news)
+        self._wake()
+
+    def go(self, row: int) -> None:
+        """Show a stance, by its row."""
+        self._ask("stance", row)
+
+    def pick(self, what: tuple[str, int] | None) -> None:
+        """Pick an edge or a robot, as a click does: ("edge", its number), ("robot", its number)."""
+        self._picked = what
+        self._wake()
+
+    @property
+    def scene(self) -> Scene:
+        """What is shown."""
+        return self._scene
+
+    def wait_closed(self) -> None:
+        """Wait until it is closed from elsewhere, or interrupted by Ctrl-C, which ends the wait without a word."""
+        try:
+            while self._thread.is_alive():
+                self._thread.join(timeout=0.5)
+        except KeyboardInterrupt:
+            return
+
+    def wait_idle(self, timeout: float = 30.0) -> bool:
+        """Wait until everything that was asked for is shown, images and all."""
+        return self._idle.wait(timeout)
+
+    def html(self) -> str:
+        """What is shown, as one HTML page that needs no server."""
+        self.wait_idle()
+        return self.server.scene.as_html(dark_mode=self.panel.dark.value)
+
+    def export(self, path: str | Path) -> None:
+        """Write that page."""
+        Path(path).write_text(self.html(), encoding="utf-8")
+
+    # what callbacks may do
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._awake = True
+            self._idle.clear()
+            self._changed.notify()
+
+    def _ask(self, what: str, value: float) -> None:
+        self._asked.append((what, value))
+        self._wake()
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        if self.frame is not None:
+            self.pick(pick(self.frame, event.ray_origin, event.ray_direction))
+
+    # the render thread
+
+    def _run(self) -> None:
+        played_at = time.perf_counter()
+        pending = True
+        while True:
+            with self._changed:
+                playing = self.panel.play.value
+                resting = time.perf_counter() - self._moved_at > UNTIL_REST
+                if not (playing or self._awake or pending):
+                    self._idle.set()
+                self._changed.wait_for(
+                    lambda: self._awake or self._ending,
+                    timeout=0 if playing else UNTIL_REST if pending or not resting or self._news else None,
+                )
+                if self._ending:
+                    return
+                self._awake = False
+            now = time.perf_counter()
+            try:
+                pending = self._step(now - played_at if playing else 0.0)
+            except Exception as error:  # a thread that has died would look like a viewer that hangs
+                traceback.print_exc()
+                self._notify("The viewer failed", f"{type(error).__name__}: {error}")
+                pending = False
+            played_at = now
+            self.frame_seconds = time.perf_counter() - now
+            time.sleep(max(BETWEEN_FRAMES - self.frame_seconds, 0.005))
+
+    def _step(self, played: float) -> bool:
+        """One frame; True where another is due, since something rests or is still being made."""
+        self._grow()
+        self._move(played)
+        scene, panel = self._scene, self.panel
+        if panel.dark.value != self._dark:
+            self._dark = panel.dark.value
+            panel.dress(self._dark)
+            self.view.dress(scene, self._dark)
+        rests = time.perf_counter() - self._moved_at > UNTIL_REST
+        low, high = scene.bounds()
+        state = ViewState(
+            time=self._time,
+            shown=panel.shown,
+            ellipses=panel.ellipses.value,
+            wedges=panel.wedges.value,
+            edges=panel.edges.value,
+            stays=panel.stays.value,
+            k_sigma=float(panel.k_sigma.value),
+            picked=self._picked[1] if self._picked and self._picked[0] == "edge" else None,
+            aside=float(high[1] - low[1] + 0.5) if panel.beside.value else 0.0,
+            dark=self._dark,
+            rests=rests,
+        )
+        frame = frame_of(scene, state)
+        waiting = self._look(frame, rests)
+        ways = self._ways if panel.markers.value else (NO_LINES, NO_LINES)
+        self.view.apply(frame, state, self._images, *ways)
+        self.frame = frame
+        panel.tell(scene, frame, self._time, self._note)
+        panel.plot(scene, frame.row)
+        waiting |= self._inspect(frame)
+        self._follow(frame)
+        return waiting or not rests
+
+    def _grow(self) -> None:
+        """Take in what was published."""
+        if not self._news or time.perf_counter() - self._grown_at < BETWEEN_GROWTHS:
+            return
+        at_end = self._scene.row_at(self._time) == len(self._scene) - 1
+        grown: Scene | None = None
+        while self._news:
+            one = self._news.popleft()
+            if isinstance(one, Scene):
+                grown = one
+            else:
+                self._live.add(one)
+                grown = None
+        first = not len(self._scene)
+        try:
+            self._scene = grown if grown is not None else self._live.scene()
+        except ColocError as error:
+            self._notify("A stance cannot be shown", str(error))
+            return
+        self.view.adopt(self._scene)
+        self.view.dress(self._scene, self._dark)
+        self.panel.adopt(self._scene)
+        self._measured.clear()
+        if at_end:
+            self._time = self._scene.middle(len(self._scene) - 1)
+        if first:
+            initial_camera(self.server, self._scene)
+        self._grown_at = time.perf_counter()
+
+    def _move(self, played: float) -> None:
+        """Time, by what was asked for and by playing."""
+        scene, before = self._scene, self._time
+        if not len(scene):
+            self._asked.clear()
+            return
+        while self._asked:
+            what, value = self._asked.popleft()
+            if what == "stance":
+                self._time = scene.middle(min(int(value), len(scene) - 1))
+            elif what == "time":
+                self._time = float(scene.starts[0]) + value
+            elif what == "step":
+                self._time = scene.middle(int(np.clip(scene.row_at(self._time) + value, 0, len(scene) - 1)))
+            elif what == "play":
+                self.panel.play.value = not self.panel.play.value
+        if played:
+            end = float(scene.ends.max())
+            self._time += played * self.panel.speed.value
+            if self._time > end:
+                self._time = float(scene.starts[0]) if before >= end - 1e-6 else end
+        if self._time != before:
+            self._moved_at = time.perf_counter()
+
+    def _look(self, frame: Frame, rests: bool) -> bool:
+        """Images and marker ways of this moment, from the worker; True while some are not there yet."""
+        scene, run = self._scene, self._scene.run
+        if run is None or not len(scene):
+            return False
+        waiting = False
+        moment = round(self._time, 1)
+        for robot in scene.robots:
+            image = self._worker.ask(
+                f"image {robot}", moment, lambda robot=robot: (inspect.camera_image(run, robot, moment),)
+            )
+            waiting |= image is None
+            if isinstance(image, Failure):
+                self._complain(f"No image of {robot}", image.why)
+            elif image is not None:
+                self._images[robot] = image[0]
+        key = (frame.row, self._dark, id(scene))
+        if rests and self.panel.markers.value:
+            ways = self._worker.ask("ways", key, lambda: self._marker_ways(scene, frame.row))
+            waiting |= ways is None
+            self._ways = ways if isinstance(ways, tuple) else (NO_LINES, NO_LINES)
+        elif not rests:
+            self._ways = (NO_LINES, NO_LINES)
+        return waiting
+
+    def _marker_ways(self, scene: Scene, row: int) -> tuple[Lines, Lines]:
+        assert scene.run is not None
+        stance = scene.stances[row]
+        measured = []
+        for pair in itertools.combinations(stance.observers, 2):
+            key = (stance.index, *pair)
+            if key not in self._measured:
+                self._measured[key] = measure_pair(scene.run, stance, *pair, scene.frontend)
+            measured.append(self._measured[key])
+        return inspect.marker_ways(scene, row, measured, self._dark)
+
+    def _inspect(self, frame: Frame) -> bool:
+        """The panel of what was clicked; True while it is being made."""
+        scene, picked = self._scene, self._picked
+        if picked is None:
+            self.panel.inspect("", None)
+            return False
+        kind, number = picked
+        if kind == "robot":
+            self.panel.inspect(inspect.robot_report(scene, number, frame.row), None)
+            return False
+        if number >= len(scene.edges):
+            self._picked = None
+            return False
+        found = self._worker.ask("edge", (number, id(scene)), lambda: inspect.examine(scene, number))
+        if isinstance(found, Failure):
+            self.panel.inspect(f"{inspect.edge_report(scene, number, None)}\n\n{found.why}", None)
+            return False
+        self.panel.inspect(inspect.edge_report(scene, number, found), found.picture if found else None)
+        return found is None
+
+    def _follow(self, frame: Frame) -> None:
+        """Move all cameras along with the robot that is followed."""
+        robot = self.panel.follow.value
+        if robot == NOBODY or robot not in self._scene.robots:
+            self._followed = None
+            return
+        here = frame.poses[self._scene.robots.index(robot), :3]
+        if not np.isfinite(here).all():
+            return
+        before = self._followed
+        self._followed = (robot, here)
+        for client in self.server.get_clients().values():
+            fresh = before is None or before[0] != robot
+            shift = here - (client.camera.look_at if fresh else before[1])  # type: ignore[index]
+            if np.abs(shift).max() > 1e-6:
+                client.camera.position = client.camera.position + shift  # what it looks at moves with it
+
+    def _complain(self, title: str, text: str) -> None:
+        """Notify once."""
+        if text not in self._told:
+            self._told.add(text)
+            self._notify(title, text)
+
+    def _notify(self, title: str, text: str) -> None:
+        for client in self.server.get_clients().values():
+            client.add_notification(title, text, auto_close_seconds=15, color="red")
+
+
+def fitting_sigma(scene: Scene) -> float:
+    """So many sigmas that the largest ellipse can be seen and is no larger than a robot's surroundings; 3 at least."""
+    if not scene.layers or not scene.layers[0].there.any():
+        return 3.0
+    covariance = scene.layers[0].covariance[scene.layers[0].there]
+    largest = float(np.sqrt(np.nanmax(covariance.trace(axis1=1, axis2=2), initial=0.0)))
+    return next((k for k in (100.0, 30.0, 10.0) if k * largest < 0.3), 3.0) if largest > 0 else 3.0
+
+
+def missing_images(scene: Scene) -> str:
+    """Which observers a run has neither images nor detections of, in words; "" where all is there."""
+    if scene.run is None:
+        return ""
+    observing = {robot for stance in scene.stances for robot in stance.observers}
+    blind = [
+        robot
+        for robot in scene.robots
+        if robot in observing and not scene.run.has_images(robot) and not scene.run.has_detections(robot)
+    ]
+    return (
+        f"the run holds neither images nor detections of {', '.join(blind)}, so that these see nothing" if blind else ""
+    )

@@ -1,0 +1,215 @@
+"""The handles of a scene in a viser server: made once, few whatever the graph's size, updated in place."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from coloc_graph.lie import quaternion
+from coloc_graph.viewer import bodies, palette
+from coloc_graph.viewer.frame import NO_LINES, Batch, Frame, Lines, ViewState, about_z
+from coloc_graph.viewer.motion import extent
+from coloc_graph.viewer.scene import TRUE, Scene
+
+#: Room about the data [m], and the largest floor that has lines every half metre.
+MARGIN, FINE = 2.0, 60.0
+#: How large a frustum is drawn [m].
+FRUSTUM = 0.14
+#: Widths of trajectories [px].
+ESTIMATE_PX, OTHER_PX, TRUTH_PX = 5.0, 2.0, 1.3
+
+Image = NDArray[np.uint8]
+
+
+class GraphView:
+    """Owns every handle of a scene. Touched by one thread alone, which calls `apply`.
+
+    `images` of `apply` are by robot, None for one that sees nothing; the same object as before is not sent again.
+    """
+
+    def __init__(self, server: viser.ViserServer, scene: Scene, dark: bool = False) -> None:
+        self.server = server
+        self.names: tuple[str, ...] = ()
+        self._sent: dict[str, object] = {}
+        self._images: dict[str, Image | None] = {}
+        self._labels: dict[str, str] = {}
+        self._dark: bool | None = None
+        self._reach = 0.0
+        with server.atomic():
+            self._floor = server.scene.add_grid("/floor", plane="xy", plane_opacity=1.0, shadow_opacity=0.2)
+            self._make_robots(scene)
+            self._make_graph()
+            self.adopt(scene)
+        self.dress(scene, dark)
+
+    def _make_robots(self, scene: Scene) -> None:
+        add = self.server.scene
+        self.robots, self._frustums, self._names, self._anchors = [], {}, [], []
+        for name, colour in zip(scene.robots, palette.robot_colours(len(scene.robots)), strict=True):
+            robot = scene.team[name] if scene.team is not None else None
+            path, tint = f"/robots/{name}", tuple(int(value) for value in colour)
+            self.robots.append(add.add_frame(path, show_axes=False, visible=False))
+            add.add_mesh_trimesh(f"{path}/body", bodies.robot_mesh(robot, colour), receive_shadow=False)
+            vertices, faces = bodies.ring(0.19, 0.215)
+            self._anchors.append(
+                add.add_mesh_simple(
+                    f"{path}/anchor", vertices, faces, color=tuple(palette.flat(colour).tolist()), position=(0, 0, 0.007), visible=False,
+                    side="double", cast_shadow=False, receive_shadow=False,
+                )
+            )  # fmt: skip
+            top = bodies.T_body_camera(robot)[2, 3]
+            self._names.append(
+                add.add_label(f"{path}/name", name, position=(0, 0, max(top, 0.2) + 0.1), anchor="bottom-center")
+            )
+            if robot is not None:
+                T, camera = robot.mount.T_body_camera, robot.camera
+                self._frustums[name] = add.add_camera_frustum(
+                    f"{path}/camera", fov=float(2 * np.arctan2(camera.height / 2, camera.fy)),
+                    aspect=camera.width / camera.height, scale=FRUSTUM, color=tint, thickness=2.0,
+                    thickness_units="screen", wxyz=quaternion(T[:3, :3]), position=tuple(T[:3, 3]), visible=False,
+                    cast_shadow=False, receive_shadow=False,
+                )  # fmt: skip
+
+    def _make_graph(self) -> None:
+        add, none = self.server.scene, NO_LINES
+        self._lines: dict[str, viser.LineSegmentsHandle] = {}
+        for name, thickness in (("edges", 2.0), ("edges_now", 4.0), ("refused", 2.0), ("picked", 7.0),
+                                ("seen", 1.2), ("driven", 2.5)):  # fmt: skip
+            self._lines[name] = add.add_line_segments(
+                f"/{name}", none.points, none.colours, thickness=thickness, thickness_units="screen"
+            )
+        hidden = Batch(*(np.zeros((1, n), np.float32) for n in (4, 3, 3)), np.zeros((1, 3), np.uint8))
+        hidden.wxyz[:, 0] = 1
+        self._batches = {
+            name: add.add_batched_meshes_simple(
+                f"/{name}", *mesh, hidden.wxyz, hidden.positions, batched_scales=hidden.scales + 1e-6,
+                batched_colors=hidden.colours, opacity=opacity, lod="off", side="double", visible=False,
+                cast_shadow=False, receive_shadow=False,
+            )
+            for name, mesh, opacity in (
+                ("ellipses", bodies.disc(), 0.5),
+                ("wedges", bodies.wedge(), 0.45),
+                ("rings", bodies.ring(0.178, 0.186), 0.9),
+            )
+        }  # fmt: skip
+
+    def adopt(self, scene: Scene) -> None:
+        """Make ready for the layers of a scene of the same robots."""
+        for name in (layer.name for layer in scene.layers):
+            if name not in self.names:
+                self._lines[f"way {name}"] = self.server.scene.add_line_segments(
+                    f"/ways/{len(self.names)}", NO_LINES.points, NO_LINES.colours,
+                    thickness=TRUTH_PX if name == TRUE else OTHER_PX if self.names else ESTIMATE_PX, thickness_units="screen",
+                )  # fmt: skip
+                self.names += (name,)
+
+    def dress(self, scene: Scene, dark: bool) -> None:
+        """The floor beneath a scene, as large as it, and in light or dark."""
+        low, high = extent(scene)
+        size = high - low + 2 * MARGIN
+        if dark == self._dark and size.max() <= self._reach:
+            return
+        self._dark, self._reach = dark, float(size.max()) * 1.3  # room to grow, so that it rarely grows
+        middle = (low + high) / 2
+        fine = size.max() < FINE
+        cell = 0.5 if fine else float(10 ** np.floor(np.log10(size.max() / 20)))
+        sides = np.ceil(np.maximum(size, self._reach * (0.5 if fine else 1.0)) / (2 * cell)) * 2 * cell
+        corner = np.round(middle / cell) * cell
+        with self.server.atomic():
+            floor = self._floor
+            floor.width, floor.height = float(sides[0]), float(sides[1])
+            floor.position = (float(corner[0]), float(corner[1]), -0.002)
+            floor.cell_size, floor.section_size = cell, 2 * cell if fine else 10 * cell
+            floor.plane_color = (38, 42, 48) if dark else (250, 250, 252)
+            floor.cell_color = (58, 63, 71) if dark else (226, 230, 236)
+            floor.section_color = (84, 91, 101) if dark else (196, 203, 213)
+
+    def _assign_image(self, name: str, image: Image | None) -> None:
+        frustum = self._frustums.get(name)
+        if frustum is None or self._images.get(name) is image:
+            return
+        frustum.visible = image is not None
+        if image is not None:
+            frustum.image = image
+        self._images[name] = image
+
+    def apply(
+        self,
+        frame: Frame,
+        state: ViewState,
+        images: Mapping[str, Image | None] | None = None,
+        seen: Lines = NO_LINES,
+        driven: Lines = NO_LINES,
+    ) -> None:
+        """Show a frame."""
+        ways = {f"way {name}": frame.ways.get(name, NO_LINES) for name in self.names}
+        lines = ways | {
+            "edges": frame.edges, "edges_now": frame.edges_now, "refused": frame.refused, "picked": frame.picked,
+            "seen": seen, "driven": driven,
+        }  # fmt: skip
+        converted = {name: (one.points, palette.linear(one.colours)) for name, one in lines.items()}
+        batches = {"ellipses": frame.ellipses, "wedges": frame.wedges, "rings": frame.rings}
+        tints = {name: palette.linear(palette.flat(one.colours)) for name, one in batches.items()}
+        turned = about_z(np.nan_to_num(frame.poses[:, 3]))
+        with self.server.atomic():  # only assignments from here on
+            for number, handle in enumerate(self.robots):
+                there = bool(np.isfinite(frame.poses[number]).all())
+                handle.visible = there
+                if there:
+                    handle.position, handle.wxyz = frame.poses[number, :3], turned[number]
+                role = frame.roles[number]
+                self._anchors[number].visible = role == "anchor" and state.stays
+                text = handle.name.rsplit("/", 1)[1] + (f"  {role}" if role else "")
+                if self._labels.get(handle.name) != text:
+                    self._names[number].text = self._labels[handle.name] = text
+            for name, image in (images or {}).items():
+                self._assign_image(name, image)
+            for name, (points, colours) in converted.items():
+                self._assign_lines(name, points, colours)
+            for name, one in batches.items():
+                self._assign_batch(name, one, tints[name])
+
+    def _assign_lines(self, name: str, points: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
+        key = (points.tobytes(), colours.tobytes()) if len(points) < 2000 else None
+        if key is not None and self._sent.get(name) == key:
+            return
+        self._sent[name] = key
+        handle = self._lines[name]
+        handle.visible = bool(len(points))
+        if len(points):
+            handle.points, handle.colors = points, colours
+
+    def _assign_batch(self, name: str, one: Batch, colours: NDArray[np.uint8]) -> None:
+        handle = self._batches[name]
+        handle.visible = bool(len(one.wxyz))
+        if not len(one.wxyz):
+            return
+        key = tuple(part.tobytes() for part in (*one[:3], colours)) if len(colours) < 2000 else None
+        if key is not None and self._sent.get(name) == key:
+            return
+        self._sent[name] = key
+        handle.batched_wxyzs, handle.batched_positions = one.wxyz, one.positions
+        handle.batched_scales, handle.batched_colors = one.scales, colours
+
+
+def initial_camera(server: viser.ViserServer, scene: Scene, aside: float = 0.0) -> None:
+    """Frame the data: from behind and the right of the way the team went, looking down on it."""
+    position, look_at = camera_on(scene, aside)
+    server.initial_camera.fov = float(np.radians(40))
+    server.initial_camera.far = max(1000.0, 10 * float(np.linalg.norm(position - look_at)))
+    server.initial_camera.position, server.initial_camera.look_at = position, look_at
+
+
+def camera_on(scene: Scene, aside: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where a camera sees all of the data from, and where it looks: (3,) and (3,) [m]."""
+    low, high = extent(scene)
+    high = high + (0.0, aside)
+    middle, half = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 + 0.4
+    along = high - low
+    # a long way is seen from its side, and a little from behind
+    side = np.array([-0.35, -1.0]) if along[0] >= along[1] else np.array([-1.0, -0.35])
+    side /= np.linalg.norm(side)
+    distance = 1.75 * half
+    eye = np.array([*(middle + side * distance * np.cos(np.radians(38))), distance * np.sin(np.radians(38))])
+    return eye, np.array([*middle, 0.0])

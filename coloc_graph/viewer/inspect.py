@@ -1,0 +1,332 @@
+"""What is behind one edge and one robot: measured again, decomposed both ways, and drawn."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import DegenerateGeometry, InputError
+from coloc_graph.frontend import PairMeasurement, measure_pair
+from coloc_graph.frontend.decomposition import choose_by_normal, decompose_svd
+from coloc_graph.frontend.homography import INLIER_GATE
+from coloc_graph.frontend.plane import on_plane
+from coloc_graph.frontend.refinement import squared_residuals
+from coloc_graph.frontend.stance import stance_plane
+from coloc_graph.frontend.tracking import Track
+from coloc_graph.lie import floor_pose, so3_log
+from coloc_graph.run import Run
+from coloc_graph.team import Camera, Team
+from coloc_graph.viewer import palette
+from coloc_graph.viewer.frame import Lines
+from coloc_graph.viewer.scene import Array, Scene
+
+Image = NDArray[np.uint8]
+
+#: An image or detections this far from an instant are of it [s].
+NEAR = 0.3
+#: Images are enlarged by so much for the picture.
+ENLARGED = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """One decomposition of a homography: `T_cj_ci` [m] as turn [deg] and way (3,), and its normal's error [deg]."""
+
+    turn_deg: float
+    way: Array
+    normal_error_deg: float
+    taken: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """What is known of one edge: the measurement made again, both its decompositions, and a picture."""
+
+    measured: PairMeasurement
+    solutions: tuple[Solution, ...]
+    picture: Image
+
+
+def examine(scene: Scene, edge: int) -> Inspection:
+    """Measure the pair of an edge once more and look at it closely; `InputError` where there is no run to look at."""
+    run, row = scene.run, int(scene.edges.rows[edge])
+    if run is None:
+        raise InputError("there is no run to measure this pair in again; open the run, or a result that lies beside it")
+    stance = scene.stances[row]
+    robot_i, robot_j = (scene.robots[int(n)] for n in (scene.edges.i[edge], scene.edges.j[edge]))
+    measured = measure_pair(run, stance, robot_i, robot_j, scene.frontend)
+    picture = _picture(run, scene.middle(row), (robot_i, robot_j), measured)
+    return Inspection(measured, _solutions(run, measured), picture)
+
+
+def _solutions(run: Run, measured: PairMeasurement) -> tuple[Solution, ...]:
+    pose, H = measured.relative_pose, measured.homography.H_j_i
+    if pose is None or pose.plane is None:
+        return ()
+    R, T, N = decompose_svd(H)
+    taken = int(choose_by_normal(N, pose.plane.N)[0])
+    errors = np.rad2deg(np.arccos(np.clip(N @ pose.plane.N, -1, 1)))
+    turns = np.rad2deg(np.linalg.norm(so3_log(R), axis=1))
+    return tuple(Solution(float(turns[n]), pose.plane.d * T[n], float(errors[n]), n == taken) for n in range(2))
+
+
+def camera_image(run: Run, robot: str, time: float) -> Image | None:
+    """What a robot's camera showed at an instant, RGB; its detections drawn where there are no images; None if none."""
+    camera = run.team[robot].camera
+    if run.has_images(robot):
+        image = min(run.images(robot, time - NEAR, time + NEAR), key=lambda one: abs(one.time - time), default=None)
+        if image is None:
+            return None
+        pixels = image.pixels
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB if pixels.ndim == 2 else cv2.COLOR_BGR2RGB), np.uint8)
+    if not run.has_detections(robot):
+        return None
+    seen = list(run.detections(robot, time - NEAR, time + NEAR))
+    if not seen:
+        return None
+    canvas = np.full((camera.height, camera.width, 3), 26, np.uint8)
+    latest = min(seen, key=lambda one: abs(one.time - time))
+    for one in seen:
+        for uv in one.uv[np.isfinite(one.uv).all(axis=1)]:
+            cv2.circle(canvas, _pixel(uv), max(camera.width // 160, 1), (96, 102, 112), -1, cv2.LINE_AA)
+    for uv in latest.uv[np.isfinite(latest.uv).all(axis=1)]:
+        cv2.circle(canvas, _pixel(uv), max(camera.width // 64, 2), (255, 244, 190), -1, cv2.LINE_AA)
+    return np.asarray(canvas, np.uint8)
+
+
+def _picture(run: Run, time: float, robots: tuple[str, str], measured: PairMeasurement) -> Image:
+    """Both images side by side with their tracks, and the points of i warped by H onto j."""
+    halves = []
+    for number, robot in enumerate(robots):
+        camera = run.team[robot].camera
+        image = camera_image(run, robot, time)
+        if image is None or not run.has_images(robot):
+            image = np.full((camera.height, camera.width, 3), 26, np.uint8)
+        half = cv2.resize(image, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_AREA)
+        half = np.asarray(half * 0.6, np.uint8)  # so that what is drawn stands out
+        if measured.tracks is not None:
+            _draw_tracks(half, measured.tracks[number], robot)
+        halves.append(half)
+    _draw_points(run, halves, robots, measured)
+    for half, text in zip(halves, (f"{robots[0]} (i)", f"{robots[1]} (j)"), strict=True):
+        cv2.putText(half, text, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.65, (255, 255, 255), 1, cv2.LINE_AA)
+    height = max(half.shape[0] for half in halves)
+    padded = [cv2.copyMakeBorder(half, 0, height - len(half), 0, 0, cv2.BORDER_CONSTANT) for half in halves]
+    return np.asarray(np.hstack([padded[0], np.full((height, 4, 3), 255, np.uint8), padded[1]]), np.uint8)
+
+
+def _draw_tracks(half: Image, tracks: Sequence[Track], robot: str) -> None:
+    for number, track in enumerate(tracks):
+        colour = tuple(int(value) for value in palette.ROBOTS[(number + 4) % len(palette.ROBOTS)])
+        points = np.round(8 * (ENLARGED * (track.uv + 0.5) - 0.5)).astype(np.int32)
+        # a pause in a track is no line across the image
+        for part in np.split(points, np.flatnonzero(np.diff(track.times) > NEAR) + 1):
+            cv2.polylines(half, [part], False, colour, 1, cv2.LINE_AA, 3)
+
+
+def _draw_points(run: Run, halves: list[Image], robots: tuple[str, str], measured: PairMeasurement) -> None:
+    found, h = measured.correspondences, measured.homography
+    if found is None or not len(found):
+        return
+    good = np.zeros(len(found), bool)
+    if h.unusable is None:
+        good = squared_residuals(h.H_j_i, found.pairs) < INLIER_GATE
+        warped = warp(h.H_j_i, run.team[robots[0]].camera.normalise(found.uv_i), run.team[robots[1]].camera)
+        for uv in warped[np.isfinite(warped).all(axis=1)]:
+            cv2.drawMarker(halves[1], _pixel(ENLARGED * uv), (86, 180, 233), cv2.MARKER_TILTED_CROSS, 9, 1, cv2.LINE_AA)
+    for half, points in zip(halves, (found.uv_i, found.uv_j), strict=True):
+        for uv, fits in zip(points, good, strict=True):
+            cv2.circle(half, _pixel(ENLARGED * uv), 4, (255, 255, 255) if fits else (213, 94, 0), 1, cv2.LINE_AA)
+
+
+def warp(H: Array, x: Array, camera: Camera) -> Array:
+    """Pixels (n, 2) of camera j where H puts normalised points (n, 2) of camera i; NaN behind it."""
+    y = np.concatenate([x, np.ones((len(x), 1))], axis=1) @ H.T
+    return camera.project(y * np.sign(np.linalg.det(H)))[0]
+
+
+def _pixel(uv: Array) -> tuple[int, int]:
+    return int(round(float(uv[0]))), int(round(float(uv[1])))
+
+
+def marker_ways(scene: Scene, row: int, measured: Sequence[PairMeasurement], dark: bool) -> tuple[Lines, Lines]:
+    """The markers' ways in a stance, on their plane: as each observer sees them, and as they are estimated.
+
+    As seen: through the mount that is stated, in the observer's colour. As estimated: through mounts as they turned
+    out, the mean of both observers, in the ink. Both from where the observers are estimated to stand.
+    """
+    if scene.run is None or scene.team is None or not scene.layers:
+        return _joined([]), _joined([])
+    base, number = scene.layers[0], {robot: n for n, robot in enumerate(scene.robots)}
+    seen: dict[str, list[tuple[Array, Array]]] = {}
+    estimated = []
+    for one in measured:
+        h = one.homography
+        places = {robot: base.xyz[number[robot], row] for robot in (h.robot_i, h.robot_j)}
+        if one.tracks is None or one.correspondences is None or not all(np.isfinite(p).all() for p in places.values()):
+            continue
+        T = {robot: floor_pose(*places[robot][:2], base.yaw[number[robot], row]) for robot in places}
+        for robot, tracks in zip((h.robot_i, h.robot_j), one.tracks, strict=True):
+            if robot not in seen:
+                seen[robot] = [
+                    (track.times, _on_floor(scene, scene.team, row, robot, T[robot], track.uv)) for track in tracks
+                ]
+        team = scene.calibrated or scene.team
+        found = one.correspondences
+        both = [
+            _on_floor(scene, team, row, robot, T[robot], uv)
+            for robot, uv in ((h.robot_i, found.uv_i), (h.robot_j, found.uv_j))
+        ]
+        for marker in np.unique(found.markers):
+            own = found.markers == marker
+            estimated.append((found.times[own], (both[0][own] + both[1][own]) / 2, palette.ink(dark)))
+    colours = palette.robot_colours(len(scene.robots))
+    return (
+        _joined([(t, p, palette.faded(colours[number[r]], dark, 0.2)) for r, every in seen.items() for t, p in every]),
+        _joined(estimated),
+    )
+
+
+def _on_floor(scene: Scene, team: Team, row: int, robot: str, T_world_body: Array, uv: Array) -> Array:
+    """Pixels (n, 2) of a robot at rest as points (n, 3) of the marker plane, in the world [m]; NaN above the horizon."""
+    assert scene.run is not None
+    one = team[robot]
+    try:
+        plane = stance_plane(_with_team(scene.run, team), scene.stances[row], robot)
+    except DegenerateGeometry:
+        return np.full((len(uv), 3), np.nan)
+    T = T_world_body @ one.mount.T_body_camera
+    points = on_plane(one.camera.normalise(uv), plane)
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def _with_team(run: Run, team: Team) -> Run:
+    return run if team is run.team else replace(run, team=team)
+
+
+def _joined(parts: Sequence[tuple[Array, Array, palette.Colours]]) -> Lines:
+    """Ways as segments: consecutive points, near in time, and not out of sight."""
+    points, colours = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3), np.uint8)]
+    for times, places, colour in parts:
+        good = (np.diff(times) < NEAR) & np.isfinite(places[:-1]).all(axis=1) & np.isfinite(places[1:]).all(axis=1)
+        segments = np.stack([places[:-1], places[1:]], axis=1)[good]
+        segments[..., 2] = 0.012  # on the floor, where the ways of the robots are
+        points.append(segments)
+        colours.append(np.broadcast_to(colour, segments.shape))
+    return Lines(np.concatenate(points).astype(np.float32), np.concatenate(colours).astype(np.uint8))
+
+
+def edge_report(scene: Scene, edge: int, found: Inspection | None) -> str:
+    """An edge in words and numbers, as markdown; with `found`, what measuring it again shows."""
+    return "\n\n".join(_edge_lines(scene, edge, found))
+
+
+def _edge_lines(scene: Scene, edge: int, found: Inspection | None) -> Iterator[str]:
+    edges = scene.edges
+    i, j = (scene.robots[int(n)] for n in (edges.i[edge], edges.j[edge]))
+    yield f"### {i} - {j}, stance {scene.stances[int(edges.rows[edge])].index}"
+    if edges.why_not[edge]:
+        yield f"**Not used:** {edges.why_not[edge]}"
+    if np.isfinite(edges.sigmas[edge]):
+        yield f"residual **{edges.sigmas[edge]:.2f} sigma** ({edges.of_what})"
+    if found is None:
+        return
+    h, pose = found.measured.homography, found.measured.relative_pose
+    rows = [("points", f"{h.points}"), ("inliers", f"{h.inliers}")]
+    if h.unusable is None:
+        rows += [
+            ("residual of the points", f"{h.residual:.2f} sigma"),
+            ("overlap in image i", f"{h.overlap_px:.0f} px"),
+            (
+                "clock of j ahead of i",
+                f"{1000 * h.time_offset:.2f} ± {1000 * h.time_offset_sigma:.2f} ms"
+                if h.time_offset_sigma
+                else "said to agree",
+            ),
+        ]
+    if pose is not None:
+        rows.append(("distance", f"{np.linalg.norm(pose.T_i_j.translation()):.4f} m"))
+    yield _table(("measured again", ""), rows)
+    if h.warning:
+        yield f"_{h.warning}_"
+    if h.unusable is None:
+        yield "H, image i to image j, normalised\n\n" + _matrix(h.H_j_i)
+    if found.solutions:
+        yield _table(
+            ("decomposition", "1", "2"),
+            [
+                ("normal's error", *(f"{one.normal_error_deg:.2f} deg" for one in found.solutions)),
+                ("turn", *(f"{one.turn_deg:.2f} deg" for one in found.solutions)),
+                ("way [m]", *(", ".join(f"{value:.3f}" for value in one.way) for one in found.solutions)),
+                ("", *("**taken**" if one.taken else "" for one in found.solutions)),
+            ],
+        )
+    if h.unusable is None:
+        yield "White: points (orange: outliers). Blue crosses in j: the points of i by H."
+
+
+def robot_report(scene: Scene, number: int, row: int) -> str:
+    """A robot at a stance in words and numbers, as markdown: pose, covariance, mount."""
+    return "\n\n".join(_robot_lines(scene, number, row))
+
+
+def _robot_lines(scene: Scene, number: int, row: int) -> Iterator[str]:
+    robot = scene.robots[number]
+    yield f"### Robot {robot}, stance {scene.stances[row].index if row >= 0 else '-'}"
+    if row < 0 or not scene.layers or not scene.layers[0].there[number, row]:
+        yield "It has no pose here: nothing ties it to the reference."
+        return
+    base = scene.layers[0]
+    x, y, z = base.xyz[number, row]
+    xy, heading = base.covariance[number, row], base.yaw_sigma[number, row]
+    rows = [("x, y", f"{x:.4f}, {y:.4f} m"), ("z", f"{1000 * z:.1f} mm"),
+            ("heading", f"{np.rad2deg(base.yaw[number, row]):.2f} deg")]  # fmt: skip
+    if np.isfinite(xy).all():
+        rows += [
+            ("sigma x, y", f"{1000 * np.sqrt(xy[0, 0]):.2f}, {1000 * np.sqrt(xy[1, 1]):.2f} mm"),
+            ("correlation x, y", f"{_correlation(xy):.2f}"),
+            ("sigma heading", f"{np.rad2deg(heading):.3f} deg"),
+        ]
+    off = scene.errors(base)[number, row]
+    if np.isfinite(off):
+        rows.append(("off the truth", f"{1000 * off:.2f} mm"))
+    yield _table((base.name, ""), rows)
+    if scene.team is None:
+        return
+    stated = scene.team[robot].mount
+    found = scene.calibrated[robot].mount if scene.calibrated is not None else None
+    yield _table(
+        ("mount", "stated", *(("found",) if found else ())),
+        [
+            (
+                name,
+                *(
+                    f"{getattr(one, key):.{digits}f} ± {getattr(one, sigma):.{digits}f}"
+                    for one in (stated, found)
+                    if one
+                ),
+            )
+            for name, key, sigma, digits in (
+                ("height [m]", "height", "height_sigma", 4),
+                ("tilt [deg]", "tilt_deg", "tilt_sigma_deg", 3),
+                ("roll [deg]", "roll_deg", "roll_sigma_deg", 3),
+            )
+        ],
+    )
+
+
+def _correlation(C: Array) -> float:
+    scale = float(np.sqrt(C[0, 0] * C[1, 1]))
+    return float(C[0, 1]) / scale if scale > 0 else 0.0
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---"] + ["--:"] * (len(header) - 1), *rows]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def _matrix(M: Array) -> str:
+    rows = [[f"{value:.5f}" for value in row] for row in M]
+    return "```\n" + "\n".join("  ".join(cell.rjust(9) for cell in row) for row in rows) + "\n```"

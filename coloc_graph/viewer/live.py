@@ -1,0 +1,79 @@
+"""A scene that grows: what an estimator says after each stance, put together in the viewer's thread."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from coloc_graph.backend import StanceEstimate
+from coloc_graph.lie import se3_inverse, so3_log
+from coloc_graph.measurements import Measurement, RelativePose
+from coloc_graph.run import Stance
+from coloc_graph.trajectory import Trajectory
+from coloc_graph.viewer.scene import Array, Scene, layer_of
+from coloc_graph.viewer.sources import as_edges, stayed
+
+#: What the layer is called, and what its edges' residuals are of.
+LIVE, OF_PAIR = "live", "of the relative pose, against the poses when it came in"
+
+
+@dataclass(frozen=True, eq=False)
+class LiveStance:
+    """A stance that has just entered, where its robots stand by it, and what was measured in it."""
+
+    stance: Stance
+    estimate: StanceEstimate
+    measurements: Sequence[Measurement] = ()
+
+
+class LiveScene:
+    """Grows a scene by `LiveStance`s; each costs its own arrays, the scene is made when it is asked for."""
+
+    def __init__(self, start: Scene) -> None:
+        self._start = start
+        self._stances: dict[int, Stance] = {}
+        self._poses: dict[str, dict[int, tuple[float, Array, Array]]] = {robot: {} for robot in start.robots}
+        self._found: list[tuple[int, str, str, float, str]] = []
+
+    def add(self, one: LiveStance) -> None:
+        """Take in a stance; one that is in already is brought up to date."""
+        stance, said = one.stance, one.estimate
+        self._stances[stance.index] = stance
+        refused = {id(r.measurement): r.reason for r in said.refused}
+        times = {m.seen: m.time for m in one.measurements if hasattr(m, "seen")}
+        for robot, pose in said.poses.items():
+            if robot in stance.observers or robot in times:
+                time = times.get(robot, stance.start)
+                self._poses[robot][stance.index] = (time, pose.matrix(), said.covariances[robot])
+        for m in one.measurements:
+            if isinstance(m, RelativePose):
+                self._found.append((m.stance, m.robot_i, m.robot_j, self._off(m), refused.get(id(m), "")))
+
+    def _off(self, one: RelativePose) -> float:
+        ends = [self._poses[robot].get(stance) for robot, stance in one.ends]
+        if ends[0] is None or ends[1] is None:
+            return float("nan")
+        off = se3_inverse(one.T_i_j.matrix()) @ se3_inverse(ends[0][1]) @ ends[1][1]
+        xi = np.concatenate([so3_log(off[:3, :3]), off[:3, 3]])
+        return float(np.sqrt(xi @ np.linalg.solve(one.covariance, xi) / 6))
+
+    def scene(self) -> Scene:
+        """Everything so far."""
+        robots = self._start.robots
+        stances = tuple(self._stances[index] for index in sorted(self._stances))
+        trajectories = {}
+        for robot, poses in self._poses.items():
+            if poses:
+                indices = sorted(poses)
+                times, T, covariances = zip(*(poses[index] for index in indices), strict=True)
+                trajectories[robot] = Trajectory(
+                    robot, np.array(times), np.array(T), np.array(indices), np.array(covariances)
+                )
+        held = [(robot, stance.index) for stance in stances for robot in stance.anchors]
+        return replace(
+            self._start,
+            stances=stances,
+            layers=(layer_of(LIVE, robots, stances, trajectories),) if stances else (),
+            edges=as_edges(self._found, robots, stances, OF_PAIR),
+            stayed=stayed(robots, stances, held),
+        )

@@ -1,0 +1,85 @@
+"""Where a robot is between two of its poses: by its wheels where there is odometry, else straight."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.viewer.scene import Layer, Scene
+
+Array = NDArray[np.float64]
+
+
+def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
+    """x, y, z [m] and heading [rad] of a robot, (n, 4), at ascending times (n,); NaN where it has no pose at all.
+
+    A robot that watches stands from the beginning of a stance to its end. In between it follows its wheels, bent so
+    that they lead from the one pose to the other.
+    """
+    out = np.full((len(time), 4), np.nan)
+    rows = np.flatnonzero(layer.there[number])
+    if not len(rows):
+        return out
+    near = _rows_about(scene, layer, number, rows, time)
+    keys, poses = _keys(scene, layer, number, near)
+    after = np.clip(np.searchsorted(keys, time, side="right"), 1, max(len(keys) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(keys) - 1)
+    gap = keys[after] - keys[before]
+    share = np.clip((time - keys[before]) / np.where(gap > 0, gap, 1.0), 0, 1)
+    a, b = poses[before], poses[after]
+    turn = _wrapped(b[:, 3] - a[:, 3])
+    out[:, :3] = a[:, :3] + share[:, None] * (b[:, :3] - a[:, :3])
+    out[:, 3] = a[:, 3] + share * turn
+    wheels = scene.wheels.get(scene.robots[number])
+    moving = (share > 0) & (share < 1) & (np.abs(b[:, :2] - a[:, :2]).max(axis=1) > 0)
+    if wheels is None or not len(wheels) or not moving.any():
+        return out
+    way = [wheels.pose_at(t[moving]) for t in (keys[before], time, keys[after])]
+    a, b, s = a[moving], b[moving], share[moving, None]
+    now, end = _ahead(a, way[0], way[1]), _ahead(a, way[0], way[2])
+    miss = b[:, [0, 1, 3]] - end
+    miss[:, 2] = _wrapped(miss[:, 2])
+    bent = now + s * miss
+    if np.isfinite(bent).all():
+        out[np.ix_(moving, [0, 1, 3])] = bent
+    return out
+
+
+def extent(scene: Scene, samples: int = 400) -> tuple[Array, Array]:
+    """Least and greatest x, y [m] of all poses and of the ways between them; as `Scene.bounds` without any."""
+    low, high = scene.bounds()
+    if not scene.layers or not len(scene):
+        return low, high
+    times = np.linspace(float(scene.starts[0]), float(scene.ends.max()), samples)
+    for number in range(len(scene.robots)):
+        way = pose_at(scene, scene.layers[0], number, times)[:, :2]
+        if np.isfinite(way).all():
+            low, high = np.minimum(low, way.min(axis=0)), np.maximum(high, way.max(axis=0))
+    return low, high
+
+
+def _rows_about(scene: Scene, layer: Layer, number: int, rows: NDArray[np.int64], time: Array) -> NDArray[np.int64]:
+    """Of the rows at which a robot has a pose those that matter for these times."""
+    first = np.searchsorted(scene.starts[rows], time[0], side="right") - 2
+    last = np.searchsorted(scene.starts[rows], time[-1], side="right") + 2
+    return np.asarray(rows[max(int(first), 0) : int(last)])
+
+
+def _keys(scene: Scene, layer: Layer, number: int, rows: NDArray[np.int64]) -> tuple[Array, Array]:
+    """The times (k,) at which a robot is known to be somewhere, ascending, and where (k, 4)."""
+    poses = np.concatenate([layer.xyz[number, rows], layer.yaw[number, rows, None]], axis=1)
+    stands = scene.standing[number, rows]
+    at = layer.times[number, rows]
+    keys = np.stack([np.where(stands, scene.starts[rows], at), np.where(stands, scene.ends[rows], at)], axis=1).ravel()
+    return np.maximum.accumulate(keys), np.repeat(poses, 2, axis=0)
+
+
+def _ahead(pose: Array, before: Array, after: Array) -> Array:
+    """x, y, heading (n, 3) of poses (n, 4) moved on as wheels went from `before` to `after` (n, 3)."""
+    turn = pose[:, 3] - before[:, 2]
+    c, s = np.cos(turn), np.sin(turn)
+    x, y = (after[:, :2] - before[:, :2]).T
+    return np.stack([pose[:, 0] + c * x - s * y, pose[:, 1] + s * x + c * y, after[:, 2] + turn], axis=1)
+
+
+def _wrapped(angle: Array) -> Array:
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -1,0 +1,75 @@
+"""Colours that are told apart with any colour vision, light and dark, and as three.js takes them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.report.drawing import COLOURS, GREY, INK
+
+Colours = NDArray[np.uint8]
+
+_SRGB = np.arange(256) / 255
+_LINEAR = np.rint(
+    255 * np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+).astype(np.uint8)
+
+
+def rgb(code: str) -> tuple[int, int, int]:
+    """The colour of `#rrggbb`."""
+    return int(code[1:3], 16), int(code[3:5], 16), int(code[5:7], 16)
+
+
+ROBOTS: Colours = np.array([rgb(code) for code in COLOURS], np.uint8)
+#: Residuals of 0, 1, 2 and 3 or more sigmas: noise is blue, and what is not turns over yellow to red.
+RESIDUAL_STOPS = ("#2c7bb6", "#2c7bb6", "#e6a019", "#c51b3a")
+_STOPS = np.array([rgb(code) for code in RESIDUAL_STOPS], float)
+MOST_SIGMAS = float(len(_STOPS) - 1)
+PICKED: Colours = np.array([255, 0, 170], np.uint8)
+
+
+def robot_colours(count: int, dark: bool = False) -> Colours:
+    """A colour a robot (count, 3); the seventh has the first's again, and its name."""
+    return seen_on(ROBOTS[np.arange(count) % len(ROBOTS)], dark)
+
+
+def seen_on(colours: Colours, dark: bool) -> Colours:
+    """Colours (..., 3) made for a light paper, lighter where it is dark."""
+    return np.rint(colours + 0.3 * (255.0 - colours)).astype(np.uint8) if dark else colours
+
+
+def ink(dark: bool) -> Colours:
+    """Text and truth."""
+    return np.array((235, 238, 242) if dark else rgb(INK), np.uint8)
+
+
+def grey(dark: bool) -> Colours:
+    """What is refused, or not known."""
+    return np.array((150, 158, 168) if dark else rgb(GREY), np.uint8)
+
+
+def paper(dark: bool) -> Colours:
+    """What everything is drawn on."""
+    return np.array((30, 33, 38) if dark else (255, 255, 255), np.uint8)
+
+
+def faded(colours: Colours, dark: bool, share: float) -> Colours:
+    """Colours (..., 3) with so much of the paper in them."""
+    return np.asarray(np.rint((1 - share) * colours.astype(float) + share * paper(dark)), np.uint8)
+
+
+def of_residuals(sigmas: NDArray[np.float64], dark: bool) -> Colours:
+    """Colours (n, 3) of residuals (n,) [sigma]; grey where they are not known."""
+    at = np.clip(np.nan_to_num(sigmas), 0, MOST_SIGMAS)
+    low = np.minimum(at.astype(int), len(_STOPS) - 2)
+    share = (at - low)[:, None]
+    colours = np.rint(_STOPS[low] * (1 - share) + _STOPS[low + 1] * share).astype(np.uint8)
+    return np.where(np.isfinite(sigmas)[:, None], seen_on(colours, dark), grey(dark))
+
+
+def flat(colours: Colours) -> Colours:
+    """Colours of what lies on the floor: the lights from above would wash them out."""
+    return np.asarray(0.7 * colours, np.uint8)
+
+
+def linear(colours: Colours) -> Colours:
+    """Colours as viser takes those of line vertices and of batches: linear, and not sRGB."""
+    return _LINEAR[colours]

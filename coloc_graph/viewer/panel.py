@@ -1,0 +1,201 @@
+"""The viewer's controls: sliders, switches, plots, legend, and the panel of what was clicked."""
+
+from collections.abc import Callable
+
+import numpy as np
+import viser
+import viser.uplot as uplot
+from numpy.typing import NDArray
+
+from coloc_graph.viewer import palette
+from coloc_graph.viewer.frame import Frame
+from coloc_graph.viewer.plots import error_curves, residual_curve, with_cursor
+from coloc_graph.viewer.scene import TRUE, Scene
+
+#: Plots are redrawn this often at most [s]: they are pushed whole.
+NOBODY = "nobody"
+HELP = "Click an edge or a robot. Space plays, arrow keys step."
+WIDTH = 330
+
+#: Called with what was asked for: ("stance", row), ("time", seconds), ("step", rows), ("play", None), ("changed", None).
+Ask = Callable[[str, float], None]
+
+
+class Panel:
+    """Owns every GUI handle. Its callbacks only pass on what was asked for; all else is for the render thread."""
+
+    def __init__(self, server: viser.ViserServer, scene: Scene, ask: Ask, k_sigma: float, *, compares: bool) -> None:
+        self._gui, self._ask = server.gui, ask
+        self._clicked = False
+        gui = server.gui
+        gui.configure_theme(brand_color=palette.rgb("#0072B2"), show_share_button=False, show_logo=False)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(WIDTH)
+        self.status = gui.add_markdown(HELP)
+        with gui.add_folder("Time"):
+            self.stance = gui.add_slider("Stance", 0, 1, 1, 0)
+            self.time = gui.add_slider("Time [s]", 0.0, 1.0, 0.1, 0.0)
+            self.play = gui.add_checkbox("Play", False, hint="space; arrow keys step")
+            self.speed = gui.add_slider("Speed", 1, 100, 1, 10, hint="seconds a second")
+            self.follow = gui.add_dropdown("Follow", (NOBODY, *scene.robots))
+        with gui.add_folder("Show"):
+            self._layers: dict[str, viser.GuiCheckboxHandle] = {}
+            self._layer_folder = gui.add_folder("Trajectories")
+            self.k_sigma = gui.add_slider("Ellipses [sigma]", 1, 100, 1, int(k_sigma))
+            self.ellipses = gui.add_checkbox("Ellipses", True)
+            self.wedges = gui.add_checkbox("Headings", True, hint="wedges of so many sigmas")
+            self.edges = gui.add_checkbox("Edges", True)
+            self.stays = gui.add_checkbox("Stay-put rings", True)
+            self.markers = gui.add_checkbox("Marker ways", True)
+            self.beside = gui.add_checkbox("Side by side", False, visible=compares)
+            self.dark = gui.add_checkbox("Dark", False)
+        with gui.add_folder("Plots"):
+            self._residual = gui.add_uplot(
+                *self._plot(["largest residual [sigma]"], ["#0072B2"]), title="Residual [sigma]", height=150,
+                scales={"x": uplot.Scale(time=False)}, legend=uplot.Legend(show=False),
+            )  # fmt: skip
+            self._error = gui.add_uplot(
+                *self._plot(list(scene.robots), [_hex(c) for c in palette.robot_colours(len(scene.robots))]),
+                title="Error [mm]" if scene.true is not None else "Sigma [mm]", height=150,
+                scales={"x": uplot.Scale(time=False)}, legend=uplot.Legend(show=False),
+            )  # fmt: skip
+        with gui.add_folder("Legend"):
+            self._legend = gui.add_html(legend(scene))
+        self._inspector = gui.add_panel(visible=False)
+        with self._inspector.add_tab("Clicked"):
+            self._report = gui.add_markdown("")
+            self._picture = gui.add_image(np.full((4, 8, 3), 40, np.uint8), format="jpeg", visible=False)
+        self._inspector.float(x=12, y=12, width=440)
+        self.adopt(scene)
+        self._listen()
+
+    def _listen(self) -> None:
+        # what this process sets itself comes without a client, and is no wish of anybody
+        @self.stance.on_update
+        def _(event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
+            if event.client is not None:
+                self._ask("stance", self.stance.value)
+
+        @self.time.on_update
+        def _(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
+            if event.client is not None:
+                self._ask("time", self.time.value)
+
+        for handle in (
+            self.play, self.k_sigma, self.ellipses, self.wedges, self.edges, self.stays, self.markers, self.beside,
+            self.dark, self.follow, self.speed,
+        ):  # fmt: skip
+            handle.on_update(lambda _: self._ask("changed", 0))
+        for label, hotkey, what, value in (
+            ("Play or pause", "space", "play", 0), ("Next stance", "arrowright", "step", 1),
+            ("Previous stance", "arrowleft", "step", -1), ("First stance", "home", "step", -(1 << 40)),
+            ("Last stance", "end", "step", 1 << 40),
+        ):  # fmt: skip
+            command = self._gui.add_command(label, hotkey=hotkey)  # type: ignore[arg-type]
+            command.on_trigger(lambda _, what=what, value=value: self._ask(what, value))  # type: ignore[misc]
+
+    def adopt(self, scene: Scene) -> None:
+        """Sliders and switches for a scene of the same robots: as long as it, a switch a trajectory."""
+        last = max(len(scene) - 1, 1)
+        length = max(round(float(scene.ends.max() - scene.starts[0]), 1), 0.1) if len(scene) else 1.0
+        if self.stance.max != last:
+            self.stance.max = last
+        if self.time.max != length:
+            self.time.max = length
+        self.stance.disabled = self.time.disabled = not len(scene)
+        added = False
+        for number, layer in enumerate(scene.layers):
+            if layer.name not in self._layers:
+                with self._layer_folder:
+                    box = self._gui.add_checkbox(layer.name, number == 0 or layer.aside or layer.name == TRUE)
+                box.on_update(lambda _: self._ask("changed", 0))
+                self._layers[layer.name] = box
+                added = True
+        if added:
+            self._legend.content = legend(scene)
+        self._curves = residual_curve(scene), error_curves(scene)
+
+    @property
+    def shown(self) -> frozenset[str]:
+        """The trajectories that are switched on."""
+        return frozenset(name for name, box in self._layers.items() if box.value)
+
+    def tell(self, scene: Scene, frame: Frame, time: float, note: str) -> None:
+        """Sliders, plots and the sentence at the top, as the picture is."""
+        if not len(scene):
+            self.status.content = f"**{scene.title}** no poses yet"
+            return
+        stance = scene.stances[frame.row]
+        drivers = ", ".join(stance.movers) or "nobody"
+        anchors = ", ".join(stance.anchors) or "nobody"
+        said = f"**Stance {stance.index}** of {len(scene)}: {drivers} drives, {anchors} stayed put"
+        notes = [one for one in (frame.note, note) if one]
+        text = "\n\n".join([said, *(f"_{one}_" for one in notes)])
+        if self.status.content != text:
+            self.status.content = text
+        at = round(min(max(time - float(scene.starts[0]), 0.0), self.time.max), 1)
+        if self.stance.value != frame.row:
+            self.stance.value = frame.row
+        if abs(self.time.value - at) > 0.05:
+            self.time.value = at
+
+    def plot(self, scene: Scene, row: int) -> None:
+        """The curves, their cursor at a row."""
+        if len(scene):
+            (x, residual), (x_error, errors) = self._curves
+            at = float(scene.stances[row].index)
+            self._residual.data = with_cursor(x, residual, at)
+            self._error.data = with_cursor(x_error, errors, at)
+
+    def inspect(self, text: str, picture: NDArray[np.uint8] | None) -> None:
+        """Open the panel of what was clicked; with an empty text, close it."""
+        if bool(text) != self._clicked:
+            self._clicked = bool(text)
+            self._inspector.visible = self._clicked
+        if text and self._report.content != text:
+            self._report.content = text
+        if picture is not None and picture is not getattr(self, "_shown", None):
+            self._shown = picture
+            self._picture.image = picture
+        visible = picture is not None
+        if self._picture.visible != visible:
+            self._picture.visible = visible
+
+    def dress(self, dark: bool) -> None:
+        """Light or dark."""
+        self._gui.configure_theme(
+            brand_color=palette.rgb("#0072B2"), show_share_button=False, show_logo=False, dark_mode=dark
+        )
+
+    @staticmethod
+    def _plot(
+        labels: list[str], colours: list[str]
+    ) -> tuple[tuple[NDArray[np.float64], ...], tuple[uplot.Series, ...]]:
+        empty = tuple(np.zeros(1) for _ in range(len(labels) + 2))
+        curves = [uplot.Series(label=label, stroke=c, width=2) for label, c in zip(labels, colours, strict=True)]
+        cursor = uplot.Series(label="now", stroke="#8c959f", width=1)
+        return empty, (uplot.Series(label="stance"), *curves, cursor)
+
+
+def legend(scene: Scene) -> str:
+    """What colours and strokes mean, as HTML."""
+    robots = "".join(
+        f'<span style="color:{_hex(colour)};font-weight:600;margin-right:.7em">&#9679; {name}</span>'
+        for name, colour in zip(scene.robots, palette.robot_colours(len(scene.robots)), strict=True)
+    )
+    stops = ", ".join(palette.RESIDUAL_STOPS)
+    lines = [
+        robots,
+        f'edges <span style="display:inline-block;width:90px;height:8px;border-radius:4px;'
+        f'background:linear-gradient(90deg,{stops})"></span> 0 to {palette.MOST_SIGMAS:.0f} sigma'
+        f"<br><small>{scene.edges.of_what}; grey dashes: refused</small>",
+        "thick: estimate, pale: other methods (chained is dashed), black or white: truth",
+        "ring: a robot stayed put there; bold ring: it is the anchor now",
+        "discs and wedges: place and heading to so many sigmas",
+    ]
+    body = "".join(f'<div style="margin:.25em 0">{line}</div>' for line in lines)
+    return f'<div style="padding:.2em .8em .5em;font-size:.8em;line-height:1.45">{body}</div>'
+
+
+def _hex(colour: NDArray[np.uint8]) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*(int(value) for value in colour))

@@ -1,0 +1,62 @@
+"""Curves over the stances, with a cursor where the slider is; uPlot draws nothing where there is NaN, so there is none."""
+
+import numpy as np
+
+from coloc_graph.viewer.scene import Array, Scene
+
+#: So many points a curve at most.
+MOST_POINTS = 400
+
+
+def residual_curve(scene: Scene) -> tuple[Array, Array]:
+    """Stance numbers (n,) and the largest residual of each (n,) [sigma]."""
+    edges = scene.edges
+    known = np.isfinite(edges.sigmas) & edges.used
+    if not known.any():
+        return np.zeros(1), np.zeros(1)
+    rows, first = np.unique(edges.rows[known], return_index=True)
+    return _thinned(_numbers(scene)[rows], np.maximum.reduceat(edges.sigmas[known], first))
+
+
+def error_curves(scene: Scene) -> tuple[Array, Array]:
+    """Stance numbers (n,) and what each robot is off the truth, (r, n) [mm]; without truth, its sigma."""
+    r = len(scene.robots)
+    if not scene.layers or not len(scene):
+        return np.zeros(1), np.zeros((r, 1))
+    base = scene.layers[0]
+    values = scene.errors(base)
+    if scene.true is None:
+        values = np.sqrt(base.covariance.trace(axis1=2, axis2=3).clip(min=0))
+    x, filled = _numbers(scene), np.zeros((r, len(scene)))
+    for n in range(r):
+        known = np.isfinite(values[n])
+        if known.any():
+            filled[n] = np.interp(x, x[known], 1000 * values[n][known])
+    return _thinned(x, filled)
+
+
+def with_cursor(x: Array, curves: Array, at: float) -> tuple[Array, ...]:
+    """x, the curves, and one more that is a vertical line at `at`: three points there, of which the middle is high."""
+    curves = np.atleast_2d(curves)
+    place = int(np.searchsorted(x, at))
+    high = max(float(curves.max(initial=0.0)), 1e-9)
+    here = [np.full(3, np.interp(at, x, curve)) for curve in curves]
+    spike = np.zeros(len(x) + 3)
+    spike[place + 1] = high
+    return (
+        np.insert(x, place, [at] * 3),
+        *(np.concatenate([c[:place], h, c[place:]]) for c, h in zip(curves, here, strict=True)),
+        spike,
+    )
+
+
+def _numbers(scene: Scene) -> Array:
+    return np.array([stance.index for stance in scene.stances], float)
+
+
+def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
+    """At most `MOST_POINTS`, the largest of each stretch."""
+    if len(x) <= MOST_POINTS:
+        return x, y
+    edges = np.linspace(0, len(x), MOST_POINTS + 1).astype(int)[:-1]
+    return x[edges], np.maximum.reduceat(y, edges, axis=-1)

@@ -1,0 +1,204 @@
+"""What the viewer shows, as arrays: robots by stances, one row a robot, NaN where a robot has no pose."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import InputError
+from coloc_graph.frontend import FrontendOptions, WheelTrack
+from coloc_graph.lie import yaw
+from coloc_graph.report.drawing import world_covariances
+from coloc_graph.run import Run, Stance
+from coloc_graph.team import Team
+from coloc_graph.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """The poses of all robots at all stances by one method: `robots` (r) by `stances` (s), NaN where there is none.
+
+    `xyz` (r, s, 3) [m] and `yaw` (r, s) [rad] in the world at `times` (r, s) [s]; `covariance` (r, s, 2, 2) [m^2] of
+    x, y along the world's axes and `yaw_sigma` (r, s) [rad], NaN where there are none. `trajectories` are what it was
+    made of. `aside` is the layer of another result, in a comparison.
+    """
+
+    name: str
+    times: Array
+    xyz: Array
+    yaw: Array
+    covariance: Array
+    yaw_sigma: Array
+    trajectories: Mapping[str, Trajectory]
+    aside: bool = False
+
+    @cached_property
+    def there(self) -> Mask:
+        """Where there is a pose, (r, s)."""
+        return np.isfinite(self.yaw)
+
+    @cached_property
+    def arrived(self) -> Mask:
+        """Where a robot stands elsewhere than at the stance before, (r, s): each place once."""
+        new = self.there.copy()
+        with np.errstate(invalid="ignore"):
+            new[:, 1:] &= ~((self.xyz[:, 1:] == self.xyz[:, :-1]).all(axis=2) & (self.yaw[:, 1:] == self.yaw[:, :-1]))
+        return new
+
+
+def layer_of(
+    name: str,
+    robots: Sequence[str],
+    stances: Sequence[Stance],
+    trajectories: Mapping[str, Trajectory],
+    *,
+    aside: bool = False,
+) -> Layer:
+    """The layer of trajectories; those without stance numbers are taken to have a pose at each stance they cover.
+
+    Raises `InputError` that names robot and stance where a pose is not finite, or of a stance that is not there.
+    """
+    row_of = {stance.index: row for row, stance in enumerate(stances)}
+    r, s = len(robots), len(stances)
+    times, angle, sigma = (np.full((r, s), np.nan) for _ in range(3))
+    xyz, covariance = np.full((r, s, 3), np.nan), np.full((r, s, 2, 2), np.nan)
+    for number, robot in enumerate(robots):
+        one = trajectories.get(robot)
+        if one is None or not len(one):
+            continue
+        named = one.stances if one.stances is not None else np.array([stance.index for stance in stances][: len(one)])
+        unknown = [index for index in named.tolist() if index not in row_of]
+        if unknown or len(named) != len(one):
+            raise InputError(
+                f"{name}: robot {robot} has a pose at stance {unknown[0] if unknown else len(one)}, which the run does "
+                "not hold: give the run that it was made of"
+            )
+        bad = ~np.isfinite(one.T_world_body).all(axis=(1, 2)) | ~np.isfinite(one.times)
+        if bad.any():
+            raise InputError(
+                f"{name}: the pose of robot {robot} at stance {named[bad.argmax()]} is not finite; solve the run again"
+            )
+        rows = np.array([row_of[index] for index in named.tolist()])
+        of_position, of_rotation = world_covariances(one)
+        times[number, rows], xyz[number, rows], angle[number, rows] = one.times, one.positions, yaw(one.T_world_body)
+        covariance[number, rows] = of_position[:, :2, :2]
+        sigma[number, rows] = np.sqrt(of_rotation[:, 2, 2].clip(min=0))
+    return Layer(name, times, xyz, angle, covariance, sigma, dict(trajectories), aside)
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """What pairs of observers measured: `rows` (m,) of the stances, robots `i` and `j` (m,) by number.
+
+    `sigmas` (m,) is the residual of each, RMS in units of its noise, NaN where it is not known; `of_what` says of what
+    it is the residual. `why_not` says why a measurement is not used, "" where it is.
+    """
+
+    rows: Index
+    i: Index
+    j: Index
+    sigmas: Array
+    why_not: tuple[str, ...]
+    of_what: str = ""
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @cached_property
+    def used(self) -> Mask:
+        """Which are in the estimate, (m,)."""
+        return np.array([not why for why in self.why_not], bool)
+
+
+NO_EDGES = Edges(*(np.empty(0, np.int64) for _ in range(3)), np.empty(0), ())
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """All that is shown of a run and its estimates; immutable.
+
+    `layers` are the estimates, the first being the one whose poses the robots stand at. `stayed` are the stay-put
+    constraints (q, 2): robot by number, row of the later stance. `team` is as stated and `calibrated` as it turned out.
+    Without a `run` there are no images, marker tracks and inspections.
+    """
+
+    robots: tuple[str, ...]
+    stances: tuple[Stance, ...]
+    layers: tuple[Layer, ...] = ()
+    edges: Edges = NO_EDGES
+    stayed: Index = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    team: Team | None = None
+    calibrated: Team | None = None
+    run: Run | None = None
+    frontend: FrontendOptions = field(default_factory=FrontendOptions)
+    wheels: Mapping[str, WheelTrack] = field(default_factory=dict)
+    title: str = ""
+
+    def __len__(self) -> int:
+        return len(self.stances)
+
+    @cached_property
+    def starts(self) -> Array:
+        """When the stances begin, (s,) [s]."""
+        return np.array([stance.start for stance in self.stances], float)
+
+    @cached_property
+    def ends(self) -> Array:
+        """When they end, (s,) [s]."""
+        return np.array([stance.end for stance in self.stances], float)
+
+    def row_at(self, time: float) -> int:
+        """The stance that has begun last at a time; the first before it, -1 without any."""
+        return min(max(int(np.searchsorted(self.starts, time, side="right")) - 1, 0), len(self) - 1)
+
+    def middle(self, row: int) -> float:
+        """The middle of a stance [s]; 0 without any."""
+        return float(self.starts[row] + self.ends[row]) / 2 if 0 <= row < len(self) else 0.0
+
+    def roles(self, row: int, robot: str) -> str:
+        """What a robot does in a stance, in a word or two."""
+        if not 0 <= row < len(self):
+            return ""
+        stance = self.stances[row]
+        if robot in stance.movers:
+            return "drives"
+        if robot in stance.observers:
+            return "anchor" if robot in stance.anchors else "watches"
+        return "stands by"
+
+    @cached_property
+    def standing(self) -> Mask:
+        """Who stands still in which stance, (r, s)."""
+        out = np.ones((len(self.robots), len(self)), bool)
+        number = {robot: n for n, robot in enumerate(self.robots)}
+        for row, stance in enumerate(self.stances):
+            for robot in stance.movers:
+                out[number[robot], row] = False
+        return out
+
+    @property
+    def true(self) -> Layer | None:
+        """The true poses."""
+        return next((layer for layer in self.layers if layer.name == TRUE), None)
+
+    def errors(self, layer: Layer) -> Array:
+        """How far each pose of a layer is from the truth, (r, s) [m]; NaN where it is not known."""
+        if self.true is None:
+            return np.full(layer.yaw.shape, np.nan)
+        return np.asarray(np.linalg.norm(layer.xyz[..., :2] - self.true.xyz[..., :2], axis=2))
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Least and greatest x, y of all poses [m]; a square of a metre about 0 where there are none."""
+        every = np.concatenate([np.empty((0, 2)), *(layer.xyz[layer.there][:, :2] for layer in self.layers)])
+        if not len(every):
+            return np.full(2, -0.5), np.full(2, 0.5)
+        return every.min(axis=0), every.max(axis=0)
+
+
+TRUE = "true"

@@ -1,0 +1,263 @@
+"""Scenes of what there is: an estimate, a result on disk, a run that is solved for it, two results of one run."""
+
+import csv
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from coloc_graph.backend import Estimate, chain, smooth
+from coloc_graph.backend.factors import Factors
+from coloc_graph.backend.graph import Places
+from coloc_graph.errors import EstimationError, InputError
+from coloc_graph.evaluation import align
+from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions, WheelTrack
+from coloc_graph.measurements import RelativePose
+from coloc_graph.pipeline import Progress, SolveOptions, solve
+from coloc_graph.results import read_result
+from coloc_graph.run import Run, Stance, open_run, read_truth
+from coloc_graph.team import read_team
+from coloc_graph.trajectory import Trajectory
+from coloc_graph.viewer.scene import NO_EDGES, TRUE, Edges, Index, Layer, Scene, layer_of
+
+#: What the methods' layers are called.
+NAMES = {"chain": "chained", "smooth": "smoothed", "joint": "joint"}
+OF_GRAPH = "of the measurement in the estimate"
+OF_POINTS = "of the points against their homography"
+
+
+def scene_of_estimate(
+    estimate: Estimate,
+    *,
+    run: Run | None = None,
+    measurements: Sequence[PairMeasurement] = (),
+    others: Sequence[Estimate] = (),
+    frontend: FrontendOptions | None = None,
+) -> Scene:
+    """The scene of an estimate, with `others` of the same graph beside it, and the run's truth where it has some.
+
+    `measurements` are all that were made, so that those which never came into the graph are shown too. Raises
+    `InputError` where a pose is not finite.
+    """
+    graph = estimate.graph
+    every = (estimate, *others)
+    layers = [layer_of(NAMES[one.method], graph.robots, graph.stances, one.trajectories) for one in every]
+    team = run.team if run is not None else None
+    return Scene(
+        robots=graph.robots,
+        stances=graph.stances,
+        layers=(*layers, *_true(run, graph.robots, graph.stances, estimate.trajectories)),
+        edges=_edges(estimate, measurements),
+        stayed=stayed(graph.robots, graph.stances, [(s.robot, s.after) for s in graph.stay_puts]),
+        team=team,
+        calibrated=estimate.calibration.of_team(team) if team is not None and estimate.calibration.rows else None,
+        run=run,
+        frontend=frontend or FrontendOptions(),
+        wheels=_wheels(run),
+        title=run.path.name if run is not None else "",
+    )
+
+
+def scene_of_run(run: Run, progress: Progress | None = None) -> Scene:
+    """The scene of a run, solved: joint, with the chain and the pose graph of the same measurements beside it.
+
+    Raises as `pipeline.solve` does.
+    """
+    options = SolveOptions().resolved()
+    solution = solve(run, options, progress)
+    others = []
+    for method in (smooth, chain):
+        try:
+            others.append(method(solution.estimate.graph))
+        except EstimationError:  # what the joint estimate can solve and another cannot is left out
+            continue
+    return scene_of_estimate(
+        solution.estimate, run=run, measurements=solution.measurements, others=others, frontend=options.frontend
+    )
+
+
+def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Scene:
+    """The scene of a result on disk, and of its run at `run_path` or where the result says that it is.
+
+    Raises `InputError` where the folder is no result, or the run is not the one it was made of.
+    """
+    result = read_result(path)
+    where = run_path or result.run_path
+    result.require_run(where)
+    run = open_run(where)
+    name = NAMES.get(str(result.summary.get("method")), str(result.summary.get("method")))
+    robots, stances = run.team.names, run.stances
+    refined = result.path / "team.toml"
+    return Scene(
+        robots=robots,
+        stances=stances,
+        layers=(
+            layer_of(name, robots, stances, result.trajectories),
+            *_true(run, robots, stances, result.trajectories),
+        ),
+        edges=_edges_on_disk(result.path / "measurements.csv", robots, stances),
+        stayed=stayed(robots, stances, _anchored(stances, result.summary.get("bumped", []))),
+        team=run.team,
+        calibrated=read_team(refined) if refined.exists() else None,
+        run=run,
+        frontend=_frontend(result.path / "config.toml"),
+        wheels=_wheels(run),
+        title=result.path.absolute().name,
+    )
+
+
+def with_other(scene: Scene, path: str | Path) -> Scene:
+    """The scene with the layers of another result of the same run; `InputError` where it is of another run."""
+    if scene.run is None:
+        raise InputError(f"{path} cannot be compared: there is no run that both could be of")
+    result = read_result(path)
+    result.require_run(scene.run.path)
+    method = str(result.summary.get("method"))
+    label = f"{result.path.absolute().name}: {NAMES.get(method, method)}"
+    other = layer_of(label, scene.robots, scene.stances, result.trajectories, aside=True)
+    return replace(scene, layers=(*scene.layers, other), title=f"{scene.title} and {result.path.absolute().name}")
+
+
+def is_run(path: str | Path) -> bool:
+    """Whether a path is to be opened as a run, and not as the folder of a result."""
+    return not os.path.isdir(path)  # noqa: PTH112  a path that is not there is opened, and says so
+
+
+def _true(
+    run: Run | None, robots: Sequence[str], stances: Sequence[Stance], estimated: Mapping[str, Trajectory]
+) -> tuple[Layer, ...]:
+    """The true poses in the estimate's world; () where the run has none, or they do not cover the estimate."""
+    if run is None or not any(len(one) for one in estimated.values()):
+        return ()
+    truth = read_truth(run.path)
+    if not truth:
+        return ()
+    try:
+        true = align(estimated, truth, run.team.reference, on_floor=run.team.floor is not None)
+    except InputError:
+        return ()
+    return (
+        layer_of(
+            TRUE,
+            robots,
+            stances,
+            {robot: replace(one, T_world_body=true[robot], covariances=None) for robot, one in estimated.items()},
+        ),
+    )
+
+
+def _wheels(run: Run | None) -> dict[str, WheelTrack]:
+    if run is None:
+        return {}
+    tracks = {robot: WheelTrack(robot, list(run.odometry(robot))) for robot in run.team.names}
+    return {robot: track for robot, track in tracks.items() if len(track)}
+
+
+def _edges(estimate: Estimate, measurements: Sequence[PairMeasurement]) -> Edges:
+    graph = estimate.graph
+    refused = {id(one.measurement): one.reason for one in estimate.refused}
+    sigmas = residuals(estimate)
+    found = [
+        (one.stance, one.robot_i, one.robot_j, sigmas.get(id(one), np.nan), refused.get(id(one), ""))
+        for one in graph.measurements
+        if isinstance(one, RelativePose)
+    ]
+    found += [
+        (h.stance, h.robot_i, h.robot_j, np.nan, h.unusable)
+        for h in (one.homography for one in measurements)
+        if h.unusable
+    ]
+    return as_edges(found, graph.robots, graph.stances, OF_GRAPH)
+
+
+def residuals(estimate: Estimate) -> dict[int, float]:
+    """The residual of each relative pose in its estimate, RMS in units of its noise, by the measurement's identity."""
+    graph = estimate.graph
+    values = gtsam.Values()
+    for robot, trajectory in estimate.trajectories.items():
+        if trajectory.stances is not None:
+            for stance, T in zip(trajectory.stances.tolist(), trajectory.T_world_body, strict=True):
+                if not values.exists(key := graph.key(robot, stance)):
+                    values.insert(key, gtsam.Pose3(T))
+    for key, errors in estimate.calibration.values.items():
+        values.insert(key, errors)
+    factors = Factors(graph.floor, estimate.calibration.variables)
+    out = {}
+    for link in graph.measurements:
+        i, j = (graph.key(*end) for end in link.ends)
+        if isinstance(link, RelativePose) and values.exists(i) and values.exists(j) and i != j:
+            factor = factors.of_link(link, i, j)
+            if all(map(values.exists, factor.keys())):
+                out[id(link)] = float(np.sqrt(2 * factor.error(values) / factors.rows(link, factor)))
+    return out
+
+
+def as_edges(
+    found: Sequence[tuple[int, str, str, float, str]], robots: Sequence[str], stances: Sequence[Stance], of_what: str
+) -> Edges:
+    """Edges of (stance, robot i, robot j, sigmas, why not), in the order of the stances."""
+    row_of = {stance.index: row for row, stance in enumerate(stances)}
+    number = {robot: n for n, robot in enumerate(robots)}
+    kept = [one for one in found if one[0] in row_of and one[1] in number and one[2] in number]
+    if not kept:
+        return NO_EDGES
+    kept.sort(key=lambda one: row_of[one[0]])
+    return Edges(
+        rows=np.array([row_of[one[0]] for one in kept]),
+        i=np.array([number[one[1]] for one in kept]),
+        j=np.array([number[one[2]] for one in kept]),
+        sigmas=np.array([one[3] for one in kept], float),
+        why_not=tuple(one[4] for one in kept),
+        of_what=of_what,
+    )
+
+
+def _edges_on_disk(path: Path, robots: Sequence[str], stances: Sequence[Stance]) -> Edges:
+    """The measurements of a result: their residual is that of the homography, which is what is on disk."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            found = [
+                (
+                    int(row["stance"]),
+                    row["robot_i"],
+                    row["robot_j"],
+                    float(row["residual"] or "nan"),
+                    (row["why_not"] or "for no reason that is written") if row["usable"] != "yes" else "",
+                )
+                for row in csv.DictReader(file)
+            ]
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); solve the run again") from error
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path} is damaged ({error}); solve the run again") from error
+    return as_edges(found, robots, stances, OF_POINTS)
+
+
+def _anchored(stances: Sequence[Stance], bumped: Sequence[Sequence[object]]) -> list[tuple[str, int]]:
+    """Who stayed put, and until which stance: all anchors but those that were found to have been bumped."""
+    moved = {(str(one[0]), one[2]) for one in bumped if len(one) == 3}
+    return [
+        (robot, after.index)
+        for before, after in zip(stances, stances[1:], strict=False)
+        for robot in after.anchors
+        if Places.stays(robot, before, after) and (robot, after.index) not in moved
+    ]
+
+
+def stayed(robots: Sequence[str], stances: Sequence[Stance], held: Sequence[tuple[str, int]]) -> Index:
+    row_of = {stance.index: row for row, stance in enumerate(stances)}
+    number = {robot: n for n, robot in enumerate(robots)}
+    return np.array([(number[robot], row_of[after]) for robot, after in held], np.int64).reshape(-1, 2)
+
+
+def _frontend(path: Path) -> FrontendOptions:
+    """The front end that a result was made with; as it is by default where the file does not say."""
+    try:
+        stated = tomllib.loads(path.read_text(encoding="utf-8"))["options"]["frontend"]
+        return FrontendOptions(**(stated | {"tracker": TrackerOptions(**stated.get("tracker", {}))}))
+    except (OSError, KeyError, TypeError, AttributeError, tomllib.TOMLDecodeError):
+        return FrontendOptions()
