@@ -8,8 +8,8 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command = commands.add_parser(
         "view",
         help="see a result, or a run that is solved for it, in the browser",
-        description="See a result, or a run that is solved for it, in the browser: robots, graph, covariances, and what "
-        "is behind each edge. Ctrl-C ends it.",
+        description="See a result, or a run that is solved for it, in the browser: robots, graph, covariances, and "
+        "what is behind each edge. Ctrl-C ends it.",
     )
     command.add_argument("path", metavar="RUN|DIR", help="a run (.mcap), or a result of `coloc solve`")
     command.add_argument("--run", dest="run_path", metavar="RUN", help="the run of a result, if it is no longer there")

@@ -5,6 +5,7 @@ import threading
 import time
 import traceback
 from collections import deque
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,12 @@ import viser
 
 from coloc_graph.errors import ColocError
 from coloc_graph.frontend import PairMeasurement, measure_pair
+from coloc_graph.run import Run
 from coloc_graph.viewer import inspect
 from coloc_graph.viewer.frame import NO_LINES, Frame, Lines, ViewState, frame_of, pick
 from coloc_graph.viewer.handles import GraphView, Image, initial_camera
 from coloc_graph.viewer.live import LiveScene, LiveStance
-from coloc_graph.viewer.panel import NOBODY, Panel
+from coloc_graph.viewer.panel import NOBODY, Panel, set_value
 from coloc_graph.viewer.scene import Scene
 from coloc_graph.viewer.server import start_server, stop_server, url_of
 from coloc_graph.viewer.worker import Failure, Worker
@@ -59,7 +61,7 @@ class Viewer:
         try:
             compares = any(layer.aside for layer in scene.layers)
             self.panel = Panel(self.server, scene, self._ask, fitting_sigma(scene), compares=compares)
-            self.panel.dark.value = dark
+            set_value(self.panel.dark, dark)
             self.view = GraphView(self.server, scene, dark)
             self._dark = False
             initial_camera(self.server, scene)
@@ -252,7 +254,7 @@ class Viewer:
             elif what == "step":
                 self._time = scene.middle(int(np.clip(scene.row_at(self._time) + value, 0, len(scene) - 1)))
             elif what == "play":
-                self.panel.play.value = not self.panel.play.value
+                set_value(self.panel.play, not self.panel.play.value)
         if played:
             end = float(scene.ends.max())
             self._time += played * self.panel.speed.value
@@ -269,9 +271,7 @@ class Viewer:
         waiting = False
         moment = round(self._time, 1)
         for robot in scene.robots:
-            image = self._worker.ask(
-                f"image {robot}", moment, lambda robot=robot: (inspect.camera_image(run, robot, moment),)
-            )
+            image = self._worker.ask(f"image {robot}", moment, partial(_image_in_a_tuple, run, robot, moment))
             waiting |= image is None
             if isinstance(image, Failure):
                 self._complain(f"No image of {robot}", image.why)
@@ -343,6 +343,10 @@ class Viewer:
     def _notify(self, title: str, text: str) -> None:
         for client in self.server.get_clients().values():
             client.add_notification(title, text, auto_close_seconds=15, color="red")
+
+
+def _image_in_a_tuple(run: Run, robot: str, time: float) -> tuple[Image | None]:
+    return (inspect.camera_image(run, robot, time),)  # None alone is what the worker says before it knows
 
 
 def fitting_sigma(scene: Scene) -> float:

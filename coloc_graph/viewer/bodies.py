@@ -4,6 +4,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from coloc_graph.lie import rotation_x, se3
 from coloc_graph.report.hero import BODY_RADIUS
 from coloc_graph.team import Robot
 from coloc_graph.viewer.palette import Colours
@@ -27,9 +28,9 @@ def robot_mesh(robot: Robot | None, colour: Colours) -> trimesh.Trimesh:
         _painted(_nose(BODY_HEIGHT - 0.012), tint),
     ]
     for side in (-1, 1):
+        T_wheel = se3(rotation_x(np.pi / 2), np.array([0, side * 0.125, 0.032]))
         wheel = trimesh.creation.cylinder(0.032, 0.03, sections=24)
-        wheel.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
-        wheel.apply_translation((0, side * 0.125, 0.032))
+        wheel.apply_transform(T_wheel)
         parts.append(_painted(wheel, (28, 30, 34)))
     markers = None if robot is None else robot.markers
     for x, y, z in np.zeros((0, 3)) if markers is None else markers.p_body:
@@ -91,7 +92,7 @@ def _camera(robot: Robot | None) -> list[trimesh.Trimesh]:
 
 
 def _cylinder(radius: float, z: float, height: float, at: tuple[float, float] = (0.0, 0.0)) -> trimesh.Trimesh:
-    mesh = trimesh.creation.cylinder(radius, height, sections=40)
+    mesh: trimesh.Trimesh = trimesh.creation.cylinder(radius, height, sections=40)
     mesh.apply_translation((*at, z + height / 2))
     return mesh
 
@@ -108,5 +109,5 @@ def _nose(z: float) -> trimesh.Trimesh:
 
 
 def _painted(mesh: trimesh.Trimesh, colour: tuple[int, ...]) -> trimesh.Trimesh:
-    mesh.visual.vertex_colors = np.tile(np.array([*colour, 255], np.uint8), (len(mesh.vertices), 1))
+    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.tile([*colour, 255], (len(mesh.vertices), 1)))
     return mesh

@@ -81,7 +81,9 @@ class Frame:
 
 
 NO_LINES = Lines(np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8))
-NO_BATCH = Batch(*(np.zeros((0, n), np.float32) for n in (4, 3, 3)), np.zeros((0, 3), np.uint8))
+NO_BATCH = Batch(
+    np.zeros((0, 4), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+)
 
 
 def frame_of(scene: Scene, state: ViewState) -> Frame:
@@ -149,7 +151,7 @@ def _way(scene: Scene, layer: Layer, rows: Index, colours: Colours, state: ViewS
             colour = palette.faded(colour, state.dark, 0.45)
         if layer.name == "chained" or (layer.aside and not state.aside):
             segments = dashed(segments)
-        parts.append(Lines(segments, np.broadcast_to(colour, (len(segments), 2, 3))))
+        parts.append(Lines(_f32(segments), np.broadcast_to(colour, (len(segments), 2, 3))))
     if not parts:
         return NO_LINES
     points = np.concatenate([one.points for one in parts]).astype(np.float32)
@@ -210,7 +212,7 @@ def _rings(scene: Scene, layer: Layer, row: int, most: int, colours: Colours, da
     number, at = number[there], at[there]
     if not len(number):
         return NO_BATCH
-    wxyz = np.tile(np.float32([1, 0, 0, 0]), (len(number), 1))
+    wxyz = about_z(np.zeros(len(number)))
     return Batch(wxyz, _raised(layer.xyz[number, at], Z_RING), np.ones((len(number), 3), np.float32), colours[number])
 
 

@@ -25,7 +25,7 @@ Image = NDArray[np.uint8]
 class GraphView:
     """Owns every handle of a scene. Touched by one thread alone, which calls `apply`.
 
-    `images` of `apply` are by robot, None for one that sees nothing; the same object as before is not sent again.
+    `images` of `apply` are by robot, None for one that sees nothing; what is the same as before is not sent again.
     """
 
     def __init__(self, server: viser.ViserServer, scene: Scene, dark: bool = False) -> None:
@@ -48,14 +48,14 @@ class GraphView:
         self.robots, self._frustums, self._names, self._anchors = [], {}, [], []
         for name, colour in zip(scene.robots, palette.robot_colours(len(scene.robots)), strict=True):
             robot = scene.team[name] if scene.team is not None else None
-            path, tint = f"/robots/{name}", tuple(int(value) for value in colour)
+            path, tint = f"/robots/{name}", np.asarray(colour)
             self.robots.append(add.add_frame(path, show_axes=False, visible=False))
             add.add_mesh_trimesh(f"{path}/body", bodies.robot_mesh(robot, colour), receive_shadow=False)
             vertices, faces = bodies.ring(0.19, 0.215)
             self._anchors.append(
                 add.add_mesh_simple(
-                    f"{path}/anchor", vertices, faces, color=tuple(palette.flat(colour).tolist()), position=(0, 0, 0.007), visible=False,
-                    side="double", cast_shadow=False, receive_shadow=False,
+                    f"{path}/anchor", vertices, faces, color=palette.flat(colour), position=(0, 0, 0.007),
+                    visible=False, side="double", cast_shadow=False, receive_shadow=False,
                 )
             )  # fmt: skip
             top = bodies.T_body_camera(robot)[2, 3]
@@ -67,7 +67,7 @@ class GraphView:
                 self._frustums[name] = add.add_camera_frustum(
                     f"{path}/camera", fov=float(2 * np.arctan2(camera.height / 2, camera.fy)),
                     aspect=camera.width / camera.height, scale=FRUSTUM, color=tint, thickness=2.0,
-                    thickness_units="screen", wxyz=quaternion(T[:3, :3]), position=tuple(T[:3, 3]), visible=False,
+                    thickness_units="screen", wxyz=quaternion(T[:3, :3]), position=T[:3, 3], visible=False,
                     cast_shadow=False, receive_shadow=False,
                 )  # fmt: skip
 
@@ -79,12 +79,11 @@ class GraphView:
             self._lines[name] = add.add_line_segments(
                 f"/{name}", none.points, none.colours, thickness=thickness, thickness_units="screen"
             )
-        hidden = Batch(*(np.zeros((1, n), np.float32) for n in (4, 3, 3)), np.zeros((1, 3), np.uint8))
-        hidden.wxyz[:, 0] = 1
+        nowhere = np.zeros((1, 3), np.float32)
         self._batches = {
             name: add.add_batched_meshes_simple(
-                f"/{name}", *mesh, hidden.wxyz, hidden.positions, batched_scales=hidden.scales + 1e-6,
-                batched_colors=hidden.colours, opacity=opacity, lod="off", side="double", visible=False,
+                f"/{name}", *mesh, about_z(np.zeros(1)), nowhere, batched_scales=nowhere + 1e-6,
+                opacity=opacity, lod="off", side="double", visible=False,
                 cast_shadow=False, receive_shadow=False,
             )
             for name, mesh, opacity in (
@@ -100,7 +99,8 @@ class GraphView:
             if name not in self.names:
                 self._lines[f"way {name}"] = self.server.scene.add_line_segments(
                     f"/ways/{len(self.names)}", NO_LINES.points, NO_LINES.colours,
-                    thickness=TRUTH_PX if name == TRUE else OTHER_PX if self.names else ESTIMATE_PX, thickness_units="screen",
+                    thickness=TRUTH_PX if name == TRUE else OTHER_PX if self.names else ESTIMATE_PX,
+                    thickness_units="screen",
                 )  # fmt: skip
                 self.names += (name,)
 
@@ -204,12 +204,12 @@ def initial_camera(server: viser.ViserServer, scene: Scene, aside: float = 0.0) 
 def camera_on(scene: Scene, aside: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where a camera sees all of the data from, and where it looks: (3,) and (3,) [m]."""
     low, high = extent(scene)
-    high = high + (0.0, aside)
+    high = high + np.array([0.0, aside])
     middle, half = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 + 0.4
     along = high - low
     # a long way is seen from its side, and a little from behind
     side = np.array([-0.35, -1.0]) if along[0] >= along[1] else np.array([-1.0, -0.35])
     side /= np.linalg.norm(side)
-    distance = 1.75 * half
-    eye = np.array([*(middle + side * distance * np.cos(np.radians(38))), distance * np.sin(np.radians(38))])
+    distance = 2.0 * half
+    eye = np.array([*(middle + side * distance * np.cos(np.radians(40))), distance * np.sin(np.radians(40))])
     return eye, np.array([*middle, 0.0])

@@ -24,10 +24,14 @@ from coloc_graph.viewer.scene import Array, Scene
 
 Image = NDArray[np.uint8]
 
-#: An image or detections this far from an instant are of it [s].
+#: An image this far from an instant is of it, and a track that pauses for longer is none there [s].
 NEAR = 0.3
+#: Or for so many times as long as it does mostly.
+PAUSE = 5.0
 #: Images are enlarged by so much for the picture.
 ENLARGED = 2
+#: So many points are drawn in it.
+MOST_POINTS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +77,10 @@ def _solutions(run: Run, measured: PairMeasurement) -> tuple[Solution, ...]:
 
 
 def camera_image(run: Run, robot: str, time: float) -> Image | None:
-    """What a robot's camera showed at an instant, RGB; its detections drawn where there are no images; None if none."""
+    """What a robot's camera showed at an instant, RGB; None if nothing.
+
+    Where there are no images, its detections of the stance are drawn, those of the instant bright.
+    """
     camera = run.team[robot].camera
     if run.has_images(robot):
         image = min(run.images(robot, time - NEAR, time + NEAR), key=lambda one: abs(one.time - time), default=None)
@@ -83,7 +90,8 @@ def camera_image(run: Run, robot: str, time: float) -> Image | None:
         return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB if pixels.ndim == 2 else cv2.COLOR_BGR2RGB), np.uint8)
     if not run.has_detections(robot):
         return None
-    seen = list(run.detections(robot, time - NEAR, time + NEAR))
+    of = next((stance for stance in run.stances if stance.start - NEAR <= time <= stance.end + NEAR), None)
+    seen = [] if of is None else list(run.detections(robot, of.start, of.end))
     if not seen:
         return None
     canvas = np.full((camera.height, camera.width, 3), 26, np.uint8)
@@ -98,47 +106,57 @@ def camera_image(run: Run, robot: str, time: float) -> Image | None:
 
 def _picture(run: Run, time: float, robots: tuple[str, str], measured: PairMeasurement) -> Image:
     """Both images side by side with their tracks, and the points of i warped by H onto j."""
-    halves = []
+    halves: list[Image] = []
     for number, robot in enumerate(robots):
         camera = run.team[robot].camera
         image = camera_image(run, robot, time)
         if image is None or not run.has_images(robot):
             image = np.full((camera.height, camera.width, 3), 26, np.uint8)
-        half = cv2.resize(image, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_AREA)
-        half = np.asarray(half * 0.6, np.uint8)  # so that what is drawn stands out
+        large = cv2.resize(image, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_AREA)
+        half: Image = (large * 0.6).astype(np.uint8)  # so that what is drawn stands out
         if measured.tracks is not None:
-            _draw_tracks(half, measured.tracks[number], robot)
+            _draw_tracks(half, measured.tracks[number])
         halves.append(half)
     _draw_points(run, halves, robots, measured)
     for half, text in zip(halves, (f"{robots[0]} (i)", f"{robots[1]} (j)"), strict=True):
-        cv2.putText(half, text, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.65, (255, 255, 255), 1, cv2.LINE_AA)
+        cv2.putText(half, text, (12, 34), cv2.FONT_HERSHEY_SIMPLEX, 0.9, (255, 255, 255), 2, cv2.LINE_AA)
     height = max(half.shape[0] for half in halves)
     padded = [cv2.copyMakeBorder(half, 0, height - len(half), 0, 0, cv2.BORDER_CONSTANT) for half in halves]
     return np.asarray(np.hstack([padded[0], np.full((height, 4, 3), 255, np.uint8), padded[1]]), np.uint8)
 
 
-def _draw_tracks(half: Image, tracks: Sequence[Track], robot: str) -> None:
+def _draw_tracks(half: Image, tracks: Sequence[Track]) -> None:
     for number, track in enumerate(tracks):
         colour = tuple(int(value) for value in palette.ROBOTS[(number + 4) % len(palette.ROBOTS)])
         points = np.round(8 * (ENLARGED * (track.uv + 0.5) - 0.5)).astype(np.int32)
         # a pause in a track is no line across the image
-        for part in np.split(points, np.flatnonzero(np.diff(track.times) > NEAR) + 1):
+        for part in np.split(points, np.flatnonzero(np.diff(track.times) > longest_gap(track.times)) + 1):
             cv2.polylines(half, [part], False, colour, 1, cv2.LINE_AA, 3)
 
 
 def _draw_points(run: Run, halves: list[Image], robots: tuple[str, str], measured: PairMeasurement) -> None:
+    """Some of the points in both images, and in j where H puts those of i."""
     found, h = measured.correspondences, measured.homography
     if found is None or not len(found):
         return
+    some = np.unique(np.linspace(0, len(found) - 1, MOST_POINTS).round().astype(int))
     good = np.zeros(len(found), bool)
     if h.unusable is None:
         good = squared_residuals(h.H_j_i, found.pairs) < INLIER_GATE
-        warped = warp(h.H_j_i, run.team[robots[0]].camera.normalise(found.uv_i), run.team[robots[1]].camera)
-        for uv in warped[np.isfinite(warped).all(axis=1)]:
-            cv2.drawMarker(halves[1], _pixel(ENLARGED * uv), (86, 180, 233), cv2.MARKER_TILTED_CROSS, 9, 1, cv2.LINE_AA)
+        some = np.union1d(some, np.flatnonzero(~good)[:MOST_POINTS])  # what does not fit is what one looks for
     for half, points in zip(halves, (found.uv_i, found.uv_j), strict=True):
-        for uv, fits in zip(points, good, strict=True):
-            cv2.circle(half, _pixel(ENLARGED * uv), 4, (255, 255, 255) if fits else (213, 94, 0), 1, cv2.LINE_AA)
+        for uv, fits in zip(points[some], good[some], strict=True):
+            cv2.circle(half, _pixel(ENLARGED * uv), 5, (255, 255, 255) if fits else (240, 120, 20), 1, cv2.LINE_AA)
+    if h.unusable is None:
+        warped = warp(h.H_j_i, run.team[robots[0]].camera.normalise(found.uv_i[some]), run.team[robots[1]].camera)
+        for uv in warped[np.isfinite(warped).all(axis=1)]:
+            at = _pixel(ENLARGED * uv)
+            cv2.drawMarker(halves[1], at, (86, 180, 233), cv2.MARKER_TILTED_CROSS, 9, 2, cv2.LINE_AA)
+
+
+def longest_gap(times: Array) -> float:
+    """How far apart in time [s] two samples of a way are at most that are joined."""
+    return max(NEAR, PAUSE * float(np.median(np.diff(times)))) if len(times) > 1 else NEAR
 
 
 def warp(H: Array, x: Array, camera: Camera) -> Array:
@@ -148,18 +166,19 @@ def warp(H: Array, x: Array, camera: Camera) -> Array:
 
 
 def _pixel(uv: Array) -> tuple[int, int]:
-    return int(round(float(uv[0]))), int(round(float(uv[1])))
+    return round(float(uv[0])), round(float(uv[1]))
 
 
 def marker_ways(scene: Scene, row: int, measured: Sequence[PairMeasurement], dark: bool) -> tuple[Lines, Lines]:
     """The markers' ways in a stance, on their plane: as each observer sees them, and as they are estimated.
 
     As seen: through the mount that is stated, in the observer's colour. As estimated: through mounts as they turned
-    out, the mean of both observers, in the ink. Both from where the observers are estimated to stand.
+    out, the mean of both observers, in the colour of who drives. Both from where the observers are estimated to stand.
     """
     if scene.run is None or scene.team is None or not scene.layers:
         return _joined([]), _joined([])
     base, number = scene.layers[0], {robot: n for n, robot in enumerate(scene.robots)}
+    colours = palette.robot_colours(len(scene.robots), dark)
     seen: dict[str, list[tuple[Array, Array]]] = {}
     estimated = []
     for one in measured:
@@ -167,13 +186,15 @@ def marker_ways(scene: Scene, row: int, measured: Sequence[PairMeasurement], dar
         places = {robot: base.xyz[number[robot], row] for robot in (h.robot_i, h.robot_j)}
         if one.tracks is None or one.correspondences is None or not all(np.isfinite(p).all() for p in places.values()):
             continue
-        T = {robot: floor_pose(*places[robot][:2], base.yaw[number[robot], row]) for robot in places}
+        T = {robot: floor_pose(places[robot][0], places[robot][1], base.yaw[number[robot], row]) for robot in places}
         for robot, tracks in zip((h.robot_i, h.robot_j), one.tracks, strict=True):
             if robot not in seen:
                 seen[robot] = [
                     (track.times, _on_floor(scene, scene.team, row, robot, T[robot], track.uv)) for track in tracks
                 ]
         team = scene.calibrated or scene.team
+        movers = scene.stances[row].movers
+        colour = colours[number[movers[0]]] if len(movers) == 1 else palette.ink(dark)
         found = one.correspondences
         both = [
             _on_floor(scene, team, row, robot, T[robot], uv)
@@ -181,8 +202,7 @@ def marker_ways(scene: Scene, row: int, measured: Sequence[PairMeasurement], dar
         ]
         for marker in np.unique(found.markers):
             own = found.markers == marker
-            estimated.append((found.times[own], (both[0][own] + both[1][own]) / 2, palette.ink(dark)))
-    colours = palette.robot_colours(len(scene.robots))
+            estimated.append((found.times[own], (both[0][own] + both[1][own]) / 2, colour))
     return (
         _joined([(t, p, palette.faded(colours[number[r]], dark, 0.2)) for r, every in seen.items() for t, p in every]),
         _joined(estimated),
@@ -190,7 +210,7 @@ def marker_ways(scene: Scene, row: int, measured: Sequence[PairMeasurement], dar
 
 
 def _on_floor(scene: Scene, team: Team, row: int, robot: str, T_world_body: Array, uv: Array) -> Array:
-    """Pixels (n, 2) of a robot at rest as points (n, 3) of the marker plane, in the world [m]; NaN above the horizon."""
+    """Pixels (n, 2) of a robot at rest as points (n, 3) [m] of the marker plane in the world; NaN above its horizon."""
     assert scene.run is not None
     one = team[robot]
     try:
@@ -210,7 +230,11 @@ def _joined(parts: Sequence[tuple[Array, Array, palette.Colours]]) -> Lines:
     """Ways as segments: consecutive points, near in time, and not out of sight."""
     points, colours = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3), np.uint8)]
     for times, places, colour in parts:
-        good = (np.diff(times) < NEAR) & np.isfinite(places[:-1]).all(axis=1) & np.isfinite(places[1:]).all(axis=1)
+        good = (
+            (np.diff(times) <= longest_gap(times))
+            & np.isfinite(places[:-1]).all(axis=1)
+            & np.isfinite(places[1:]).all(axis=1)
+        )
         segments = np.stack([places[:-1], places[1:]], axis=1)[good]
         segments[..., 2] = 0.012  # on the floor, where the ways of the robots are
         points.append(segments)

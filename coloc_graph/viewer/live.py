@@ -7,7 +7,7 @@ import numpy as np
 
 from coloc_graph.backend import StanceEstimate
 from coloc_graph.lie import se3_inverse, so3_log
-from coloc_graph.measurements import Measurement, RelativePose
+from coloc_graph.measurements import Measurement, RelativePose, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.scene import Array, Scene, layer_of
@@ -40,7 +40,7 @@ class LiveScene:
         stance, said = one.stance, one.estimate
         self._stances[stance.index] = stance
         refused = {id(r.measurement): r.reason for r in said.refused}
-        times = {m.seen: m.time for m in one.measurements if hasattr(m, "seen")}
+        times = {m.seen: m.time for m in one.measurements if isinstance(m, Sighting)}
         for robot, pose in said.poses.items():
             if robot in stance.observers or robot in times:
                 time = times.get(robot, stance.start)

@@ -72,4 +72,4 @@ def flat(colours: Colours) -> Colours:
 
 def linear(colours: Colours) -> Colours:
     """Colours as viser takes those of line vertices and of batches: linear, and not sRGB."""
-    return _LINEAR[colours]
+    return np.asarray(_LINEAR[colours])

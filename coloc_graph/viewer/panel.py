@@ -12,12 +12,11 @@ from coloc_graph.viewer.frame import Frame
 from coloc_graph.viewer.plots import error_curves, residual_curve, with_cursor
 from coloc_graph.viewer.scene import TRUE, Scene
 
-#: Plots are redrawn this often at most [s]: they are pushed whole.
 NOBODY = "nobody"
 HELP = "Click an edge or a robot. Space plays, arrow keys step."
-WIDTH = 330
+WIDTH, INSPECTOR_WIDTH = 330, 480
 
-#: Called with what was asked for: ("stance", row), ("time", seconds), ("step", rows), ("play", None), ("changed", None).
+#: Called with what was asked for: ("stance", row), ("time", seconds), ("step", rows), ("play", 0), ("changed", 0).
 Ask = Callable[[str, float], None]
 
 
@@ -65,7 +64,7 @@ class Panel:
         with self._inspector.add_tab("Clicked"):
             self._report = gui.add_markdown("")
             self._picture = gui.add_image(np.full((4, 8, 3), 40, np.uint8), format="jpeg", visible=False)
-        self._inspector.float(x=12, y=12, width=440)
+        self._inspector.float(x=12, y=12, width=INSPECTOR_WIDTH)
         self.adopt(scene)
         self._listen()
 
@@ -135,9 +134,9 @@ class Panel:
             self.status.content = text
         at = round(min(max(time - float(scene.starts[0]), 0.0), self.time.max), 1)
         if self.stance.value != frame.row:
-            self.stance.value = frame.row
+            set_value(self.stance, frame.row)
         if abs(self.time.value - at) > 0.05:
-            self.time.value = at
+            set_value(self.time, at)
 
     def plot(self, scene: Scene, row: int) -> None:
         """The curves, their cursor at a row."""
@@ -172,9 +171,17 @@ class Panel:
         labels: list[str], colours: list[str]
     ) -> tuple[tuple[NDArray[np.float64], ...], tuple[uplot.Series, ...]]:
         empty = tuple(np.zeros(1) for _ in range(len(labels) + 2))
-        curves = [uplot.Series(label=label, stroke=c, width=2) for label, c in zip(labels, colours, strict=True)]
-        cursor = uplot.Series(label="now", stroke="#8c959f", width=1)
+        curves = [
+            uplot.Series(label=label, stroke=c, width=2, points={"show": False})
+            for label, c in zip(labels, colours, strict=True)
+        ]
+        cursor = uplot.Series(label="now", stroke="#8c959f", width=1, points={"show": False})
         return empty, (uplot.Series(label="stance"), *curves, cursor)
+
+
+def set_value(handle: object, value: float | bool) -> None:
+    """Set a control from this side."""
+    handle.value = value  # type: ignore[attr-defined]  # viser hides the setter from type checkers
 
 
 def legend(scene: Scene) -> str:

@@ -1,4 +1,4 @@
-"""Curves over the stances, with a cursor where the slider is; uPlot draws nothing where there is NaN, so there is none."""
+"""Curves over the stances, with a cursor where the slider is. Without NaN: uPlot draws nothing where there is one."""
 
 import numpy as np
 

@@ -116,7 +116,8 @@ class Edges:
         return np.array([not why for why in self.why_not], bool)
 
 
-NO_EDGES = Edges(*(np.empty(0, np.int64) for _ in range(3)), np.empty(0), ())
+_NONE: Index = np.empty(0, np.int64)
+NO_EDGES = Edges(_NONE, _NONE, _NONE, np.empty(0), ())
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """Scenes of what there is: an estimate, a result on disk, a run that is solved for it, two results of one run."""
 
 import csv
+import itertools
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -242,13 +243,14 @@ def _anchored(stances: Sequence[Stance], bumped: Sequence[Sequence[object]]) -> 
     moved = {(str(one[0]), one[2]) for one in bumped if len(one) == 3}
     return [
         (robot, after.index)
-        for before, after in zip(stances, stances[1:], strict=False)
+        for before, after in itertools.pairwise(stances)
         for robot in after.anchors
         if Places.stays(robot, before, after) and (robot, after.index) not in moved
     ]
 
 
 def stayed(robots: Sequence[str], stances: Sequence[Stance], held: Sequence[tuple[str, int]]) -> Index:
+    """Stay-put constraints (q, 2), robot by number and row, of (robot, later stance)."""
     row_of = {stance.index: row for row, stance in enumerate(stances)}
     number = {robot: n for n, robot in enumerate(robots)}
     return np.array([(number[robot], row_of[after]) for robot, after in held], np.int64).reshape(-1, 2)
