@@ -1,5 +1,6 @@
 """The joint estimate on runs whose mounts, markers, floor and clocks are not quite as the team says."""
 
+import json
 from dataclasses import replace
 
 import msgspec
@@ -8,13 +9,16 @@ import pytest
 from scipy.stats import chi2
 
 from coloc_graph.backend import Estimator, PoseGraph, joint, smooth
+from coloc_graph.cli.accuracy import print_calibration
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.evaluation import align, evaluate
 from coloc_graph.measurements import RelativePose, Sighting
 from coloc_graph.pipeline import SolveOptions, solve
+from coloc_graph.results import write_result
 from coloc_graph.run import open_run, read_truth
 from coloc_graph.run.reader import read_true_team
 from coloc_graph.simulation import Imperfections, simulate
+from coloc_graph.team import read_team
 
 #: As the issue of the field has it: a degree, half a centimetre, a span by calipers, a floor that is a floor.
 WRONG = Imperfections(mount_sigma_deg=1.0, height_sigma=0.005, span_sigma=1e-4, floor_sigma_deg=0.1)
@@ -221,3 +225,30 @@ def test_a_part_of_a_graph_is_a_graph(solved):
     assert isinstance(part, PoseGraph) and len(part.stances) == 5
     assert all(max(index for _, index in m.ends) < 5 for m in part.measurements)
     assert set(part.nodes) <= set(graph.nodes)
+
+
+def test_a_result_reports_the_calibration_and_holds_the_team_as_it_turned_out(solved, wrong_mounts, tmp_path, capsys):
+    out = tmp_path / "result"
+    write_result(solved, out)
+    rows = json.loads((out / "summary.json").read_text())["calibration"]
+    assert (
+        len(rows) == 7 and {"robot", "what", "unit", "stated", "stated_sigma", "found", "found_sigma"} <= rows[0].keys()
+    )
+    team = read_team(out / "team.toml")
+    found = {(row["robot"], row["what"]): row for row in rows}
+    assert team["A"].mount.tilt_deg == found["A", "tilt"]["found"]
+    assert team["B"].mount.height_sigma == found["B", "height"]["found_sigma"]
+    assert team["C"].markers.span == pytest.approx(found["C", "span"]["found"], abs=1e-12)
+    assert team["C"].mount == solved.run.team["C"].mount  # it looked at nobody
+    report = (out / "report.html").read_text()
+    assert "<h2>Calibration</h2>" in report and f"{found['A', 'tilt']['found']:.3f} ±" in report
+    print_calibration(solved.estimate.calibration)
+    assert f"{found['A', 'roll']['found']:.2f} +- " in capsys.readouterr().out
+
+
+def test_nothing_that_was_exact_is_reported(solutions, tmp_path, capsys):
+    write_result(solutions["joint"], tmp_path / "result")
+    assert not (tmp_path / "result" / "team.toml").exists()
+    assert "Calibration" not in (tmp_path / "result" / "report.html").read_text()
+    print_calibration(solutions["joint"].estimate.calibration)
+    assert capsys.readouterr().out == ""
