@@ -6,8 +6,9 @@
     │   ├── RunError          a run (MCAP)
     │   └── TracksError       tracks or planes in a CSV
     ├── DegenerateGeometry    the geometry cannot give what is asked, with the remedy
-    └── EstimationError       the graph cannot be solved, or the solver's answer did not pass its check
-        └── MeasurementError  a measurement, or a stance, cannot enter the graph
+    ├── EstimationError       the graph cannot be solved, or the solver's answer did not pass its check
+    │   └── MeasurementError  a measurement, or a stance, cannot enter the graph
+    └── RobotError            a device of a robot does not answer, is lost, or refuses to go on
 
 Messages are one sentence: what is wrong, where (file, line, stance, robot), and what to do. They are raised
 deep and caught once, in `cli`, which prints the sentence and ends with exit code 2.
@@ -44,6 +45,10 @@ class EstimationError(ColocError):
 
 class MeasurementError(EstimationError):
     """A measurement, or a stance, cannot enter the graph; the message says which one and why."""
+
+
+class RobotError(ColocError):
+    """A device of a robot does not answer, is lost, or refuses to go on; the message names its port and the remedy."""
 
 
 class ColocWarning(UserWarning):

@@ -1,0 +1,91 @@
+"""The serial line to a Create: found, opened, written to and read from, each with a timeout; `CreateLine`."""
+
+import contextlib
+import threading
+import time
+
+import serial
+
+from coloc_graph.errors import RobotError
+from coloc_graph.robot_io import create_protocol as oi
+from coloc_graph.robot_io.create_odometry import WHEELS
+from coloc_graph.robot_io.create_state import DELTAS, STREAMED
+
+#: How long a robot may take to answer at one baud, and a write or a read to end [s].
+ANSWER, WRITE, READ = 1.0, 0.2, 0.05
+
+
+class CreateLine:
+    """An open line on which a robot streams; `RobotError` where none answers. `model` 1, 2 or None to find out.
+
+    `lost` says why it can be used no more, None while it can.
+    """
+
+    def __init__(self, port: str, model: int | None) -> None:
+        self.port = port
+        self.lost: str | None = None
+        self._lock = threading.RLock()
+        models = [model] if model else [2, 1]
+        try:
+            self._serial = serial.Serial(
+                port, WHEELS[models[0]].baud, timeout=READ, write_timeout=WRITE, exclusive=True
+            )
+        except (OSError, ValueError) as error:
+            raise RobotError(f"cannot open {port} ({error}): is it plugged in, free, and yours to use?") from error
+        try:
+            self.model = next((one for one in models if self._answers(one)), 0)
+            if not self.model:
+                bauds = " or ".join(str(WHEELS[one].baud) for one in models)
+                raise RobotError(f"no Create answers on {port} at {bauds} baud: switch it on, check model and cable")
+        except BaseException:
+            self.close()
+            raise
+
+    def _answers(self, model: int) -> bool:
+        """Whether sound frames come at this model's baud."""
+        self.layouts = [STREAMED[1], (*STREAMED[1], *DELTAS)] if model == 1 else [STREAMED[2]]
+        self.decoder = oi.StreamDecoder(*self.layouts)
+        try:
+            self._serial.baudrate = WHEELS[model].baud
+            self._serial.reset_input_buffer()
+        except OSError as error:
+            raise RobotError(f"{self.port} cannot be set to {WHEELS[model].baud} baud ({error})") from error
+        self.send(bytes([oi.START]) + oi.stream(self.layouts[0]))
+        until = time.monotonic() + ANSWER
+        while time.monotonic() < until and self.decoder.header_counts is None:
+            self.read()
+        return self.decoder.header_counts is not None
+
+    def send(self, data: bytes) -> None:
+        """Write these bytes. `RobotError` where the line is lost or takes nothing."""
+        if self.lost is None:
+            held = self._lock.acquire(timeout=2 * WRITE)
+            try:
+                self._serial.write(data)
+                return
+            except serial.SerialTimeoutException as error:
+                raise RobotError(f"{self.port} takes no bytes: check the cable and its flow control") from error
+            except (OSError, TypeError, ValueError) as error:
+                self.lost = self.lost or str(error)
+            finally:
+                if held:
+                    self._lock.release()
+        raise RobotError(f"the line on {self.port} is lost ({self.lost}): check the cable and open it again")
+
+    def read(self) -> list[dict[int, int]]:
+        """The frames that have come, after `READ` at most. `RobotError` where the line is lost."""
+        try:
+            return self.decoder.feed(self._serial.read(max(1, self._serial.in_waiting)))
+        except (OSError, TypeError) as error:
+            self.lost = self.lost or str(error)
+            with contextlib.suppress(OSError, TypeError):  # the way out may be whole
+                self._serial.write(oi.HALT)
+            raise RobotError(
+                f"the line on {self.port} is lost ({self.lost}): check the cable, open it again"
+            ) from error
+
+    def close(self) -> None:
+        """Let go of the port."""
+        self.lost = self.lost or "closed"
+        with contextlib.suppress(OSError):
+            self._serial.close()
