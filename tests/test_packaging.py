@@ -26,15 +26,15 @@ LAYERS = [
     {"run"},
     {"frontend", "backend", "robot_io", "simulation", "evaluation"},
     {"exchange", "pipeline", "inspection"},
-    {"viewer", "report"},
+    {"report"},
     {"results"},
-    {"experiments"},
+    {"experiments", "viewer"},
     {"cli"},
 ]
 RANK = {part: rank for rank, parts in enumerate(LAYERS) for part in parts}
 #: Only what compares with truth, or shows it, reads it.
 TRUTH = {"read_truth", "read_true_team"}
-READS_TRUTH = {"run", "evaluation", "results", "cli"}
+READS_TRUTH = {"run", "evaluation", "results", "viewer", "cli"}
 
 
 def part_of(path):

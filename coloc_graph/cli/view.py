@@ -34,12 +34,14 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.run import open_run
     from coloc_graph.viewer import Viewer, is_run, scene_of_result, scene_of_run, with_other
     from coloc_graph.viewer.app import missing_images
-    from coloc_graph.viewer.browser import write_png
+    from coloc_graph.viewer.browser import require_browser, write_png
     from coloc_graph.viewer.server import is_loopback, require_free
 
     writes = bool(args.export or args.png)
     port = 0 if writes else args.port
     require_free(args.host, port)  # before the work, not after it
+    if args.png:
+        require_browser()
     if is_run(args.path):
         with progress("measurements made") as report:
             scene = scene_of_run(open_run(args.path), report)

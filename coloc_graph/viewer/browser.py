@@ -1,17 +1,23 @@
 """A picture of the viewer, rendered by the browser that the machine has, without a window."""
 
+import base64
+import json
 import shutil
 import subprocess
 import tempfile
 import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-import cv2
-import numpy as np
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 from coloc_graph.errors import InputError
 from coloc_graph.viewer.app import Viewer
-from coloc_graph.viewer.handles import camera_on
+from coloc_graph.viewer.panel import WIDTH
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 #: Without a window or a graphics card, and without the network.
@@ -19,6 +25,16 @@ ARGUMENTS = (
     "--no-sandbox", "--disable-dev-shm-usage", "--use-gl=angle", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
 )  # fmt: skip
+#: The page has drawn its floor; viser's own name for it.
+DRAWN = "window.__viserMutable?.nodeRefFromName?.['/floor'] != null"
+#: Fonts and textures are decoded by the browser, which does not say when it is done [s].
+DECODING = 3.0
+#: Room beside the scene for the panel, which is cut off [px].
+BESIDE = WIDTH + 8
+_HIDE = (
+    "document.head.appendChild(Object.assign(document.createElement('style'), "
+    "{textContent: '.mantine-Notifications-root{display:none!important}'}))"
+)
 
 
 def find_browser() -> str | None:
@@ -26,46 +42,88 @@ def find_browser() -> str | None:
     return next((path for name in BROWSERS if (path := shutil.which(name))), None)
 
 
-def write_png(viewer: Viewer, path: str | Path, size: tuple[int, int] = (1280, 720), timeout: float = 120.0) -> None:
-    """Render what is shown to a PNG of this width and height, seen from where the data are framed.
-
-    Raises `InputError` where there is no browser, or it does not come up in time [s].
-    """
+def require_browser() -> str:
+    """The path of a Chromium; `InputError` where there is none."""
     browser = find_browser()
     if browser is None:
         raise InputError(
             f"a PNG is rendered by Chromium, and none of {', '.join(BROWSERS)} is on this machine: install one, or "
             "write a page with --export, which any browser opens"
         )
-    width, height = size
+    return browser
+
+
+def write_png(viewer: Viewer, path: str | Path, size: tuple[int, int] = (1280, 720), timeout: float = 120.0) -> None:
+    """Render what is shown to a PNG of this width and height, seen from where the data are framed.
+
+    Raises `InputError` where there is no browser, or it does not come up in time [s].
+    """
+    browser = require_browser()
     until = time.monotonic() + timeout
-    with tempfile.TemporaryDirectory() as profile:
-        page = f"{viewer.url}/?fixedDpr=1"
-        command = [browser, "--headless=new", *ARGUMENTS, f"--user-data-dir={profile}",
-                   f"--window-size={width + 60},{height + 200}", "--remote-debugging-port=0", page]  # fmt: skip
+    try:
+        with _page(browser, until) as page:
+            width, height = size
+            view = {"width": width + BESIDE, "height": height, "deviceScaleFactor": 1, "mobile": False}
+            _call(page, "Emulation.setDeviceMetricsOverride", view, until)
+            _call(page, "Page.navigate", {"url": f"{viewer.url}/?fixedDpr=1"}, until)
+            while not _call(page, "Runtime.evaluate", {"expression": DRAWN}, until)["result"].get("value"):
+                time.sleep(0.2)
+            _call(page, "Runtime.evaluate", {"expression": _HIDE}, until)
+            viewer.wait_idle(max(until - time.monotonic(), 0.1))
+            time.sleep(DECODING)
+            clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
+            shot = _call(page, "Page.captureScreenshot", {"format": "png", "clip": clip}, until)
+    except (TimeoutError, OSError, ValueError, KeyError) as error:
+        raise InputError(f"{browser} gives no picture ({error}); write a page with --export instead") from error
+    try:
+        Path(path).write_bytes(base64.b64decode(shot["data"]))
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}); give another place") from error
+
+
+@contextmanager
+def _page(browser: str, until: float) -> Iterator[Connection]:
+    """An empty page of a browser without a window, to be talked to by Chrome's DevTools protocol."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
+        command = [browser, "--headless=new", *ARGUMENTS, f"--user-data-dir={profile}", "--no-first-run",
+                   "--remote-debugging-port=0", "about:blank"]  # fmt: skip
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
-            before = set(viewer.server.get_clients())
-            while not (new := set(viewer.server.get_clients()) - before):
-                if process.poll() is not None or time.monotonic() > until:
-                    raise InputError(f"{browser} does not come up without a window; write a page with --export instead")
+            said = Path(profile) / "DevToolsActivePort"
+            while not (said.exists() and said.read_text().strip()):
+                _require_time(until)
+                if process.poll() is not None:
+                    raise OSError("it ended at once")
                 time.sleep(0.1)
-            client = viewer.server.get_clients()[new.pop()]
-            viewer.wait_idle(max(until - time.monotonic(), 1.0))
-            time.sleep(3.0)  # textures and fonts are decoded by the browser, which does not say when
-            position, look_at = camera_on(viewer.scene)
-            client.camera.position, client.camera.look_at = position, look_at
-            image = client.get_render(height, width, transport_format="png", timeout=timeout)
-        except TimeoutError as error:
-            raise InputError(f"{browser} gives no picture in {timeout:.0f} s; write a page with --export") from error
+            port = int(said.read_text().split()[0])
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=10) as answer:
+                pages = [one for one in json.load(answer) if one["type"] == "page"]
+            if not pages:
+                raise OSError("it opens no page")
+            with connect(pages[0]["webSocketDebuggerUrl"], max_size=None, open_timeout=10) as page:
+                yield page
         finally:
             process.terminate()
             try:
                 process.wait(timeout=10)
             except subprocess.TimeoutExpired:
                 process.kill()
-    paper = np.array((38, 42, 48) if viewer.panel.dark.value else (255, 255, 255), float)
-    alpha = image[..., 3:4] / 255.0 if image.shape[-1] == 4 else 1.0
-    flat = np.rint(image[..., :3] * alpha + paper * (1 - alpha)).astype(np.uint8)
-    if not cv2.imwrite(str(path), cv2.cvtColor(flat, cv2.COLOR_RGB2BGR)):
-        raise InputError(f"{path} cannot be written; give another place")
+
+
+def _call(page: Connection, method: str, parameters: dict[str, Any], until: float) -> dict[str, Any]:
+    """The answer of the browser to one call."""
+    page.send(json.dumps({"id": 1, "method": method, "params": parameters}))
+    while True:
+        answer = json.loads(page.recv(timeout=_require_time(until)))
+        if answer.get("id") == 1:
+            if "error" in answer:
+                raise ValueError(answer["error"].get("message", method))
+            return dict(answer["result"])
+
+
+def _require_time(until: float) -> float:
+    """What is left of the time [s]; `TimeoutError` where nothing is."""
+    left = until - time.monotonic()
+    if left <= 0:
+        raise TimeoutError("it takes too long")
+    return left
