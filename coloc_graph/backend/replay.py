@@ -2,16 +2,23 @@
 
 import time
 from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from coloc_graph.backend.estimate import Estimate
+from coloc_graph.backend.estimate import Estimate, StanceEstimate
 from coloc_graph.backend.estimator import Estimator
 from coloc_graph.backend.factors import Method
 from coloc_graph.backend.graph import PoseGraph
 from coloc_graph.measurements import Measurement
+from coloc_graph.run import Stance
+
+#: Called after each stance with it, where its robots stand, and what was measured in it and on the way to it.
+Entered = Callable[[Stance, StanceEstimate, Sequence[Measurement]], None]
 
 
-def replay(graph: PoseGraph, method: Method = "smooth") -> tuple[Estimate, tuple[float, ...]]:
+def replay(
+    graph: PoseGraph, method: Method = "smooth", entered: Entered | None = None
+) -> tuple[Estimate, tuple[float, ...]]:
     """The estimate at the end by `smooth` or `joint`, and how long each stance took to enter [s].
 
     A stance without an anchor, which an estimator refuses, raises `MeasurementError`.
@@ -28,7 +35,9 @@ def replay(graph: PoseGraph, method: Method = "smooth") -> tuple[Estimate, tuple
         started = time.perf_counter()
         # before the first nobody can have stayed, whatever it says
         here = replace(stance, anchors=()) if before is None else stance
-        estimator.add(here, by_stance[stance.index], after=before)
+        said = estimator.add(here, by_stance[stance.index], after=before)
         seconds.append(time.perf_counter() - started)
+        if entered is not None:
+            entered(here, said, by_stance[stance.index])
         before = stance.index
     return estimator.estimate(), tuple(seconds)

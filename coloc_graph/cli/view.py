@@ -1,6 +1,11 @@
 """coloc view RUN|DIR."""
 
 import argparse
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coloc_graph.viewer import Viewer
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -27,9 +32,6 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 
 def run(args: argparse.Namespace) -> int:
     """Make the scene, show it."""
-    import sys
-    import webbrowser
-
     from coloc_graph.cli.printing import progress, warn
     from coloc_graph.run import open_run
     from coloc_graph.viewer import Viewer, is_run, scene_of_result, scene_of_run, with_other
@@ -61,8 +63,21 @@ def run(args: argparse.Namespace) -> int:
             print(args.png)
         if writes:
             return 0
-        print(f"{viewer.url} (Ctrl-C ends it)", flush=True)
-        if not args.no_browser and sys.stdout.isatty():
-            webbrowser.open(viewer.url)
-        viewer.wait_closed()
+        show(viewer, browser=not args.no_browser)
     return 0
+
+
+def show(viewer: "Viewer", *, browser: bool, work: Callable[[], None] | None = None) -> None:
+    """Say where a viewer is, open it on a terminal, do what `work` there is, and wait for Ctrl-C, which ends it all."""
+    import sys
+    import webbrowser
+    from contextlib import suppress
+
+    with suppress(KeyboardInterrupt):
+        # stderr, since stdout is for results
+        print(f"the viewer is at {viewer.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
+        if browser and sys.stdout.isatty():
+            webbrowser.open(viewer.url)
+        if work is not None:
+            work()
+        viewer.wait_closed()

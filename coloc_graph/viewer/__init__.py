@@ -6,9 +6,17 @@
 from coloc_graph.viewer.app import Viewer
 from coloc_graph.viewer.live import LiveStance
 from coloc_graph.viewer.scene import Edges, Layer, Scene
-from coloc_graph.viewer.sources import is_run, scene_of_estimate, scene_of_result, scene_of_run, with_other
+from coloc_graph.viewer.sources import (
+    empty_scene,
+    is_run,
+    scene_of_estimate,
+    scene_of_result,
+    scene_of_run,
+    scene_of_solution,
+    with_other,
+)
 
 __all__ = [
-    "Edges", "Layer", "LiveStance", "Scene", "Viewer", "is_run", "scene_of_estimate", "scene_of_result", "scene_of_run",
-    "with_other",
+    "Edges", "Layer", "LiveStance", "Scene", "Viewer", "empty_scene", "is_run", "scene_of_estimate", "scene_of_result",
+    "scene_of_run", "scene_of_solution", "with_other",
 ]  # fmt: skip

@@ -17,7 +17,7 @@ from coloc_graph.frontend import PairMeasurement, measure_pair
 from coloc_graph.run import Run
 from coloc_graph.viewer import inspect
 from coloc_graph.viewer.frame import NO_LINES, Frame, Lines, ViewState, frame_of, pick
-from coloc_graph.viewer.handles import GraphView, Image, initial_camera
+from coloc_graph.viewer.handles import GraphView, Image, camera_on, initial_camera
 from coloc_graph.viewer.live import LiveScene, LiveStance
 from coloc_graph.viewer.panel import NOBODY, Panel, set_value
 from coloc_graph.viewer.scene import Scene
@@ -235,8 +235,12 @@ class Viewer:
         self._measured.clear()
         if at_end:
             self._time = self._scene.middle(len(self._scene) - 1)
-        if first:
-            initial_camera(self.server, self._scene)
+        initial_camera(self.server, self._scene)  # of who comes later, and of `reset view`
+        if first and len(self._scene):
+            set_value(self.panel.k_sigma, int(fitting_sigma(self._scene)))
+            position, look_at = camera_on(self._scene)
+            for client in self.server.get_clients().values():
+                client.camera.position, client.camera.look_at = position, look_at
         self._grown_at = time.perf_counter()
 
     def _move(self, played: float) -> None:

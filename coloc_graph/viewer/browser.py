@@ -27,8 +27,9 @@ ARGUMENTS = (
 )  # fmt: skip
 #: The page has drawn its floor; viser's own name for it.
 DRAWN = "window.__viserMutable?.nodeRefFromName?.['/floor'] != null"
-#: Fonts and textures are decoded by the browser, which does not say when it is done [s].
-DECODING = 3.0
+#: The browser fades in, and decodes fonts and textures, and does not say when it is done: a picture counts that stays
+#: the same for so long [s].
+SETTLED = 2.0
 #: Room beside the scene for the panel, which is cut off [px].
 BESIDE = WIDTH + 8
 _HIDE = (
@@ -69,14 +70,16 @@ def write_png(viewer: Viewer, path: str | Path, size: tuple[int, int] = (1280, 7
             while not _call(page, "Runtime.evaluate", {"expression": DRAWN}, until)["result"].get("value"):
                 time.sleep(0.2)
             _call(page, "Runtime.evaluate", {"expression": _HIDE}, until)
+            while not viewer.server.get_clients():
+                _require_time(until)
+                time.sleep(0.1)
             viewer.wait_idle(max(until - time.monotonic(), 0.1))
-            time.sleep(DECODING)
             clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
-            shot = _call(page, "Page.captureScreenshot", {"format": "png", "clip": clip}, until)
+            picture = _settled(page, {"format": "png", "clip": clip}, until)
     except (TimeoutError, OSError, ValueError, KeyError) as error:
         raise InputError(f"{browser} gives no picture ({error}); write a page with --export instead") from error
     try:
-        Path(path).write_bytes(base64.b64decode(shot["data"]))
+        Path(path).write_bytes(picture)
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror}); give another place") from error
 
@@ -108,6 +111,15 @@ def _page(browser: str, until: float) -> Iterator[Connection]:
                 process.wait(timeout=10)
             except subprocess.TimeoutExpired:
                 process.kill()
+
+
+def _settled(page: Connection, parameters: dict[str, Any], until: float) -> bytes:
+    """A screenshot that is the same as the two before it."""
+    pictures: list[bytes] = []
+    while len(pictures) < 3 or len(set(pictures[-3:])) > 1:
+        time.sleep(SETTLED / 2)
+        pictures.append(base64.b64decode(_call(page, "Page.captureScreenshot", parameters, until)["data"]))
+    return pictures[-1]
 
 
 def _call(page: Connection, method: str, parameters: dict[str, Any], until: float) -> dict[str, Any]:

@@ -210,6 +210,6 @@ def camera_on(scene: Scene, aside: float = 0.0) -> tuple[NDArray[np.float64], ND
     # a long way is seen from its side, and a little from behind
     side = np.array([-0.35, -1.0]) if along[0] >= along[1] else np.array([-1.0, -0.35])
     side /= np.linalg.norm(side)
-    distance = 2.0 * half
+    distance = 1.8 * half
     eye = np.array([*(middle + side * distance * np.cos(np.radians(40))), distance * np.sin(np.radians(40))])
     return eye, np.array([*middle, 0.0])

@@ -13,7 +13,7 @@ from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.scene import Array, Scene, layer_of
 from coloc_graph.viewer.sources import as_edges, stayed
 
-#: What the layer is called, and what its edges' residuals are of.
+#: What the layer is called where the scene it starts from has none, and what its edges' residuals are of.
 LIVE, OF_PAIR = "live", "of the relative pose, against the poses when it came in"
 
 
@@ -31,6 +31,7 @@ class LiveScene:
 
     def __init__(self, start: Scene) -> None:
         self._start = start
+        self._name = start.layers[0].name if start.layers else LIVE
         self._stances: dict[int, Stance] = {}
         self._poses: dict[str, dict[int, tuple[float, Array, Array]]] = {robot: {} for robot in start.robots}
         self._found: list[tuple[int, str, str, float, str]] = []
@@ -73,7 +74,7 @@ class LiveScene:
         return replace(
             self._start,
             stances=stances,
-            layers=(layer_of(LIVE, robots, stances, trajectories),) if stances else (),
+            layers=(layer_of(self._name, robots, stances, trajectories),) if stances else (),
             edges=as_edges(self._found, robots, stances, OF_PAIR),
             stayed=stayed(robots, stances, held),
         )

@@ -5,20 +5,21 @@ import itertools
 import os
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
-from coloc_graph.backend import Estimate, chain, smooth
+from coloc_graph.backend import Estimate, Method, chain, smooth
 from coloc_graph.backend.factors import Factors
 from coloc_graph.backend.graph import Places
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.evaluation import align
 from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions, WheelTrack
 from coloc_graph.measurements import RelativePose
-from coloc_graph.pipeline import Progress, SolveOptions, solve
+from coloc_graph.pipeline import Progress, Solution, SolveOptions, solve
 from coloc_graph.results import read_result
 from coloc_graph.run import Run, Stance, open_run, read_truth
 from coloc_graph.team import read_team
@@ -63,22 +64,40 @@ def scene_of_estimate(
     )
 
 
+def empty_scene(run: Run, method: Method, frontend: FrontendOptions | None = None) -> Scene:
+    """The scene of a run before anything is estimated, for stances to be published to."""
+    return Scene(
+        robots=run.team.names,
+        stances=(),
+        layers=(layer_of(NAMES[method], run.team.names, (), {}),),
+        team=run.team,
+        run=run,
+        frontend=frontend or FrontendOptions(),
+        wheels=_wheels(run),
+        title=run.path.name,
+    )
+
+
 def scene_of_run(run: Run, progress: Progress | None = None) -> Scene:
     """The scene of a run, solved: joint, with the chain and the pose graph of the same measurements beside it.
 
     Raises as `pipeline.solve` does.
     """
     options = SolveOptions().resolved()
-    solution = solve(run, options, progress)
-    others = []
-    for method in (smooth, chain):
-        try:
-            others.append(method(solution.estimate.graph))
-        except EstimationError:  # what the joint estimate can solve and another cannot is left out
-            continue
+    return scene_of_solution(solve(run, options, progress))
+
+
+def scene_of_solution(solution: Solution) -> Scene:
+    """The scene of a solution, with what the other methods make of the same measurements beside it."""
+    estimate, others = solution.estimate, []
+    for name, method in (("smooth", smooth), ("chain", chain)):
+        if name != estimate.method:
+            with suppress(EstimationError):  # what one method can solve and another cannot is left out
+                others.append(method(estimate.graph))
     return scene_of_estimate(
-        solution.estimate, run=run, measurements=solution.measurements, others=others, frontend=options.frontend
-    )
+        estimate, run=solution.run, measurements=solution.measurements, others=others,
+        frontend=solution.options.resolved().frontend,
+    )  # fmt: skip
 
 
 def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Scene:

@@ -1,0 +1,436 @@
+"""The viewer without a browser: scenes, pictures of them, picking, bad input, the server."""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from teams import graph_of_team, team_of
+
+from coloc_graph.backend import replay, smooth
+from coloc_graph.cli import main
+from coloc_graph.errors import InputError
+from coloc_graph.lie import floor_pose
+from coloc_graph.run import Stance, open_run
+from coloc_graph.simulation import simulate
+from coloc_graph.trajectory import Trajectory
+from coloc_graph.viewer import (
+    LiveStance,
+    Scene,
+    Viewer,
+    empty_scene,
+    inspect,
+    palette,
+    scene_of_estimate,
+    scene_of_result,
+    scene_of_solution,
+    with_other,
+)
+from coloc_graph.viewer.frame import MOVING, ViewState, dashed, ellipse_axes, frame_of, pick, thinned_rows
+from coloc_graph.viewer.live import LiveScene
+from coloc_graph.viewer.motion import pose_at
+from coloc_graph.viewer.plots import with_cursor
+from coloc_graph.viewer.scene import layer_of
+from coloc_graph.viewer.server import is_loopback, require_free, url_of
+
+COLOC = Path(sys.executable).with_name("coloc")
+
+
+def shown(scene, row=None, **options):
+    row = len(scene) - 1 if row is None else row
+    names = frozenset(layer.name for layer in scene.layers)
+    return frame_of(scene, ViewState(time=scene.middle(row), shown=names, **options))
+
+
+@pytest.fixture(scope="module")
+def scene(result):
+    return scene_of_result(result)
+
+
+@pytest.fixture(scope="module")
+def solved(short_solution):
+    return scene_of_solution(short_solution)
+
+
+# scenes
+
+
+def test_a_result_on_disk_is_what_was_solved(scene, solutions):
+    estimate = solutions["joint"].estimate
+    assert [layer.name for layer in scene.layers] == ["joint", "true"]
+    base = scene.layers[0]
+    for number, robot in enumerate(scene.robots):
+        for row, stance in enumerate(scene.stances):
+            assert np.allclose(base.xyz[number, row], estimate.pose(robot, stance.index).translation(), atol=1e-9)
+    assert len(scene.edges) == len(solutions["joint"].measurements) and scene.edges.used.all()
+    assert {(scene.robots[n], row) for n, row in scene.stayed} == {
+        (stay.robot, stay.after) for stay in estimate.graph.stay_puts
+    }
+    assert (np.nanmax(scene.errors(base)) < 0.02 and scene.calibrated is None) or scene.calibrated.names == scene.robots
+
+
+def test_all_methods_of_a_solution_are_layers_and_residuals_are_in_sigmas(solved):
+    assert [layer.name for layer in solved.layers] == ["joint", "smoothed", "chained", "true"]
+    assert solved.edges.of_what == "of the measurement in the estimate"
+    assert ((solved.edges.sigmas > 0.1) & (solved.edges.sigmas < 3)).all()
+
+
+def test_residuals_are_what_the_noise_is():
+    """RMS over 8 rows of unit variance each: a median near 1, whatever the team."""
+    team = team_of(4, 30, seed=2)
+    drawn = scene_of_estimate(smooth(graph_of_team(team)))
+    assert drawn.run is None and 0.5 < np.median(drawn.edges.sigmas) < 1.2
+
+
+def test_a_wrong_measurement_is_a_refused_edge_with_its_reason():
+    team = team_of(4, 6, seed=3, wrong=0.1)
+    estimate = smooth(graph_of_team(team))
+    drawn = scene_of_estimate(estimate)
+    wrong = {one for one in drawn.edges.why_not if one}
+    assert len(estimate.refused) == (~drawn.edges.used).sum() > 0 and all("contradicted" in why for why in wrong)
+    frame = shown(drawn)
+    assert len(frame.refused.points) > (~drawn.edges.used).sum()  # dashes
+
+
+def test_nan_in_a_pose_names_robot_and_stance():
+    stances = [Stance(n, 10.0 * n, 10.0 * n + 5, ("A", "B")) for n in range(3)]
+    T = np.tile(np.eye(4), (3, 1, 1))
+    T[1, 0, 3] = np.nan
+    with pytest.raises(InputError, match="robot B at stance 1 is not finite"):
+        layer_of("joint", ("A", "B"), stances, {"B": Trajectory("B", np.arange(3.0), T, np.arange(3))})
+
+
+def test_a_pose_of_a_stance_that_is_not_there_is_refused():
+    stances = [Stance(0, 0.0, 5.0, ("A",))]
+    with pytest.raises(InputError, match="pose at stance 4, which the run does not hold"):
+        layer_of("joint", ("A",), stances, {"A": Trajectory("A", np.zeros(1), np.eye(4)[None], np.array([4]))})
+
+
+@pytest.mark.parametrize("stances", [0, 1])
+def test_empty_and_tiny_scenes_have_a_picture(short, stances):
+    empty = empty_scene(open_run(short), "joint")
+    drawn = replace(empty, stances=open_run(short).stances[:stances])
+    if stances:
+        first = Trajectory("A", np.zeros(1), np.eye(4)[None], np.zeros(1, int), np.zeros((1, 6, 6)))
+        drawn = replace(drawn, layers=(layer_of("joint", drawn.robots, drawn.stances, {"A": first}),))
+    frame = shown(drawn)
+    assert frame.row == stances - 1 and np.isfinite(frame.poses).all(axis=1).sum() == stances
+    low, high = drawn.bounds()
+    assert np.isfinite([low, high]).all()
+
+
+def test_scenes_without_any_layer_have_a_picture():
+    assert frame_of(Scene(("A",), ()), ViewState()).row == -1
+
+
+# pictures
+
+
+def test_observers_stand_during_a_stance_and_walk_between():
+    stances = (Stance(0, 0.0, 4.0, ("A",)), Stance(1, 10.0, 14.0, ("A",)))
+    T = floor_pose([0.0, 1.0], [0.0, 0.0], [3.0, -3.0])
+    one = layer_of("joint", ("A",), stances, {"A": Trajectory("A", np.array([0.0, 10.0]), T, np.arange(2))})
+    drawn = Scene(("A",), stances, (one,))
+    way = pose_at(drawn, one, 0, np.array([-5.0, 0.0, 3.9, 7.0, 10.0, 99.0]))
+    assert np.allclose(way[:, 0], [0, 0, 0, 0.5, 1, 1])
+    assert np.isclose(np.cos(way[3, 3]), -1)  # from 3 to -3 rad it turns the short way, by pi
+
+
+def test_wheels_lead_from_pose_to_pose(scene):
+    base, number = scene.layers[0], scene.robots.index("C")
+    times = base.times[number]
+    assert np.allclose(pose_at(scene, base, number, times)[:, :2], base.xyz[number, :, :2], atol=1e-9)
+    dense = pose_at(scene, base, number, np.linspace(times[0], times[-1], 4000))
+    steps = np.linalg.norm(np.diff(dense[:, :2], axis=0), axis=1)
+    assert steps.max() < 0.1 * np.ptp(dense[:, 0]) and steps.sum() > 1.5 * np.linalg.norm(dense[-1] - dense[0])
+
+
+def test_a_frame_shows_no_more_than_what_was(scene):
+    frames = [shown(scene, row) for row in range(len(scene))]
+    assert [frame.row for frame in frames] == list(range(len(scene)))
+    assert [len(frame.edge_ids) for frame in frames] == [
+        int((scene.edges.rows <= row).sum()) for row in range(len(scene))
+    ]
+    assert len(frames[0].rings.wxyz) == 0 < len(frames[-1].rings.wxyz)
+    assert all(not frame.note for frame in frames)
+    assert frames[3].roles == tuple(scene.roles(3, robot) for robot in scene.robots)
+    assert set(frames[3].roles) == {"anchor", "watches", "drives"}
+
+
+def test_ellipses_have_the_axes_of_their_covariances(rng):
+    root = rng.normal(size=(5, 2, 2))
+    covariance = root @ root.mT
+    axes, direction = ellipse_axes(covariance)
+    values, vectors = np.linalg.eigh(covariance)
+    assert np.allclose(axes, np.sqrt(values[:, ::-1]))
+    along = np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    assert np.allclose(np.abs((along * vectors[:, :, 1]).sum(axis=1)), 1)
+
+
+@pytest.mark.parametrize(("row", "most"), [(0, 10), (9, 10), (10, 10), (5000, 100), (5000, 1)])
+def test_thinning_keeps_the_last_ones_and_spreads_the_rest(row, most):
+    rows = thinned_rows(row, most)
+    assert rows[-1] == row and (np.diff(rows) > 0).all() and len(rows) <= most + 1
+    if row + 1 > most > 1:
+        assert rows[0] == 0 and (rows[-(most // 2) :] == np.arange(row - most // 2 + 1, row + 1)).all()
+
+
+def test_dashes_lie_on_their_segment_and_are_not_too_many():
+    whole = np.array([[[0.0, 0, 0], [1, 0, 0]]])
+    cut = dashed(whole)
+    assert len(cut) == 9 and cut.min() == 0 and cut[:, :, 0].max() < 1
+    assert 0.4 < (cut[:, 1] - cut[:, 0]).sum() < 0.6
+    assert dashed(1e6 * whole) is not None and len(dashed(1e6 * whole)) == 1
+
+
+def huge(stances):
+    """A scene of three robots that leap on and on, made of arrays."""
+    robots = ("A", "B", "C")
+    made = tuple(
+        Stance(n, 10.0 * n, 10.0 * n + 5, ("A", "B"), ("C",), ("AB"[n % 2],) if n else ()) for n in range(stances)
+    )
+    n = np.arange(stances)
+    C = np.tile(1e-4 * np.eye(6), (stances, 1, 1))
+    paths = {
+        robot: Trajectory(robot, 10.0 * n, floor_pose(0.3 * (n // 2), np.full(stances, 0.5 * k), 0.0 * n), n, C)
+        for k, robot in enumerate(robots)
+    }
+    return Scene(robots, made, (layer_of("joint", robots, made, paths),))
+
+
+def test_a_huge_scene_is_thinned_while_it_moves_and_says_so():
+    drawn = huge(20_000)
+    moving, resting = shown(drawn, rests=False), shown(drawn)
+    assert len(moving.ellipses.wxyz) < MOVING < len(resting.ways["joint"].points)
+    assert "of 20,000 stances are drawn" in moving.note and "more when time rests" in moving.note
+    seconds = min(timed(lambda: shown(drawn, rests=False)) for _ in range(5))
+    assert seconds < 0.05  # 3 ms on a machine that does nothing else
+
+
+def timed(what):
+    started = time.perf_counter()
+    what()
+    return time.perf_counter() - started
+
+
+# picking
+
+
+def test_a_ray_finds_the_edge_or_the_robot_it_passes(scene):
+    frame = shown(scene)
+    eye = np.array([-1.0, -4.0, 3.0])
+    for number in range(len(frame.edge_ids)):
+        middle = frame.edge_points[number].mean(axis=0)
+        if min(np.linalg.norm(middle[:2] - pose[:2]) for pose in frame.poses) > 0.45:
+            assert pick(frame, eye, middle - eye) == ("edge", int(frame.edge_ids[number]))
+    for number, pose in enumerate(frame.poses):
+        assert pick(frame, eye, np.add(pose[:3], (0, 0, 0.2)) - eye) == ("robot", number)
+    assert pick(frame, eye, (0, 0, 1)) is None and pick(frame, eye, (0, -1, 0)) is None
+
+
+# inspection
+
+
+def test_an_edge_is_measured_again_and_decomposed_both_ways(scene, solutions):
+    measured = solutions["joint"].measurements[2]
+    found = inspect.examine(scene, 2)
+    assert np.allclose(found.measured.homography.H_j_i, measured.homography.H_j_i)
+    taken = [n for n, one in enumerate(found.solutions) if one.taken]
+    assert taken == [measured.relative_pose.solution]
+    assert found.solutions[taken[0]].normal_error_deg < found.solutions[1 - taken[0]].normal_error_deg
+    assert np.isclose(np.deg2rad(found.solutions[taken[0]].normal_error_deg), measured.relative_pose.normal_error)
+    assert found.picture.ndim == 3 and found.picture.std() > 5
+    text = inspect.edge_report(scene, 2, found)
+    for word in ("inliers", "overlap", "clock", "decomposition", "**taken**", f"{measured.homography.points}"):
+        assert word in text
+
+
+def test_points_warped_by_the_homography_are_where_the_other_camera_sees_them(scene):
+    found = inspect.examine(scene, 1).measured
+    cameras = [scene.team[robot].camera for robot in (found.homography.robot_i, found.homography.robot_j)]
+    warped = inspect.warp(found.homography.H_j_i, cameras[0].normalise(found.correspondences.uv_i), cameras[1])
+    assert np.median(np.linalg.norm(warped - found.correspondences.uv_j, axis=1)) < 1.0  # 0.3 px of noise in both
+
+
+def test_marker_ways_of_both_observers_lie_on_each_other_and_where_the_driver_was(scene):
+    row = 3
+    found = [inspect.examine(scene, n).measured for n in np.flatnonzero(scene.edges.rows == row)]
+    seen, estimated = inspect.marker_ways(scene, row, found, dark=False)
+    driver = scene.robots.index(scene.stances[row].movers[0])
+    way = pose_at(scene, scene.layers[0], driver, np.linspace(scene.starts[row], scene.ends[row], 500))
+    for lines in (seen, estimated):
+        points = lines.points.reshape(-1, 3)
+        off = np.linalg.norm(points[:, None, :2] - way[None, :, :2], axis=2).min(axis=1)
+        assert len(points) > 10 and np.median(off) < 0.3  # a marker is 0.125 m off the middle of its robot
+
+
+def test_a_camera_shows_its_detections_where_there_are_no_images(scene):
+    during = inspect.camera_image(scene.run, "A", scene.middle(0))
+    assert during.shape == (240, 320, 3) and during.max() > 200
+    assert inspect.camera_image(scene.run, "A", scene.starts[0] - 100) is None
+
+
+def test_a_robot_is_told_in_numbers(scene):
+    text = inspect.robot_report(scene, 1, 4)
+    for word in ("Robot B, stance 4", "heading", "sigma x, y", "off the truth", "mount", "tilt"):
+        assert word in text
+
+
+def test_without_a_run_an_edge_says_what_is_missing():
+    drawn = scene_of_estimate(smooth(graph_of_team(team_of(3, 4))))
+    with pytest.raises(InputError, match="no run to measure this pair in"):
+        inspect.examine(drawn, 0)
+
+
+# live
+
+
+def test_stances_that_are_published_make_the_scene(short_solution):
+    start = empty_scene(short_solution.run, "joint")
+    live, graph = LiveScene(start), short_solution.estimate.graph
+    replay(graph, "joint", lambda *one: live.add(LiveStance(*one)))
+    grown = live.scene()
+    last = grown.layers[0].xyz[:, -1]
+    for number, robot in enumerate(grown.robots):
+        want = short_solution.estimate.pose(robot, graph.stances[-1].index).translation()
+        assert np.allclose(last[number], want, atol=2e-3)
+    assert len(grown.edges) == 3 and np.isfinite(grown.edges.sigmas).all() and len(grown.stayed) == 2
+
+
+def test_publishing_costs_the_estimator_less_than_a_millisecond(short_solution):
+    entered = []
+    replay(short_solution.estimate.graph, "joint", lambda *one: entered.append(LiveStance(*one)))
+    with Viewer(empty_scene(short_solution.run, "joint"), port=0) as viewer:
+        seconds = [timed(lambda one=one: viewer.publish(one)) for _ in range(100) for one in entered]
+        assert np.median(seconds) < 1e-3
+        assert viewer.wait_idle() and len(viewer.scene) == len(entered)
+
+
+# server and command
+
+
+def test_a_busy_port_and_a_host_that_is_none_are_told_at_once(tmp_path, capsys):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"port {port} of 127.0.0.1 is taken"):
+            require_free("127.0.0.1", port)
+        assert main(["view", str(tmp_path / "no.mcap"), "--port", str(port)]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+        with pytest.raises(InputError, match="taken"):
+            Viewer(Scene(("A",), ()), port=port)
+    with pytest.raises(InputError, match="not an address of this machine"):
+        require_free("192.0.2.1", 8080)  # set aside for documentation, RFC 5737
+    with pytest.raises(InputError, match="there is no port 70000"):
+        require_free("127.0.0.1", 70_000)
+
+
+@pytest.mark.parametrize(("host", "own"), [("127.0.0.1", True), ("localhost", True), ("::1", True), ("0.0.0.0", False)])
+def test_only_loopback_is_private(host, own):
+    assert is_loopback(host) is own
+    assert url_of("0.0.0.0", 80) == "http://127.0.0.1:80" and url_of("::1", 80) == "http://[::1]:80"
+
+
+def test_nobody_is_given_a_share_link():
+    with Viewer(Scene(("A",), ()), port=0) as viewer:
+        assert viewer.server.request_share_url() is None
+        assert viewer.server._share_tunnel is None
+        assert viewer.url.startswith("http://127.0.0.1:")
+
+
+def test_a_closed_viewer_leaves_its_port():
+    viewer = Viewer(Scene(("A",), ()), port=0)
+    port = viewer.server.get_port()
+    viewer.close()
+    viewer.close()
+    require_free("127.0.0.1", port)
+    assert not viewer._thread.is_alive()
+
+
+def test_ctrl_c_ends_it_without_a_word(result):
+    command = [COLOC, "view", result, "--no-browser", "--port", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        said = process.stderr.readline()
+        assert re.match(r"the viewer is at http://127\.0\.0\.1:\d+ \(Ctrl-C ends it\)", said)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert (process.returncode, out, err) == (0, "", "")
+
+
+@pytest.mark.parametrize("make", ["another run", "no result", "damaged"])
+def test_bad_input_is_one_sentence(make, result, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    if make == "no result":
+        copy.mkdir()
+        words = "is not a result"
+    else:
+        shutil.copytree(result, copy)
+        words = "damaged"
+        run = result.parent / "hallway.mcap"
+        shutil.copy(run, tmp_path / "hallway.mcap")
+        if make == "another run":
+            simulate("hallway", tmp_path / "hallway.mcap", stances=2, seed=9, points=20)
+            words = "is not the run that"
+        else:
+            (copy / "measurements.csv").write_text("stance,nothing\n1,2\n")
+    assert main(["view", str(copy), "--no-browser", "--port", "0"]) == 2
+    err = capsys.readouterr().err
+    assert words in err and err.startswith("coloc: ") and err.count("\n") == 1
+
+
+def test_another_result_is_compared_and_one_of_another_run_refused(scene, result, short_solution, tmp_path):
+    from coloc_graph.results import write_result
+
+    both = with_other(scene, result)
+    assert [layer.aside for layer in both.layers] == [False, False, True]
+    beside, over = shown(both, aside=2.0), shown(both)
+    name = both.layers[-1].name
+    assert np.isclose(
+        beside.ways[name].points[..., 1].mean() - shown(both).ways["joint"].points[..., 1].mean(), 2, atol=0.5
+    )
+    assert len(over.ways[name].points) > len(beside.ways[name].points)  # dashed where it lies over the first
+    write_result(short_solution, tmp_path / "other")
+    with pytest.raises(InputError, match="is not the run that"):
+        with_other(scene, tmp_path / "other")
+
+
+def test_images_that_are_missing_are_said(short, copied, tmp_path):
+    from coloc_graph.viewer.app import missing_images
+
+    blind = copied(short, tmp_path / "blind.mcap", change=lambda r: None if hasattr(r, "uv") and r.robot == "A" else r)
+    assert missing_images(empty_scene(open_run(short), "joint")) == ""
+    drawn = replace(empty_scene(open_run(blind), "joint"), stances=open_run(blind).stances)
+    assert "neither images nor detections of A" in missing_images(drawn)
+
+
+def test_without_a_browser_a_png_is_refused_with_the_way_out(result, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PATH", os.fspath(tmp_path))
+    assert main(["view", str(result), "--png", str(tmp_path / "view.png")]) == 2
+    assert "rendered by Chromium" in (err := capsys.readouterr().err) and "--export" in err and err.count("\n") == 1
+
+
+# colours and plots
+
+
+def test_residuals_are_told_apart_and_unknown_ones_are_grey():
+    colours = palette.of_residuals(np.array([0.0, 2.0, 3.0, 50.0, np.nan]), dark=False)
+    assert (colours[2] == colours[3]).all() and (colours[4] == palette.grey(False)).all()
+    assert np.abs(np.diff(colours[:3].astype(int), axis=0)).sum(axis=1).min() > 100
+
+
+def test_the_cursor_is_a_line_at_the_slider():
+    x, curve, spike = with_cursor(np.arange(5.0), np.array([1.0, 2, 3, 4, 5]), 2.0)
+    assert (np.diff(x) >= 0).all() and np.isfinite(curve).all() and spike.max() == 5 and x[spike.argmax()] == 2
+    assert np.isclose(curve[spike.argmax()], 3)

@@ -1,0 +1,102 @@
+"""The viewer in a real browser: what a user sees and does."""
+
+# ruff: noqa: F811  the fixtures' names are imported, and are arguments
+
+import numpy as np
+import pytest
+from browser import browser, client_of, page_of, pixel_of, place_of, until  # noqa: F401  fixtures
+
+from coloc_graph.backend import replay
+from coloc_graph.viewer import LiveStance, Viewer, empty_scene, scene_of_result, scene_of_solution
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def scene(result):
+    return scene_of_result(result)
+
+
+def test_slider_click_and_keys(scene, page_of):
+    """One page for all three, since a page takes seconds to come up."""
+    with Viewer(scene, port=0) as viewer:
+        page = page_of(viewer.url, "/robots/A")
+        client = client_of(viewer)
+        assert viewer.wait_idle()
+        last, before = viewer.frame.row, place_of(page, "/robots/A")
+        assert last == len(scene) - 1
+
+        # the slider moves a robot
+        slider = page.get_by_role("slider").first
+        slider.focus()
+        slider.press("Home")
+        assert until(lambda: viewer.frame.row == 0)
+        assert until(lambda: np.linalg.norm(np.subtract(place_of(page, "/robots/A"), before)) > 0.5)
+
+        # the space bar plays, and time goes on
+        page.locator("canvas").first.focus()
+        page.mouse.move(5, 250)
+        slider.blur()
+        page.keyboard.press("Space")
+        assert until(lambda: viewer.panel.play.value)
+        played = viewer.panel.time.value
+        assert until(lambda: viewer.panel.time.value > played + 5)
+        page.keyboard.press("Space")
+        assert until(lambda: not viewer.panel.play.value)
+        page.keyboard.press("Home")
+        assert until(lambda: viewer.frame.row == 0)
+        page.keyboard.press("ArrowRight")
+        assert until(lambda: viewer.frame.row == 1)
+
+        # a click on an edge opens its panel
+        viewer.go(last)
+        assert until(lambda: viewer.frame.row == last) and viewer.wait_idle()
+        points = viewer.frame.edge_points
+        seen = [(n, pixel_of(client, points[n].mean(axis=0))) for n in range(len(points))]
+        clear = [
+            (n, uv)
+            for n, uv in seen
+            if 20 < uv[0] < client.camera.image_width - 20
+            and 20 < uv[1] < client.camera.image_height - 20
+            and min(np.linalg.norm(uv - pixel_of(client, pose[:3])) for pose in viewer.frame.poses) > 40
+        ]
+        number, uv = clear[0]
+        page.mouse.move(*uv)
+        page.mouse.down()
+        page.mouse.up()
+        assert until(lambda: viewer._picked == ("edge", int(viewer.frame.edge_ids[number])))
+        edge, edges = int(viewer.frame.edge_ids[number]), scene.edges
+        title = f"{scene.robots[edges.i[edge]]} - {scene.robots[edges.j[edge]]}, stance {edges.rows[edge]}"
+        assert until(lambda: page.get_by_text(title).first.is_visible())
+        assert until(lambda: page.get_by_text("decomposition").first.is_visible())
+        assert until(lambda: page.get_by_text("inliers").first.is_visible())
+
+
+def test_a_live_stance_appears_while_one_looks_at_an_old_one(short_solution, page_of):
+    run = short_solution.run
+    with Viewer(empty_scene(run, "joint"), port=0) as viewer:
+        page = page_of(viewer.url)
+        entered = []
+        replay(short_solution.estimate.graph, "joint", lambda *one: entered.append(LiveStance(*one)))
+        for one in entered[:2]:
+            viewer.publish(one)
+        assert until(lambda: len(viewer.scene) == 2) and viewer.wait_idle()
+        assert until(lambda: page.evaluate("() => window.__viserMutable.nodeRefFromName['/robots/A'].visible"))
+        viewer.go(0)
+        assert until(lambda: viewer.frame.row == 0)
+        viewer.publish(entered[2])
+        assert until(lambda: page.get_by_role("slider").first.get_attribute("aria-valuemax") == "2")
+        assert viewer.frame.row == 0
+        viewer.publish(scene_of_solution(short_solution))
+        assert until(lambda: page.get_by_text("chained").first.is_visible())
+        assert viewer.frame.row == 0
+
+
+def test_an_exported_page_opens_from_its_file(scene, page_of, tmp_path):
+    path = tmp_path / "view.html"
+    with Viewer(scene, port=0) as viewer:
+        viewer.export(path)
+        wanted = viewer.frame.poses[0]
+    assert path.stat().st_size < 3e6
+    page = page_of(path.as_uri(), "/robots/A")
+    assert until(lambda: np.hypot(*np.delete(place_of(page, "/robots/A"), 1)) > 0.5 * np.hypot(*wanted[:2]))
