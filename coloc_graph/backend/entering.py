@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 #: What is no further than this from where it is expected [m, rad], or than so many sigmas of the wheels that expect it
 #: there, is taken in at once and tested then.
-NEAR, SIGMAS = 0.05, 4.0
+NEAR, SIGMAS = 0.05, 6.0
 
 #: A link and the keys of its ends.
 Tie = tuple[Link, int, int]
