@@ -22,7 +22,7 @@ from coloc_graph.robot_io.process_end import guard, release
 from coloc_graph.run.messages import OdometrySample
 
 #: How long a drive command holds by default, and at most [s].
-LEASE, LONGEST_LEASE = 0.25, 0.5
+LEASE, LONGEST_LEASE = 0.2, 0.5
 #: Without a frame for this long [s], a moving robot is stopped and a standing one does not set off.
 STALE = 0.3
 #: How often what must end is looked for, and a stop that the robot has not taken is sent again [s].
@@ -178,7 +178,7 @@ class Create:
             line = self._may_drive()
         self._halt(None)
         state = self._feed.state
-        asleep = self._stale() or state is None or state.mode == Mode.OFF
+        asleep = self._feed.age > STALE or state is None or state.mode == Mode.OFF
         self._armed = False
         line.send((bytes([oi.START]) if asleep else b"") + self._enter_mode + oi.HALT + oi.stream(line.layouts[0]))
         since = time.monotonic() + 2 * oi.STREAM_PERIOD
@@ -225,9 +225,6 @@ class Create:
     def _enter_mode(self) -> bytes:
         return bytes([oi.FULL if self._mode == Mode.FULL else oi.SAFE])
 
-    def _stale(self) -> bool:
-        return self._feed.age > STALE
-
     def _may_drive(self) -> CreateLine:
         """The line. `RobotError` where it must not be driven."""
         if self._line is None:
@@ -235,7 +232,7 @@ class Create:
         why, remedy = self._fault, "put it right and call recover()"
         if self._line.lost:
             why, remedy = f"its line is lost ({self._line.lost})", "check the cable, close it and open it again"
-        elif why is None and self._stale():
+        elif why is None and self._feed.age > STALE:
             why = f"no sensor data came for {STALE} s"
         if why is not None:
             raise RobotError(f"the Create on {self.port} does not drive, {why}: {remedy}")
@@ -243,14 +240,14 @@ class Create:
 
     def _halt(self, fault: str | None) -> None:
         """Stop the wheels and remember why; never raises."""
-        if fault and not self._fault:
-            self._fault = fault
-            log.warning("Create on %s stops: %s", self.port, fault)
+        new, self._fault = bool(fault and not self._fault), self._fault or fault
         self._halts += 1
         self._deadline, self._commanded, self._halted_at = None, (0, 0), time.monotonic()
         if self._line is not None:
             with contextlib.suppress(RobotError):
                 self._line.send(oi.HALT)
+        if new:
+            log.warning("Create on %s stops: %s", self.port, fault)
 
     def _wait(self, met: Callable[[], bool], timeout: float) -> bool:
         return self._feed.wait(met, lambda: self._line is None or self._line.lost is not None, timeout)
@@ -262,6 +259,8 @@ class Create:
         except BaseException as error:
             if not self._ended.is_set():
                 self._halt(str(error) if isinstance(error, RobotError) else f"its driver failed ({error!r})")
+                if line.lost and work == self._read:
+                    line.stop_when_back(self._ended)
 
     def _read(self, line: CreateLine) -> None:
         """The reader thread: frames as they come, and what they tell to stop for."""
@@ -284,8 +283,7 @@ class Create:
         left_mode = self._armed and state.mode != self._mode
         self._armed, self._hazards = state.mode == self._mode, set(hazards)
         if left_mode:
-            left, now_in = self._mode.name.lower(), state.mode.name.lower()
-            self._halt(f"it left {left} mode for {now_in}{self._feed.because}")
+            self._halt(f"it left {self._mode.name.lower()} mode for {state.mode.name.lower()}{self._feed.because}")
         elif new:
             self._halt(f"it met {' and '.join(new)}")
 
@@ -295,7 +293,7 @@ class Create:
             now, deadline = time.monotonic(), self._deadline
             if deadline is not None and now >= deadline:
                 self._halt(None)
-            elif deadline is not None and self._stale():
+            elif deadline is not None and self._feed.age > STALE:
                 self._halt(f"no sensor data came for {STALE} s")
             elif deadline is None and self._feed.told_to_move and now - self._halted_at > REPEAT and not line.lost:
                 self._halt(None)

@@ -14,7 +14,7 @@ import termios
 import threading
 import time
 import tty
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection
 from typing import Self
 
 import numpy as np
@@ -24,14 +24,8 @@ from coloc_graph.robot_io import create_protocol as oi
 from coloc_graph.robot_io.create_odometry import WHEELS
 from coloc_graph.robot_io.create_physics import Body, Physics
 from coloc_graph.robot_io.create_protocol import Mode, Packet
+from coloc_graph.robot_io.create_state import CLIFFS, DROPS
 
-CLIFFS = {
-    "left": Packet.CLIFF_LEFT,
-    "front_left": Packet.CLIFF_FRONT_LEFT,
-    "front_right": Packet.CLIFF_FRONT_RIGHT,
-    "right": Packet.CLIFF_RIGHT,
-}
-DROPS = {"left": oi.BumpDrop.DROP_LEFT, "right": oi.BumpDrop.DROP_RIGHT, "caster": oi.BumpDrop.DROP_CASTER}
 _BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 
 
@@ -56,22 +50,14 @@ class CreateEmulator:
         self.mute = False
         self.corruption = 0.0
         self.received = bytearray()
-        self._cliffs: set[str] = set()
-        self._drops: set[str] = set()
-        self._docked = False
+        self._cliffs, self._drops, self._docked = set[str](), set[str](), False
         self._asked_at = [0.0, 0.0]
         self._listed: tuple[int, ...] = ()
-        self._streaming = False
-        self._next_frame = 0.0
-        self._pending = b""
+        self._streaming, self._next_frame, self._pending = False, 0.0, b""
         self._rng = np.random.default_rng(self._body.physics.seed + 1)
         self._lock = threading.RLock()
-        self._master, self._slave = os.openpty()  # the far end stays open here, so that a driver may come and go
-        tty.setraw(self._master)
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.port = os.ttyname(self._slave)
-        self._wired, self._ended = True, False
+        self._wired = self._ended = False
+        self.plug_in()
         self._thread = threading.Thread(target=self._run, name=f"emulated Create {model}", daemon=True)
         self._thread.start()
 
@@ -94,6 +80,15 @@ class CreateEmulator:
                 self._wired = False
                 os.close(self._slave)
                 os.close(self._master)
+
+    def plug_in(self) -> None:
+        """A line, and with it a new `port`, as at the start or after `hang_up`."""
+        with self._lock:
+            self.hang_up()
+            self._master, self._slave = os.openpty()  # the far end stays open here: a driver may come and go
+            tty.setraw(self._slave)
+            os.set_blocking(self._master, False)
+            self.port, self._wired = os.ttyname(self._slave), True
 
     @property
     def pose(self) -> NDArray[np.float64]:
@@ -119,14 +114,14 @@ class CreateEmulator:
             return np.array(self._body.trace)
 
     def cliff(self, where: str, there: bool = True) -> None:
-        """A cliff under "left", "front_left", "front_right" or "right"."""
+        """A cliff under "left", "front left", "front right" or "right"."""
         with self._lock:
-            _mark(self._cliffs, CLIFFS, where, there)
+            _mark(self._cliffs, CLIFFS.values(), where, there)
 
     def wheel_drop(self, where: str, there: bool = True) -> None:
         """The "left" or "right" wheel, or the "caster" (Create 1), hangs in the air."""
         with self._lock:
-            _mark(self._drops, DROPS, where, there)
+            _mark(self._drops, DROPS.values(), where, there)
 
     def dock(self, there: bool = True) -> None:
         """On the charger, or off it."""
@@ -227,9 +222,9 @@ class CreateEmulator:
         body = self._body
         if packet == Packet.BUMPS_DROPS:
             bumps = body.bump_left * oi.BumpDrop.BUMP_LEFT | body.bump_right * oi.BumpDrop.BUMP_RIGHT
-            return int(bumps | sum(DROPS[where] for where in self._drops))
-        if packet in CLIFFS.values():
-            return int(any(CLIFFS[where] == packet for where in self._cliffs))
+            return int(bumps | sum(bit for bit, where in DROPS.items() if where in self._drops))
+        if packet in CLIFFS:
+            return int(CLIFFS[Packet(packet)] in self._cliffs)
         if packet in (Packet.LEFT_TICKS, Packet.RIGHT_TICKS):
             i = packet - Packet.LEFT_TICKS
             return self._encoders[i] + int(body.counted[i] // WHEELS[2].metres)
@@ -267,7 +262,7 @@ class CreateEmulator:
             os.write(self._master, data)
 
 
-def _mark(marked: set[str], known: Mapping[str, int], where: str, there: bool) -> None:
+def _mark(marked: set[str], known: Collection[str], where: str, there: bool) -> None:
     if where not in known:
         raise ValueError(f'"{where}" is none of {", ".join(known)}')
     (marked.add if there else marked.discard)(where)

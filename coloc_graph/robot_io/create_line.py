@@ -11,8 +11,8 @@ from coloc_graph.robot_io import create_protocol as oi
 from coloc_graph.robot_io.create_odometry import WHEELS
 from coloc_graph.robot_io.create_state import DELTAS, STREAMED
 
-#: How long a robot may take to answer at one baud, and a write or a read to end [s].
-ANSWER, WRITE, READ = 1.0, 0.2, 0.05
+#: How long a robot may take to answer at one baud, a write or a read to end, a lost port to come back [s].
+ANSWER, WRITE, READ, BACK = 1.0, 0.2, 0.05, 10.0
 
 
 class CreateLine:
@@ -27,9 +27,7 @@ class CreateLine:
         self._lock = threading.RLock()
         models = [model] if model else [2, 1]
         try:
-            self._serial = serial.Serial(
-                port, WHEELS[models[0]].baud, timeout=READ, write_timeout=WRITE, exclusive=True
-            )
+            self._serial = self._opened(models[0])
         except (OSError, ValueError) as error:
             raise RobotError(f"cannot open {port} ({error}): is it plugged in, free, and yours to use?") from error
         try:
@@ -83,6 +81,21 @@ class CreateLine:
             raise RobotError(
                 f"the line on {self.port} is lost ({self.lost}): check the cable, open it again"
             ) from error
+
+    def stop_when_back(self, ended: threading.Event) -> bool:
+        """For some seconds after the line was lost, stop the robot if its port comes back. Whether it did."""
+        until = time.monotonic() + BACK
+        with contextlib.suppress(OSError):
+            self._serial.close()
+        while time.monotonic() < until and not ended.wait(0.05):
+            with contextlib.suppress(OSError, ValueError), self._opened(self.model) as again:
+                again.write(oi.HALT + oi.pause_stream() + bytes([oi.START]))
+                again.flush()
+                return True
+        return False
+
+    def _opened(self, model: int) -> serial.Serial:
+        return serial.Serial(self.port, WHEELS[model].baud, timeout=READ, write_timeout=WRITE, exclusive=True)
 
     def close(self) -> None:
         """Let go of the port."""

@@ -55,8 +55,14 @@ def arc_covariance(left: float, right: float, base: float) -> Array:
     var_left, var_right = per_metre * abs(left), per_metre * abs(right)
     forward, turned = (left + right) / 2, (right - left) / base
     c, s = cos(turned / 2), sin(turned / 2)
+    chord = s / (turned / 2) if abs(turned) > 1e-6 else 1.0
+    shrinks = (c - chord) / turned if abs(turned) > 1e-6 else 0.0
     # columns: forward, turned
-    J = np.array([[c, -forward * s / 2], [s, forward * c / 2], [0.0, 1.0]])
+    J = np.array([
+        [chord * c, forward * (shrinks * c - chord * s / 2)],
+        [chord * s, forward * (shrinks * s + chord * c / 2)],
+        [0.0, 1.0],
+    ])  # fmt: skip
     W = np.array([[0.5, 0.5], [-1 / base, 1 / base]])  # of left, right
     A = J @ W
     covariance: Array = A @ np.diag([var_left, var_right]) @ A.T

@@ -184,7 +184,7 @@ class StreamDecoder:
     """
 
     def __init__(self, *layouts: Sequence[int]) -> None:
-        self._layouts = {sum(1 + PACKETS[i].size for i in one): tuple(one) for one in layouts}
+        self._layouts = {sum(1 + PACKETS[i].size for i in one): (tuple(one), _struct(one)) for one in layouts}
         self._longest = max(self._layouts) + 3
         self._buffer = bytearray()
         self._stretch = 0
@@ -230,14 +230,17 @@ class StreamDecoder:
         with_header, without = sum(frame) & 0xFF == 0, sum(frame[1:]) & 0xFF == 0
         if not (with_header or without) or self.header_counts not in (None, with_header):
             return None
-        values, at = {}, 2
-        for i in self._layouts[frame[1]]:
-            end = at + 1 + PACKETS[i].size
-            if frame[at] != i:
-                return None
-            values.update(decode_values([i], frame[at + 1 : end]))
-            at = end
+        packets, layout = self._layouts[frame[1]]
+        read = layout.unpack(frame[2:-1])
+        if read[::2] != packets:
+            return None
         if self.header_counts is None and self._last == with_header:
             self.header_counts = with_header
         self._last = with_header
-        return values
+        return dict(zip(packets, read[1::2], strict=True))
+
+
+def _struct(packets: Sequence[int]) -> struct.Struct:
+    """Of a frame's body: each packet's number, then its value."""
+    kinds = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h"}
+    return struct.Struct(">" + "".join("B" + kinds[PACKETS[i].size, PACKETS[i].signed] for i in packets))

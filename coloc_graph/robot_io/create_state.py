@@ -5,19 +5,20 @@ from dataclasses import dataclass
 
 from coloc_graph.robot_io.create_protocol import BumpDrop, Mode, Packet
 
-_CLIFFS = {
+#: Where cliffs, dropped wheels and bumps may be.
+CLIFFS = {
     Packet.CLIFF_LEFT: "left",
     Packet.CLIFF_FRONT_LEFT: "front left",
     Packet.CLIFF_FRONT_RIGHT: "front right",
     Packet.CLIFF_RIGHT: "right",
 }
-_DROPS = {BumpDrop.DROP_LEFT: "left", BumpDrop.DROP_RIGHT: "right", BumpDrop.DROP_CASTER: "caster"}
+DROPS = {BumpDrop.DROP_LEFT: "left", BumpDrop.DROP_RIGHT: "right", BumpDrop.DROP_CASTER: "caster"}
 _BUMPS = {BumpDrop.BUMP_LEFT: "left", BumpDrop.BUMP_RIGHT: "right"}
 
 #: What the driver streams from each model; a Create 1 is asked for `DELTAS` only now and then.
 DELTAS = (Packet.DISTANCE, Packet.ANGLE)
 _COMMON = (
-    Packet.BUMPS_DROPS, *_CLIFFS, Packet.CHARGERS, Packet.MODE, Packet.CHARGING_STATE, Packet.VOLTAGE, Packet.CHARGE,
+    Packet.BUMPS_DROPS, *CLIFFS, Packet.CHARGERS, Packet.MODE, Packet.CHARGING_STATE, Packet.VOLTAGE, Packet.CHARGE,
     Packet.CAPACITY, Packet.REQUESTED_LEFT, Packet.REQUESTED_RIGHT,
 )  # fmt: skip
 STREAMED: dict[int, tuple[Packet, ...]] = {1: _COMMON, 2: (*_COMMON, Packet.LEFT_TICKS, Packet.RIGHT_TICKS)}
@@ -67,8 +68,8 @@ def read_state(values: Mapping[int, int], time: float) -> CreateState:
         time,
         Mode(values[Packet.MODE]),
         frozenset(where for bit, where in _BUMPS.items() if bits & bit),
-        frozenset(where for packet, where in _CLIFFS.items() if values[packet]),
-        frozenset(where for bit, where in _DROPS.items() if bits & bit),
+        frozenset(where for packet, where in CLIFFS.items() if values[packet]),
+        frozenset(where for bit, where in DROPS.items() if bits & bit),
         "home base" if chargers & 2 else "internal" if chargers & 1 else None,
         values[Packet.CHARGING_STATE] in (1, 2, 3),
         values[Packet.VOLTAGE] * 1e-3,
