@@ -30,6 +30,8 @@ unit: $(VENV)/installed-dev
 bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/single_step.py
 	$(BIN)/python benchmarks/hallway.py --seeds 40
+	$(BIN)/python benchmarks/joint.py
+	$(BIN)/python benchmarks/joint.py --images 10 --six-step 50 --far 50 --honesty 200 --speed
 	$(BIN)/python benchmarks/relative_pose.py --outliers
 	$(BIN)/python benchmarks/frontend.py
 	$(BIN)/python benchmarks/clock_offset.py
