@@ -28,6 +28,8 @@ from coloc_graph.viewer.worker import Failure, Worker
 BETWEEN_FRAMES, UNTIL_REST = 0.03, 0.35
 #: Live stances are put together at most this often [s].
 BETWEEN_GROWTHS = 0.25
+#: Plots are pushed whole, and this often at most while time moves [s].
+BETWEEN_PLOTS = 0.15
 
 
 class Viewer:
@@ -53,11 +55,11 @@ class Viewer:
         self._ways: tuple[Lines, Lines] = (NO_LINES, NO_LINES)
         self._measured: dict[tuple[int, str, str], PairMeasurement] = {}
         self._live = LiveScene(scene)
-        self._grown_at = 0.0
+        self._grown_at = self._plotted_at = 0.0
         self._told: set[str] = set()
         self._note = missing_images(scene)
         self.frame: Frame | None = None
-        self.frame_seconds = 0.0
+        self.frame_seconds = self.frame_cpu_seconds = 0.0
         try:
             compares = any(layer.aside for layer in scene.layers)
             self.panel = Panel(self.server, scene, self._ask, fitting_sigma(scene), compares=compares)
@@ -164,7 +166,7 @@ class Viewer:
                 if self._ending:
                     return
                 self._awake = False
-            now = time.perf_counter()
+            now, used = time.perf_counter(), time.thread_time()
             try:
                 pending = self._step(now - played_at if playing else 0.0)
             except Exception as error:  # a thread that has died would look like a viewer that hangs
@@ -173,6 +175,7 @@ class Viewer:
                 pending = False
             played_at = now
             self.frame_seconds = time.perf_counter() - now
+            self.frame_cpu_seconds = time.thread_time() - used
             time.sleep(max(BETWEEN_FRAMES - self.frame_seconds, 0.005))
 
     def _step(self, played: float) -> bool:
@@ -185,7 +188,7 @@ class Viewer:
             panel.dress(self._dark)
             self.view.dress(scene, self._dark)
         rests = time.perf_counter() - self._moved_at > UNTIL_REST
-        low, high = scene.bounds()
+        low, high = scene.bounds
         state = ViewState(
             time=self._time,
             shown=panel.shown,
@@ -205,7 +208,9 @@ class Viewer:
         self.view.apply(frame, state, self._images, *ways)
         self.frame = frame
         panel.tell(scene, frame, self._time, self._note)
-        panel.plot(scene, frame.row)
+        if rests or time.perf_counter() - self._plotted_at > BETWEEN_PLOTS:
+            panel.plot(scene, frame.row)
+            self._plotted_at = time.perf_counter()
         waiting |= self._inspect(frame)
         self._follow(frame)
         return waiting or not rests

@@ -15,7 +15,7 @@ from coloc_graph.viewer.scene import Array, Index, Layer, Scene
 Float32 = NDArray[np.float32]
 
 #: So many poses are drawn at most: while time moves, and once it rests.
-MOVING, RESTING = 4_000, 20_000
+MOVING, RESTING = 2_400, 20_000
 #: Heights [m] over the floor: ellipses, rings, wedges, trajectories, edges.
 Z_ELLIPSE, Z_RING, Z_WEDGE, Z_WAY, Z_EDGE = 0.004, 0.006, 0.008, 0.010, 0.13
 #: Dashes and gaps of what is refused, and of what is chained, are so long [m]; so many at most.
@@ -124,7 +124,8 @@ def thinned_rows(row: int, most: int) -> Index:
         return np.arange(row + 1)
     recent = max(most // 2, 1)
     early = np.linspace(0, row - recent, max(most - recent, 1)).round().astype(np.int64)
-    return np.unique(np.concatenate([early, np.arange(row - recent + 1, row + 1)]))
+    rows = np.concatenate([early, np.arange(row - recent + 1, row + 1)])
+    return np.asarray(rows[np.append(True, np.diff(rows) > 0)])
 
 
 def _way(scene: Scene, layer: Layer, rows: Index, colours: Colours, state: ViewState, depth: int) -> Lines:

@@ -34,6 +34,7 @@ class GraphView:
         self._sent: dict[str, object] = {}
         self._images: dict[str, Image | None] = {}
         self._labels: dict[str, str] = {}
+        self._visible: dict[str, bool] = {}
         self._dark: bool | None = None
         self._reach = 0.0
         with server.atomic():
@@ -125,11 +126,15 @@ class GraphView:
             floor.cell_color = (58, 63, 71) if dark else (226, 230, 236)
             floor.section_color = (84, 91, 101) if dark else (196, 203, 213)
 
+    def _show(self, handle: viser.SceneNodeHandle, visible: bool) -> None:
+        if self._visible.get(handle.name) is not visible:  # to ask viser costs more than to remember
+            self._visible[handle.name] = handle.visible = visible
+
     def _assign_image(self, name: str, image: Image | None) -> None:
         frustum = self._frustums.get(name)
         if frustum is None or self._images.get(name) is image:
             return
-        frustum.visible = image is not None
+        self._show(frustum, image is not None)
         if image is not None:
             frustum.image = image
         self._images[name] = image
@@ -155,11 +160,11 @@ class GraphView:
         with self.server.atomic():  # only assignments from here on
             for number, handle in enumerate(self.robots):
                 there = bool(np.isfinite(frame.poses[number]).all())
-                handle.visible = there
+                self._show(handle, there)
                 if there:
                     handle.position, handle.wxyz = frame.poses[number, :3], turned[number]
                 role = frame.roles[number]
-                self._anchors[number].visible = role == "anchor" and state.stays
+                self._show(self._anchors[number], role == "anchor" and state.stays)
                 text = handle.name.rsplit("/", 1)[1] + (f"  {role}" if role else "")
                 if self._labels.get(handle.name) != text:
                     self._names[number].text = self._labels[handle.name] = text
@@ -176,13 +181,13 @@ class GraphView:
             return
         self._sent[name] = key
         handle = self._lines[name]
-        handle.visible = bool(len(points))
+        self._show(handle, bool(len(points)))
         if len(points):
             handle.points, handle.colors = points, colours
 
     def _assign_batch(self, name: str, one: Batch, colours: NDArray[np.uint8]) -> None:
         handle = self._batches[name]
-        handle.visible = bool(len(one.wxyz))
+        self._show(handle, bool(len(one.wxyz)))
         if not len(one.wxyz):
             return
         key = tuple(part.tobytes() for part in (*one[:3], colours)) if len(colours) < 2000 else None

@@ -15,10 +15,10 @@ def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
     that they lead from the one pose to the other.
     """
     out = np.full((len(time), 4), np.nan)
-    rows = np.flatnonzero(layer.there[number])
+    rows = layer.rows[number]
     if not len(rows):
         return out
-    near = _rows_about(scene, layer, number, rows, time)
+    near = _rows_about(scene, rows, time)
     keys, poses = _keys(scene, layer, number, near)
     after = np.clip(np.searchsorted(keys, time, side="right"), 1, max(len(keys) - 1, 1))
     before = after - 1
@@ -46,7 +46,7 @@ def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
 
 def extent(scene: Scene, samples: int = 400) -> tuple[Array, Array]:
     """Least and greatest x, y [m] of all poses and of the ways between them; as `Scene.bounds` without any."""
-    low, high = scene.bounds()
+    low, high = scene.bounds
     if not scene.layers or not len(scene):
         return low, high
     times = np.linspace(float(scene.starts[0]), float(scene.ends.max()), samples)
@@ -57,11 +57,11 @@ def extent(scene: Scene, samples: int = 400) -> tuple[Array, Array]:
     return low, high
 
 
-def _rows_about(scene: Scene, layer: Layer, number: int, rows: NDArray[np.int64], time: Array) -> NDArray[np.int64]:
+def _rows_about(scene: Scene, rows: NDArray[np.int64], time: Array) -> NDArray[np.int64]:
     """Of the rows at which a robot has a pose those that matter for these times."""
-    first = np.searchsorted(scene.starts[rows], time[0], side="right") - 2
-    last = np.searchsorted(scene.starts[rows], time[-1], side="right") + 2
-    return np.asarray(rows[max(int(first), 0) : int(last)])
+    first = int(np.searchsorted(rows, scene.row_at(float(time[0])), side="right")) - 2
+    last = int(np.searchsorted(rows, scene.row_at(float(time[-1])), side="right")) + 2
+    return rows[max(first, 0) : last]
 
 
 def _keys(scene: Scene, layer: Layer, number: int, rows: NDArray[np.int64]) -> tuple[Array, Array]:

@@ -44,6 +44,11 @@ class Layer:
         return np.isfinite(self.yaw)
 
     @cached_property
+    def rows(self) -> tuple[Index, ...]:
+        """The stances at which each robot has a pose, by its number."""
+        return tuple(np.flatnonzero(there) for there in self.there)
+
+    @cached_property
     def arrived(self) -> Mask:
         """Where a robot stands elsewhere than at the stance before, (r, s): each place once."""
         new = self.there.copy()
@@ -194,6 +199,7 @@ class Scene:
             return np.full(layer.yaw.shape, np.nan)
         return np.asarray(np.linalg.norm(layer.xyz[..., :2] - self.true.xyz[..., :2], axis=2))
 
+    @cached_property
     def bounds(self) -> tuple[Array, Array]:
         """Least and greatest x, y of all poses [m]; a square of a metre about 0 where there are none."""
         every = np.concatenate([np.empty((0, 2)), *(layer.xyz[layer.there][:, :2] for layer in self.layers)])
