@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 import pytest
+import serial
 from scipy.stats import chi2
 
 from coloc_graph.errors import InputError, RobotError
@@ -20,7 +21,7 @@ from coloc_graph.robot_io.create import Create
 from coloc_graph.robot_io.create_emulator import CreateEmulator
 from coloc_graph.robot_io.create_odometry import DeltaWay, EncoderWay, Odometer, arc, arc_covariance, ticks_between
 from coloc_graph.robot_io.create_physics import Body, Physics, Wall
-from coloc_graph.robot_io.create_protocol import Mode, Packet
+from coloc_graph.robot_io.create_protocol import Mode, Packet, decode_values
 from coloc_graph.robot_io.create_state import DELTAS
 
 #: After whatever befalls it, the wheels are to stand still within this [s].
@@ -123,15 +124,15 @@ def test_a_wall_presses_the_bumper_and_stops_who_asks_for_it():
 # ---- what stops the wheels
 
 
-@pytest.mark.parametrize("speed", [0.2, 0.5])
-def test_a_lease_that_expires_stops_the_wheels(create, robot, speed):
-    set_off(create, robot, speed)
-    since = time.monotonic()
-    create.drive(speed, 0.0)
-    took = stopped_after(robot, since, within=STOPPED)
-    assert took > 0.2
-    assert create.fault is None
-    create.drive(speed, 0.0)  # no fault: it may go on
+@pytest.mark.parametrize(("model", "speed"), [(2, 0.2), (2, 0.4), (1, 0.2)])
+def test_a_lease_that_expires_stops_the_wheels(model, speed):
+    with CreateEmulator(model) as robot, Create(robot.port, model) as create:
+        set_off(create, robot, speed)
+        since = time.monotonic()
+        create.drive(speed, 0.0)
+        assert stopped_after(robot, since) > 0.2
+        assert create.fault is None
+        create.drive(speed, 0.0)  # no fault: it may go on
 
 
 def test_renewals_keep_it_going_and_a_stop_ends_it(create, robot):
@@ -141,6 +142,9 @@ def test_renewals_keep_it_going_and_a_stop_ends_it(create, robot):
     create.stop()
     stopped_after(robot, since, within=0.25)
     assert until(lambda: not create.moving)
+    t, x, _, _, left, right = robot.trace().T
+    assert np.all(np.abs(np.diff(left)) <= 2.0 * np.diff(t) + 1e-9) and np.array_equal(left, right)
+    assert 0.14 < x[-1] < 0.2 and left.max() == pytest.approx(0.2)
 
 
 def test_an_exception_in_the_block_stops_the_wheels(robot):
@@ -525,10 +529,10 @@ def test_counts_that_no_wheel_can_reach_are_left_out():
     assert [one is None for one in told] == [False, True, True, False, False]
 
 
-def simulated(model, seed, frames=335):
+def simulated(model, seed, frames=335, **physics):
     """A random drive through the emulator's body without its clock: the samples, and the true poses at their ends."""
     rng = np.random.default_rng(seed)
-    body = Body(model, Physics(seed=seed, step=0.005), 0.0)
+    body = Body(model, Physics(seed=seed, step=0.005, **physics), 0.0)
     odometer, way = Odometer("A"), EncoderWay() if model == 2 else DeltaWay()
     samples, asked = [], np.zeros(2)
     true_start = body.x, body.y, body.yaw
@@ -563,6 +567,11 @@ def test_nees_of_odometry(model, runs):
     assert np.mean(values) > (low if model == 2 else 0.5)  # a Create 1 is too coarse to be believed more
 
 
+def test_without_slip_the_way_is_true_to_the_tick():
+    samples, _, true = simulated(2, 3, slip=0.0, encoder=0.0)
+    np.testing.assert_allclose(samples[-1].pose, true, atol=4e-3)  # a tick is 0.4 mm, across the wheels 1.9 mrad
+
+
 def test_at_rest_samples_are_few_and_the_rest_is_closed_before_a_movement():
     odometer, still = Odometer("A"), np.zeros((3, 3))
     samples = [one for n in range(200) for one in odometer.add(n * 0.015, (0.0, 0.0, 0.0), still)]
@@ -574,6 +583,26 @@ def test_at_rest_samples_are_few_and_the_rest_is_closed_before_a_movement():
 
 
 # ---- the emulator by itself
+
+
+def test_the_emulator_answers_queries_and_the_old_drive_command(robot):
+    with serial.Serial(robot.port, 115200, timeout=1.0) as line:
+        line.write(bytes([128, 132]) + oi.query([35, 22]))
+        assert line.read(3) == bytes([3]) + (15_400).to_bytes(2, "big")
+        line.write(bytes([137, 0, 200, 0, 1]) + oi.query([41, 42]))  # on the spot, to the left
+        assert decode_values([41, 42], line.read(4)) == {41: 200, 42: -200}
+        line.write(bytes([137, 0, 200, 0x80, 0]) + oi.query([42]))
+        assert line.read(2) == bytes([0, 200])
+        line.write(bytes([137, 0, 200, 0x01, 0xF4]) + oi.query([41, 42]))  # a circle of 500 mm to the left
+        assert decode_values([41, 42], line.read(4)) == {41: 247, 42: 153}
+        line.write(bytes([173, 145, 0, 100, 0, 100]))
+        assert until(lambda: robot.mode == Mode.OFF and robot.still_since is not None)
+    with pytest.raises(ValueError, match='"above" is none of left'):
+        robot.cliff("above")
+    before = len(robot.received)
+    with serial.Serial(robot.port, 57600, timeout=0.05) as line:
+        line.write(bytes([128, 131]))
+        assert line.read(1) == b"" and len(robot.received) == before
 
 
 def test_the_emulator_as_a_program():

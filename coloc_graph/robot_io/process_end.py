@@ -5,6 +5,7 @@ the signal do what it does by default. Nothing in a process can act on SIGKILL, 
 """
 
 import atexit
+import logging
 import os
 import signal
 import threading
@@ -12,6 +13,8 @@ import weakref
 from collections.abc import Callable
 from types import FrameType
 from typing import Any, Protocol
+
+log = logging.getLogger(__name__)
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -40,6 +43,8 @@ def guard(device: Stoppable) -> bool:
         atexit.register(_at_exit, _process)
     _guarded.add(device)
     if threading.current_thread() is not threading.main_thread():
+        if not _before:
+            log.warning("opened outside the main thread: signals will not stop %s, its lease and the exit will", device)
         return bool(_before)
     for number in SIGNALS:
         handler = signal.getsignal(number)
