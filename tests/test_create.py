@@ -283,6 +283,31 @@ def test_a_stop_has_the_last_word_over_a_drive_that_is_under_way(create, robot):
         create.recover()
 
 
+def test_a_stop_while_it_recovers_holds(create, robot, monkeypatch):
+    create.emergency_stop("once")
+    wait = create._wait
+
+    def interrupted(*arguments):
+        create.emergency_stop("twice")
+        return wait(*arguments)
+
+    monkeypatch.setattr(create, "_wait", interrupted)
+    with pytest.raises(RobotError, match="stopped again while it recovered"):
+        create.recover()
+    monkeypatch.undo()
+    with pytest.raises(RobotError, match="stopped again"):
+        create.drive(0.1, 0.0)
+    create.recover()
+    set_off(create, robot)
+
+
+def test_an_ordinary_end_is_no_fault(robot, caplog):
+    for _ in range(3):
+        with Create(robot.port, 2) as create:
+            create.drive(0.1, 0.0)
+    assert not caplog.records
+
+
 # ---- the end of a process
 
 PROGRAM = """

@@ -65,8 +65,7 @@ class Create:
             raise InputError(f"limits are above 0, not {max_speed} m/s and {max_turn} rad/s")
         self.port, self.max_speed, self.max_turn = port, max_speed, max_turn
         self._asked_model, self._stop_on = model, frozenset(stop_on)
-        self._mode = Mode.FULL if full else Mode.SAFE
-        self._robot, self._period = robot, odometry_period
+        self._mode, self._robot, self._period = Mode.FULL if full else Mode.SAFE, robot, odometry_period
         self._line: CreateLine | None = None
         self._feed = SensorFeed(2, robot, odometry_period)
 
@@ -82,10 +81,9 @@ class Create:
         self._ended = threading.Event()
         self._fault: str | None = None
         self._armed = self._ask = False
-        self._halts, self._halted_at = 0, 0.0
+        self._halted_at, self._halts, self._blames = 0.0, object(), object()  # new ones with each stop, each fault
         self._deadline: float | None = None
-        self._commanded = (0, 0)
-        self._hazards: set[str] = set()
+        self._commanded, self._hazards = (0, 0), set[str]()
         self._feed = SensorFeed(line.model, self._robot, self._period)
         self._last_ask = time.monotonic()
         self._threads = [
@@ -138,8 +136,7 @@ class Create:
             raise InputError(f"drive({v}, {w}) is no motion: give finite m/s and rad/s")
         if not 0 < lease <= LONGEST_LEASE:
             raise InputError(f"a lease is above 0 and at most {LONGEST_LEASE} s, not {lease} s: renew it instead")
-        halts = self._halts if self._line else 0
-        line = self._may_drive()
+        halts, line = self._halts if self._line else None, self._may_drive()
         half = WHEELS[self.model].base / 2
         wheel = (abs(v) + abs(w) * half) * 1e3 / oi.MAX_WHEEL_SPEED
         slower = max(1.0, abs(v) / self.max_speed, abs(w) / self.max_turn, wheel)
@@ -151,7 +148,7 @@ class Create:
         except RobotError as error:
             self._halt(str(error))
             raise
-        if self._halts != halts:  # stopped while this was under way: the stop has the last word
+        if self._halts is not halts:  # stopped while this was under way: the stop has the last word
             self._halt(None)
             self._may_drive()
         return (left + right) / 2e3, (right - left) * 1e-3 / (2 * half)
@@ -177,7 +174,7 @@ class Create:
         if line is None or line.lost:
             line = self._may_drive()
         self._halt(None)
-        state = self._feed.state
+        blames, state = self._blames, self._feed.state
         asleep = self._feed.age > STALE or state is None or state.mode == Mode.OFF
         self._armed = False
         line.send((bytes([oi.START]) if asleep else b"") + self._enter_mode + oi.HALT + oi.stream(line.layouts[0]))
@@ -187,6 +184,9 @@ class Create:
             self._halt(why)
             raise RobotError(f"the Create on {self.port} cannot go on, {why}: put it right and try again")
         self._fault = None
+        if self._blames is not blames:
+            self._fault = "it was stopped again while it recovered"
+            self._may_drive()
 
     @property
     def state(self) -> CreateState:
@@ -240,8 +240,8 @@ class Create:
 
     def _halt(self, fault: str | None) -> None:
         """Stop the wheels and remember why; never raises."""
+        self._halts, self._blames = object(), object() if fault else self._blames
         new, self._fault = bool(fault and not self._fault), self._fault or fault
-        self._halts += 1
         self._deadline, self._commanded, self._halted_at = None, (0, 0), time.monotonic()
         if self._line is not None:
             with contextlib.suppress(RobotError):
@@ -280,7 +280,7 @@ class Create:
         """Stop where the robot left its mode, or met what it is to stop on."""
         hazards = state.hazards()
         new = [said for name, said in hazards.items() if name in self._stop_on and name not in self._hazards]
-        left_mode = self._armed and state.mode != self._mode
+        left_mode = self._armed and state.mode != self._mode and not self._ended.is_set()
         self._armed, self._hazards = state.mode == self._mode, set(hazards)
         if left_mode:
             self._halt(f"it left {self._mode.name.lower()} mode for {state.mode.name.lower()}{self._feed.because}")
