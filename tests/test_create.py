@@ -390,6 +390,22 @@ def test_signal_handlers_are_as_before_after_the_last_is_closed(robot):
     assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)] == before
 
 
+def test_opened_outside_the_main_thread_it_says_what_will_not_stop_it(robot, caplog):
+    opened = []
+    thread = threading.Thread(target=lambda: opened.append(Create(robot.port, 2).open()))
+    thread.start()
+    thread.join(timeout=3.0)
+    try:
+        assert "signals will not stop" in caplog.text
+        set_off(opened[0], robot)
+        with pytest.raises(RobotError, match="open already"):
+            opened[0].open()
+    finally:
+        since = time.monotonic()
+        opened[0].close()
+    stopped_after(robot, since)
+
+
 # ---- the line
 
 

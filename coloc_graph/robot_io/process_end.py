@@ -44,7 +44,7 @@ def guard(device: Stoppable) -> bool:
     _guarded.add(device)
     if threading.current_thread() is not threading.main_thread():
         if not _before:
-            log.warning("opened outside the main thread: signals will not stop %s, its lease and the exit will", device)
+            log.warning("opened outside the main thread: signals will not stop what moves, the lease and the exit will")
         return bool(_before)
     for number in SIGNALS:
         handler = signal.getsignal(number)
