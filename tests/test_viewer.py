@@ -356,17 +356,19 @@ def test_a_closed_viewer_leaves_its_port():
     assert not viewer._thread.is_alive()
 
 
-def test_ctrl_c_ends_it_without_a_word(result):
-    command = [COLOC, "view", result, "--no-browser", "--port", "0"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+@pytest.mark.parametrize("command", ["view", "solve"])
+def test_ctrl_c_ends_it_without_a_word(command, result, short, tmp_path):
+    of = {"view": [result], "solve": [short, "--out", tmp_path / "out", "--incremental", "--view"]}[command]
+    arguments = [COLOC, command, *of, "--no-browser", "--port", "0"]
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
-        said = process.stderr.readline()
+        said = next(line for line in process.stderr if "viewer" in line)
         assert re.match(r"the viewer is at http://127\.0\.0\.1:\d+ \(Ctrl-C ends it\)", said)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
     finally:
         process.kill()
-    assert (process.returncode, out, err) == (0, "", "")
+    assert (process.returncode, err) == (0, "") and ("3 of 3 measurements used" in out) == (command == "solve")
 
 
 @pytest.mark.parametrize("make", ["another run", "no result", "damaged"])

@@ -32,7 +32,10 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 
 def run(args: argparse.Namespace) -> int:
     """Make the scene, show it."""
+    from pathlib import Path
+
     from coloc_graph.cli.printing import progress, warn
+    from coloc_graph.errors import InputError
     from coloc_graph.run import open_run
     from coloc_graph.viewer import Viewer, is_run, scene_of_result, scene_of_run, with_other
     from coloc_graph.viewer.app import missing_images
@@ -42,6 +45,9 @@ def run(args: argparse.Namespace) -> int:
     writes = bool(args.export or args.png)
     port = 0 if writes else args.port
     require_free(args.host, port)  # before the work, not after it
+    for out in (args.export, args.png):
+        if out and not Path(out).absolute().parent.is_dir():
+            raise InputError(f"{out} cannot be written, since there is no such folder; make it, or give another place")
     if args.png:
         require_browser()
     if is_run(args.path):

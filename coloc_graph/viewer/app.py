@@ -46,7 +46,7 @@ class Viewer:
         self._news: deque[Scene | LiveStance] = deque()
         self._changed = threading.Condition()
         self._awake, self._ending = True, False
-        self._idle = threading.Event()
+        self._idle, self._closed = threading.Event(), threading.Event()
         self._time = scene.middle(len(scene) - 1)
         self._moved_at = 0.0
         self._picked: tuple[str, int] | None = None
@@ -91,6 +91,7 @@ class Viewer:
         self._thread.join(timeout=10)
         self._worker.close()
         stop_server(self.server)
+        self._closed.set()
 
     def publish(self, news: Scene | LiveStance) -> None:
         """Show a stance that has just entered, or another scene of the same robots. Costs the caller no work."""
@@ -114,8 +115,8 @@ class Viewer:
     def wait_closed(self) -> None:
         """Wait until it is closed from elsewhere, or interrupted by Ctrl-C, which ends the wait without a word."""
         try:
-            while self._thread.is_alive():
-                self._thread.join(timeout=0.5)
+            while not self._closed.wait(0.5):  # a join that is interrupted takes its thread for ended
+                pass
         except KeyboardInterrupt:
             return
 

@@ -16,6 +16,9 @@ from coloc_graph.viewer.scene import TRUE, Scene
 MARGIN, FINE = 2.0, 60.0
 #: How large a frustum is drawn [m].
 FRUSTUM = 0.14
+#: The camera at the beginning: its vertical field of view and how steeply it looks down [rad], what it is taken to be
+#: wide for its height, and the share of the picture that the data fill. Robots are so tall [m].
+FOV, PITCH, ASPECT, FILLED, TALL = float(np.radians(40)), float(np.radians(40)), 1.3, 0.85, 0.6
 #: Widths of trajectories [px].
 ESTIMATE_PX, OTHER_PX, TRUTH_PX = 5.0, 2.0, 1.3
 
@@ -122,6 +125,7 @@ class GraphView:
             floor.width, floor.height = float(sides[0]), float(sides[1])
             floor.position = (float(corner[0]), float(corner[1]), -0.002)
             floor.cell_size, floor.section_size = cell, 2 * cell if fine else 10 * cell
+            floor.fade_distance = max(100.0, 3 * self._reach)
             floor.plane_color = (38, 42, 48) if dark else (250, 250, 252)
             floor.cell_color = (58, 63, 71) if dark else (226, 230, 236)
             floor.section_color = (84, 91, 101) if dark else (196, 203, 213)
@@ -201,7 +205,7 @@ class GraphView:
 def initial_camera(server: viser.ViserServer, scene: Scene, aside: float = 0.0) -> None:
     """Frame the data: from behind and the right of the way the team went, looking down on it."""
     position, look_at = camera_on(scene, aside)
-    server.initial_camera.fov = float(np.radians(40))
+    server.initial_camera.fov = FOV
     server.initial_camera.far = max(1000.0, 10 * float(np.linalg.norm(position - look_at)))
     server.initial_camera.position, server.initial_camera.look_at = position, look_at
 
@@ -210,11 +214,16 @@ def camera_on(scene: Scene, aside: float = 0.0) -> tuple[NDArray[np.float64], ND
     """Where a camera sees all of the data from, and where it looks: (3,) and (3,) [m]."""
     low, high = extent(scene)
     high = high + np.array([0.0, aside])
-    middle, half = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 + 0.4
-    along = high - low
+    middle, along = (low + high) / 2, high - low
     # a long way is seen from its side, and a little from behind
     side = np.array([-0.35, -1.0]) if along[0] >= along[1] else np.array([-1.0, -0.35])
-    side /= np.linalg.norm(side)
-    distance = 1.8 * half
-    eye = np.array([*(middle + side * distance * np.cos(np.radians(40))), distance * np.sin(np.radians(40))])
-    return eye, np.array([*middle, 0.0])
+    side *= np.cos(PITCH) / np.linalg.norm(side)
+    back = np.array([*side, np.sin(PITCH)])
+    right = np.cross([0.0, 0.0, 1.0], back) / np.cos(PITCH)
+    up = np.cross(back, right)
+    corners = np.array([(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0.0, TALL)])
+    corners -= (*middle, 0.0)
+    # from how far a corner is just seen, across and up: its offset is the half angle's tangent times its depth
+    tangent = np.tan(FOV / 2) * FILLED
+    needed = np.maximum(np.abs(corners @ right) / (tangent * ASPECT), np.abs(corners @ up) / tangent) + corners @ back
+    return np.array([*middle, 0.0]) + float(needed.max()) * back, np.array([*middle, 0.0])

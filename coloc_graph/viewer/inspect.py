@@ -151,7 +151,7 @@ def _draw_points(run: Run, halves: list[Image], robots: tuple[str, str], measure
         warped = warp(h.H_j_i, run.team[robots[0]].camera.normalise(found.uv_i[some]), run.team[robots[1]].camera)
         for uv in warped[np.isfinite(warped).all(axis=1)]:
             at = _pixel(ENLARGED * uv)
-            cv2.drawMarker(halves[1], at, (86, 180, 233), cv2.MARKER_TILTED_CROSS, 9, 2, cv2.LINE_AA)
+            cv2.drawMarker(halves[1], at, (86, 180, 233), cv2.MARKER_TILTED_CROSS, 9, 1, cv2.LINE_AA)
 
 
 def longest_gap(times: Array) -> float:
@@ -305,7 +305,7 @@ def _robot_lines(scene: Scene, number: int, row: int) -> Iterator[str]:
     base = scene.layers[0]
     x, y, z = base.xyz[number, row]
     xy, heading = base.covariance[number, row], base.yaw_sigma[number, row]
-    rows = [("x, y", f"{x:.4f}, {y:.4f} m"), ("z", f"{1000 * z:.1f} mm"),
+    rows = [("x, y", f"{x:.4f}, {y:.4f} m"), ("z", f"{1000 * z + 0.0:.1f} mm"),
             ("heading", f"{np.rad2deg(base.yaw[number, row]):.2f} deg")]  # fmt: skip
     if np.isfinite(xy).all():
         rows += [
