@@ -47,7 +47,7 @@ MEASUREMENT_COLUMNS = (
         "time_offset_sigma",
         "overlap_px",
     ),
-    *("normal_error_deg", "solution", "distance", "usable", "why_not"),
+    *("normal_error_deg", "solution", "distance", "estimate_residual", "usable", "why_not"),
 )
 
 
@@ -177,7 +177,8 @@ def accuracy_json(accuracy: Accuracy) -> dict[str, Any]:
 
 
 def _measurements(solution: Solution) -> str:
-    """One row a homography. Angles in degrees, the relative pose is that of body j in body i."""
+    """One row a homography. Angles in degrees, the relative pose is that of body j in body i; `residual` is that of the
+    points, `estimate_residual` that of the measurement in the estimate, each RMS in units of its noise."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(MEASUREMENT_COLUMNS)
@@ -197,6 +198,7 @@ def _measurements(solution: Solution) -> str:
                 _cell(math.degrees(pose.normal_error)) if pose else "",
                 pose.solution if pose else "",
                 _cell(float(np.linalg.norm(pose.T_i_j.translation()))) if pose else "",
+                _cell(solution.estimate.residual(pose)) if pose else "",
                 "no" if why_not else "yes",
                 why_not or "",
             ]

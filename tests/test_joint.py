@@ -140,6 +140,14 @@ def test_a_mount_that_is_not_as_stated_is_warned_of_by_name(wrong_mounts, copied
     assert warning.startswith("A: tilt") and "stated 26.00 +- 1.00" in warning
 
 
+def test_residuals_are_in_units_of_the_noise(solved):
+    homographies = [m for m in solved.estimate.graph.measurements if isinstance(m, RelativePose)]
+    residuals = np.array([solved.estimate.residual(m) for m in homographies])
+    assert 0.3 < np.mean(residuals**2) < 1.2  # less than 1: each pose was fitted to them
+    far = replace(homographies[3], homography=homographies[4].homography)
+    assert solved.estimate.residual(far) > 10
+
+
 def test_a_wrong_homography_is_found(solved):
     graph = solved.estimate.graph
     first, second = [m for m in graph.measurements if isinstance(m, RelativePose)][4:6]

@@ -95,8 +95,20 @@ class Estimate:
         index = np.concatenate([6 * different.index(key) + np.arange(6) for key in keys])
         return np.asarray(joint[np.ix_(index, index)])
 
+    def residual(self, measurement: Measurement) -> float:
+        """How far a measurement is from the estimate, RMS in units of its noise; NaN where an end of it has no pose."""
+        values, graph = self._values, self.graph
+        i, j = (graph.key(*end) for end in measurement.ends)
+        if not (values.exists(i) and values.exists(j)) or i == j:
+            return float("nan")
+        factors = Factors(graph.floor, self.calibration.variables)
+        factor = factors.of_link(measurement, i, j)
+        if not all(map(values.exists, factor.keys())):
+            return float("nan")
+        return float(np.sqrt(2 * factor.error(values) / factors.rows(measurement, factor)))
+
     @cached_property
-    def _posterior(self) -> Posterior:
+    def _values(self) -> gtsam.Values:
         values = gtsam.Values()
         for robot, trajectory in self.trajectories.items():
             assert trajectory.stances is not None
@@ -104,11 +116,15 @@ class Estimate:
                 key = self.graph.key(robot, stance)
                 if not values.exists(key):
                     values.insert(key, gtsam.Pose3(T))
-        used = self.graph.without(one.measurement for one in self.refused)
-        factors = Factors(self.graph.floor, self.calibration.variables).of_graph(used, values.keys())[0]
         for key, errors in self.calibration.values.items():
             values.insert(key, errors)
-        return Posterior(factors, values)
+        return values
+
+    @cached_property
+    def _posterior(self) -> Posterior:
+        used = self.graph.without(one.measurement for one in self.refused)
+        factors_of = Factors(self.graph.floor, self.calibration.variables)
+        return Posterior(factors_of.of_graph(used, poses_in(self._values))[0], self._values)
 
     @cached_property
     def _index(self) -> dict[Node, int]:
