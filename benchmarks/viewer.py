@@ -44,7 +44,7 @@ def leapfrog(robots: int, stances: int) -> Scene:
 
 
 def measure(robots: int, stances: int) -> dict[str, float]:
-    """Milliseconds: to open, an update while scrubbing by the clock and of its thread, at rest, `publish` for its caller."""
+    """Milliseconds to open, of an update while scrubbing (by the clock, of its thread), at rest, of `publish`."""
     scene = leapfrog(robots, stances)
     started = time.perf_counter()
     viewer = Viewer(scene, port=0)

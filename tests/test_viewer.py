@@ -317,6 +317,19 @@ def test_publishing_costs_the_estimator_less_than_a_millisecond(short_solution):
 # server and command
 
 
+def test_help_imports_neither_viser_nor_anything_heavy():
+    script = """
+import sys, contextlib, io
+from coloc_graph.cli import main
+for command in ("view", "solve"):
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+        main([command, "--help"])
+sys.exit(" ".join({"viser", "trimesh", "numpy", "gtsam", "matplotlib", "websockets"} & set(sys.modules)) or 0)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_a_busy_port_and_a_host_that_is_none_are_told_at_once(tmp_path, capsys):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -19,10 +19,11 @@ def rgb(code: str) -> tuple[int, int, int]:
 
 
 ROBOTS: Colours = np.array([rgb(code) for code in COLOURS], np.uint8)
-#: Residuals of 0, 1, 2 and 3 or more sigmas: noise is blue, and what is not turns over yellow to red.
-RESIDUAL_STOPS = ("#2c7bb6", "#2c7bb6", "#e6a019", "#c51b3a")
+#: Residuals of 0, 0.5, ... and 3 or more sigmas: noise is blue, and what is not turns over amber to red; nowhere grey.
+RESIDUAL_STOPS = ("#2c7bb6", "#2c7bb6", "#2c7bb6", "#2aa198", "#e6a019", "#dd5f2c", "#c51b3a")
 _STOPS = np.array([rgb(code) for code in RESIDUAL_STOPS], float)
-MOST_SIGMAS = float(len(_STOPS) - 1)
+STOPS_A_SIGMA = 2
+MOST_SIGMAS = (len(_STOPS) - 1) / STOPS_A_SIGMA
 PICKED: Colours = np.array([255, 0, 170], np.uint8)
 
 
@@ -58,7 +59,7 @@ def faded(colours: Colours, dark: bool, share: float) -> Colours:
 
 def of_residuals(sigmas: NDArray[np.float64], dark: bool) -> Colours:
     """Colours (n, 3) of residuals (n,) [sigma]; grey where they are not known."""
-    at = np.clip(np.nan_to_num(sigmas), 0, MOST_SIGMAS)
+    at = STOPS_A_SIGMA * np.clip(np.nan_to_num(sigmas), 0, MOST_SIGMAS)
     low = np.minimum(at.astype(int), len(_STOPS) - 2)
     share = (at - low)[:, None]
     colours = np.rint(_STOPS[low] * (1 - share) + _STOPS[low + 1] * share).astype(np.uint8)
