@@ -8,6 +8,7 @@ from browser import browser, client_of, page_of, pixel_of, place_of, until  # no
 
 from coloc_graph.backend import replay
 from coloc_graph.viewer import LiveStance, Viewer, empty_scene, scene_of_result, scene_of_solution
+from coloc_graph.viewer.panel import NOBODY, set_value
 
 pytestmark = pytest.mark.slow
 
@@ -48,9 +49,16 @@ def test_slider_click_and_keys(scene, page_of):
         page.keyboard.press("ArrowRight")
         assert until(lambda: viewer.frame.row == 1)
 
+        # the camera follows a robot
+        set_value(viewer.panel.follow, "A")
+        for row in (2, last):
+            viewer.go(row)
+            assert until(lambda row=row: viewer.frame.row == row) and viewer.wait_idle()
+            assert until(lambda: np.allclose(client.camera.look_at, viewer.frame.poses[0, :3], atol=0.02))
+        set_value(viewer.panel.follow, NOBODY)
+
         # a click on an edge opens its panel
-        viewer.go(last)
-        assert until(lambda: viewer.frame.row == last) and viewer.wait_idle()
+        assert viewer.wait_idle()
         points = viewer.frame.edge_points
         seen = [(n, pixel_of(client, points[n].mean(axis=0))) for n in range(len(points))]
         clear = [
