@@ -35,6 +35,7 @@ bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/relative_pose.py --outliers
 	$(BIN)/python benchmarks/frontend.py
 	$(BIN)/python benchmarks/clock_offset.py
+	$(BIN)/python benchmarks/viewer.py
 	$(BIN)/python benchmarks/backend.py $(if $(GRAPHS),--data $(GRAPHS))
 ifneq ($(DATA),)
 	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)

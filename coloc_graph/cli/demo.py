@@ -9,14 +9,13 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--out", default="demo-out", metavar="DIR", help="folder for run and result (demo-out)")
     command.add_argument("--stances", type=int, default=40)
     command.add_argument("--seed", type=int, default=0)
-    command.add_argument("--no-browser", action="store_true", help="do not open the report")
+    command.add_argument("--no-browser", action="store_true", help="do not open the viewer")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, solve, print, show."""
     import sys
-    import webbrowser
     from contextlib import suppress
     from pathlib import Path
 
@@ -50,7 +49,11 @@ def run(args: argparse.Namespace) -> int:
     print_accuracy(accuracy)
     print_promised(solution.estimate.trajectories)
     html = out / "result" / "report.html"
-    print(f"the report: {html}, and a picture: {picture}")
+    print(f"the report: {html}, and a picture: {picture}; `coloc view {out / 'result'}` shows it")
     if not args.no_browser and sys.stdout.isatty():
-        webbrowser.open(html.absolute().as_uri())
+        from coloc_graph.cli.view import show
+        from coloc_graph.viewer import Viewer, scene_of_solution
+
+        with Viewer(scene_of_solution(solution), host="127.0.0.1", port=0) as viewer:  # any port that is free
+            show(viewer, browser=True)
     return 0

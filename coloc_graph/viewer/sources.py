@@ -9,11 +9,9 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import gtsam
 import numpy as np
 
 from coloc_graph.backend import Estimate, Method, chain, smooth
-from coloc_graph.backend.factors import Factors
 from coloc_graph.backend.graph import Places
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.evaluation import align
@@ -180,9 +178,8 @@ def _wheels(run: Run | None) -> dict[str, WheelTrack]:
 def _edges(estimate: Estimate, measurements: Sequence[PairMeasurement]) -> Edges:
     graph = estimate.graph
     refused = {id(one.measurement): one.reason for one in estimate.refused}
-    sigmas = residuals(estimate)
     found = [
-        (one.stance, one.robot_i, one.robot_j, sigmas.get(id(one), np.nan), refused.get(id(one), ""))
+        (one.stance, one.robot_i, one.robot_j, estimate.residual(one), refused.get(id(one), ""))
         for one in graph.measurements
         if isinstance(one, RelativePose)
     ]
@@ -192,28 +189,6 @@ def _edges(estimate: Estimate, measurements: Sequence[PairMeasurement]) -> Edges
         if h.unusable
     ]
     return as_edges(found, graph.robots, graph.stances, OF_GRAPH)
-
-
-def residuals(estimate: Estimate) -> dict[int, float]:
-    """The residual of each relative pose in its estimate, RMS in units of its noise, by the measurement's identity."""
-    graph = estimate.graph
-    values = gtsam.Values()
-    for robot, trajectory in estimate.trajectories.items():
-        if trajectory.stances is not None:
-            for stance, T in zip(trajectory.stances.tolist(), trajectory.T_world_body, strict=True):
-                if not values.exists(key := graph.key(robot, stance)):
-                    values.insert(key, gtsam.Pose3(T))
-    for key, errors in estimate.calibration.values.items():
-        values.insert(key, errors)
-    factors = Factors(graph.floor, estimate.calibration.variables)
-    out = {}
-    for link in graph.measurements:
-        i, j = (graph.key(*end) for end in link.ends)
-        if isinstance(link, RelativePose) and values.exists(i) and values.exists(j) and i != j:
-            factor = factors.of_link(link, i, j)
-            if all(map(values.exists, factor.keys())):
-                out[id(link)] = float(np.sqrt(2 * factor.error(values) / factors.rows(link, factor)))
-    return out
 
 
 def as_edges(
@@ -237,24 +212,27 @@ def as_edges(
 
 
 def _edges_on_disk(path: Path, robots: Sequence[str], stances: Sequence[Stance]) -> Edges:
-    """The measurements of a result: their residual is that of the homography, which is what is on disk."""
+    """The measurements of a result, with their residual in the estimate (of the homography's points in results of
+    versions that did not write it)."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
+            rows = csv.DictReader(file)
+            column = "estimate_residual" if "estimate_residual" in (rows.fieldnames or ()) else "residual"
             found = [
                 (
                     int(row["stance"]),
                     row["robot_i"],
                     row["robot_j"],
-                    float(row["residual"] or "nan"),
+                    float(row[column] or "nan"),
                     (row["why_not"] or "for no reason that is written") if row["usable"] != "yes" else "",
                 )
-                for row in csv.DictReader(file)
+                for row in rows
             ]
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); solve the run again") from error
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path} is damaged ({error}); solve the run again") from error
-    return as_edges(found, robots, stances, OF_POINTS)
+    return as_edges(found, robots, stances, OF_POINTS if column == "residual" else OF_GRAPH)
 
 
 def _anchored(stances: Sequence[Stance], bumped: Sequence[Sequence[object]]) -> list[tuple[str, int]]:
