@@ -142,7 +142,8 @@ def _fit(method: Method, graph: PoseGraph, start: gtsam.Values | None = None) ->
         return mounts.get(key, factors_of.nominal(key))
 
     def expected(link: Link) -> gtsam.Pose3:
-        return factors_of.expected(link, errors) if mounts else link.T_i_j
+        i, j = map(graph.places.key, link.ends)
+        return factors_of.expected(link, i, j, errors) if mounts else link.T_i_j
 
     # also with a start: what it does not hold is composed, and what nothing ties any more is left out
     known = {} if start is None else {key: start.atPose3(key) for key in poses_in(start)}

@@ -67,7 +67,7 @@ class Sorter:
                 i, j = self._ends(link)
                 has_i, has_j = (key in self._tied or key in start for key in (i, j))
                 is_new = i not in self._tied or j not in self._tied
-                T_i_j = self._factors.expected(link, self._errors) if is_new else link.T_i_j
+                T_i_j = self._factors.expected(link, i, j, self._errors) if is_new else link.T_i_j
                 tested = isinstance(link, RelativePose | Sighting)
                 if i == j:
                     continue

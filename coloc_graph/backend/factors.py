@@ -69,6 +69,7 @@ class Factors:
 
     def __init__(self, floor: Floor | None, variables: Variables | None = None) -> None:
         self.floor, self.variables = floor, variables
+        self._ready: dict[int, gtsam.NonlinearFactor] = {}
         tilt, height = GAUGE_SIGMA, GAUGE_SIGMA
         if floor is not None:
             tilt = max(float(np.deg2rad(floor.tilt_sigma_deg)), LEAST_FLOOR_SIGMA)
@@ -115,6 +116,9 @@ class Factors:
 
     def of_link(self, link: Link, i: int, j: int) -> gtsam.NonlinearFactor:
         """The factor of a link on the keys of its two poses, and of the calibration variables that it needs."""
+        ready = self._ready.pop(id(link), None)
+        if ready is not None and list(ready.keys()[:2]) == [i, j]:
+            return ready
         if self.variables is not None and self._as_seen(link):
             if isinstance(link, Sighting):
                 return markers_factor(link, i, j, self.variables)
@@ -122,13 +126,18 @@ class Factors:
             return homography_factor(link, i, j, self.variables, self.floor is not None)
         return gtsam.BetweenFactorPose3(i, j, link.T_i_j, _noise(link))
 
-    def expected(self, link: Link, errors: Callable[[int], Array]) -> gtsam.Pose3:
-        """The pose of a link's second end in its first, with calibration variables at `errors` of their keys."""
+    def expected(self, link: Link, i: int, j: int, errors: Callable[[int], Array]) -> gtsam.Pose3:
+        """The pose of a link's second end in its first, with calibration variables at `errors` of their keys.
+
+        The factor that this takes is kept for when the link enters the graph.
+        """
         if self.variables is not None and self.floor is not None and self._as_seen(link):
             if isinstance(link, Sighting):
                 return sighted(link, self.variables, errors)
             assert isinstance(link, RelativePose)
-            return related(link, homography_factor(link, 0, 1, self.variables, True), errors)
+            factor = self.of_link(link, i, j)
+            self._ready[id(link)] = factor
+            return related(link, factor, errors)
         return link.T_i_j
 
     def of_graph(self, graph: PoseGraph, keys: Iterable[int]) -> tuple[gtsam.NonlinearFactorGraph, tuple[Link, ...]]:

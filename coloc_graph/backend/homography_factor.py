@@ -77,7 +77,7 @@ def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, 
     return _factor(model.rows, (i, j), keys, sizes, of_homography)
 
 
-def related(link: RelativePose, factor: gtsam.CustomFactor, errors: Callable[[int], Array]) -> gtsam.Pose3:
+def related(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[[int], Array]) -> gtsam.Pose3:
     """The pose on the floor of j in i that a homography's factor likes best, with calibration variables at `errors` of
     their keys; as it was measured where the search for it leads nowhere."""
     i, j, *variable = map(int, factor.keys())
