@@ -13,7 +13,7 @@ from coloc_graph.backend import Estimator, PoseGraph, joint, smooth
 from coloc_graph.cli.accuracy import print_calibration
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.evaluation import align, evaluate
-from coloc_graph.measurements import RelativePose, Sighting
+from coloc_graph.measurements import Odometry, RelativePose, Sighting
 from coloc_graph.pipeline import SolveOptions, solve
 from coloc_graph.results import write_result
 from coloc_graph.run import open_run, read_truth
@@ -228,6 +228,38 @@ def test_joint_covariances_hold_the_calibration(solved):
         )
 
 
+def test_what_is_asked_of_a_measurement_that_is_not_in_leaves_the_covariances_as_they_are(solved):
+    """Its factor may need a variable that the estimate does not have: here a plane that was stated."""
+    estimate = joint(solved.estimate.graph)
+    other = next(m for m in estimate.graph.measurements if isinstance(m, RelativePose))
+    plane = replace(other.plane, normal_from_mount=False, d_from_mount=False, normal_sigma=0.01, d_sigma=0.01)
+    assert np.isnan(estimate.residual(replace(other, plane=plane)))
+    assert estimate.joint_covariance([("A", 11)]).shape == (6, 6)
+
+
+def test_an_estimator_that_is_rebuilt_finds_the_mounts_as_batch_does(solved, monkeypatch, tmp_path):
+    """After a revocation or from a checkpoint: a long run's mounts come first there, too."""
+    asked = []
+    genuine = sys.modules["coloc_graph.backend.fit"]._mounts_first
+    monkeypatch.setattr("coloc_graph.backend.fit._mounts_first", lambda graph: asked.append(graph) or genuine(graph))
+    graph, estimator = solved.estimate.graph, Estimator.of(solved.run.team)
+    for stance in graph.stances[:5]:
+        made = [m for m in graph.measurements if max(index for _, index in m.ends) == stance.index]
+        estimator.add(stance, made, after=stance.index - 1 if stance.index else None)
+    assert not asked
+    estimator.save(tmp_path / "point.json")
+    again = Estimator.resume(tmp_path / "point.json")
+    assert len(asked) == 1
+    # spans that come in from now on are taken apart where the mounts are, not where they were said to be
+    anchors = again._live.factors_of.variables.anchors
+    found = solved.estimate.calibration.mounts
+    for robot in "AB":
+        assert np.abs(anchors[found[robot].key] - found[robot].errors)[1:].max() < np.deg2rad(0.3)
+    odometry = next(m for m in estimator.measurements if isinstance(m, Odometry))
+    again.revoke(next(m for m in again.measurements if m.ends == odometry.ends))
+    assert len(asked) == 2
+
+
 def test_a_part_of_a_graph_is_a_graph(solved):
     graph = solved.estimate.graph
     part = graph.up_to(5)
@@ -265,7 +297,7 @@ def test_nothing_that_was_exact_is_reported(solutions, tmp_path, capsys):
 
 def test_a_long_run_finds_its_mounts_in_its_first_part(solved, monkeypatch):
     """Composed by mounts a degree off, a hundred stances are bent too far for any search to unbend."""
-    module = sys.modules["coloc_graph.backend.batch"]
+    module = sys.modules["coloc_graph.backend.fit"]
     monkeypatch.setattr(module, "LONG_RUN", 8)
     started = []
     genuine = module.optimise

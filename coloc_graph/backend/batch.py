@@ -4,82 +4,30 @@
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtri
 
-from coloc_graph.backend.chain import compose, spanning_tree
-from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, agreement, innovation
+from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, innovation
 from coloc_graph.backend.estimate import Bump, Estimate, Refusal, make_estimate
-from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in, require_rigs
+from coloc_graph.backend.factors import Method, require_rigs
+from coloc_graph.backend.fit import Fit, fit_graph
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
-from coloc_graph.backend.solver import Posterior, lm_parameters, optimise, with_stack
+from coloc_graph.backend.solver import Posterior, lm_parameters, with_stack
 from coloc_graph.measurements import RelativePose, Sighting
 from coloc_graph.team import Slip
 
-Array = NDArray[np.float64]
-
 #: A fit that noise alone makes this bad less often than this is looked into.
 LEAST_CHANCE_OF_ALL = 1e-4
-#: In larger graphs only the measurements are tested whose residual noise exceeds less often than `LOOKED_INTO`.
-ALL_TESTED, LOOKED_INTO = 500, 1e-3
 #: A stay-put constraint is loosened by so much to see whether the others contradict it.
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)
 #: A bump must explain this much more chi2 than any wrong measurement to be called one.
 MORE_LIKELY = 1.1
 MOST_BUMPS = 3
-#: Of a run of so many stances the mounts are found in the first part of this many.
-LONG_RUN, PART = 80, 3
-#: Rounds of finding the mounts and taking spans apart there; mounts 3 degrees off take two.
-MOST_ANCHORINGS = 4
 #: Rounds of refusing the worst and taking back what then agrees.
 ROUNDS = 20
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """A graph at its optimum; `links` are the last factors, in that order."""
-
-    graph: PoseGraph
-    factors_of: Factors
-    factors: gtsam.NonlinearFactorGraph
-    links: tuple[Link, ...]
-    values: gtsam.Values
-    iterations: int
-
-    @property
-    def chi2(self) -> float:
-        return float(2 * self.factors.error(self.values))
-
-    @property
-    def dof(self) -> int:
-        """Rows that weigh, less unknowns."""
-        return self.factors_of.dof(self.values, [(link, self.factor(n)) for n, link in enumerate(self.links)])
-
-    @property
-    def chance(self) -> float:
-        return float(chdtrc(self.dof, self.chi2)) if self.dof > 0 else 1.0
-
-    def factor(self, index: int) -> gtsam.NonlinearFactor:
-        """The factor of a link, by its index."""
-        return self.factors.at(self.factors.size() - len(self.links) + index)
-
-    def agreements(self, posterior: Posterior, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
-        """How the links of some kinds agree with all others, by index; see `ALL_TESTED`."""
-        found = {}
-        for index, link in enumerate(self.links):
-            if not isinstance(link, kinds):
-                continue
-            factor = self.factor(index)
-            if len(self.links) > ALL_TESTED and 2 * factor.error(self.values) < chdtri(
-                self.factors_of.rows(link, factor), LOOKED_INTO
-            ):
-                continue
-            found[index] = agreement(factor, self.values, posterior.joint(list(factor.keys())))
-        return found
 
 
 def smooth(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None = None) -> Estimate:
@@ -106,7 +54,7 @@ def joint(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None =
 
 
 def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Values | None) -> Estimate:
-    fit = _fit(method, graph, start)
+    fit = fit_graph(method, graph, start)
     posterior = Posterior(fit.factors, fit.values)
     refused: tuple[Refusal, ...] = ()
     bumped: tuple[Bump, ...] = ()
@@ -116,7 +64,7 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
             graph = _moved(graph, bump.stay_put)
         refused = _find_wrong(method, graph)
         if refused or bumped:
-            fit = _fit(method, graph.without(one.measurement for one in refused))
+            fit = fit_graph(method, graph.without(one.measurement for one in refused))
             posterior = Posterior(fit.factors, fit.values)
     return make_estimate(
         method,
@@ -132,55 +80,7 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
     )
 
 
-def _fit(method: Method, graph: PoseGraph, start: gtsam.Values | None = None) -> _Fit:
-    if method == "joint" and start is None:
-        start = _mounts_first(graph)
-    factors_of = factors_for(method, graph, start)
-    mounts = {} if start is None else calibrations_in(start)
-
-    def errors(key: int) -> Array:
-        return mounts.get(key, factors_of.nominal(key))
-
-    def expected(link: Link) -> gtsam.Pose3:
-        i, j = map(graph.places.key, link.ends)
-        return factors_of.expected(link, i, j, errors) if mounts else link.T_i_j
-
-    # also with a start: what it does not hold is composed, and what nothing ties any more is left out
-    known = {} if start is None else {key: start.atPose3(key) for key in poses_in(start)}
-    values = gtsam.Values()
-    for key, pose in compose(graph, spanning_tree(graph, graph.links), factors_of.start, expected, known).items():
-        values.insert(key, pose)
-    iterations = 0
-    for _ in range(MOST_ANCHORINGS):
-        factors, links = factors_of.of_graph(graph, poses_in(values))
-        for key in factors_of.calibrated:
-            if not values.exists(key):
-                values.insert(key, errors(key))
-        values, used = optimise(factors, values)
-        iterations += used
-        # spans were taken apart for mounts as stated: once more where they turned out to be elsewhere
-        if factors_of.is_anchored(values):
-            break
-        factors_of = factors_for(method, graph, values)
-    return _Fit(graph, factors_of, factors, links, values, iterations)
-
-
-def _mounts_first(graph: PoseGraph) -> gtsam.Values | None:
-    """The mounts as a part of a long run has them, to compose all of it by; None where it is short.
-
-    With mounts a degree off each step is composed half a degree wrong, a hundred of them are a circle the wrong way
-    round, and no search in the poses of a whole run unbends that.
-    """
-    part = graph.up_to(len(graph.stances) // PART)
-    if len(graph.stances) < LONG_RUN or not spanning_tree(part, part.links):
-        return None
-    known = gtsam.Values()
-    for key, errors in calibrations_in(_fit("joint", part).values).items():
-        known.insert(key, errors)
-    return known
-
-
-def _is_suspicious(fit: _Fit, posterior: Posterior) -> bool:
+def _is_suspicious(fit: Fit, posterior: Posterior) -> bool:
     if fit.dof <= 0:
         return False
     if fit.chance < LEAST_CHANCE_OF_ALL:
@@ -201,10 +101,10 @@ def _scale(tested: Iterable[Agreement]) -> float:
 def _find_wrong(method: Method, graph: PoseGraph) -> tuple[Refusal, ...]:
     """The measurements that all others contradict."""
     # poses alone for a start: GTSAM's optimiser copies its factors, which those that are Python cannot be
-    doubted = _outliers(_fit("smooth", graph))
+    doubted = _outliers(fit_graph("smooth", graph))
     # twice the same set ends it, as does the last round
     for _ in range(ROUNDS):
-        fit = _fit(method, graph.without(doubted.values()))
+        fit = fit_graph(method, graph.without(doubted.values()))
         posterior = Posterior(fit.factors, fit.values)
         tested = fit.agreements(posterior, (RelativePose, Sighting))
         scale = _scale(tested.values())
@@ -225,7 +125,7 @@ def _find_wrong(method: Method, graph: PoseGraph) -> tuple[Refusal, ...]:
     )
 
 
-def _outliers(fit: _Fit) -> dict[int, Link]:
+def _outliers(fit: Fit) -> dict[int, Link]:
     """The relative poses that graduated non-convexity leaves out, by identity; everything else is taken for true.
 
     Source: Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", 2020.
@@ -241,7 +141,7 @@ def _outliers(fit: _Fit) -> dict[int, Link]:
     return {id(fit.links[index]): fit.links[index] for index in suspects if weights[first + index] < 0.5}
 
 
-def _innovation(fit: _Fit, posterior: Posterior, link: Link) -> Agreement:
+def _innovation(fit: Fit, posterior: Posterior, link: Link) -> Agreement:
     """How a link that is not in the fit agrees with it; 0 of 0 where an end of it has no pose there."""
     i, j = map(fit.graph.places.key, link.ends)
     factor = fit.factors_of.of_link(link, i, j)
@@ -250,7 +150,7 @@ def _innovation(fit: _Fit, posterior: Posterior, link: Link) -> Agreement:
     return innovation(factor, fit.values, posterior.joint(list(factor.keys())))
 
 
-def _agrees(fit: _Fit, posterior: Posterior, link: Link, scale: float) -> bool:
+def _agrees(fit: Fit, posterior: Posterior, link: Link, scale: float) -> bool:
     """Whether a link that was left out agrees with the rest, or is all that ties one of its ends."""
     return _innovation(fit, posterior, link).chance(scale) >= LEAST_CHANCE
 
@@ -261,7 +161,7 @@ def _find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
     loose = replace(graph, slips=slips)
     bumps: list[Bump] = []
     for _ in range(MOST_BUMPS):
-        fit = _fit(method, loose)
+        fit = fit_graph(method, loose)
         tested = fit.agreements(Posterior(fit.factors, fit.values), (StayPut, RelativePose, Sighting))
         stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
         if not stays:
@@ -274,7 +174,7 @@ def _find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
         stay = fit.links[plainest]
         assert isinstance(stay, StayPut)
         loose = _moved(loose, stay)
-        moved = _fit(method, loose)
+        moved = fit_graph(method, loose)
         before, after = (moved.values.atPose3(loose.places.key(node)) for node in stay.ends)
         named = replace(stay, slip=graph.slips.get(stay.robot))
         bumps.append(Bump(named, before.between(after), stays[plainest].sigmas))

@@ -300,7 +300,7 @@ class Estimator:
     def _rebuild(self) -> None:
         """The graph anew from the log without what was refused: after a failure, a revocation, from a checkpoint."""
         kept = self.graph.without(one.measurement for one in self.refused)
-        self._live, links = rebuilt(kept, self._new_factors())
+        self._live, links = rebuilt(kept, self.method)
         inside = set(map(id, links))
         self._loose = [link for link in kept.links if id(link) not in inside and len(set(self._keys(link))) == 2]
 

@@ -156,19 +156,14 @@ class Factors:
             if i in wanted and j in wanted and i != j:
                 made.append(self.of_link(link, i, j))
                 links.append(link)
-        for key in self.calibrated:
+        for key in sorted({key for factor in made for key in factor.keys()[2:]}):
             factors.add(self.calibration_prior(key))
         for factor in made:
             factors.add(factor)
         return factors, tuple(links)
 
-    @property
-    def calibrated(self) -> tuple[int, ...]:
-        """The calibration variables that the factors made so far have asked for."""
-        return () if self.variables is None else tuple(sorted(self.variables.sigmas))
-
     def nominal(self, key: int) -> Array:
-        """Where the search for one of them starts: as stated."""
+        """Where the search for a calibration variable starts: as stated."""
         assert self.variables is not None
         return self.variables.start(key)
 
@@ -177,7 +172,7 @@ class Factors:
         return self.variables is None or self.variables.is_anchored(calibrations_in(values))
 
     def calibration_prior(self, key: int) -> gtsam.NonlinearFactor:
-        """What is stated of one of them."""
+        """What is stated of a calibration variable."""
         assert self.variables is not None
         return self.variables.prior(key)
 

@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from coloc_graph.backend.calibration import ANCHORED, is_calibration
-from coloc_graph.backend.chain import compose, spanning_tree
+from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, agreement, innovation
 from coloc_graph.backend.entering import Entering
-from coloc_graph.backend.factors import Factors
+from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
+from coloc_graph.backend.fit import fit_graph
 from coloc_graph.backend.graph import Link, PoseGraph
-from coloc_graph.backend.solver import CALIBRATED, isam_parameters, joint_covariance, optimise, with_stack
+from coloc_graph.backend.solver import CALIBRATED, isam_parameters, joint_covariance, with_stack
 from coloc_graph.errors import EstimationError
 
 Array = NDArray[np.float64]
@@ -174,19 +175,13 @@ class LiveGraph:
         return (agreement if inside else innovation)(one.factor, values, joint_covariance(self.isam, keys))
 
 
-def rebuilt(graph: PoseGraph, factors_of: Factors) -> tuple[LiveGraph, tuple[Link, ...]]:
+def rebuilt(graph: PoseGraph, method: Method) -> tuple[LiveGraph, tuple[Link, ...]]:
     """A live graph of everything in a graph that is tied to the reference, at its optimum, and the links that are."""
-    live = LiveGraph(factors_of)
-    steps = spanning_tree(graph, graph.links)
-    initial = gtsam.Values()
-    poses = compose(graph, steps, factors_of.start) if steps else {graph.reference_key: gtsam.Pose3()}
-    for key, pose in poses.items():
-        initial.insert(key, pose)
-    factors, links = factors_of.of_graph(graph, poses)
-    for key in factors_of.calibrated:
-        initial.insert(key, factors_of.nominal(key))
-    values, _ = with_stack(len(poses), lambda: optimise(factors, initial))
-    live.isam.update(factors, values)
-    live.tied = set(poses)
-    live._calibrated = {key: values.atVector(key) for key in factors_of.calibrated}
-    return live, links
+    if not spanning_tree(graph, graph.links):
+        graph = graph.without(graph.measurements)  # nothing is tied yet but the reference
+    fit = with_stack(len(graph.nodes), lambda: fit_graph(method, graph))
+    live = LiveGraph(fit.factors_of)
+    live.isam.update(fit.factors, fit.values)
+    live.tied = set(poses_in(fit.values))
+    live._calibrated = calibrations_in(fit.values)
+    return live, fit.links
