@@ -22,10 +22,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from monte_carlo import anees_interval, over_seeds, rms_interval, simulated, solved
+from monte_carlo import anees_interval, over_seeds, rms_interval, simulated, solved, truth_of
 from msgspec.structs import replace as with_fields
 
 from coloc_graph.backend import replay
+from coloc_graph.evaluation import align
+from coloc_graph.lie import se3_inverse, so3_log
 from coloc_graph.pipeline import SolveOptions, solve
 from coloc_graph.results import assess
 from coloc_graph.run import open_run
@@ -103,10 +105,6 @@ def tracks(seeds: int) -> dict[str, dict[str, object]]:
 
 def last_pose(seed: int, points: int) -> float:
     """NEES of A's last pose alone, planar, 3 numbers: independent from seed to seed."""
-    from monte_carlo import truth_of
-
-    from coloc_graph.evaluation import align
-    from coloc_graph.lie import se3_inverse, so3_log
 
     world = simulated("hallway", seed, points=points, stances=12, imperfections=WRONG)
     solution, _ = solved(world, SolveOptions("joint"))
@@ -114,7 +112,7 @@ def last_pose(seed: int, points: int) -> float:
     true = align(solution.estimate.trajectories, truth_of(world), "A", on_floor=True)["A"][-1]
     T = se3_inverse(trajectory.T_world_body[-1]) @ true
     xi = np.concatenate([so3_log(T[:3, :3])[2:], T[:2, 3]])
-    C = trajectory.covariances[-1][2:5, 2:5]  # type: ignore[index]
+    C = trajectory.covariances[-1][2:5, 2:5]
     return float(xi @ np.linalg.solve(C, xi))
 
 
@@ -160,7 +158,7 @@ def segments(seed: int, imperfections: Imperfections) -> dict[str, list[float]]:
     for name in ("eq. (2), chained (the paper)", "joint, without odometry"):
         solution, _ = solved(world, METHODS[name])
         places = {
-            robot: {int(k): p for k, p in zip(t.stances, t.positions, strict=True)}  # type: ignore[arg-type]
+            robot: {int(k): p for k, p in zip(t.stances, t.positions, strict=True)}
             for robot, t in solution.estimate.trajectories.items()
         }
         errors[name] = []
@@ -307,10 +305,10 @@ def speed() -> dict[str, float]:
 
 def print_row(name: str, row: dict[str, object]) -> None:
     """One line of a table."""
-    low, high = row["length_error_percent_95"]  # type: ignore[misc]
+    low, high = row["length_error_percent_95"]
     chi2 = "" if row["chi2_per_dof"] is None else f"  chi2/dof {row['chi2_per_dof']:.3f}"
     print(
-        f"{name:52} length {row['length_error_percent_rms']:.3f} % ({low:.3f}-{high:.3f})  heading "  # type: ignore
+        f"{name:52} length {row['length_error_percent_rms']:.3f} % ({low:.3f}-{high:.3f})  heading "
         f"{row['heading_deg_rms']:.3f} deg{chi2}  NEES {row['anees']:.2f}  refused {row['refused']}",
         flush=True,
     )

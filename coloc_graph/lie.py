@@ -170,6 +170,16 @@ def _sl3_basis() -> Array:
 SL3_BASIS: Array = _sl3_basis()
 
 
+def _vee_matrix() -> Array:
+    """From the nine entries, row by row, to the coordinates: the pseudo-inverse of the basis, with the identity's share
+    of the diagonal left out."""
+    entries = np.column_stack([SL3_BASIS.reshape(8, 9).T, np.eye(3).ravel()])
+    return np.ascontiguousarray(np.linalg.inv(entries)[:8].T)
+
+
+_VEE: Array = _vee_matrix()
+
+
 def sl3_hat(h: ArrayLike) -> Array:
     """Traceless matrices (..., 3, 3) of coordinates (..., 8)."""
     return np.asarray(np.tensordot(np.asarray(h, float), SL3_BASIS, axes=1))
@@ -178,14 +188,7 @@ def sl3_hat(h: ArrayLike) -> Array:
 def sl3_vee(D: ArrayLike) -> Array:
     """Coordinates (..., 8) of matrices (..., 3, 3), whose trace is removed first."""
     D = np.asarray(D, float)
-    third = np.trace(D, axis1=-2, axis2=-1) / 3
-    return np.stack(
-        [
-            D[..., 0, 1], D[..., 0, 2], D[..., 1, 0], D[..., 1, 2], D[..., 2, 0], D[..., 2, 1],
-            D[..., 0, 0] - third, third - D[..., 2, 2],
-        ],
-        axis=-1,
-    )  # fmt: skip
+    return np.asarray(D.reshape(*D.shape[:-2], 9) @ _VEE)
 
 
 # ad of each basis element, laid so that h @ _SL3_AD is ad(h)
@@ -228,10 +231,11 @@ def sl3_log(H: ArrayLike) -> Array:
         E, roots = _square_root(E), roots + 1
         Z = _cayley(E)
         size = np.abs(Z).max(initial=0.0)
-    # Z + Z^3 / 3 + Z^5 / 5 + ..., of which the terms below 1e-17 are left out
-    terms = math.ceil(17 / -math.log10(max(3 * size, 1e-17) ** 2))
+    # Z + Z^3 / 3 + Z^5 / 5 + ..., up to where terms are below rounding; the norm is that of the largest of all
     square = Z @ Z
-    series = np.broadcast_to(np.eye(3) / (2 * terms + 1), E.shape)
+    norm = math.sqrt(float((Z * Z).sum(axis=(-2, -1)).max(initial=1e-34)))
+    terms = max(1, math.ceil(16.5 / (-2 * math.log10(norm)))) if norm < 1 else 60
+    series = _IDENTITY / (2 * terms + 1)
     for n in range(2 * terms - 1, 0, -2):
         series = _IDENTITY / n + square @ series
     logarithm: Array = np.asarray(Z @ series * 2.0 ** (1 + roots), np.float64)

@@ -63,17 +63,18 @@ def test_a_mount_that_is_off_sits_where_one_that_is_stated_so_does(rng):
     stated = Mount(
         height=0.41, tilt_deg=20.0 + np.rad2deg(tilt), roll_deg=1.0 + np.rad2deg(roll), yaw_deg=5.0, x=0.05, y=-0.02
     )
-    R, t, by_error = MountModel(MOUNT_I).at(np.array([height, tilt, roll]))
+    camera = MountModel(MOUNT_I).at(np.array([height, tilt, roll]))
+    R, t = camera.R, camera.t
     np.testing.assert_allclose(R, stated.R_body_camera, atol=1e-14)
     np.testing.assert_allclose(t, [0.05, -0.02, 0.41], atol=1e-14)
 
     def tangent(errors):
         """Of the camera that is off in the one that is not."""
-        R_off, t_off, _ = MountModel(MOUNT_I).at(np.array([height, tilt, roll]) + errors)
-        W = R.T @ R_off
-        return np.array([W[2, 1], W[0, 2], W[1, 0], *(R.T @ (t_off - t))])
+        off = MountModel(MOUNT_I).at(np.array([height, tilt, roll]) + errors)
+        W = R.T @ off.R
+        return np.array([W[2, 1], W[0, 2], W[1, 0], *(R.T @ (off.t - t))])
 
-    np.testing.assert_allclose(by_error, by_differences(tangent, np.zeros(3)), atol=1e-9)
+    np.testing.assert_allclose(camera.by_errors, by_differences(tangent, np.zeros(3)), atol=1e-9)
 
 
 @pytest.mark.parametrize("on_floor", [True, False])

@@ -36,35 +36,59 @@ class MountModel:
     def _R_yaw(self) -> Array:
         return rotation_z(np.deg2rad(self.mount.yaw_deg))
 
-    def at(self, errors: Array) -> tuple[Array, Array, Array]:
-        """R_body_camera (3, 3), where the camera is in the body (3,) [m], and the camera's tangent (6, 3) by error."""
+    def at(self, errors: Array) -> "MountedCamera":
+        """The camera of a mount that is off by `errors` (3,)."""
         m = self.mount
         height, tilt, roll = errors.tolist()
         tilt, roll = tilt + math.radians(m.tilt_deg), roll + math.radians(m.roll_deg)
         ct, st, cr, sr = math.cos(tilt), math.sin(tilt), math.cos(roll), math.sin(roll)
         R_yt = self._R_yaw @ np.array([[ct, 0.0, st], [0.0, 1.0, 0.0], [-st, 0.0, ct]])
         R_ro = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]]) @ R_BODY_OPTICAL
-        R = R_yt @ R_ro
-        by_error = np.zeros((6, 3))
-        by_error[3:, 0] = R[2]
-        by_error[:3, 1] = R_ro[1]
-        by_error[:3, 2] = R_BODY_OPTICAL[0]
-        return R, np.array([m.x, m.y, m.height + height]), by_error
+        return MountedCamera(R_yt @ R_ro, np.array([m.x, m.y, m.height + height]), R_ro)
+
+
+@dataclass(frozen=True, eq=False)
+class MountedCamera:
+    """Where a camera is in its body: `R` (3, 3) and `t` (3,) [m] of T_body_camera, `R_ro` that of roll and optics."""
+
+    R: Array
+    t: Array
+    R_ro: Array
+
+    @property
+    def by_errors(self) -> Array:
+        """The camera's tangent (6, 3) by the mount's errors."""
+        out = np.zeros((6, 3))
+        out[3:, 0] = self.R[2]
+        out[:3, 1] = self.R_ro[1]
+        out[:3, 2] = R_BODY_OPTICAL[0]
+        return out
+
+    @property
+    def by_body(self) -> Array:
+        """The camera's tangent (6, 6) by the body's: the adjoint of T_camera_body."""
+        out = np.zeros((6, 6))
+        out[:3, :3] = out[3:, 3:] = self.R.T
+        out[3:, :3] = -self.R.T @ _hat(self.t)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """The marker plane in one camera: plane coordinates (X, Y, 1) to camera rays is `P` (3, 3), and n . X = 1 there.
 
-    `by_body` (6, 6), `by_mount` (6, 3) and `by_height` (6,) are the camera's tangents by the body's, by the mount's
-    errors and by the height of the plane.
+    `camera` is where it is in the body, `R` (3, 3) how it is turned against the plane.
     """
 
     P: Array
     P_inverse: Array
-    by_body: Array
-    by_mount: Array
-    by_height: Array
+    camera: MountedCamera
+    R: Array
+
+    @property
+    def by_height(self) -> Array:
+        """The camera's tangent (6,) by the height of the plane: a higher plane is a lower camera."""
+        return np.concatenate([np.zeros(3), -self.R[2]])
 
     @property
     def n(self) -> Array:
@@ -78,23 +102,16 @@ class _Seen:
 
 def _see(T_plane_body: Array, mount: MountModel, errors: Array, height: float) -> _Seen | None:
     """The plane z = `height` in the camera; None where the camera is in it."""
-    R_bc, t_bc, by_mount = mount.at(errors)
-    R = T_plane_body[:3, :3] @ R_bc
-    t = T_plane_body[:3, :3] @ t_bc + T_plane_body[:3, 3]
+    camera = mount.at(errors)
+    R = T_plane_body[:3, :3] @ camera.R
+    t = T_plane_body[:3, :3] @ camera.t + T_plane_body[:3, 3]
     d = t[2] - height
     if not abs(d) > 1e-4:
         return None
     # a point (x, y, height) is R^T (x - t_x, y - t_y, -d) in the camera
     P = R.T @ np.array([[1.0, 0.0, -t[0]], [0.0, 1.0, -t[1]], [0.0, 0.0, -d]])
     P_inverse = np.array([[1.0, 0.0, -t[0] / d], [0.0, 1.0, -t[1] / d], [0.0, 0.0, -1 / d]]) @ R
-    # the camera's tangent by the body's: Ad of T_camera_body
-    by_body = np.zeros((6, 6))
-    by_body[:3, :3] = by_body[3:, 3:] = R_bc.T
-    by_body[3:, :3] = -R_bc.T @ _hat(t_bc)
-    # a higher plane is a lower camera
-    by_height = np.zeros(6)
-    by_height[3:] = -R[2]
-    return _Seen(P, P_inverse, by_body, by_mount, by_height)
+    return _Seen(P, P_inverse, camera, R)
 
 
 def _hat(v: Array) -> Array:
@@ -213,15 +230,15 @@ class HomographyModel:
             by_camera_i[rows, 3:] += np.outer(by_n @ n, n)
             by_span[self.movers.index(one.mover)][rows, 0] += by_length
         by_span[0][:, 1] = by_camera_i @ i.by_height + by_camera_j @ j.by_height
-        by_j = by_camera_j @ j.by_body
+        by_j = by_camera_j @ j.camera.by_body
         # without a floor the plane goes where body i goes, which is body j the other way
-        by_i = by_camera_i @ i.by_body if self.on_floor else -by_j @ _adjoint(_inverse(T_plane_j))
+        by_i = by_camera_i @ i.camera.by_body if self.on_floor else -by_j @ _adjoint(_inverse(T_plane_j))
         return Residual(
             e,
             by_i,
             by_j,
-            by_camera_i @ i.by_mount,
-            by_camera_j @ j.by_mount,
+            by_camera_i @ i.camera.by_errors,
+            by_camera_j @ j.camera.by_errors,
             tuple(by_span),
             -self._by_h @ self._by_offset,
         )
@@ -318,12 +335,12 @@ class MarkersModel:
 
     def place(self, mount: Array, markers: Array) -> tuple[float, float, float] | None:
         """x, y [m] and heading [rad] of the robot in an observer that stands level; None where a ray goes up."""
-        R_bc, t_bc, _ = self._constants[0].at(mount)
-        rays = np.column_stack([self.x, np.ones(2)]) @ R_bc.T
-        above = t_bc[2] - self.markers.height - markers[1]
+        camera = self._constants[0].at(mount)
+        rays = np.column_stack([self.x, np.ones(2)]) @ camera.R.T
+        above = camera.t[2] - self.markers.height - markers[1]
         if not (above > 0 and rays[:, 2].max() < -1e-3):
             return None
-        a, b = t_bc[:2] - rays[:, :2] * (above / rays[:, 2:])
+        a, b = camera.t[:2] - rays[:, :2] * (above / rays[:, 2:])
         (ax, ay), (bx, by) = self.markers.positions[:2]
         heading = math.atan2(b[1] - a[1], b[0] - a[0]) - math.atan2(by - ay, bx - ax)
         c, s = math.cos(heading), math.sin(heading)
@@ -340,13 +357,13 @@ class MarkersModel:
         """The whitened residual (4,), and its Jacobians by observer and seen (4, 6), by the observer's mount (4, 3) and
         by the markers (4, 2); None where a marker is not before the camera."""
         model, roots = self._constants
-        R_bc, t_bc, by_mount = model.at(mount)
+        camera = model.at(mount)
         nominal = self.markers.p_body[:2]
         scale = np.array([1 + markers[0], 1 + markers[0], 1.0])
         p_body = nominal * scale + np.array([0.0, 0.0, markers[1]])
         R_wo, R_ws = T_world_observer[:3, :3], T_world_seen[:3, :3]
-        R_cw = (R_wo @ R_bc).T
-        p_camera = (p_body @ R_ws.T + T_world_seen[:3, 3] - T_world_observer[:3, 3] - R_wo @ t_bc) @ R_cw.T
+        R_cw = (R_wo @ camera.R).T
+        p_camera = (p_body @ R_ws.T + T_world_seen[:3, 3] - T_world_observer[:3, 3] - R_wo @ camera.t) @ R_cw.T
         if not p_camera[:, 2].min() > 1e-3:
             return None
         w = 1 / p_camera[:, 2]
@@ -357,12 +374,9 @@ class MarkersModel:
         project[:, :, 2] = -x * w[:, None]
         project = np.asarray(roots @ project, float)
         by_camera: Array = np.concatenate([project @ hat(p_camera), -project], axis=2).reshape(4, 6)
-        by_body = np.zeros((6, 6))
-        by_body[:3, :3] = by_body[3:, 3:] = R_bc.T
-        by_body[3:, :3] = -R_bc.T @ _hat(t_bc)
         turned = np.asarray(project @ (R_cw @ R_ws), float)
         by_seen: Array = np.concatenate([-turned @ hat(p_body), turned], axis=2).reshape(4, 6)
         of_markers = np.zeros((2, 3, 2))
         of_markers[:, :2, 0], of_markers[:, 2, 1] = nominal[:, :2], 1.0
         by_markers = np.asarray((turned @ of_markers).reshape(4, 2), float)
-        return e.ravel(), by_camera @ by_body, by_seen, by_camera @ by_mount, by_markers
+        return e.ravel(), by_camera @ camera.by_body, by_seen, by_camera @ camera.by_errors, by_markers
