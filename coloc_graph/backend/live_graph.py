@@ -122,11 +122,15 @@ class LiveGraph:
             now = {key: self.errors(key) for key in self._calibrated}
             if all(np.abs(now[key] - before).max() < CALIBRATED for key, before in self._calibrated.items()):
                 break
-            again = gtsam.ISAM2UpdateParams()
-            again.force_relinearize = True
-            self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), again)
+            self._linearise()
             self._calibrated = now
         return indices
+
+    def _linearise(self) -> None:
+        """Everything anew where it is, and one step from there."""
+        again = gtsam.ISAM2UpdateParams()
+        again.force_relinearize = True
+        self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), again)
 
     def _known(self, key: int) -> gtsam.Pose3 | Array:
         return self.errors(key) if is_calibration(key) else self.isam.calculateEstimatePose3(key)
@@ -158,11 +162,17 @@ class LiveGraph:
     def _take_out(self, inside: dict[int, Entered]) -> list[tuple[Link, Agreement]]:
         """Take out what all others contradict, the worst first."""
         refused: list[tuple[Link, Agreement]] = []
+        converged = False
         while inside:
             among = {index: self._agreement(one) for index, one in inside.items()}
             worst = min(among, key=lambda index: among[index].chance())
             if among[worst].chance() >= LEAST_CHANCE:
                 break
+            if not converged:
+                # what one step leaves of a residual counts many times over where little else checks it
+                self._linearise()
+                converged = True
+                continue
             refused.append((inside.pop(worst).link, among[worst]))
             self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [worst])
         return refused
