@@ -126,7 +126,7 @@ def test_an_led_in_a_frame_is_where_the_true_marker_projects(world):
 
 def test_a_body_is_dark_and_the_background_smooth_and_dim(world):
     capture = world.captures[0][0]
-    field = backdrop(capture.view, make_scenery(world), stream(4, "sensor"))
+    field = backdrop(capture.view.camera, capture.view.T_world_camera, make_scenery(world), stream(4, "sensor"))
     assert 8 < np.median(field) < 32
     image = next(frames(world, 0, capture, make_scenery(world), Sensor(read_noise=0.0, shot_gain=0.0))).pixels
     uv, inside = capture.view.project(world.paths["C"].pose_at(capture.times[:1])[0, :3, 3] + (0, 0, 0.06))

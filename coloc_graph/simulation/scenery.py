@@ -1,7 +1,9 @@
-"""Depth images: what an observer's camera sees of the world, frame by frame: LEDs, bodies, and bright things
-that are no LEDs."""
+"""Depth images: what a camera sees of the world, frame by frame: LEDs, bodies, and bright things that are no LEDs.
 
-from collections.abc import Iterator
+`frames` are those of a simulated run; `backdrop`, `RobotInView` and `draw` make one of any poses, as a live world does.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,8 +13,8 @@ from numpy.typing import NDArray
 from coloc_graph.run.messages import Image
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.rendering import Field, Sensor, Spots, add_spots, expose, fill, spots
-from coloc_graph.simulation.tours import View
 from coloc_graph.simulation.world import Capture, World, stream
+from coloc_graph.team import Camera
 
 #: An LED is a disc of this radius [m]; a body is a dark cylinder, radius and height [m], at a grey level.
 LED_RADIUS = 0.005
@@ -44,10 +46,14 @@ class Scenery:
 
 
 def make_scenery(world: World) -> Scenery:
-    """Ceiling lamps mirrored in the floor, shining specks on it, and windows; drawn by the world's seed."""
-    rng = stream(world.seed, "scenery")
-    first = min(pose[0] for pose in world.scenario.poses)
-    last = max(pose[0] for pose in world.scenario.poses)
+    """The scenery of a simulated run, drawn by its seed."""
+    ahead = [pose[0] for pose in world.scenario.poses]
+    return scenery_along(min(ahead), max(ahead), stream(world.seed, "scenery"))
+
+
+def scenery_along(first: float, last: float, rng: np.random.Generator) -> Scenery:
+    """Of robots that drive from x = `first` to `last` [m]: ceiling lamps mirrored in the floor, shining specks on it,
+    and windows."""
     lamps_x = np.arange(first + 3.5, last + 12.0, 2.2)
     n = len(lamps_x)
     lamps = np.column_stack([lamps_x + rng.normal(0, 0.2, n), rng.uniform(-1.2, 1.2, n), np.full(n, -CEILING)])
@@ -68,30 +74,31 @@ def make_scenery(world: World) -> Scenery:
     )
 
 
-def backdrop(view: View, scenery: Scenery, rng: np.random.Generator) -> Field:
-    """The field (height, width) of a camera at rest with no robot before it: dark, and bright things."""
-    camera = view.camera
+def backdrop(camera: Camera, T_world_camera: Array, scenery: Scenery, rng: np.random.Generator) -> Field:
+    """The field (height, width) of a camera with no robot before it: dark, and bright things."""
     x, y = np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height)[:, None]
     a, b, c = rng.uniform(-1, 1, 3)
     field = (19 - (5 + b) * y + 2.5 * a * x - (2 + c) * x**2).astype(np.float32)
     for corners, level in zip(scenery.windows, scenery.window_levels, strict=True):
-        uv, _, ok = _image_of(view, corners)
+        uv, _, ok = _image_of(camera, T_world_camera, corners)
         if ok.all():
             fill(field, uv, float(level))
     field = np.asarray(cv2.GaussianBlur(field, (0, 0), 1.2), np.float32)
-    uv, depth, ok = _image_of(view, scenery.places)
+    uv, depth, ok = _image_of(camera, T_world_camera, scenery.places)
     radius = camera.fx * scenery.radii[ok] / depth[ok]
     add_spots(field, spots(uv[ok], radius, scenery.levels[ok], psf_sigma=scenery.blurs[ok]))
     return field
 
 
-def _image_of(view: View, points_world: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Pixels (..., 2), depths (...) [m], and which points (..., 3) [m] are in the image or near it."""
-    R_world_camera, p_world = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
-    points = (points_world - p_world) @ R_world_camera
+def _image_of(camera: Camera, T_world_camera: Array, points_world: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Pixels (..., n, 2), depths (..., n) [m], and which points (..., n, 3) [m] are in the image or near it.
+
+    The camera stands at one pose (4, 4), or at as many as there are sets of points.
+    """
+    points = (points_world - T_world_camera[..., None, :3, 3]) @ T_world_camera[..., :3, :3]
     depth = points[..., 2]
     ok = (depth > 0.05) & (np.hypot(points[..., 0], points[..., 1]) < _FIELD_LIMIT * depth)
-    return view.camera.project(points)[0], depth, np.asarray(ok)
+    return camera.project(points)[0], depth, np.asarray(ok)
 
 
 def frames(world: World, k: int, capture: Capture, scenery: Scenery, sensor: Sensor | None = None) -> Iterator[Image]:
@@ -99,46 +106,70 @@ def frames(world: World, k: int, capture: Capture, scenery: Scenery, sensor: Sen
     sensor = sensor or Sensor()
     index = world.team.names.index(capture.robot)
     rng = stream(world.seed, "sensor", k * len(world.team.names) + index)
-    field = backdrop(capture.view, scenery, rng)
-    others = [_Other(world, name, capture, sensor) for name in world.team.names if name != capture.robot]
+    camera, T_world_camera = capture.view.camera, capture.view.T_world_camera
+    field = backdrop(camera, T_world_camera, scenery, rng)
+    half = sensor.exposure / 2
+    others = []
+    for name in world.team.names:
+        if name != capture.robot:
+            T_world_body = [world.paths[name].pose_at(capture.times + shift) for shift in (0.0, -half, half)]
+            markers = world.true_team[name].markers
+            p_body = np.zeros((0, 3)) if markers is None else markers.p_body
+            others.append(RobotInView(camera, [T_world_camera] * 3, T_world_body, p_body, sensor))
     for i, stamp in enumerate(capture.stamps.tolist()):
-        image = field.copy()
-        for other in others:
-            other.add_mirrored(image, i)
-        # the far ones first: a near body hides what is behind it
-        for other in sorted(others, key=lambda other: -float(other.distance[i])):
-            other.paint(image, i)
-        yield Image(capture.robot, stamp, expose(image, sensor, rng))
+        yield Image(capture.robot, stamp, draw(field, others, i, sensor, rng))
 
 
-class _Other:
-    """One robot as another's camera sees it, over all captures of a stance."""
+def draw(
+    field: Field, others: Sequence["RobotInView"], i: int, sensor: Sensor, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """The image (height, width) of capture i: a backdrop with other robots before it."""
+    image = field.copy()
+    for other in others:
+        other.add_mirrored(image, i)
+    # the far ones first: a near body hides what is behind it
+    for other in sorted(others, key=lambda other: -float(other.distance[i])):
+        other.paint(image, i)
+    return expose(image, sensor, rng)
 
-    def __init__(self, world: World, name: str, capture: Capture, sensor: Sensor) -> None:
-        times, view = capture.times, capture.view
-        T_world_body = world.paths[name].pose_at(times)
-        self.distance = np.linalg.norm(T_world_body[:, :3, 3] - view.T_world_camera[:3, 3], axis=-1)
+
+class RobotInView:
+    """One robot as another's camera sees it, over n captures.
+
+    `T_world_camera`, each (4, 4) or (n, 4, 4), and `T_world_body`, each (n, 4, 4), are in the middle, at the beginning
+    and at the end of the exposures. `p_body` (m, 3) [m] are its LEDs.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        T_world_camera: Sequence[Array],
+        T_world_body: Sequence[Array],
+        p_body: Array,
+        sensor: Sensor,
+    ) -> None:
+        self._camera, self._cameras, self._sensor = camera, T_world_camera, sensor
+        middle = T_world_body[0]
+        #: How far it is from the camera (n,) [m].
+        self.distance = np.linalg.norm(middle[:, :3, 3] - T_world_camera[0][..., :3, 3], axis=-1)
         angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
         circle = BODY_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
         hull = np.concatenate([np.column_stack([circle, np.full(24, z)]) for z in (0.0, BODY_HEIGHT)])
-        hull_world = np.einsum("nij,mj->nmi", T_world_body[:, :3, :3], hull) + T_world_body[:, None, :3, 3]
-        self._hull, _, hull_ok = _image_of(view, hull_world)
+        self._hull, _, hull_ok = _image_of(camera, T_world_camera[0], _placed(middle, hull))
         self._visible = np.atleast_1d(hull_ok.all(axis=1))
-        half = sensor.exposure / 2
-        leds = [world.markers_world(name, times + shift) for shift in (0.0, -half, half)]
-        self._leds = self._spots(view, leds, 1.0, sensor.led_level, 1.0, sensor)
+        leds = [_placed(T, p_body) for T in T_world_body]
+        self._leds = self._spots(leds, 1.0, sensor.led_level, 1.0)
         mirrored = [led * (1.0, 1.0, -1.0) for led in leds]
-        self._mirrored = self._spots(
-            view, mirrored, MIRROR_RADIUS, MIRROR_LEVEL * sensor.led_level, MIRROR_BLUR, sensor
-        )  # fmt: skip
+        self._mirrored = self._spots(mirrored, MIRROR_RADIUS, MIRROR_LEVEL * sensor.led_level, MIRROR_BLUR)
 
-    @staticmethod
-    def _spots(view: View, places: list[Array], widen: float, level: float, blur: float, sensor: Sensor) -> list[Spots]:
+    def _spots(self, places: list[Array], widen: float, level: float, blur: float) -> list[Spots]:
         """The spots of each capture, of LEDs (n, m, 3) in the middle, at the beginning and the end of it."""
-        uv, depth, ok = _image_of(view, places[0])
-        motion = _image_of(view, places[2])[0] - _image_of(view, places[1])[0]
-        radius = widen * view.camera.fx * LED_RADIUS / depth
-        psf = blur * sensor.psf_sigma
+        (uv, depth, ok), (first, _, _), (last, _, _) = (
+            _image_of(self._camera, T, leds) for T, leds in zip(self._cameras, places, strict=True)
+        )
+        motion = last - first
+        radius = widen * self._camera.fx * LED_RADIUS / depth
+        psf = blur * self._sensor.psf_sigma
         return [
             spots(uv[i][ok[i]], radius[i][ok[i]], level, motion[i][ok[i]], psf) for i in range(len(uv))
         ]  # fmt: skip
@@ -153,3 +184,8 @@ class _Other:
             outline = np.asarray(cv2.convexHull(self._hull[i].astype(np.float32)))[:, 0]
             fill(field, outline, BODY_LEVEL)
         add_spots(field, self._leds[i])
+
+
+def _placed(T_world_body: Array, p_body: Array) -> Array:
+    """Points (n, m, 3) in the world [m] of points (m, 3) of bodies at poses (n, 4, 4)."""
+    return np.asarray(np.einsum("nij,mj->nmi", T_world_body[:, :3, :3], p_body) + T_world_body[:, None, :3, 3])
