@@ -9,6 +9,7 @@
     ├── EstimationError       the graph cannot be solved, or the solver's answer did not pass its check
     │   └── MeasurementError  a measurement, or a stance, cannot enter the graph
     └── RobotError            a device of a robot does not answer, is lost, or refuses to go on
+        └── CameraError       a camera
 
 Messages are one sentence: what is wrong, where (file, line, stance, robot), and what to do. They are raised
 deep and caught once, in `cli`, which prints the sentence and ends with exit code 2.
@@ -49,6 +50,10 @@ class MeasurementError(EstimationError):
 
 class RobotError(ColocError):
     """A device of a robot does not answer, is lost, or refuses to go on; the message names its port and the remedy."""
+
+
+class CameraError(RobotError):
+    """A camera cannot be opened, delivers no images or others than the team says; the message says which and why."""
 
 
 class ColocWarning(UserWarning):

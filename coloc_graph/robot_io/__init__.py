@@ -1,9 +1,12 @@
 """Devices of a robot: cameras, wheels, clocks, messages, coordination (knows devices; no graph).
 
 `Create` drives wheels, and sees to it that they stop; docs/wheels.md. Its emulator is in `create_emulator`.
+`open_camera` opens cameras; docs/cameras.md.
 """
 
+from coloc_graph.robot_io.camera import open_camera
+from coloc_graph.robot_io.camera_source import CameraSource, Frame
 from coloc_graph.robot_io.create import Create
 from coloc_graph.robot_io.create_state import CreateState
 
-__all__ = ["Create", "CreateState"]
+__all__ = ["CameraSource", "Create", "CreateState", "Frame", "open_camera"]
