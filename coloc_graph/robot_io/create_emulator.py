@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.robot_io import create_protocol as oi
 from coloc_graph.robot_io.create_odometry import WHEELS
@@ -91,6 +91,12 @@ class CreateEmulator:
             self.port, self._wired = os.ttyname(self._slave), True
 
     @property
+    def wired(self) -> bool:
+        """Whether its line is plugged in."""
+        with self._lock:
+            return self._wired
+
+    @property
     def pose(self) -> NDArray[np.float64]:
         """Where it truly is: x [m], y [m], yaw [rad]."""
         with self._lock:
@@ -112,6 +118,20 @@ class CreateEmulator:
         """The truth over the last minutes (n, 6): time [s, by its clock], x, y [m], yaw [rad], left, right [m/s]."""
         with self._lock:
             return np.array(self._body.trace)
+
+    def poses_at(self, times: ArrayLike) -> NDArray[np.float64]:
+        """Where it truly was at instants (n,) of the last minutes [s, by its clock]: (n, 3), yaw unwrapped.
+
+        What it does in the last step of its physics is not known yet.
+        """
+        with self._lock:
+            self._body.advance(self._clock())
+            return self._body.poses_at(times)
+
+    def push(self, dx: float, dy: float, dyaw: float) -> None:
+        """Somebody bumps into it: it moves by so much in the world [m], [rad], and its encoders count nothing."""
+        with self._lock:
+            self._body.push(dx, dy, dyaw)
 
     def cliff(self, where: str, there: bool = True) -> None:
         """A cliff under "left", "front left", "front right" or "right"."""

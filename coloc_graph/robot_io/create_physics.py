@@ -3,10 +3,11 @@
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from math import atan2, cos, hypot, pi, sin
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.robot_io.create_odometry import ENCODER, SLIP, WHEELS
 
@@ -68,12 +69,27 @@ class Body:
         self.still_since: float | None = self.time
         self._rng = np.random.default_rng(self.physics.seed)
         self._noise: list[float] = []
+        self._pushes = 0
         self._record()
 
     def advance(self, to: float) -> None:
         """On to the instant `to` in whole steps."""
         while self.time + self.physics.step <= to:
             self._step(self.physics.step)
+
+    def poses_at(self, times: ArrayLike) -> Array:
+        """Where it was at instants (n,) [s] of the last minutes: x, y [m], yaw [rad, unwrapped], (n, 3)."""
+        times = np.asarray(times, float)
+        back = int((self.time - times.min(initial=self.time)) / self.physics.step) + self._pushes + 2
+        rows = np.array(list(islice(reversed(self.trace), back)))[::-1]
+        columns = rows[:, 1], rows[:, 2], np.unwrap(rows[:, 3])
+        return np.stack([np.interp(times, rows[:, 0], column) for column in columns], axis=1)
+
+    def push(self, dx: float, dy: float, dyaw: float) -> None:
+        """Move it at once by so much in the world [m], [rad]: no wheel turns, no encoder counts."""
+        self.x, self.y, self.yaw = self.x + dx, self.y + dy, (self.yaw + dyaw + pi) % (2 * pi) - pi
+        self._pushes += 1
+        self._record()
 
     def _step(self, dt: float) -> None:
         self.time += dt
