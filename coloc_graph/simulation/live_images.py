@@ -25,49 +25,59 @@ from coloc_graph.team import Team
 #: A frame is rendered so long after its exposure [s]: by then where everybody was is known.
 AFTER = 0.005
 
+#: So many images' noise is drawn, and from one image to the next it is taken so much further on.
+NOISE, LEAP = 5, 104_729
+
 log = logging.getLogger(__name__)
 
-#: T_world_body (n, 4, 4) of a robot at instants (n,) [s, CLOCK_MONOTONIC].
+#: T_world_body (robots, n, 4, 4) of all robots, in the team's order, at instants (n,) [s, CLOCK_MONOTONIC].
 Poses = Callable[[Array], Array]
 
 
 class LiveCamera:
-    """One robot's camera: `image` is what it sees at an instant. Others are seen as they stand in `poses`.
+    """One robot's camera: `image` is what it sees at an instant, of all others as they stand in `poses`.
 
     While it stands still, what does not move is drawn once.
     """
 
-    def __init__(
-        self, robot: str, true_team: Team, poses: Mapping[str, Poses], scenery: Scenery, sensor: Sensor, seed: int
-    ) -> None:
-        self._robot, self._team, self._poses, self._scenery, self._sensor = robot, true_team, poses, scenery, sensor
-        self._seed = (seed, true_team.names.index(robot))
+    def __init__(self, robot: str, true_team: Team, poses: Poses, scenery: Scenery, sensor: Sensor, seed: int) -> None:
+        self._index = true_team.names.index(robot)
+        self._team, self._poses, self._scenery, self._sensor = true_team, poses, scenery, sensor
+        self._seed = (seed, self._index)
+        lens = true_team.robots[self._index].camera
+        # drawn once: each image takes its noise from another place of it
+        self._noise = np.random.default_rng(self._seed).standard_normal(
+            NOISE * lens.height * lens.width, dtype=np.float32
+        )
         self._field: Field | None = None
         self._stood = np.empty(0)
 
     def image(self, middle: float, number: int) -> NDArray[np.uint8]:
         """The image (height, width) of an exposure around the instant `middle` [s]; `number` draws its noise."""
         half = self._sensor.exposure / 2
-        instants = np.array([middle, middle - half, middle + half])
-        own = self._team[self._robot]
-        T_world_camera = self._poses[self._robot](instants) @ own.mount.T_body_camera
+        T_world_body = self._poses(np.array([middle, middle - half, middle + half]))
+        own = self._team.robots[self._index]
+        T_world_camera = T_world_body[self._index] @ own.mount.T_body_camera
         if self._field is None or not np.array_equal(T_world_camera[0], self._stood):
             rng = np.random.default_rng(self._seed)
             self._field = backdrop(own.camera, T_world_camera[0], self._scenery, rng)
             self._stood = T_world_camera[0]
         others = []
-        for other in self._team.robots:
-            if other.name != self._robot:
+        for other, T in zip(self._team.robots, T_world_body, strict=True):
+            if other is not own:
                 p_body = np.zeros((0, 3)) if other.markers is None else other.markers.p_body
-                T_world_body = self._poses[other.name](instants)[:, None]
-                others.append(RobotInView(own.camera, list(T_world_camera), list(T_world_body), p_body, self._sensor))
-        return draw(self._field, others, 0, self._sensor, np.random.default_rng((*self._seed, number)))
+                others.append(RobotInView(own.camera, list(T_world_camera), list(T[:, None]), p_body, self._sensor))
+        size = self._field.size
+        first = number * LEAP % (self._noise.size - size)
+        noise = self._noise[first : first + size].reshape(self._field.shape)
+        return draw(self._field, others, 0, self._sensor, noise)
 
 
 class ImageServer:
-    """Serves the frames of `cameras` at their rates `fps` on a Unix socket at `path`; a context manager.
+    """Serves the frames of `cameras` at their rates `fps` on a Unix socket at `path`, until it is closed.
 
-    `frozen` names the robots whose cameras have stopped delivering.
+    Cameras do not expose at the same instants: each is a part of a frame behind the one before. `frozen` names the
+    robots whose cameras have stopped delivering.
     """
 
     def __init__(self, path: Path, cameras: Mapping[str, Callable[[], LiveCamera]], fps: Mapping[str, float]) -> None:
@@ -141,13 +151,14 @@ class ImageServer:
 
     def _stream(self, connection: socket.socket, robot: str) -> None:
         camera, period = self._cameras[robot](), 1 / self._fps[robot]
-        number = int((time.monotonic() - self._began) / period) + 1
+        began = self._began + period * list(self._cameras).index(robot) / len(self._cameras)
+        number = int((time.monotonic() - began) / period) + 1
         while not self._ended.is_set():
-            middle = self._began + number * period
+            middle = began + number * period
             if self._ended.wait(max(0.0, middle + AFTER - time.monotonic())):
                 return
             if robot not in self.frozen:
                 pixels = camera.image(middle, number)
                 connection.sendall(HEADER.pack(round(middle * 1e9), *pixels.shape) + pixels.tobytes())
             # who comes too late leaves frames out
-            number = max(number + 1, int((time.monotonic() - AFTER - self._began) / period))
+            number = max(number + 1, int((time.monotonic() - AFTER - began) / period))

@@ -113,8 +113,7 @@ class LiveWorld:
             see = sensor or Sensor()
 
             def camera(robot: str) -> Callable[[], LiveCamera]:
-                at = {name: self._poses_of(name) for name in team.names}
-                return lambda: LiveCamera(robot, self.true_team, at, scenery, see, seed)
+                return lambda: LiveCamera(robot, self.true_team, self.poses_at, scenery, see, seed)
 
             self._images = ImageServer(
                 Path(self.address),
@@ -161,9 +160,11 @@ class LiveWorld:
             self.emulators[robot].plug_in()
         link.symlink_to(self.emulators[robot].port)
 
-    def pose_at(self, robot: str, times: Array) -> Array:
-        """True T_world_body (n, 4, 4) of a robot at instants (n,) of the last minutes [s, CLOCK_MONOTONIC]."""
-        return self._floor.pose(self.emulators[self._known(robot)].poses_at(times))
+    def poses_at(self, times: Array) -> Array:
+        """True T_world_body (robots, n, 4, 4) of all robots, in the team's order, at instants (n,) of the last minutes
+        [s, CLOCK_MONOTONIC]."""
+        planar = np.concatenate([emulator.poses_at(times) for emulator in self.emulators.values()])
+        return self._floor.pose(planar).reshape(len(self.emulators), -1, 4, 4)
 
     def truth(self, robot: str) -> tuple[NDArray[np.int64], Array]:
         """All true poses so far: times (n,) [ns, CLOCK_MONOTONIC], T_world_body (n, 4, 4), at `TRUTH_RATE`."""
@@ -187,9 +188,6 @@ class LiveWorld:
         if robot not in self.emulators:
             raise InputError(f"the simulated world has no robot {robot}; it has {', '.join(self.emulators)}")
         return robot
-
-    def _poses_of(self, robot: str) -> Callable[[Array], Array]:
-        return lambda times: self.pose_at(robot, times)
 
     def _instants(self, numbers: NDArray[np.int64]) -> Array:
         """The instants (n,) [s, CLOCK_MONOTONIC] of true poses by their numbers."""

@@ -3,6 +3,7 @@
 A field is an image before it is exposed: expected grey levels (height, width), float32, unclipped.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -57,12 +58,9 @@ def spots(
     """`Spots` of anything that can be spread to their shapes."""
     uv = np.asarray(uv, float).reshape(-1, 2)
     n = len(uv)
-
-    def spread(value: ArrayLike) -> Array:
-        return np.broadcast_to(np.asarray(value, float), (n,))
-
-    moved = np.broadcast_to(np.asarray(motion, float), (n, 2))
-    return Spots(uv, spread(radius), spread(level), moved, spread(psf_sigma))
+    of_all = (np.full(n, value, float) for value in (radius, level, psf_sigma))
+    radius, level, psf_sigma = of_all
+    return Spots(uv, radius, level, np.full((n, 2), motion, float), psf_sigma)
 
 
 def render(
@@ -80,7 +78,8 @@ def render(
     field = np.empty((size[1], size[0]), np.float32)
     field[:] = background
     add_spots(field, lights)
-    return expose(field, sensor or Sensor(), rng)
+    noise = None if rng is None else rng.standard_normal(field.shape, dtype=np.float32)
+    return expose(field, sensor or Sensor(), noise)
 
 
 def add_spots(field: Field, lights: Spots) -> None:
@@ -89,30 +88,45 @@ def add_spots(field: Field, lights: Spots) -> None:
     Each is a uniform disc, smeared along its motion, seen through a Gaussian PSF and integrated over every
     pixel in closed form: the centroid of its light is its `uv`. Outside the field there is nothing to draw.
     """
-    for uv, radius, level, motion, sigma in zip(
-        lights.uv, lights.radius, lights.level, lights.motion, lights.psf_sigma, strict=True
-    ):
-        if radius > 0 and np.isfinite(uv).all():
-            _add_spot(field, uv, float(radius), float(level), motion, float(sigma))
+    columns = (lights.uv, lights.radius, lights.level, lights.motion, lights.psf_sigma)
+    for (u, v), radius, level, motion, sigma in zip(*(column.tolist() for column in columns), strict=True):
+        if radius > 0 and math.isfinite(u) and math.isfinite(v):
+            _add_spot(field, u, v, radius, level, motion, sigma)
 
 
-def _add_spot(field: Field, uv: Array, radius: float, level: float, motion: Array, sigma: float) -> None:
-    reach = radius + 5.0 * sigma + np.abs(motion) / 2
-    low = np.maximum(np.floor(uv - reach), 0).astype(int)
-    high = np.minimum(np.ceil(uv + reach), (field.shape[1] - 1, field.shape[0] - 1)).astype(int)
-    if (high < low).any():
+def _add_spot(
+    field: Field, u: float, v: float, radius: float, level: float, motion: tuple[float, float], sigma: float
+) -> None:
+    reach = radius + 5.0 * sigma
+    left, right = _window(u, reach + abs(motion[0]) / 2, field.shape[1])
+    top, bottom = _window(v, reach + abs(motion[1]) / 2, field.shape[0])
+    if right <= left or bottom <= top:
         return
     # point sources that stand for the disc and for its way, closer together than the PSF is wide
-    disc = radius * _unit_disc(int(np.clip(np.ceil(2 * radius / sigma) + 2, 4, 24)))
-    steps = int(np.ceil(np.hypot(*motion) / (0.5 * sigma))) + 1
-    way = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None] * motion
-    sources = uv + (disc[:, None] + way).reshape(-1, 2)
-    columns = np.arange(low[0], high[0] + 2) - 0.5
-    rows = np.arange(low[1], high[1] + 2) - 0.5
-    in_columns = np.diff(ndtr((columns - sources[:, :1]) / sigma), axis=1)
-    in_rows = np.diff(ndtr((rows - sources[:, 1:]) / sigma), axis=1)
-    light = level * np.pi * radius**2 / len(sources)
-    field[low[1] : high[1] + 1, low[0] : high[0] + 1] += (light * in_rows.T @ in_columns).astype(np.float32)
+    disc = radius * _unit_disc(min(max(math.ceil(2 * radius / sigma) + 2, 4), 24))
+    steps = math.ceil(math.hypot(*motion) / (0.5 * sigma)) + 1
+    if steps > 1:
+        way = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None] * motion
+        disc = (disc[:, None] + way).reshape(-1, 2)
+    # how much of each source lies between the borders of pixels: of columns, then of rows
+    borders = np.empty((len(disc), right - left + bottom - top + 2))
+    middle = right - left + 1
+    np.subtract(np.arange(left, right + 1) - 0.5, u + disc[:, :1], out=borders[:, :middle])
+    np.subtract(np.arange(top, bottom + 1) - 0.5, v + disc[:, 1:], out=borders[:, middle:])
+    borders /= sigma
+    ndtr(borders, out=borders)
+    share = borders[:, 1:] - borders[:, :-1]
+    in_columns, in_rows = share[:, : middle - 1], share[:, middle:]
+    light = level * np.pi * radius**2 / len(disc)
+    field[top:bottom, left:right] += (light * in_rows.T @ in_columns).astype(np.float32)
+
+
+def _window(centre: float, reach: float, size: int) -> tuple[int, int]:
+    """First pixel, and one after the last, within reach of a centre [px]."""
+    # far outside, a number may be too large to be whole
+    if not -reach - 1 < centre < size + reach + 1:
+        return 0, 0
+    return max(math.floor(centre - reach), 0), min(math.ceil(centre + reach), size - 1) + 1
 
 
 @lru_cache(maxsize=64)
@@ -139,10 +153,19 @@ def fill(field: Field, polygon: ArrayLike, level: float) -> None:
     patch += (level - patch) * (mask.astype(np.float32) / np.float32(255))
 
 
-def expose(field: Field, sensor: Sensor, rng: np.random.Generator | None) -> Pixels:
-    """The 8-bit image of a field: shot and read noise (none without `rng`), rounded, clipped to 0 and 255."""
-    levels = field
-    if rng is not None:
-        sigma = np.sqrt(np.float32(sensor.read_noise**2) + np.float32(sensor.shot_gain) * np.maximum(field, 0))
-        levels = field + sigma * rng.standard_normal(field.shape, dtype=np.float32)
-    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+def expose(field: Field, sensor: Sensor, noise: Field | None) -> Pixels:
+    """The 8-bit image of a field: shot and read noise, rounded, clipped to 0 and 255.
+
+    `noise` (height, width) is normal with variance 1; without it there is none.
+    """
+    levels = field.copy()
+    if noise is not None:
+        sigma = np.maximum(field, 0)
+        sigma *= np.float32(sensor.shot_gain)
+        sigma += np.float32(sensor.read_noise**2)
+        np.sqrt(sigma, out=sigma)
+        sigma *= noise
+        levels += sigma
+    np.rint(levels, out=levels)
+    np.clip(levels, 0, 255, out=levels)
+    return levels.astype(np.uint8)

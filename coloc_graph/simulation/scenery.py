@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.run.messages import Image
 from coloc_graph.simulation.paths import Array
-from coloc_graph.simulation.rendering import Field, Sensor, Spots, add_spots, expose, fill, spots
+from coloc_graph.simulation.rendering import Field, Pixels, Sensor, Spots, add_spots, expose, fill, spots
 from coloc_graph.simulation.world import Capture, World, stream
 from coloc_graph.team import Camera
 
@@ -79,12 +79,13 @@ def backdrop(camera: Camera, T_world_camera: Array, scenery: Scenery, rng: np.ra
     x, y = np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height)[:, None]
     a, b, c = rng.uniform(-1, 1, 3)
     field = (19 - (5 + b) * y + 2.5 * a * x - (2 + c) * x**2).astype(np.float32)
-    for corners, level in zip(scenery.windows, scenery.window_levels, strict=True):
-        uv, _, ok = _image_of(camera, T_world_camera, corners)
-        if ok.all():
-            fill(field, uv, float(level))
+    w = len(scenery.windows)
+    uv, depth, ok = _image_of(camera, T_world_camera, np.concatenate([scenery.windows.reshape(-1, 3), scenery.places]))
+    corners, whole = uv[: 4 * w].reshape(w, 4, 2), ok[: 4 * w].reshape(w, 4).all(axis=1)
+    for outline, level in zip(corners[whole], scenery.window_levels[whole].tolist(), strict=True):
+        fill(field, outline, level)
     field = np.asarray(cv2.GaussianBlur(field, (0, 0), 1.2), np.float32)
-    uv, depth, ok = _image_of(camera, T_world_camera, scenery.places)
+    uv, depth, ok = uv[4 * w :], depth[4 * w :], ok[4 * w :]
     radius = camera.fx * scenery.radii[ok] / depth[ok]
     add_spots(field, spots(uv[ok], radius, scenery.levels[ok], psf_sigma=scenery.blurs[ok]))
     return field
@@ -97,8 +98,8 @@ def _image_of(camera: Camera, T_world_camera: Array, points_world: Array) -> tup
     """
     points = (points_world - T_world_camera[..., None, :3, 3]) @ T_world_camera[..., :3, :3]
     depth = points[..., 2]
-    ok = (depth > 0.05) & (np.hypot(points[..., 0], points[..., 1]) < _FIELD_LIMIT * depth)
-    return camera.project(points)[0], depth, np.asarray(ok)
+    ok = np.asarray((depth > 0.05) & (np.hypot(points[..., 0], points[..., 1]) < _FIELD_LIMIT * depth))
+    return camera.project(points)[0], depth, ok
 
 
 def frames(world: World, k: int, capture: Capture, scenery: Scenery, sensor: Sensor | None = None) -> Iterator[Image]:
@@ -117,20 +118,19 @@ def frames(world: World, k: int, capture: Capture, scenery: Scenery, sensor: Sen
             p_body = np.zeros((0, 3)) if markers is None else markers.p_body
             others.append(RobotInView(camera, [T_world_camera] * 3, T_world_body, p_body, sensor))
     for i, stamp in enumerate(capture.stamps.tolist()):
-        yield Image(capture.robot, stamp, draw(field, others, i, sensor, rng))
+        noise = rng.standard_normal(field.shape, dtype=np.float32)
+        yield Image(capture.robot, stamp, draw(field, others, i, sensor, noise))
 
 
-def draw(
-    field: Field, others: Sequence["RobotInView"], i: int, sensor: Sensor, rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """The image (height, width) of capture i: a backdrop with other robots before it."""
+def draw(field: Field, others: Sequence["RobotInView"], i: int, sensor: Sensor, noise: Field | None) -> Pixels:
+    """The image (height, width) of capture i: a backdrop with other robots before it, and noise of variance 1."""
     image = field.copy()
     for other in others:
         other.add_mirrored(image, i)
     # the far ones first: a near body hides what is behind it
     for other in sorted(others, key=lambda other: -float(other.distance[i])):
         other.paint(image, i)
-    return expose(image, sensor, rng)
+    return expose(image, sensor, noise)
 
 
 class RobotInView:
@@ -148,31 +148,28 @@ class RobotInView:
         p_body: Array,
         sensor: Sensor,
     ) -> None:
-        self._camera, self._cameras, self._sensor = camera, T_world_camera, sensor
         middle = T_world_body[0]
         #: How far it is from the camera (n,) [m].
         self.distance = np.linalg.norm(middle[:, :3, 3] - T_world_camera[0][..., :3, 3], axis=-1)
-        angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-        circle = BODY_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
-        hull = np.concatenate([np.column_stack([circle, np.full(24, z)]) for z in (0.0, BODY_HEIGHT)])
-        self._hull, _, hull_ok = _image_of(camera, T_world_camera[0], _placed(middle, hull))
-        self._visible = np.atleast_1d(hull_ok.all(axis=1))
-        leds = [_placed(T, p_body) for T in T_world_body]
-        self._leds = self._spots(leds, 1.0, sensor.led_level, 1.0)
-        mirrored = [led * (1.0, 1.0, -1.0) for led in leds]
-        self._mirrored = self._spots(mirrored, MIRROR_RADIUS, MIRROR_LEVEL * sensor.led_level, MIRROR_BLUR)
+        leds = np.stack([_placed(T, p_body) for T in T_world_body])
+        hull = np.broadcast_to(_placed(middle, _HULL), (3, len(middle), *_HULL.shape))
+        points = np.concatenate([leds, leds * (1.0, 1.0, -1.0), hull], axis=2)
+        cameras = np.stack([np.broadcast_to(T, (len(middle), 4, 4)) for T in T_world_camera])
+        uv, depth, ok = _image_of(camera, cameras, points)  # (3, n, 2 m + hull)
+        motion = uv[2] - uv[1]
+        m = len(p_body)
+        self._hull, self._visible = uv[0, :, 2 * m :], np.atleast_1d(ok[0, :, 2 * m :].all(axis=1))
+        radius = camera.fx * LED_RADIUS / depth[0]
 
-    def _spots(self, places: list[Array], widen: float, level: float, blur: float) -> list[Spots]:
-        """The spots of each capture, of LEDs (n, m, 3) in the middle, at the beginning and the end of it."""
-        (uv, depth, ok), (first, _, _), (last, _, _) = (
-            _image_of(self._camera, T, leds) for T, leds in zip(self._cameras, places, strict=True)
-        )
-        motion = last - first
-        radius = widen * self._camera.fx * LED_RADIUS / depth
-        psf = blur * self._sensor.psf_sigma
-        return [
-            spots(uv[i][ok[i]], radius[i][ok[i]], level, motion[i][ok[i]], psf) for i in range(len(uv))
-        ]  # fmt: skip
+        def seen(which: slice, widen: float, level: float, blur: float) -> list[Spots]:
+            psf = blur * sensor.psf_sigma
+            return [
+                spots(uv[0, i, which][there], widen * radius[i, which][there], level, motion[i, which][there], psf)
+                for i, there in enumerate(ok[0, :, which])
+            ]
+
+        self._leds = seen(slice(m), 1.0, sensor.led_level, 1.0)
+        self._mirrored = seen(slice(m, 2 * m), MIRROR_RADIUS, MIRROR_LEVEL * sensor.led_level, MIRROR_BLUR)
 
     def add_mirrored(self, field: Field, i: int) -> None:
         """Add what the floor mirrors of its LEDs."""
@@ -184,6 +181,16 @@ class RobotInView:
             outline = np.asarray(cv2.convexHull(self._hull[i].astype(np.float32)))[:, 0]
             fill(field, outline, BODY_LEVEL)
         add_spots(field, self._leds[i])
+
+
+def _hull() -> Array:
+    """The rim of a body at its bottom and its top, (48, 3) [m]."""
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    circle = BODY_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
+    return np.concatenate([np.column_stack([circle, np.full(24, z)]) for z in (0.0, BODY_HEIGHT)])
+
+
+_HULL = _hull()
 
 
 def _placed(T_world_body: Array, p_body: Array) -> Array:
