@@ -111,9 +111,10 @@ class _Feed:
             self._changed.wait_for(lambda: self._opened or self.lost, timeout)
             if not self._opened and not self.lost:
                 self.lost = f"{self.name} did not open within {timeout:g} s: check that it is plugged in, and try again"
-        if self.lost:
-            self._ended.set()
-            raise CameraError(self.lost)
+            if self._opened:
+                return
+        self._ended.set()
+        raise CameraError(self.lost)
 
     def read(self, timeout: float) -> Frame:
         with self._changed:

@@ -29,7 +29,6 @@ class Video:
             self._images = self._of_file(where)
         else:
             raise CameraError(f"{name} cannot be opened: there is no file or folder {path}")
-        self._next = self._following(0)
         self._began, self._number = time.monotonic(), 0
 
     def _of_folder(self, folder: Path) -> Iterator[NDArray[np.uint8]]:
@@ -61,12 +60,6 @@ class Video:
 
         return images()
 
-    def _following(self, number: int) -> NDArray[np.uint8]:
-        image = next(self._images, None)
-        if image is None:
-            raise CameraError(f"{self._name} has ended after {number} images; open it anew to see it again")
-        return image
-
     def grab(self) -> Frame | None:
         """The next image, once it is due."""
         ahead = self._began + self._number * self._period - time.monotonic()
@@ -74,10 +67,12 @@ class Video:
             time.sleep(min(ahead, WAIT))
             if ahead > WAIT:
                 return None
-        frame = Frame(self._clock(), self._next)
+        stamp = self._clock()
+        image = next(self._images, None)
+        if image is None:
+            raise CameraError(f"{self._name} has ended after {self._number} images; open it anew to see it again")
         self._number += 1
-        self._next = self._following(self._number)
-        return frame
+        return Frame(stamp, image)
 
     def close(self) -> None:
         """Let go of the file."""
