@@ -428,11 +428,11 @@ def test_a_v4l2_camera_without_the_format_or_the_size_is_refused(capture, monkey
     with pytest.raises(CameraError, match=r"robot A .* does not deliver the format YUYV: list what it does"):
         open_camera("v4l2:/dev/null", CAMERA, "A")
     capture.formats = ("YUYV",)
-    with open_camera("v4l2:/dev/null", replace(CAMERA, width=62), "A") as source:
-        with pytest.raises(
-            CameraError, match="6144 bytes an image, but 62 x 48 px in YUYV have 5952: set the camera's"
-        ):
-            source.read()
+    with (
+        open_camera("v4l2:/dev/null", replace(CAMERA, width=62), "A") as source,
+        pytest.raises(CameraError, match="6144 bytes an image, but 62 x 48 px in YUYV have 5952: set the camera's"),
+    ):
+        source.read()
 
 
 def test_a_v4l2_camera_that_is_unplugged_is_told_from_one_that_is_silent(capture, monkeypatch):
