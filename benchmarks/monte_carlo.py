@@ -3,6 +3,8 @@
 A file per seed would only cost time: this is the same world, seen through the same methods that `Run` has.
 """
 
+import itertools
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -36,6 +38,7 @@ class MemoryRun:
         for k in range(len(world.stances)):
             for tracks in observe(world, k):
                 self._detections[tracks.robot] += tracks.records()
+        self._odometry: dict[str, list[OdometrySample]] = {}
         self._world = world
 
     def has_detections(self, robot: str) -> bool:
@@ -46,13 +49,17 @@ class MemoryRun:
         """As `Run`."""
         return (one for one in self._detections[robot] if start <= one.time <= end)
 
-    def odometry(self, robot: str) -> Iterator[OdometrySample]:
+    def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
         """As `Run`."""
-        world = self._world
-        moves = [(start, end) for mover, start, end in world.moves if mover == robot]
-        wheels = odometry(world.paths[robot], moves, stream(world.seed, "wheels", world.team.names.index(robot)))
-        late = float(world.clock(robot, 0.0))
-        return iter(wheels.records(robot, EPOCH, world.stances[-1].end, late))
+        if robot not in self._odometry:
+            world = self._world
+            moves = [(begin, finish) for mover, begin, finish in world.moves if mover == robot]
+            wheels = odometry(world.paths[robot], moves, stream(world.seed, "wheels", world.team.names.index(robot)))
+            late = float(world.clock(robot, 0.0))
+            self._odometry[robot] = list(wheels.records(robot, EPOCH, world.stances[-1].end, late))
+        samples = self._odometry[robot]
+        first = 0 if start is None else bisect_left(samples, start, key=lambda one: one.time)
+        return itertools.takewhile(lambda one: end is None or one.time <= end, itertools.islice(samples, first, None))
 
 
 def truth_of(world: World) -> dict[str, Trajectory]:

@@ -1,36 +1,24 @@
 """The whole road from a run to an estimate; reads like sections III and IV of the paper."""
 
-import itertools
 import math
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import get_args
 
 from scipy.special import chdtrc
 
-from coloc_graph.backend import Estimate, Loose, Method, PoseGraph, chain, diagnose, joint, loosened, replay, smooth
+from coloc_graph.backend import Estimate, Loose, PoseGraph, chain, diagnose, joint, smooth
 from coloc_graph.errors import EstimationError, InputError
-from coloc_graph.frontend import (
-    FrontendOptions,
-    PairMeasurement,
-    Scale,
-    WheelTrack,
-    measure_pair,
-    share_clock_offsets,
-    sight_movers,
-)
+from coloc_graph.frontend import PairMeasurement, share_clock_offsets
 from coloc_graph.frontend.plausibility import implausible
-from coloc_graph.measurements import Measurement, RelativePose
-from coloc_graph.run import Run
+from coloc_graph.run import Run, Stance
+from coloc_graph.stance_solver import METHODS, EnteredStance, Motions, SolveOptions, StanceSolver, measure_stance
 
-METHODS: tuple[Method, ...] = get_args(Method)
+__all__ = ["METHODS", "EnteredStance", "Progress", "Solution", "SolveOptions", "StanceSolver", "solve"]
 
 BATCH = {"chain": chain, "smooth": smooth, "joint": joint}
 
-#: Where the scale comes from the markers' span alone, the heights of cameras are known no better than this [m].
-UNKNOWN_HEIGHT = 0.1
 #: Measurements that noise alone lets disagree less often than this are warned of.
 LEAST_CHANCE = 1e-4
 #: So many kinds of reasons are named where every measurement is refused.
@@ -38,35 +26,6 @@ REASONS_NAMED = 3
 
 #: Called with how many measurements are done, and of how many.
 Progress = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class SolveOptions:
-    """Everything that a result depends on besides the run.
-
-    `chain` is the paper: homographies by least squares in one image, eq. (2), composition. `smooth` takes
-    maximum-likelihood homographies and relative poses into a pose graph, with `odometry` and where the movers are
-    seen. `joint` takes the homographies themselves, and calibrates mounts, markers and clocks along with the poses.
-    `incremental` feeds the graph to an estimator stance by stance, as a team in the field would.
-    """
-
-    method: Method = "joint"
-    frontend: FrontendOptions | None = None
-    odometry: bool = True
-    incremental: bool = False
-
-    def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise InputError(f"there is no method `{self.method}`; choose one of {', '.join(METHODS)}")
-        if self.incremental and self.method == "chain":
-            raise InputError("a chain is composed, and never incremental: leave out `incremental`, or use joint")
-
-    def resolved(self) -> "SolveOptions":
-        """With the front end that belongs to the method, where none is chosen."""
-        if self.frontend is not None:
-            return self
-        paper = FrontendOptions(criterion="transfer", pose="eq2")
-        return replace(self, frontend=paper if self.method == "chain" else FrontendOptions())
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -103,60 +62,120 @@ class Solution:
         )
 
 
-def solve(run: Run, options: SolveOptions | None = None, progress: Progress | None = None) -> Solution:
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """What comes of all stances of a run; seconds are of the front end, and of each stance's update."""
+
+    estimate: Estimate
+    measured: tuple[PairMeasurement, ...]
+    clock_warnings: list[str]
+    seconds_frontend: float
+    seconds_updates: tuple[float, ...] = ()
+
+
+def solve(
+    run: Run,
+    options: SolveOptions | None = None,
+    progress: Progress | None = None,
+    entered: Callable[[EnteredStance], None] | None = None,
+) -> Solution:
     """Localise a team: measure every pair of observers in every stance, and make an estimate of it all.
 
-    Raises `InputError` where the run holds nothing to solve and `EstimationError` where no measurement ties
-    any robot to the reference; what is merely left out is said in `Solution.warnings`.
+    `entered` hears of each stance of an incremental estimate as soon as it is in. Raises `InputError` where the run
+    holds nothing to solve and `EstimationError` where no measurement ties any robot to the reference; what is merely
+    left out is said in `Solution.warnings`.
     """
     options = (options or SolveOptions()).resolved()
     _require_observers(run)
     started = time.perf_counter()
-
-    measurements, clock_warnings = share_clock_offsets(_measure(run, options, progress), run.team.clock_sigma)
-    poses = [m.relative_pose for m in measurements if m.relative_pose is not None]
-    if not poses:
-        unlikely = [f"; {what}" for what in _implausible(run, options, measurements)][:1]
-        raise EstimationError(
-            f"{run.path}: no stance gives a relative pose; {_reasons(measurements)}{''.join(unlikely)}"
-        )
-    measured = time.perf_counter()
-
-    graph = PoseGraph.of(run.team, run.stances, [*poses, *_motions(run, options, measurements, poses)])
-    loose = diagnose(graph)
-    if not any(
-        robot != run.team.reference for robot, _ in set(graph.nodes) - {n for part in loose for n in part.nodes}
-    ):
-        raise EstimationError(
-            f"{run.path}: no measurement ties a robot to the reference {run.team.reference}; "
-            f"{_why_untied(loose, measurements)}"
-        )
-    assert options.frontend is not None
-    if options.method == "joint" and options.frontend.scale == "span":
-        graph = replace(graph, rigs=loosened(graph.rigs, UNKNOWN_HEIGHT))
-    updates: tuple[float, ...] = ()
-    if options.incremental:
-        estimate, updates = replay(graph, options.method)
-        if estimate.refused:  # or was it that an anchor was pushed? An estimator looks at one stance at a time
-            estimate = replace(estimate, bumped=BATCH[options.method](graph).bumped)
-    else:
-        estimate = BATCH[options.method](graph)
-    solved = time.perf_counter()
+    counted = _Counted(run, options, progress)
+    solved = _incrementally(run, options, counted, entered) if options.incremental else _at_once(run, options, counted)
+    estimate, measured = solved.estimate, solved.measured
     return Solution(
         run=run,
         options=options,
         estimate=estimate,
-        measurements=measurements,
+        measurements=measured,
         warnings=(
             *run.warnings,
-            *clock_warnings,
-            *_implausible(run, options, measurements),
-            *_warnings(estimate, loose, measurements),
+            *solved.clock_warnings,
+            *_implausible(run, options, measured),
+            *_warnings(estimate, diagnose(estimate.graph), measured),
         ),
-        seconds_frontend=measured - started,
-        seconds_backend=solved - measured,
-        seconds_updates=updates,
+        seconds_frontend=solved.seconds_frontend,
+        seconds_backend=time.perf_counter() - started - solved.seconds_frontend,
+        seconds_updates=solved.seconds_updates,
     )
+
+
+def _at_once(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
+    started = time.perf_counter()
+    alone = [one for stance in run.stances for one in measure(stance)]
+    measured, clock_warnings = share_clock_offsets(alone, run.team.clock_sigma)
+    poses = [m.relative_pose for m in measured if m.relative_pose is not None]
+    _require_poses(run, options, measured)
+    made = time.perf_counter()
+    motions = []
+    if options.method != "chain" and run.team.floor is not None:
+        # the paper's chain takes neither, and wheels know the floor alone
+        of_stance = Motions(run.team, odometry=options.odometry).of_stance
+        for stance in run.stances:
+            pairs = [m for m in measured if m.homography.stance == stance.index]
+            motions += of_stance(run, stance, pairs)
+    graph = PoseGraph.of(run.team, run.stances, [*poses, *motions])
+    graph = replace(graph, rigs=options.rigs(run.team) or graph.rigs)
+    _require_ties(run, graph, measured)
+    return _Solved(BATCH[options.method](graph), measured, clock_warnings, made - started)
+
+
+def _incrementally(
+    run: Run, options: SolveOptions, measure: "_Counted", entered: Callable[[EnteredStance], None] | None
+) -> _Solved:
+    solver = StanceSolver(run.team, options)
+    for stance in run.stances:
+        one = solver.enter(run, stance, measure(stance))
+        if entered is not None:
+            entered(one)
+    _require_poses(run, options, solver.measured)
+    graph = solver.estimator.graph
+    _require_ties(run, graph, solver.measured)
+    estimate = solver.estimator.estimate()
+    if estimate.refused:  # or was it that an anchor was pushed? An estimator looks at one stance at a time
+        estimate = replace(estimate, bumped=BATCH[options.method](graph).bumped)
+    frontend, updates = zip(*solver.seconds, strict=True)
+    return _Solved(estimate, solver.measured, solver.warnings, sum(frontend), updates)
+
+
+class _Counted:
+    """Measures stances, and says how many pairs are done."""
+
+    def __init__(self, run: Run, options: SolveOptions, progress: Progress | None) -> None:
+        self._run, self._options, self._progress = run, options, progress
+        self._pairs = sum(math.comb(len(stance.observers), 2) for stance in run.stances)
+        self._done = 0
+
+    def __call__(self, stance: Stance) -> Iterator[PairMeasurement]:
+        for one in measure_stance(self._run, stance, self._options):
+            self._done += 1
+            if self._progress is not None:
+                self._progress(self._done, self._pairs)
+            yield one
+
+
+def _require_poses(run: Run, options: SolveOptions, measured: Sequence[PairMeasurement]) -> None:
+    if not any(m.relative_pose is not None for m in measured):
+        unlikely = [f"; {what}" for what in _implausible(run, options, measured)][:1]
+        raise EstimationError(f"{run.path}: no stance gives a relative pose; {_reasons(measured)}{''.join(unlikely)}")
+
+
+def _require_ties(run: Run, graph: PoseGraph, measured: Sequence[PairMeasurement]) -> None:
+    loose = diagnose(graph)
+    tied = set(graph.nodes) - {node for part in loose for node in part.nodes}
+    if not any(robot != run.team.reference for robot, _ in tied):
+        raise EstimationError(
+            f"{run.path}: no measurement ties a robot to the reference {run.team.reference}; "
+            f"{_why_untied(loose, measured)}"
+        )
 
 
 def _require_observers(run: Run) -> None:
@@ -167,43 +186,6 @@ def _require_observers(run: Run) -> None:
             f"{run.path}: stance {run.stances[0].index} has one observer only, as has every other; "
             "at least two robots must stand and watch the same mover"
         )
-
-
-def _measure(run: Run, options: SolveOptions, progress: Progress | None) -> tuple[PairMeasurement, ...]:
-    assert options.frontend is not None
-    # a joint estimate takes the scale from the spans by itself, and the heights for a start
-    scale: Scale = "heights" if options.method == "joint" else options.frontend.scale
-    frontend = replace(options.frontend, scale=scale)
-    pairs = [(stance, *pair) for stance in run.stances for pair in itertools.combinations(stance.observers, 2)]
-    measurements = []
-    for done, (stance, robot_i, robot_j) in enumerate(pairs, start=1):
-        measurements.append(measure_pair(run, stance, robot_i, robot_j, frontend))
-        if progress is not None:
-            progress(done, len(pairs))
-    return tuple(measurements)
-
-
-def _motions(
-    run: Run, options: SolveOptions, measurements: Sequence[PairMeasurement], poses: Sequence[RelativePose]
-) -> list[Measurement]:
-    """Where the movers were seen, and what the wheels say of each robot's way from one pose to its next."""
-    if options.method == "chain" or run.team.floor is None:
-        return []  # the paper's chain takes neither, and wheels know the floor alone
-    wheels = {robot: WheelTrack(robot, list(run.odometry(robot))) for robot in run.team.names}
-    sightings = sight_movers(run, measurements, wheels)
-    if not options.odometry:
-        return list(sightings)
-    graph = PoseGraph.of(run.team, run.stances, [*poses, *sightings])
-    ways: list[Measurement] = []
-    last: dict[str, int] = {}
-    for robot, stance in graph.nodes:
-        before = last.get(robot)
-        last[robot] = stance
-        if before is not None and graph.key(robot, before) != graph.key(robot, stance):
-            start, end = graph.times[robot, before], graph.times[robot, stance]
-            way = wheels[robot].between(before, stance, start, end, run.team.clock_sigma)
-            ways += [] if way is None else [way]
-    return [*sightings, *ways]
 
 
 def _reasons(measurements: Sequence[PairMeasurement]) -> str:
@@ -234,8 +216,7 @@ def _kind(reason: str, *robots: str) -> str:
 
 def _implausible(run: Run, options: SolveOptions, measurements: Sequence[PairMeasurement]) -> Iterator[str]:
     """Where the stated plane contradicts the markers that were seen; the first of each observer, and how many."""
-    assert options.frontend is not None
-    if options.frontend.scale == "span":
+    if options.by_span:
         return  # the stated distance is not used
     stances = {stance.index: stance for stance in run.stances}
     found: dict[str, list[tuple[int, str]]] = {}
@@ -250,7 +231,7 @@ def _implausible(run: Run, options: SolveOptions, measurements: Sequence[PairMea
         yield f"stance {each[0][0]}{f' (and {others} more alike)' if others else ''}: {each[0][1]}"
 
 
-def _why_untied(loose: tuple[Loose, ...], measurements: tuple[PairMeasurement, ...]) -> str:
+def _why_untied(loose: tuple[Loose, ...], measurements: Iterable[PairMeasurement]) -> str:
     refused = [m.homography for m in measurements if m.homography.unusable]
     if refused:
         return f"stance {refused[0].stance}, {refused[0].robot_i} and {refused[0].robot_j}: {refused[0].unusable}"

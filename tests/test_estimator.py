@@ -57,6 +57,31 @@ def test_incremental_at_the_end_is_batch(made):
         assert np.array_equal(one, other)
 
 
+def test_an_incremental_solution_is_heard_of_stance_by_stance(hallway):
+    run = open_run(hallway)
+    heard = []
+    solution = solve(run, SolveOptions(incremental=True), entered=heard.append)
+    assert [one.stance.index for one in heard] == [stance.index for stance in run.stances]
+    assert heard[0].stance.anchors == () and len(heard[0].pairs) == 1
+    assert sum(len(one.measurements) for one in heard) == len(solution.estimate.graph.measurements)
+    # what was known when the last one came in is what is known at the end, but for what one step of ISAM2 leaves
+    for robot, pose in heard[-1].estimate.poses.items():
+        if robot in solution.estimate.trajectories:
+            last = solution.estimate.trajectories[robot].T_world_body[-1]
+            assert np.abs(pose.matrix() - last).max() < 1e-3
+
+
+def test_what_is_measured_stance_by_stance_is_what_is_measured_at_once(hallway, solutions):
+    at_once, by_stance = solutions["joint"], solve(open_run(hallway), SolveOptions(incremental=True))
+    ways = [
+        {m.ends: m for m in one.estimate.graph.measurements if isinstance(m, Odometry)} for one in (at_once, by_stance)
+    ]
+    assert ways[0].keys() == ways[1].keys() and len(ways[0]) > 10
+    for ends, way in ways[0].items():
+        assert np.allclose(way.T_before_after.matrix(), ways[1][ends].T_before_after.matrix(), atol=1e-12)
+        assert np.allclose(way.covariance, ways[1][ends].covariance, rtol=1e-9)
+
+
 def test_incremental_is_batch_on_a_run(hallway, solutions):
     solution = solve(open_run(hallway), SolveOptions(incremental=True))
     batch = solutions["joint"].estimate

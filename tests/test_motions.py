@@ -171,8 +171,9 @@ def test_markers_that_are_not_their_span_apart_are_no_robot(rng):
 
 def test_a_run_gives_one_sighting_of_the_mover_a_stance_near_its_truth(hallway):
     run = open_run(hallway)
-    measured = [measure_pair(run, stance, *stance.observers, FrontendOptions()) for stance in run.stances]
-    seen = sight_movers(run, measured, {})
+    seen = []
+    for stance in run.stances:
+        seen += sight_movers(run, stance, [measure_pair(run, stance, *stance.observers, FrontendOptions())], {})
     assert [(one.stance, one.seen) for one in seen] == [(k, "C") for k in range(8)]
     truth = read_truth(hallway)
     for one in seen:

@@ -8,7 +8,7 @@ from coloc_graph.frontend.correspondence import Correspondences
 from coloc_graph.frontend.plane import on_plane
 from coloc_graph.frontend.stance import stance_plane
 from coloc_graph.measurements import Plane
-from coloc_graph.run import Run, Stance
+from coloc_graph.run import Recorded, Stance
 from coloc_graph.team import Camera
 
 #: No LED is made out further away than this [m].
@@ -17,7 +17,7 @@ FARTHEST = 20.0
 SPAN_TOLERANCE = 0.30
 
 
-def implausible(run: Run, stance: Stance, robot: str, found: Correspondences) -> str | None:
+def implausible(run: Recorded, stance: Stance, robot: str, found: Correspondences) -> str | None:
     """Why the marker plane of an observer contradicts what it saw (`uv_i` of `found`), in words; None where not.
 
     Seen on the plane, the markers must be in front of the camera and near, and the two of a mover their known
@@ -45,7 +45,7 @@ def implausible(run: Run, stance: Stance, robot: str, found: Correspondences) ->
     return None
 
 
-def _known_span(run: Run, stance: Stance) -> float | None:
+def _known_span(run: Recorded, stance: Stance) -> float | None:
     """The distance between the two markers that move [m]; None where not just two do."""
     carried = [markers for name in stance.movers if (markers := run.team[name].markers) is not None]
     return carried[0].span if len(carried) == 1 and len(carried[0].positions) == 2 else None

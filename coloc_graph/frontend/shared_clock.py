@@ -9,17 +9,18 @@ from coloc_graph.frontend.stance import LEAST_OBSERVED, NOT_OBSERVABLE, PairMeas
 
 
 def share_clock_offsets(
-    measurements: Sequence[PairMeasurement], clock_sigma: float
+    measurements: Sequence[PairMeasurement], clock_sigma: float, before: Sequence[PairMeasurement] = ()
 ) -> tuple[tuple[PairMeasurement, ...], list[str]]:
     """Measurements made once more with the offset that all stances of a pair know together, and warnings.
 
     `clock_sigma` [s] is how well the clocks are said to agree; where it is 0 nothing changes. A pair's offset is
     the weighted mean of what its stances and the prior know, and its uncertainty is in each homography's information.
+    What was measured `before` has its say in it, and is not measured again.
     """
     if clock_sigma == 0:
         return tuple(measurements), []
     evidence: dict[tuple[str, str], list[ClockOffset]] = defaultdict(list)
-    for one in measurements:
+    for one in (*before, *measurements):
         pair, known = _in_order(one, one.offset_evidence)
         evidence[pair] += [known] if known is not None else []
     warnings: list[str] = []

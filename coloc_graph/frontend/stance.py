@@ -37,7 +37,7 @@ from coloc_graph.frontend.spans import marker_span
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.frontend.wheels import WheelTrack
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose, Sighting
-from coloc_graph.run import Detections, Flag, Run, Stance
+from coloc_graph.run import Detections, Flag, Recorded, Stance
 from coloc_graph.team import Camera, Markers
 
 Array = NDArray[np.float64]
@@ -90,7 +90,7 @@ class PairMeasurement:
 class _Seen:
     """What a pair of observers saw in one stance."""
 
-    run: Run
+    run: Recorded
     stance: Stance
     robot_i: str
     robot_j: str
@@ -104,7 +104,9 @@ class _Seen:
         return self.run.team[self.robot_i].camera, self.run.team[self.robot_j].camera
 
 
-def measure_pair(run: Run, stance: Stance, robot_i: str, robot_j: str, options: FrontendOptions) -> PairMeasurement:
+def measure_pair(
+    run: Recorded, stance: Stance, robot_i: str, robot_j: str, options: FrontendOptions
+) -> PairMeasurement:
     """The homography and relative pose between two observers in one stance; degenerate geometry is an answer.
 
     Where the team's clocks are not said to agree (`Team.clock_sigma`), their offset is estimated with it.
@@ -212,7 +214,7 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
     return tuple(made)
 
 
-def stance_markers(run: Run, stance: Stance) -> Markers | None:
+def stance_markers(run: Recorded, stance: Stance) -> Markers | None:
     """The markers that are watched in a stance; None where no mover carries any.
 
     Raises `DegenerateGeometry` where the movers' markers are at different heights.
@@ -225,7 +227,7 @@ def stance_markers(run: Run, stance: Stance) -> Markers | None:
     return carried[0] if carried else None
 
 
-def stance_plane(run: Run, stance: Stance, robot: str) -> Plane:
+def stance_plane(run: Recorded, stance: Stance, robot: str) -> Plane:
     """The marker plane in a robot's camera: as stated for the stance, else from its mount and the movers.
 
     Raises `DegenerateGeometry` where there is no such plane below the camera.
@@ -243,39 +245,38 @@ def stance_plane(run: Run, stance: Stance, robot: str) -> Plane:
     return plane_from_mount(run.team[robot].mount, markers, run.team.floor)
 
 
-def sight_movers(run: Run, measured: Iterable[PairMeasurement], wheels: Mapping[str, WheelTrack]) -> list[Sighting]:
-    """Where the moving robots were, by the observer that saw each best in each stance; nothing without a floor.
+def sight_movers(
+    run: Recorded, stance: Stance, measured: Iterable[PairMeasurement], wheels: Mapping[str, WheelTrack]
+) -> list[Sighting]:
+    """Where the moving robots were in a stance, by the observer that saw each best; nothing without a floor.
 
-    `measured` are all pairs of a run. A robot whose markers cannot be told apart, or are never seen at once, is not
-    in the list; tracks without names are followed where one robot moves alone.
+    `measured` are all pairs of the stance. A robot whose markers cannot be told apart, or are never seen at once, is
+    not in the list; tracks without names are followed where one robot moves alone.
     """
-    stances = {stance.index: stance for stance in run.stances}
-    best: dict[tuple[int, str], Sighting] = {}
-    done: set[tuple[int, str]] = set()
+    if run.team.floor is None or stance.index in run.planes:
+        return []
+    tracks: dict[str, list[Track]] = {}
     for one in measured:
-        h = one.homography
-        stance = stances[h.stance]
-        if one.tracks is None or run.team.floor is None or stance.index in run.planes:
+        if one.tracks is not None:
+            for observer, seen in zip((one.homography.robot_i, one.homography.robot_j), one.tracks, strict=True):
+                tracks.setdefault(observer, seen)
+    best: dict[str, Sighting] = {}
+    for observer, seen in tracks.items():
+        try:
+            plane = stance_plane(run, stance, observer)
+        except DegenerateGeometry:  # a camera below the markers, which the homography's refusal names
             continue
-        for observer, tracks in zip((h.robot_i, h.robot_j), one.tracks, strict=True):
-            if (stance.index, observer) in done:
+        for mover in stance.movers:
+            if len(stance.movers) > 1 and not any(track.marker for track in seen):
                 continue
-            done.add((stance.index, observer))
-            try:
-                plane = stance_plane(run, stance, observer)
-            except DegenerateGeometry:  # a camera below the markers, which the homography's refusal names
-                continue
-            for mover in stance.movers:
-                if len(stance.movers) > 1 and not any(track.marker for track in tracks):
-                    continue
-                seen = sight(stance, run.team[observer], run.team[mover], tracks, plane, wheels.get(mover))
-                before = best.get((stance.index, mover))
-                if seen is not None and (before is None or np.trace(seen.covariance) < np.trace(before.covariance)):
-                    best[stance.index, mover] = seen
+            sighting = sight(stance, run.team[observer], run.team[mover], seen, plane, wheels.get(mover))
+            before = best.get(mover)
+            if sighting is not None and (before is None or np.trace(sighting.covariance) < np.trace(before.covariance)):
+                best[mover] = sighting
     return list(best.values())
 
 
-def stance_tracks(run: Run, stance: Stance, robot: str, options: FrontendOptions) -> list[Track]:
+def stance_tracks(run: Recorded, stance: Stance, robot: str, options: FrontendOptions) -> list[Track]:
     """The tracks of the movers' markers in one camera: from detections where the run has them, else from images.
 
     Detections that name their marker are tracks already; the others, and images, go through the tracker.
