@@ -20,8 +20,9 @@ from coloc_graph.frontend.detection import detect_leds
 from coloc_graph.lie import so3_log
 from coloc_graph.robot_io import Create, open_camera
 from coloc_graph.robot_io.camera_source import STALE
+from coloc_graph.robot_io.create_physics import Body, Physics
 from coloc_graph.run import read_true_team, read_truth
-from coloc_graph.simulation import MILD_LENS, Imperfections, reference_team
+from coloc_graph.simulation import MILD_LENS, Imperfections, Sensor, reference_team
 from coloc_graph.simulation.live_world import LONGEST_PATH, TRUTH_RATE, LiveWorld, start_poses
 from coloc_graph.simulation.rig import stated_team
 from coloc_graph.simulation.tours import View
@@ -142,6 +143,19 @@ def test_a_moving_camera_sees_from_where_it_is(own):
         wheels.stop()
     assert len(errors) > 10
     assert np.median(np.max(errors, axis=1)) < 0.2
+
+
+def test_a_camera_that_has_moved_sees_what_one_that_is_opened_there_does():
+    quiet = Sensor(read_noise=0.0, shot_gain=0.0)
+    with LiveWorld(team_of(), sensor=quiet) as own, camera_of(own, "A") as camera:
+        before = camera.read(2.0)
+        own.push("A", 0.1, -0.05, 0.1)
+        moved = time.monotonic_ns()
+        while (after := camera.read(2.0)).stamp_ns < moved + 10_000_000:
+            pass
+        with camera_of(own, "A") as opened:
+            assert np.array_equal(after.pixels, opened.read(2.0).pixels)
+        assert (after.pixels != before.pixels).mean() > 0.05
 
 
 def test_images_come_at_the_cameras_rate_soon_and_with_noise_of_their_own(world):
@@ -291,6 +305,15 @@ def test_poses_of_the_past_are_those_of_the_trace(own):
     turned = poses[:, 2] - rows[:, 3]
     assert np.cos(turned) == pytest.approx(np.ones(len(rows)))
     assert emulator.poses_at([time.monotonic() - 60])[0] == pytest.approx(trace[0, 1:4])
+
+
+def test_yaw_is_whole_where_a_turn_goes_past_half_a_circle():
+    body = Body(2, Physics(start=(0.0, 0.0, 3.0)), 0.0)
+    body.wanted = (-0.1, 0.1)
+    body.advance(1.0)
+    yaw = body.poses_at(np.arange(0.0, 1.0, 1e-4))[:, 2]
+    assert yaw[-1] > np.pi or yaw[0] < -np.pi
+    assert np.abs(np.diff(yaw)).max() < 0.01
 
 
 def test_the_floor_tilts_by_the_place_and_by_nothing_else(rng):

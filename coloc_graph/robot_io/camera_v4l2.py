@@ -28,7 +28,7 @@ EXPOSURE, AUTOGAIN, GAIN = 0x00980911, 0x00980912, 0x00980913
 EXPOSURE_AUTO, EXPOSURE_ABSOLUTE = 0x009A0901, 0x009A0902
 EXPOSURE_MANUAL = 1
 
-#: A kernel's stamp lies so far back when its frame is read [s], or it is not of CLOCK_MONOTONIC.
+#: A kernel's stamp lies so far back when the first frame is read [s], or it is not of CLOCK_MONOTONIC.
 YOUNGEST, OLDEST = -1e-3, 1.0
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ class V4l2Camera:
         self._name, self._camera, self._clock = name, camera, clock
         self._path, _, query = path.partition("?")
         settings = _settings(name, query)
-        self._stamped = True
+        self._stamped: bool | None = None  # not known before the first frame
         _check_device(name, self._path)
         # OpenCV waits so long for a frame [s], 10 by default, and only then the device can be closed
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
@@ -91,13 +91,14 @@ class V4l2Camera:
         there, raw = self._capture.retrieve()
         if not there:
             return None
-        if self._stamped and not YOUNGEST <= (read - stamp) * 1e-9 <= OLDEST:
-            self._stamped = False
-            log.warning(
-                "%s: its kernel's time stamps are not of CLOCK_MONOTONIC; images are stamped when they are read, which "
-                "is later and less even",
-                self._name,
-            )
+        if self._stamped is None:
+            self._stamped = YOUNGEST <= (read - stamp) * 1e-9 <= OLDEST
+            if not self._stamped:
+                log.warning(
+                    "%s: its kernel's time stamps are not of CLOCK_MONOTONIC; images are stamped when they are read, "
+                    "which is later and less even",
+                    self._name,
+                )
         pixels = luma(self._name, np.asarray(raw, np.uint8), self._camera)
         return Frame((stamp if self._stamped else read) + clock_ahead(self._clock), pixels)
 
