@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from coloc_graph.common_view import View
 from coloc_graph.errors import CameraError, InputError
 from coloc_graph.evaluation import true_poses
 from coloc_graph.frontend.detection import detect_leds
@@ -25,7 +26,6 @@ from coloc_graph.run import read_true_team, read_truth
 from coloc_graph.simulation import MILD_LENS, Imperfections, Sensor, reference_team
 from coloc_graph.simulation.live_world import LONGEST_PATH, TRUTH_RATE, LiveWorld, start_poses
 from coloc_graph.simulation.rig import stated_team
-from coloc_graph.simulation.tours import View
 from coloc_graph.simulation.uneven_floor import UnevenFloor
 from coloc_graph.team import write_team
 from coloc_graph.trajectory import Trajectory

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from coloc_graph.common_view import View
 from coloc_graph.errors import InputError
 from coloc_graph.run import open_run, read_true_team, read_truth
 from coloc_graph.simulation import (
@@ -16,7 +17,6 @@ from coloc_graph.simulation import (
     six_step,
 )
 from coloc_graph.simulation.paths import SPEED, TURN_RATE, drive, tilt_rotation, travel
-from coloc_graph.simulation.tours import View
 
 FAULTY = Imperfections(
     mount_sigma_deg=0.5, height_sigma=0.003, span_sigma=0.001, floor_sigma_deg=0.1, clock_offset=0.02, time_jitter=0.001

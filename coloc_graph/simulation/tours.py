@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from coloc_graph.common_view import View, places_in_view
 from coloc_graph.errors import InputError
-from coloc_graph.lie import se3_inverse
 from coloc_graph.simulation.paths import SPEED, Array, Leg, drive, stop_and_go, travel, wrap
 from coloc_graph.simulation.scenarios import Box
-from coloc_graph.team import Camera
 
 #: Half the straight stretch on which a pose is passed [m]: a late capture sees the marker move evenly.
 RUN_IN = 0.03
@@ -23,26 +22,6 @@ TRACK_MARGIN, IMAGE_MARGIN = 1.0, 8.0
 
 #: Depths at which images are taken, from the pair's middle [m]; a short stance is less deep, to be wide.
 NEAR, FAR, FAR_IN_HASTE = 0.45, 2.2, 1.5
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A camera at rest in the world."""
-
-    camera: Camera
-    T_world_camera: Array
-
-    def project(self, points_world: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
-        """Pixels (..., 2) of points (..., 3) [m] in the world, and which of them the image contains."""
-        T_camera_world = se3_inverse(self.T_world_camera)
-        return self.camera.project(np.asarray(points_world, float) @ T_camera_world[:3, :3].T + T_camera_world[:3, 3])
-
-    def sees(self, points_world: ArrayLike, margin: float) -> NDArray[np.bool_]:
-        """Which points (..., 3) [m] lie in the image, `margin` [px] from its border."""
-        uv, inside = self.project(points_world)
-        size = np.array([self.camera.width, self.camera.height])
-        with np.errstate(invalid="ignore"):
-            return np.asarray(inside & (uv >= margin - 0.5).all(-1) & (uv <= size - 0.5 - margin).all(-1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,15 +188,9 @@ def _corners(
     views: tuple[View, View], markers: Array, middle: tuple[float, float], far: float, left: bool, where: str
 ) -> Array:
     """Places (4, 2) of the body where both cameras see all markers at any yaw: near, far corners, middle."""
-    x, y = np.meshgrid(np.arange(NEAR, far + 1e-9, 0.05), np.arange(-1.5, 1.5 + 1e-9, 0.05), indexing="ij")
-    xy = np.column_stack([x.ravel() + middle[0], y.ravel() + middle[1]])
-    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    rim = np.hypot(*markers[:, :2].T).max() * np.column_stack([np.cos(angles), np.sin(angles)])
-    points = np.concatenate([xy[:, None] + rim, np.full((len(xy), len(rim), 1), markers[0, 2])], axis=-1)
-    seen = (views[0].sees(points, IMAGE_MARGIN) & views[1].sees(points, IMAGE_MARGIN)).all(axis=1)
-    if seen.sum() < 3:
+    region = places_in_view(views, markers, middle, (NEAR, far), IMAGE_MARGIN)
+    if len(region) < 3:
         raise no_common_view(where)
-    region = xy[seen]
     side = 1.0 if left else -1.0
     directions = np.array([[-1.0, 0.0], [1.0, 1.5 * side], [1.0, -1.5 * side]])
     extreme = np.argmax(region @ directions.T, axis=0)

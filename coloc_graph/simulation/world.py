@@ -6,13 +6,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from coloc_graph.common_view import View
 from coloc_graph.errors import InputError
 from coloc_graph.lie import floor_pose
 from coloc_graph.run.messages import Stance
 from coloc_graph.simulation.paths import Array, Path, PathBuilder, drive, tilt_rotation
 from coloc_graph.simulation.rig import IMAGE_BIAS, MILD_LENS, Imperfections, reference_team, stated_team, true_team
 from coloc_graph.simulation.scenarios import Pose, Scenario
-from coloc_graph.simulation.tours import LONGEST_BURST, Tour, View, patrol, scatter
+from coloc_graph.simulation.tours import LONGEST_BURST, Tour, patrol, scatter
 from coloc_graph.team import Team
 
 #: When every simulated run begins [UTC s].

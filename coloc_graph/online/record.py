@@ -1,0 +1,125 @@
+"""What the coordinator hears, in memory for the next stance and in a run on disk for good."""
+
+import threading
+from bisect import bisect_left, bisect_right
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
+
+from coloc_graph.errors import RunError
+from coloc_graph.run import Detections, Image, Motion, OdometrySample, Planes, RunWriter, Stance, open_run
+from coloc_graph.run.schemas import to_ns, to_seconds
+from coloc_graph.team import Team
+
+T = TypeVar("T", Detections, OdometrySample)
+
+#: So much of what is on disk is kept in memory too [s].
+MEMORY = 600.0
+
+
+class Record:
+    """A run that is written while it is measured: `run.Recorded` of the newest minutes. A context manager.
+
+    What comes late is moved to the time of the last of its kind, since time does not run backwards in a run.
+    """
+
+    def __init__(self, path: str | Path, team: Team) -> None:
+        self.path, self.team = Path(path), team
+        self.planes: dict[int, Planes] = {}
+        self._writer = RunWriter(path, team)
+        self._detections: dict[str, list[Detections]] = defaultdict(list)
+        self._odometry: dict[str, list[OdometrySample]] = defaultdict(list)
+        self._moving: dict[str, tuple[bool, float]] = {}
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+
+    def take(self, one: Detections | OdometrySample) -> Detections | OdometrySample:
+        """Take in what a robot sent; it comes back as it will be read from the run."""
+        with self._lock:
+            if isinstance(one, Detections):
+                return self._into(self._detections[one.robot], one)
+            return self._into(self._odometry[one.robot], one)
+
+    def moves(self, robot: str, time: float, moving: bool) -> None:
+        """Note whether a robot moves, where that is news."""
+        with self._lock:
+            before = self._moving.get(robot)
+            if before is None or before[0] != moving:
+                time = time if before is None else max(time, before[1])
+                self._moving[robot] = moving, time
+                self._writer.write(Motion(robot, time, moving))
+
+    def complete(self, stance: Stance) -> None:
+        """A stance is over and in the estimate."""
+        self._writer.write(stance)
+
+    def rounded(self, time: float) -> float:
+        """A time as it will be read from the run."""
+        return to_seconds(to_ns(time))
+
+    def has_detections(self, robot: str) -> bool:
+        """A team in the field sends what it detected."""
+        return True
+
+    def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
+        """The detections of a robot's camera in a time [UTC s]."""
+        return iter(_between(self._detections[robot], start, end))
+
+    def images(self, robot: str, start: float, end: float) -> Iterator[Image]:
+        """None: images stay on the robot."""
+        return iter(())
+
+    def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
+        """A robot's odometry in a time [UTC s]."""
+        return iter(_between(self._odometry[robot], start, end))
+
+    def _into(self, kept: list[T], one: T) -> T:
+        time = max(self.rounded(one.time), kept[-1].time if kept else 0.0)
+        one = replace(one, time=time)
+        self._writer.write(one)
+        kept.append(one)
+        if kept[-1].time - kept[0].time > 1.2 * MEMORY:
+            del kept[: bisect_left(kept, kept[-1].time - MEMORY, key=lambda old: old.time)]
+        return one
+
+
+def _between(kept: Sequence[T], start: float | None, end: float | None) -> Sequence[T]:
+    first = 0 if start is None else bisect_left(kept, start, key=lambda one: one.time)
+    last = len(kept) if end is None else bisect_right(kept, end, key=lambda one: one.time)
+    return kept[first:last]
+
+
+def continued(path: str | Path, team: Team) -> tuple[Record, tuple[Stance, ...]]:
+    """A record that goes on where another ended, perhaps without warning, with all that could be read of it.
+
+    The old file is kept beside it with a number. `RunError` where it is of another team.
+    """
+    path = Path(path)
+    number = next(n for n in range(1, 10_000) if not path.with_suffix(f".{n}.mcap").exists())
+    old_path = path.with_suffix(f".{number}.mcap")
+    old = open_run(path)
+    if old.team != team:
+        raise RunError(f"{path}: is of another team, or of another description of it: begin in a new folder")
+    path.rename(old_path)
+    old = open_run(old_path)
+    record = Record(path, team)
+    for robot in team.names:
+        for detections in old.detections(robot):
+            record.take(detections)
+        for sample in old.odometry(robot):
+            record.take(sample)
+        for motion in old.motions(robot):
+            record.moves(robot, motion.time, motion.moving)
+    for stance in old.stances:
+        record.complete(stance)
+    return record, old.stances

@@ -1,0 +1,210 @@
+"""What the online system is made of: course and formation, driving, whereabouts, the record, phases."""
+
+import math
+
+import numpy as np
+import pytest
+
+from coloc_graph.common_view import View
+from coloc_graph.errors import InputError, RunError
+from coloc_graph.lie import floor_pose
+from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Course, Formation
+from coloc_graph.online.motion import Follower
+from coloc_graph.online.odometry_join import DROVE, STOOD, JoinedOdometry
+from coloc_graph.online.phases import FOLLOWS, Phase, Phases, as_dot
+from coloc_graph.online.record import Record, continued
+from coloc_graph.online.whereabouts import Whereabouts, compose, inverse
+from coloc_graph.run import Detections, OdometrySample, Stance, open_run
+from coloc_graph.simulation.rig import reference_team
+
+COURSE = Course(((0.0, 0.0), (3.0, 0.0), (3.0, 2.0)))
+FORMATION = Formation(Course(((0.0, 0.0), (5.0, 0.0))), ("A", "B"))
+
+
+def odometry(robot, time, x, y, yaw):
+    return OdometrySample(robot, time, np.array([x, y, yaw]), 1e-6 * np.eye(3))
+
+
+def detections(robot, time, n=2):
+    uv, covariance = np.arange(2.0 * n).reshape(n, 2) / 3, np.tile(0.01 * np.eye(2), (n, 1, 1))
+    return Detections(robot, time, uv, covariance, ("",) * n, np.zeros(n, np.uint8), np.full(n, 90.0), np.full(n, 9.0))
+
+
+@pytest.mark.parametrize("way", [-0.4, 0.0, 1.0, 2.9, 3.5, 5.0, 6.0])
+def test_a_course_is_followed_round_its_corner(way):
+    x, y, heading = COURSE.at(way)
+    assert heading == pytest.approx(0.0 if way <= 3 else math.pi / 2)
+    assert COURSE.way_of((x, y)) == pytest.approx(way)
+    left = x - 0.2 * math.sin(heading), y + 0.2 * math.cos(heading)
+    assert COURSE.way_of(left) == pytest.approx(way, abs=1e-9) or 2.7 < way < 3.3
+    assert COURSE.length == 5.0
+
+
+@pytest.mark.parametrize("points", [((0.0, 0.0),), ((0.0, 0.0), (0.05, 0.0)), ((0.0, 0.0), (math.nan, 1.0))])
+def test_a_course_that_leads_nowhere_is_refused(points):
+    with pytest.raises(InputError, match="goal"):
+        Course(points)
+
+
+def test_observers_stand_as_in_the_paper_and_leap_in_turn():
+    places = {"A": FORMATION.place("A", 0.0), "B": FORMATION.place("B", STAGGER)}
+    leapt = []
+    for _ in range(4):
+        a, b = places["A"], places["B"]
+        assert math.dist(a[:2], b[:2]) == pytest.approx(APART)
+        assert b[2] - a[2] == pytest.approx(BETWEEN)
+        robot, to = FORMATION.next_leap(places)
+        assert math.dist(places[robot][:2], to[:2]) == pytest.approx(2 * STAGGER)
+        places[robot] = to
+        leapt.append(robot)
+    assert leapt == ["A", "B", "A", "B"]
+    assert FORMATION.progress(places) == pytest.approx(4.5 * STAGGER)
+
+
+def views(places):
+    team = reference_team()
+    return [View(team[r].camera, floor_pose(*places[r]) @ team[r].mount.T_body_camera) for r in ("A", "B")]
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0, math.pi])
+def test_the_mover_is_sent_where_all_see_it_whatever_the_heading(heading):
+    ahead = 5 * math.cos(heading), 5 * math.sin(heading)
+    formation = Formation(Course(((0.0, 0.0), ahead)), ("A", "B"))
+    places = {"A": formation.place("A", 0.0), "B": formation.place("B", STAGGER)}
+    markers = reference_team()["C"].markers.p_body
+    for left in (True, False):
+        patrol = formation.patrol(places, views(places), markers, left)
+        for xy in patrol:
+            for yaw in (0.0, 0.7, 2.0):
+                points = markers @ floor_pose(*xy, yaw)[:3, :3].T + (*xy, 0.0)
+                assert all(view.sees(points, 10.0).all() for view in views(places))
+        sideways = patrol @ (-math.sin(heading), math.cos(heading))
+        along = patrol @ (math.cos(heading), math.sin(heading))
+        assert np.ptp(sideways) > 0.5 and np.ptp(along) > 0.7
+        assert (sideways[0] > sideways[1]) == left
+
+
+def test_observers_that_look_away_from_each_other_are_told_to_turn():
+    places = {"A": (0.0, 0.4, 1.2), "B": (0.2, -0.4, -1.2)}
+    with pytest.raises(InputError, match="see too little of the floor together"):
+        FORMATION.patrol(places, views(places), reference_team()["C"].markers.p_body, True)
+
+
+def driven(follower, pose, seconds=150.0, dt=0.05):
+    way = [pose]
+    for _ in range(int(seconds / dt)):
+        twist = follower.step(*pose)
+        if twist is None:
+            return np.array(way)
+        yaw = pose[2] + twist.w * dt / 2
+        pose = pose[0] + twist.v * dt * math.cos(yaw), pose[1] + twist.v * dt * math.sin(yaw), pose[2] + twist.w * dt
+        way.append(pose)
+    raise AssertionError(f"it is still under way after {seconds} s, at {pose}")
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_robot_drives_through_its_places_and_ends_as_told(seed):
+    rng = np.random.default_rng(seed)
+    places = [tuple(map(float, xy)) for xy in rng.uniform(-2, 2, (rng.integers(1, 5), 2))]
+    yaw = float(rng.uniform(-7, 7)) if seed % 3 else None
+    way = driven(Follower(places, yaw, 0.25, backwards=bool(seed % 2)), (0.0, 0.0, float(rng.uniform(-3, 3))))
+    for place in places:
+        assert np.hypot(*(way[:, :2] - place).T).min() < 0.03
+    assert np.hypot(*(way[-1, :2] - places[-1])) < 0.03
+    if yaw is not None:
+        assert abs(math.remainder(way[-1, 2] - yaw, 2 * math.pi)) < 0.03
+    assert np.hypot(*np.diff(way[:, :2], axis=0).T).max() < 0.25 * 0.05 + 1e-9
+
+
+def test_a_robot_goes_backwards_only_where_it_may():
+    assert np.ptp(driven(Follower([(-1.0, 0.0)], None, 0.2), (0.0, 0.0, 0.0))[:, 2]) < 0.1
+    assert np.ptp(driven(Follower([(-1.0, 0.0)], None, 0.2, backwards=False), (0.0, 0.0, 0.0))[:, 2]) > 3.0
+
+
+def test_a_robot_is_where_it_was_last_seen_and_its_wheels_went_since():
+    place = Whereabouts((1.0, 2.0, math.pi / 2))
+    assert place.place() == (1.0, 2.0, math.pi / 2) and not place.known
+    for n in range(11):
+        place.take(odometry("A", 10.0 + n, 5.0 + 0.1 * n, 0.0, 0.0))
+    assert place.place(10.0) == pytest.approx((1.0, 2.0, math.pi / 2))
+    assert place.place() == pytest.approx((1.0, 3.0, math.pi / 2))
+    place.fix(15.0, (0.0, 0.0, 0.0))
+    assert place.place(15.0) == pytest.approx((0.0, 0.0, 0.0))
+    assert place.place() == pytest.approx((0.5, 0.0, 0.0))
+    assert place.in_odometry((0.0, 0.0, 0.0)) == pytest.approx((5.5, 0.0, 0.0))
+    assert place.moved_since(12.0) and not place.moved_since(20.0)
+    assert compose(inverse((1.0, 2.0, 3.0)), (1.0, 2.0, 3.0)) == pytest.approx((0.0, 0.0, 0.0))
+
+
+def test_odometry_goes_on_over_a_restart_and_admits_what_it_missed():
+    joined = JoinedOdometry()
+    joined.restart(moving=True)  # before anything there is nothing to join
+    assert np.allclose(joined.take(odometry("A", 0.0, 0.0, 0.0, 0.0)).covariance, 1e-6 * np.eye(3))
+    joined.take(odometry("A", 1.0, 1.0, 0.0, math.pi / 2))
+    joined.restart(moving=False)
+    again = joined.take(odometry("A", 2.0, 0.0, 0.0, 0.0))
+    assert np.allclose(again.pose, (1.0, 0.0, math.pi / 2))
+    assert np.allclose(np.sqrt(np.diag(again.covariance)), STOOD)
+    assert np.allclose(joined.take(odometry("A", 3.0, 0.5, 0.0, 0.0)).pose, (1.0, 0.5, math.pi / 2))
+    joined.restart(moving=True)
+    assert np.allclose(np.sqrt(np.diag(joined.take(odometry("A", 4.0, 9.0, 9.0, 1.0)).covariance)), DROVE)
+
+
+def test_a_record_gives_back_what_its_run_holds(tmp_path):
+    team = reference_team()
+    with Record(tmp_path / "run.mcap", team) as record:
+        for n in range(50):
+            record.take(detections("A", 1e9 + n / 30))
+            record.take(odometry("C", 1e9 + n / 20, 0.1 * n, 0.0, 0.0))
+        late = record.take(detections("A", 1e9))  # time does not run backwards
+        record.moves("C", 1e9, True)
+        record.moves("C", 1e9 + 1, True)
+        record.moves("C", 1e9 + 2, False)
+        record.complete(Stance(0, 1e9, 1e9 + 2, ("A", "B"), ("C",)))
+        memory = list(record.detections("A", 1e9 + 0.5, 1e9 + 1.5)), list(record.odometry("C"))
+    run = open_run(tmp_path / "run.mcap")
+    assert len(memory[0]) == 31 and late.time == record.rounded(1e9 + 49 / 30)
+    for ours, read in zip(memory[0], run.detections("A", 1e9 + 0.5, 1e9 + 1.5), strict=True):
+        assert ours.time == read.time and np.array_equal(ours.uv, read.uv)
+        assert np.array_equal(ours.covariance, read.covariance)
+    for ours, read in zip(memory[1], run.odometry("C"), strict=True):
+        assert ours.time == read.time and np.array_equal(ours.pose, read.pose)
+        assert np.array_equal(ours.covariance, read.covariance)
+    assert [one.moving for one in run.motions("C")] == [True, False]
+
+
+def test_a_record_that_was_cut_off_goes_on_and_the_old_one_is_kept(tmp_path):
+    team, path = reference_team(), tmp_path / "run.mcap"
+    with Record(path, team) as record:
+        for n in range(2000):
+            record.take(detections("A", 1e9 + n / 30, 8))
+        record.complete(Stance(0, 1e9, 1e9 + 2, ("A", "B"), ("C",)))
+    path.write_bytes(path.read_bytes()[:-3000])
+    with continued(path, team)[0] as record:
+        assert record.take(detections("A", 1e9 + 100)).time == 1e9 + 100
+    kept, run = open_run(tmp_path / "run.1.mcap"), open_run(path)
+    assert kept.warnings and not run.warnings
+    before = [one.time for one in kept.detections("A")]
+    assert [one.time for one in run.detections("A")] == [*before, 1e9 + 100] and len(before) > 1000
+    assert run.stances == kept.stances
+    with pytest.raises(RunError, match="another team"):
+        continued(path, reference_team((0.1, 0.0, 0.0, 0.0)))
+
+
+def test_phases_follow_each_other_as_drawn():
+    heard = []
+    phases = Phases(heard.append)
+    with pytest.raises(ValueError, match="capturing cannot follow gathering"):
+        phases.enter(Phase.CAPTURING, 0)
+    for phase in (Phase.SYNCHRONISING, Phase.HOLDING, Phase.SYNCHRONISING, Phase.FAILED):
+        phases.enter(phase, 3, "because")
+    assert [(change.phase, change.stance, change.why) for change in heard][-1] == (Phase.FAILED, 3, "because")
+    with pytest.raises(ValueError, match="failed cannot follow failed"):
+        phases.enter(Phase.FAILED, 3)
+    drawn = as_dot()
+    assert all(f'"{phase}"' in drawn for phase in Phase)
+    assert drawn.count("->") == sum(map(len, FOLLOWS.values())) + len(Phase) - 2
+    reached = {Phase.GATHERING}
+    for _ in Phase:
+        reached |= {after for phase in reached for after in FOLLOWS[phase]}
+    assert reached == set(Phase) - {Phase.FAILED}
