@@ -23,6 +23,7 @@ from coloc_graph.run import Stance, open_run
 from coloc_graph.simulation import simulate
 from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer import (
+    LivePoses,
     LiveStance,
     Scene,
     Viewer,
@@ -312,6 +313,69 @@ def test_publishing_costs_the_estimator_less_than_a_millisecond(short_solution):
         seconds = [timed(lambda one=one: viewer.publish(one)) for _ in range(100) for one in entered]
         assert np.median(seconds) < 1e-3
         assert viewer.wait_idle() and len(viewer.scene) == len(entered)
+
+
+def at(x, y, angle):
+    return floor_pose(x, y, angle)
+
+
+def shows(viewer, robot, pose, timeout=5.0):
+    """Whether a robot's handle comes to be at x, y, heading in time."""
+    handle, ends = viewer.view.robots[viewer.scene.robots.index(robot)], time.monotonic() + timeout
+    while time.monotonic() < ends:
+        w, z = handle.wxyz[0], handle.wxyz[3]
+        if handle.visible and np.allclose([*handle.position[:2], 2 * np.arctan2(z, w)], pose, atol=1e-5):
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def test_robots_are_shown_where_they_are_between_stances(short_solution):
+    final = scene_of_solution(short_solution)
+    with Viewer(empty_scene(short_solution.run, "joint"), port=0) as viewer:
+        assert viewer.wait_idle()
+        viewer.publish(LivePoses(0.0, {"A": at(1.0, 2.0, 0.5)}, "on its way"))  # before there is any stance
+        assert shows(viewer, "A", (1.0, 2.0, 0.5)) and "on its way" in viewer.panel.status.content
+        replay(short_solution.estimate.graph, "joint", lambda *one: viewer.publish(LiveStance(*one)))
+        assert viewer.wait_idle() and len(viewer.scene) == 3 and viewer.frame.row == 2
+        edges = viewer.view._sent["edges"]
+        stood = viewer.frame.poses.copy()
+        viewer.publish(LivePoses(1.0, {"B": at(1.5, 2.5, -0.5)}, "stance 3: capturing, 112 points"))
+        assert shows(viewer, "B", (1.5, 2.5, -0.5))
+        assert "stance 3: capturing, 112 points" in viewer.panel.status.content
+        assert np.array_equal(viewer.frame.poses[0], stood[0])  # who is not named stands where the graph has it
+        assert viewer.view._sent["edges"] is edges  # the graph was not touched
+        viewer.go(0)  # whoever looks at what was sees it
+        base = viewer.scene.layers[0]
+        assert shows(viewer, "B", [*base.xyz[1, 0, :2], base.yaw[1, 0]])
+        viewer.publish(LivePoses(2.0, {"B": at(9.0, 9.0, 0.0)}))
+        assert not shows(viewer, "B", (9.0, 9.0, 0.0), timeout=0.5)
+        viewer.go(2)
+        assert shows(viewer, "B", (9.0, 9.0, 0.0))
+        viewer.publish(final)
+        assert shows(viewer, "B", [*final.layers[0].xyz[1, 2, :2], final.layers[0].yaw[1, 2]])
+
+
+def test_live_poses_cost_the_caller_nothing_and_only_the_newest_is_shown(short_solution):
+    with Viewer(empty_scene(short_solution.run, "joint"), port=0) as viewer:
+        assert viewer.wait_idle()
+        seconds = [
+            timed(lambda x=x: viewer.publish(LivePoses(x, {"A": at(x, 0.0, 0.0)}))) for x in np.linspace(0, 5, 1000)
+        ]
+        assert np.median(seconds) < 1e-3
+        assert shows(viewer, "A", (5.0, 0.0, 0.0), timeout=2.0)
+
+
+def test_live_poses_that_cannot_be_shown_are_named_and_the_others_shown(short_solution):
+    robots = short_solution.run.team.names
+    poses = LivePoses(0.0, {"A": at(1.0, 0.0, 0.0), "B": np.full((4, 4), np.nan), "Z": np.eye(4), "C": np.eye(3)})
+    words = poses.unfit(robots)
+    assert "no robot Z" in words and "robot B is no finite" in words and "robot C is no finite" in words
+    shown = poses.over(robots, np.zeros((3, 4)))
+    assert np.allclose(shown[0, :2], (1, 0)) and not shown[1:].any()
+    with Viewer(empty_scene(short_solution.run, "joint"), port=0) as viewer:
+        viewer.publish(poses)
+        assert shows(viewer, "A", (1.0, 0.0, 0.0)) and viewer._told == {words}
 
 
 # server and command

@@ -4,7 +4,7 @@
 """
 
 from coloc_graph.viewer.app import Viewer
-from coloc_graph.viewer.live import LiveStance
+from coloc_graph.viewer.live import LivePoses, LiveStance
 from coloc_graph.viewer.scene import Edges, Layer, Scene
 from coloc_graph.viewer.sources import (
     empty_scene,
@@ -17,6 +17,6 @@ from coloc_graph.viewer.sources import (
 )
 
 __all__ = [
-    "Edges", "Layer", "LiveStance", "Scene", "Viewer", "empty_scene", "is_run", "scene_of_estimate", "scene_of_result",
-    "scene_of_run", "scene_of_solution", "with_other",
+    "Edges", "Layer", "LivePoses", "LiveStance", "Scene", "Viewer", "empty_scene", "is_run", "scene_of_estimate",
+    "scene_of_result", "scene_of_run", "scene_of_solution", "with_other",
 ]  # fmt: skip

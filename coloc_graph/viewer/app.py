@@ -5,6 +5,7 @@ import threading
 import time
 import traceback
 from collections import deque
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from coloc_graph.run import Run
 from coloc_graph.viewer import inspect
 from coloc_graph.viewer.frame import NO_LINES, Frame, Lines, ViewState, frame_of, pick
 from coloc_graph.viewer.handles import GraphView, Image, camera_on, initial_camera
-from coloc_graph.viewer.live import LiveScene, LiveStance
+from coloc_graph.viewer.live import LivePoses, LiveScene, LiveStance
 from coloc_graph.viewer.panel import NOBODY, Panel, set_value
 from coloc_graph.viewer.scene import Scene
 from coloc_graph.viewer.server import start_server, stop_server, url_of
@@ -45,7 +46,9 @@ class Viewer:
         self._asked: deque[tuple[str, float]] = deque()
         self._news: deque[Scene | LiveStance] = deque()
         self._changed = threading.Condition()
-        self._awake, self._ending = True, False
+        self._awake = True
+        self._moved = self._ending = False
+        self._now: LivePoses | None = None
         self._idle, self._closed = threading.Event(), threading.Event()
         self._time = scene.middle(len(scene) - 1)
         self._moved_at = 0.0
@@ -93,8 +96,17 @@ class Viewer:
         stop_server(self.server)
         self._closed.set()
 
-    def publish(self, news: Scene | LiveStance) -> None:
-        """Show a stance that has just entered, or another scene of the same robots. Costs the caller no work."""
+    def publish(self, news: Scene | LiveStance | LivePoses) -> None:
+        """Show a stance that has just entered, where the robots are now, or another scene of the same robots.
+
+        Costs the caller no work. Of `LivePoses` the newest is shown, to whoever looks at the last stance; a scene ends
+        them.
+        """
+        if isinstance(news, LivePoses):
+            with self._changed:
+                self._now, self._moved = news, True
+                self._changed.notify()
+            return
         self._news.append(news)
         self._wake()
 
@@ -152,32 +164,62 @@ class Viewer:
     # the render thread
 
     def _run(self) -> None:
-        played_at = time.perf_counter()
+        played_at = due = time.perf_counter()
         pending = True
         while True:
             with self._changed:
                 playing = self.panel.play.value
                 resting = time.perf_counter() - self._moved_at > UNTIL_REST
-                if not (playing or self._awake or pending):
+                if not (playing or self._awake or pending or self._news):
                     self._idle.set()
+                more = playing or pending or not resting or bool(self._news)
+                wait = 0.0 if playing else max(due - time.perf_counter(), 0.0)
                 self._changed.wait_for(
-                    lambda: self._awake or self._ending,
-                    timeout=0 if playing else UNTIL_REST if pending or not resting or self._news else None,
+                    lambda: self._awake or self._moved or self._ending, timeout=wait if more else None
                 )
                 if self._ending:
                     return
-                self._awake = False
+                drives = not (playing or self._awake or (more and time.perf_counter() >= due))
+                self._awake = self._moved = False
             now, used = time.perf_counter(), time.thread_time()
             try:
-                pending = self._step(now - played_at if playing else 0.0)
+                if drives:
+                    self._drive()
+                else:
+                    pending = self._step(now - played_at if playing else 0.0)
             except Exception as error:  # a thread that has died would look like a viewer that hangs
                 traceback.print_exc()
                 self._notify("The viewer failed", f"{type(error).__name__}: {error}")
                 pending = False
-            played_at = now
+            if not drives:
+                played_at, due = now, time.perf_counter() + UNTIL_REST
             self.frame_seconds = time.perf_counter() - now
             self.frame_cpu_seconds = time.thread_time() - used
             time.sleep(max(BETWEEN_FRAMES - self.frame_seconds, 0.005))
+
+    def _drive(self) -> None:
+        """Move the robots to where they are now, and nothing else."""
+        before = self.frame
+        if before is None:
+            return
+        self.frame = self._brought_up_to_date(before)
+        with self.server.atomic():
+            self.view.place(self.frame.poses)
+        self._tell(self.frame)
+        self._follow(self.frame)
+
+    def _brought_up_to_date(self, frame: Frame) -> Frame:
+        """A frame with the robots where they are now, for whoever looks at the last stance."""
+        now, scene = self._now, self._scene
+        if now is None or frame.row != len(scene) - 1 or self.panel.play.value:
+            return frame
+        if unfit := now.unfit(scene.robots):
+            self._complain("Not all can be shown", unfit)
+        return replace(frame, poses=now.over(scene.robots, frame.poses))
+
+    def _tell(self, frame: Frame) -> None:
+        notes = (self._now.note if self._now is not None else "", frame.note, self._note)
+        self.panel.tell(self._scene, frame, self._time, notes)
 
     def _step(self, played: float) -> bool:
         """One frame; True where another is due, since something rests or is still being made."""
@@ -203,12 +245,12 @@ class Viewer:
             dark=self._dark,
             rests=rests,
         )
-        frame = frame_of(scene, state)
+        frame = self._brought_up_to_date(frame_of(scene, state))
         waiting = self._look(frame, rests)
         ways = self._ways if panel.markers.value else (NO_LINES, NO_LINES)
         self.view.apply(frame, state, self._images, *ways)
         self.frame = frame
-        panel.tell(scene, frame, self._time, self._note)
+        self._tell(frame)
         if rests or time.perf_counter() - self._plotted_at > BETWEEN_PLOTS:
             panel.plot(scene, frame.row)
             self._plotted_at = time.perf_counter()
@@ -225,7 +267,7 @@ class Viewer:
         while self._news:
             one = self._news.popleft()
             if isinstance(one, Scene):
-                grown = one
+                grown, self._now = one, None
             else:
                 self._live.add(one)
                 grown = None

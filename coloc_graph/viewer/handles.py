@@ -160,13 +160,9 @@ class GraphView:
         converted = {name: (one.points, palette.linear(one.colours)) for name, one in lines.items()}
         batches = {"ellipses": frame.ellipses, "wedges": frame.wedges, "rings": frame.rings}
         tints = {name: palette.linear(palette.flat(one.colours)) for name, one in batches.items()}
-        turned = about_z(np.nan_to_num(frame.poses[:, 3]))
         with self.server.atomic():  # only assignments from here on
+            self.place(frame.poses)
             for number, handle in enumerate(self.robots):
-                there = bool(np.isfinite(frame.poses[number]).all())
-                self._show(handle, there)
-                if there:
-                    handle.position, handle.wxyz = frame.poses[number, :3], turned[number]
                 role = frame.roles[number]
                 self._show(self._anchors[number], role == "anchor" and state.stays)
                 text = handle.name.rsplit("/", 1)[1] + (f"  {role}" if role else "")
@@ -178,6 +174,17 @@ class GraphView:
                 self._assign_lines(name, points, colours)
             for name, one in batches.items():
                 self._assign_batch(name, one, tints[name])
+
+    def place(self, poses: NDArray[np.float64]) -> None:
+        """Show the robots at poses (r, 4) of x, y, z, heading, and not at all where these are NaN."""
+        turned = about_z(np.nan_to_num(poses[:, 3]))
+        for number, (handle, pose) in enumerate(zip(self.robots, poses, strict=True)):
+            there = bool(np.isfinite(pose).all())
+            self._show(handle, there)
+            key = pose.tobytes()
+            if there and self._sent.get(handle.name) != key:
+                self._sent[handle.name] = key
+                handle.position, handle.wxyz = pose[:3], turned[number]
 
     def _assign_lines(self, name: str, points: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
         key = (points.tobytes(), colours.tobytes()) if len(points) < 2000 else None

@@ -1,6 +1,6 @@
 """A scene that grows: what an estimator says after each stance, put together in the viewer's thread."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +24,40 @@ class LiveStance:
     stance: Stance
     estimate: StanceEstimate
     measurements: Sequence[Measurement] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LivePoses:
+    """Where robots are at a `time` [s], between stances too: `T_world_body` (4, 4) [m] by robot.
+
+    `note` says what goes on. Robots that are not named are shown where their last stance has them.
+    """
+
+    time: float
+    T_world_body: Mapping[str, Array]
+    note: str = ""
+
+    def over(self, robots: Sequence[str], poses: Array) -> Array:
+        """`poses` (r, 4) of x, y, z, heading of `robots`, with those that are live here."""
+        out = poses.copy()
+        for number, robot in enumerate(robots):
+            T = self.T_world_body.get(robot)
+            if T is not None and _is_transform(T):
+                out[number, :3], out[number, 3] = T[:3, 3], np.arctan2(T[1, 0], T[0, 0])
+        return out
+
+    def unfit(self, robots: Sequence[str]) -> str:
+        """What of it cannot be shown, in words; "" where all can."""
+        strangers = sorted(set(self.T_world_body) - set(robots))
+        broken = [robot for robot, T in self.T_world_body.items() if not _is_transform(T)]
+        return "; ".join(
+            [*(f"there is no robot {robot} in this team" for robot in strangers),
+             *(f"the live pose of robot {robot} is no finite 4x4 transform" for robot in broken)]
+        )  # fmt: skip
+
+
+def _is_transform(T: Array) -> bool:
+    return np.shape(T) == (4, 4) and bool(np.isfinite(T).all())
 
 
 class LiveScene:

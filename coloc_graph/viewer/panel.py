@@ -1,6 +1,6 @@
 """The viewer's controls: sliders, switches, plots, legend, and the panel of what was clicked."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import viser
@@ -119,24 +119,25 @@ class Panel:
         """The trajectories that are switched on."""
         return frozenset(name for name, box in self._layers.items() if box.value)
 
-    def tell(self, scene: Scene, frame: Frame, time: float, note: str) -> None:
-        """Sliders, plots and the sentence at the top, as the picture is."""
+    def tell(self, scene: Scene, frame: Frame, time: float, notes: Sequence[str]) -> None:
+        """Sliders and the sentence at the top with the `notes` there are, as the picture is."""
         if not len(scene):
-            self.status.content = f"**{scene.title}** no poses yet"
+            self._say(f"**{scene.title}** no poses yet", notes)
             return
         stance = scene.stances[frame.row]
         drivers = ", ".join(stance.movers) or "nobody"
         anchors = ", ".join(stance.anchors) or "nobody"
-        said = f"**Stance {stance.index}** of {len(scene)}: {drivers} drives, {anchors} stayed put"
-        notes = [one for one in (frame.note, note) if one]
-        text = "\n\n".join([said, *(f"_{one}_" for one in notes)])
-        if self.status.content != text:
-            self.status.content = text
+        self._say(f"**Stance {stance.index}** of {len(scene)}: {drivers} drives, {anchors} stayed put", notes)
         at = round(min(max(time - float(scene.starts[0]), 0.0), self.time.max), 1)
         if self.stance.value != frame.row:
             set_value(self.stance, frame.row)
         if abs(self.time.value - at) > 0.05:
             set_value(self.time, at)
+
+    def _say(self, what: str, notes: Sequence[str]) -> None:
+        text = "\n\n".join([what, *(f"_{one}_" for one in notes if one)])
+        if self.status.content != text:
+            self.status.content = text
 
     def plot(self, scene: Scene, row: int) -> None:
         """The curves, their cursor at a row."""
