@@ -19,6 +19,7 @@ from coloc_graph.backend import replay, smooth
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
 from coloc_graph.lie import floor_pose
+from coloc_graph.pipeline import SolveOptions, solve
 from coloc_graph.run import Stance, open_run
 from coloc_graph.simulation import simulate
 from coloc_graph.trajectory import Trajectory
@@ -303,7 +304,26 @@ def test_stances_that_are_published_make_the_scene(short_solution):
     for number, robot in enumerate(grown.robots):
         want = short_solution.estimate.pose(robot, graph.stances[-1].index).translation()
         assert np.allclose(last[number], want, atol=2e-3)
+    assert "by mounts as stated" in grown.edges.of_what  # an estimator that calibrates says no other residual
     assert len(grown.edges) == 3 and np.isfinite(grown.edges.sigmas).all() and len(grown.stayed) == 2
+
+
+def test_stances_are_shown_while_the_run_is_solved_and_what_cannot_be_used_too(short, collinear, copied, tmp_path):
+    second = open_run(short).stances[1]
+    bad = copied(short, tmp_path / "bad.mcap", change=lambda r: (
+        collinear(r) if hasattr(r, "uv") and second.start - 1 <= r.time <= second.end + 1 else r
+    ))  # fmt: skip
+    run, rows = open_run(bad), []
+    with Viewer(empty_scene(run, "joint"), port=0) as viewer:
+
+        def entered(one):
+            viewer.publish(LiveStance(one.stance, one.estimate, one.measurements, one.pairs))
+            assert viewer.wait_idle()
+            rows.append((len(viewer.scene), len(viewer.scene.edges), int(viewer.scene.edges.used.sum())))
+
+        solve(run, SolveOptions(incremental=True), entered=entered)
+        assert rows == [(1, 1, 1), (2, 2, 1), (3, 3, 2)]
+        assert "line" in viewer.scene.edges.why_not[1] and len(viewer.frame.refused.points)
 
 
 def test_publishing_costs_the_estimator_less_than_a_millisecond(short_solution):
@@ -441,11 +461,28 @@ def test_ctrl_c_ends_it_without_a_word(command, result, short, tmp_path):
     try:
         said = next(line for line in process.stderr if "viewer" in line)
         assert re.match(r"the viewer is at http://127\.0\.0\.1:\d+ \(Ctrl-C ends it\)", said)
+        solved = command == "view" or any("3 of 3 measurements used" in line for line in process.stdout)
+        time.sleep(0.5)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        _, err = process.communicate(timeout=30)
     finally:
         process.kill()
-    assert (process.returncode, err) == (0, "") and ("3 of 3 measurements used" in out) == (command == "solve")
+    assert (
+        solved and process.returncode == 0 and not [one for one in err.splitlines() if "measurements made" not in one]
+    )
+
+
+def test_ctrl_c_while_it_is_solved_says_that_there_is_no_result(hallway, tmp_path):
+    arguments = [COLOC, "solve", hallway, "--out", tmp_path / "out", "--incremental", "--view", "--no-browser"]
+    process = subprocess.Popen([*arguments, "--port", "0"], stderr=subprocess.PIPE, text=True)
+    try:
+        assert any("measurements made" in line for line in process.stderr)  # some are, and not all
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 130 and err.splitlines()[-1] == "coloc: interrupted" and "Traceback" not in err
+    assert not (tmp_path / "out" / "summary.json").exists()
 
 
 @pytest.mark.parametrize("make", ["another run", "no result", "damaged"])

@@ -1,12 +1,16 @@
 """coloc solve RUN --out DIR."""
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from coloc_graph.cli.printing import counted, print_json, progress, warn
 
 if TYPE_CHECKING:
-    from coloc_graph.pipeline import Solution
+    from coloc_graph.evaluation import Accuracy
+    from coloc_graph.pipeline import EnteredStance, Solution, SolveOptions
+    from coloc_graph.run import Run
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -28,7 +32,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     )
     command.add_argument("--incremental", action="store_true", help="feed it stance by stance, as in the field")
     command.add_argument(
-        "--view", action="store_true", help="see it in the browser; with --incremental, its stances enter one by one"
+        "--view", action="store_true", help="see it in the browser; with --incremental, while it is solved"
     )
     command.add_argument("--port", type=int, default=8080, help="of --view (8080)")
     command.add_argument("--no-browser", action="store_true", help="with --view, do not open a browser")
@@ -38,14 +42,12 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve, write, print."""
-    import statistics
+    """Solve, write, print; with --view, show."""
     from dataclasses import replace
 
-    from coloc_graph.cli.accuracy import print_accuracy, print_calibration, print_last_poses, print_promised
-    from coloc_graph.errors import ColocError
-    from coloc_graph.pipeline import SolveOptions, solve
-    from coloc_graph.results import holds_result, require_place, summarise, write_result
+    from coloc_graph.cli.view import announce, show
+    from coloc_graph.pipeline import SolveOptions
+    from coloc_graph.results import require_place
     from coloc_graph.run import open_run
 
     require_place(args.out)  # before the work, not after it
@@ -58,18 +60,73 @@ def run(args: argparse.Namespace) -> int:
     ).resolved()
     assert options.frontend is not None
     options = replace(options, frontend=replace(options.frontend, scale=args.scale))
+    with _earlier_result_named(args.out):
+        logged = open_run(args.run_path)
+    if not args.view:
+        _solved(args, logged, options)
+        return 0
+
+    from coloc_graph.viewer import LiveStance, Viewer, empty_scene, scene_of_solution
+
+    if not args.incremental:
+        solution = _solved(args, logged, options)
+        with Viewer(scene_of_solution(solution), port=args.port) as viewer:
+            show(viewer, browser=not args.no_browser)
+        return 0
+    with Viewer(empty_scene(logged, options.method, options.frontend), port=args.port) as viewer:
+
+        def entered(one: "EnteredStance") -> None:
+            viewer.publish(LiveStance(one.stance, one.estimate, one.measurements, one.pairs))
+
+        announce(viewer, browser=not args.no_browser)
+        solution = _solved(args, logged, options, entered)
+        viewer.publish(scene_of_solution(solution))
+        viewer.wait_closed()
+    return 0
+
+
+@contextmanager
+def _earlier_result_named(out: str) -> Iterator[None]:
+    """An error says that an earlier result is still there, so that nobody takes it for the new one."""
+    from coloc_graph.errors import ColocError
+    from coloc_graph.results import holds_result
+
     try:
-        with progress("measurements made") as report:
-            solution = solve(open_run(args.run_path), options, report)
-        accuracy = write_result(solution, args.out)
+        yield
     except ColocError as error:
-        if holds_result(args.out):
-            raise type(error)(f"{error}; {args.out} still holds an earlier result") from error
+        if holds_result(out):
+            raise type(error)(f"{error}; {out} still holds an earlier result") from error
         raise
+
+
+def _solved(
+    args: argparse.Namespace,
+    run: "Run",
+    options: "SolveOptions",
+    entered: "Callable[[EnteredStance], None] | None" = None,
+) -> "Solution":
+    """Solve, write, print."""
+    from coloc_graph.pipeline import solve
+    from coloc_graph.results import summarise, write_result
+
+    with _earlier_result_named(args.out):
+        with progress("measurements made") as report:
+            solution = solve(run, options, report, entered)
+        accuracy = write_result(solution, args.out)
     warn(solution.warnings)
     if args.json:
         print_json(summarise(solution, accuracy))
-        return _view(args, solution) if args.view else 0
+    else:
+        _print(solution, accuracy, args.out)
+    return solution
+
+
+def _print(solution: "Solution", accuracy: "Accuracy | None", out: str) -> None:
+    """What came out, in figures."""
+    import statistics
+
+    from coloc_graph.cli.accuracy import print_accuracy, print_calibration, print_last_poses, print_promised
+
     estimate = solution.estimate
     if accuracy is None:
         print_last_poses(estimate.trajectories)
@@ -83,32 +140,5 @@ def run(args: argparse.Namespace) -> int:
     agreement = f", chi2/dof {estimate.chi2 / estimate.dof:.2f}" if estimate.dof > 0 else ""
     print(
         f"{solution.used} of {counted(len(solution.measurements), 'measurement')} used{agreement}; "
-        f"{args.out} holds trajectories, measurements.csv and report.html"
+        f"{out} holds trajectories, measurements.csv and report.html"
     )
-    return _view(args, solution) if args.view else 0
-
-
-def _view(args: argparse.Namespace, solution: "Solution") -> int:
-    """Show a solution until Ctrl-C; an incremental one enters again, stance by stance, slowly enough to be seen."""
-    import time
-
-    from coloc_graph.backend import replay
-    from coloc_graph.cli.view import show
-    from coloc_graph.viewer import LiveStance, Viewer, empty_scene, scene_of_solution
-
-    graph, options = solution.estimate.graph, solution.options.resolved()
-    final = scene_of_solution(solution)
-    start = empty_scene(solution.run, options.method, options.frontend) if args.incremental else final
-    pause = min(0.3, 20 / len(graph.stances))
-    with Viewer(start, port=args.port) as viewer:
-
-        def enter(*entered: Any) -> None:
-            viewer.publish(LiveStance(*entered))
-            time.sleep(pause)
-
-        def work() -> None:
-            replay(graph, options.method, enter)
-            viewer.publish(final)
-
-        show(viewer, browser=not args.no_browser, work=work if args.incremental else None)
-    return 0

@@ -1,7 +1,6 @@
 """coloc view RUN|DIR."""
 
 import argparse
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -73,17 +72,21 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def show(viewer: "Viewer", *, browser: bool, work: Callable[[], None] | None = None) -> None:
-    """Say where a viewer is, open it on a terminal, do what `work` there is, and wait for Ctrl-C, which ends it all."""
-    import sys
-    import webbrowser
+def show(viewer: "Viewer", *, browser: bool) -> None:
+    """Say where a viewer is, open it on a terminal, and wait for Ctrl-C, which ends it."""
     from contextlib import suppress
 
     with suppress(KeyboardInterrupt):
-        # stderr, since stdout is for results
-        print(f"the viewer is at {viewer.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
-        if browser and sys.stdout.isatty():
-            webbrowser.open(viewer.url)
-        if work is not None:
-            work()
+        announce(viewer, browser=browser)
         viewer.wait_closed()
+
+
+def announce(viewer: "Viewer", *, browser: bool) -> None:
+    """Say where a viewer is, and open it on a terminal."""
+    import sys
+    import webbrowser
+
+    # stderr, since stdout is for results
+    print(f"the viewer is at {viewer.url} (Ctrl-C ends it)", file=sys.stderr, flush=True)
+    if browser and sys.stdout.isatty():
+        webbrowser.open(viewer.url)

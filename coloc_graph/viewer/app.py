@@ -31,6 +31,8 @@ BETWEEN_FRAMES, UNTIL_REST = 0.03, 0.35
 BETWEEN_GROWTHS = 0.25
 #: Plots are pushed whole, and this often at most while time moves [s].
 BETWEEN_PLOTS = 0.15
+#: So many pairs are kept that were measured; each holds its tracks.
+MOST_MEASURED = 100
 
 
 class Viewer:
@@ -271,6 +273,9 @@ class Viewer:
             else:
                 self._live.add(one)
                 grown = None
+                for pair in one.pairs:  # they need not be measured again to be shown
+                    h = pair.homography
+                    self._measured[h.stance, h.robot_i, h.robot_j] = pair
         first = not len(self._scene)
         try:
             self._scene = grown if grown is not None else self._live.scene()
@@ -280,7 +285,6 @@ class Viewer:
         self.view.adopt(self._scene)
         self.view.dress(self._scene, self._dark)
         self.panel.adopt(self._scene)
-        self._measured.clear()
         if at_end:
             self._time = self._scene.middle(len(self._scene) - 1)
         initial_camera(self.server, self._scene)  # of who comes later, and of `reset view`
@@ -343,10 +347,11 @@ class Viewer:
         stance = scene.stances[row]
         measured = []
         for pair in itertools.combinations(stance.observers, 2):
-            key = (stance.index, *pair)
-            if key not in self._measured:
-                self._measured[key] = measure_pair(scene.run, stance, *pair, scene.frontend)
-            measured.append(self._measured[key])
+            one = self._measured.get((stance.index, *pair)) or measure_pair(scene.run, stance, *pair, scene.frontend)
+            if len(self._measured) > MOST_MEASURED:
+                self._measured.clear()
+            self._measured[stance.index, *pair] = one
+            measured.append(one)
         return inspect.marker_ways(scene, row, measured, self._dark)
 
     def _inspect(self, frame: Frame) -> bool:

@@ -6,24 +6,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coloc_graph.backend import StanceEstimate
+from coloc_graph.frontend import PairMeasurement
 from coloc_graph.lie import se3_inverse, so3_log
 from coloc_graph.measurements import Measurement, RelativePose, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.scene import Array, Scene, layer_of
-from coloc_graph.viewer.sources import as_edges, stayed
+from coloc_graph.viewer.sources import NAMES, as_edges, stayed
 
-#: What the layer is called where the scene it starts from has none, and what its edges' residuals are of.
-LIVE, OF_PAIR = "live", "of the relative pose, against the poses when it came in"
+#: What the layer is called where the scene it starts from has none.
+LIVE = "live"
+#: What live residuals are of; an estimator that calibrates mounts says no others while it runs.
+OF_PAIR = "of the relative pose, against the poses when it came in"
+OF_STATED_MOUNTS = "of the relative pose by mounts as stated, against the poses when it came in"
 
 
 @dataclass(frozen=True, eq=False)
 class LiveStance:
-    """A stance that has just entered, where its robots stand by it, and what was measured in it."""
+    """A stance that has just entered, where its robots stand by it, and what was measured in it.
+
+    `pairs` are those that were looked at, so that the ones that cannot be used are seen too.
+    """
 
     stance: Stance
     estimate: StanceEstimate
     measurements: Sequence[Measurement] = ()
+    pairs: Sequence[PairMeasurement] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +76,7 @@ class LiveScene:
         self._name = start.layers[0].name if start.layers else LIVE
         self._stances: dict[int, Stance] = {}
         self._poses: dict[str, dict[int, tuple[float, Array, Array]]] = {robot: {} for robot in start.robots}
-        self._found: list[tuple[int, str, str, float, str]] = []
+        self._found: dict[int, list[tuple[int, str, str, float, str]]] = {}
 
     def add(self, one: LiveStance) -> None:
         """Take in a stance; one that is in already is brought up to date."""
@@ -80,9 +88,15 @@ class LiveScene:
             if robot in stance.observers or robot in times:
                 time = times.get(robot, stance.start)
                 self._poses[robot][stance.index] = (time, pose.matrix(), said.covariances[robot])
-        for m in one.measurements:
-            if isinstance(m, RelativePose):
-                self._found.append((m.stance, m.robot_i, m.robot_j, self._off(m), refused.get(id(m), "")))
+        self._found[stance.index] = [
+            (m.stance, m.robot_i, m.robot_j, self._off(m), refused.get(id(m), ""))
+            for m in one.measurements
+            if isinstance(m, RelativePose)
+        ] + [
+            (h.stance, h.robot_i, h.robot_j, np.nan, h.unusable)
+            for h in (pair.homography for pair in one.pairs)
+            if h.unusable
+        ]
 
     def _off(self, one: RelativePose) -> float:
         ends = [self._poses[robot].get(stance) for robot, stance in one.ends]
@@ -104,11 +118,12 @@ class LiveScene:
                 trajectories[robot] = Trajectory(
                     robot, np.array(times), np.array(T), np.array(indices), np.array(covariances)
                 )
+        found = [edge for every in self._found.values() for edge in every]
         held = [(robot, stance.index) for stance in stances for robot in stance.anchors]
         return replace(
             self._start,
             stances=stances,
             layers=(layer_of(self._name, robots, stances, trajectories),) if stances else (),
-            edges=as_edges(self._found, robots, stances, OF_PAIR),
+            edges=as_edges(found, robots, stances, OF_STATED_MOUNTS if self._name == NAMES["joint"] else OF_PAIR),
             stayed=stayed(robots, stances, held),
         )

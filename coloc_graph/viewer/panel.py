@@ -102,16 +102,14 @@ class Panel:
         if self.time.max != length:
             self.time.max = length
         self.stance.disabled = self.time.disabled = not len(scene)
-        added = False
         for number, layer in enumerate(scene.layers):
             if layer.name not in self._layers:
                 with self._layer_folder:
                     box = self._gui.add_checkbox(layer.name, number == 0 or layer.aside or layer.name == TRUE)
                 box.on_update(lambda _: self._ask("changed", 0))
                 self._layers[layer.name] = box
-                added = True
-        if added:
-            self._legend.content = legend(scene)
+        if self._legend.content != (means := legend(scene)):
+            self._legend.content = means
         self._curves = residual_curve(scene), error_curves(scene)
 
     @property
