@@ -11,7 +11,7 @@ WAVES = 64
 
 
 class UnevenFloor:
-    """A smooth slope at every place: normal with `sigma` [rad] along x and along y, correlated over `FLOOR_GRAIN`.
+    """A smooth slope at every place: normal with `sigma` [rad] along x and along y, another one `FLOOR_GRAIN` away.
 
     The floor is at z = 0 everywhere; only bodies tilt. Source: Rahimi and Recht, "Random Features for Large-Scale
     Kernel Machines", 2007.
@@ -19,7 +19,7 @@ class UnevenFloor:
 
     def __init__(self, sigma: float, rng: np.random.Generator) -> None:
         self._scale = sigma * np.sqrt(2 / WAVES)
-        self._waves = rng.standard_normal((2, WAVES, 2)) / FLOOR_GRAIN
+        self._waves = rng.standard_normal((2, WAVES, 2)) / (FLOOR_GRAIN / 2)
         self._phases = rng.uniform(0, 2 * np.pi, (2, WAVES))
 
     def slope(self, xy: ArrayLike) -> Array:
