@@ -98,13 +98,3 @@ def test_a_live_stance_appears_while_one_looks_at_an_old_one(short_solution, pag
         viewer.publish(scene_of_solution(short_solution))
         assert until(lambda: page.get_by_text("chained").first.is_visible())
         assert viewer.frame.row == 0
-
-
-def test_an_exported_page_opens_from_its_file(scene, page_of, tmp_path):
-    path = tmp_path / "view.html"
-    with Viewer(scene, port=0) as viewer:
-        viewer.export(path)
-        wanted = viewer.frame.poses[0]
-    assert path.stat().st_size < 3e6
-    page = page_of(path.as_uri(), "/robots/A")
-    assert until(lambda: np.hypot(*np.delete(place_of(page, "/robots/A"), 1)) > 0.5 * np.hypot(*wanted[:2]))

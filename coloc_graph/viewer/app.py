@@ -17,6 +17,7 @@ from coloc_graph.errors import ColocError
 from coloc_graph.frontend import PairMeasurement, measure_pair
 from coloc_graph.run import Run
 from coloc_graph.viewer import inspect
+from coloc_graph.viewer.export import page_of
 from coloc_graph.viewer.frame import NO_LINES, Frame, Lines, ViewState, frame_of, pick
 from coloc_graph.viewer.handles import GraphView, Image, camera_on, initial_camera
 from coloc_graph.viewer.live import LivePoses, LiveScene, LiveStance
@@ -139,9 +140,9 @@ class Viewer:
         return self._idle.wait(timeout)
 
     def html(self) -> str:
-        """What is shown, as one HTML page that needs no server."""
+        """What is shown, stance by stance, as one HTML page that plays without a server."""
         self.wait_idle()
-        return self.server.scene.as_html(dark_mode=self.panel.dark.value)
+        return page_of(self._scene, self._state(rests=True))
 
     def export(self, path: str | Path) -> None:
         """Write that page."""
@@ -207,7 +208,7 @@ class Viewer:
         self.frame = self._brought_up_to_date(before)
         with self.server.atomic():
             self.view.place(self.frame.poses)
-        self._tell(self.frame)
+            self._tell(self.frame)
         self._follow(self.frame)
 
     def _brought_up_to_date(self, frame: Frame) -> Frame:
@@ -233,8 +234,25 @@ class Viewer:
             panel.dress(self._dark)
             self.view.dress(scene, self._dark)
         rests = time.perf_counter() - self._moved_at > UNTIL_REST
-        low, high = scene.bounds
-        state = ViewState(
+        state = self._state(rests)
+        frame = self._brought_up_to_date(frame_of(scene, state))
+        waiting = self._look(frame, rests)
+        ways = self._ways if panel.markers.value else (NO_LINES, NO_LINES)
+        with self.server.atomic():  # the server's thread is woken once, and nothing is shown half
+            self.view.apply(frame, state, self._images, *ways)
+            self._tell(frame)
+            if rests or time.perf_counter() - self._plotted_at > BETWEEN_PLOTS:
+                panel.plot(scene, frame.row)
+                self._plotted_at = time.perf_counter()
+            waiting |= self._inspect(frame)
+        self.frame = frame
+        self._follow(frame)
+        return waiting or not rests
+
+    def _state(self, rests: bool) -> ViewState:
+        panel = self.panel
+        low, high = self._scene.bounds
+        return ViewState(
             time=self._time,
             shown=panel.shown,
             ellipses=panel.ellipses.value,
@@ -247,18 +265,6 @@ class Viewer:
             dark=self._dark,
             rests=rests,
         )
-        frame = self._brought_up_to_date(frame_of(scene, state))
-        waiting = self._look(frame, rests)
-        ways = self._ways if panel.markers.value else (NO_LINES, NO_LINES)
-        self.view.apply(frame, state, self._images, *ways)
-        self.frame = frame
-        self._tell(frame)
-        if rests or time.perf_counter() - self._plotted_at > BETWEEN_PLOTS:
-            panel.plot(scene, frame.row)
-            self._plotted_at = time.perf_counter()
-        waiting |= self._inspect(frame)
-        self._follow(frame)
-        return waiting or not rests
 
     def _grow(self) -> None:
         """Take in what was published."""

@@ -1,0 +1,103 @@
+"""A scene as one HTML page that plays without a server or a network: viser's recording, and a legend over it."""
+
+import html
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from coloc_graph.errors import ColocError
+from coloc_graph.viewer import inspect, palette
+from coloc_graph.viewer.frame import Frame, ViewState, frame_of, thinned_rows
+from coloc_graph.viewer.handles import GraphView, Image, initial_camera
+from coloc_graph.viewer.panel import legend
+from coloc_graph.viewer.scene import Scene
+from coloc_graph.viewer.server import start_server, stop_server
+
+#: A stance takes so long, in a long run less, for all to take no more than so long; the last one is held; it moves in
+#: steps of so long [s].
+STANCE_SECONDS, MOST_SECONDS, HELD_SECONDS, STEP_SECONDS = 1.0, 60.0, 3.0, 0.1
+#: So many stances are played at most; of no more than so many each has its images and its robots' trails in each step.
+MOST_STANCES, IN_FULL = 240, 80
+#: Over the team [m].
+CAPTION_HEIGHT = 0.9
+
+
+def page_of(scene: Scene, state: ViewState) -> str:
+    """The page: what `state` says is shown, from the first stance to the last.
+
+    Clicks, switches, plots and marker ways need a server, and are not in it.
+    """
+    rows = thinned_rows(len(scene) - 1, MOST_STANCES)
+    full = len(rows) <= IN_FULL
+    state = replace(state, picked=None, rests=full)
+    bare = replace(state, shown=frozenset(), ellipses=False, wedges=False, edges=False, stays=False)
+    each = min(STANCE_SECONDS, MOST_SECONDS / max(len(rows), 1))
+    steps = max(round(each / STEP_SECONDS), 2)
+    server = start_server("127.0.0.1", 0, scene.title)
+    try:
+        view = GraphView(server, scene, state.dark)
+        initial_camera(server, scene, state.aside)
+        caption = server.scene.add_label("/stance", "", anchor="bottom-center")
+
+        def show(time: float, images: dict[str, Image | None] | None = None) -> Frame:
+            frame = frame_of(scene, replace(state, time=time))
+            view.apply(frame, state, images)
+            caption.text, caption.position = _caption(scene, frame)
+            return frame
+
+        frame = show(scene.middle(0), _images(scene, 0))
+        recording = server.get_scene_serializer()  # it begins with what there is by now
+        for now, then in itertools.pairwise(rows.tolist()):
+            for time in np.linspace(scene.middle(now), scene.middle(then), steps + 1)[1:-1].tolist():
+                recording.insert_sleep(each / steps)
+                if full:
+                    show(time)
+                else:
+                    view.place(frame_of(scene, replace(bare, time=time)).poses)
+            recording.insert_sleep(each / steps)
+            frame = show(scene.middle(then), _images(scene, then) if full else None)
+        if len(rows) > 1:
+            recording.insert_sleep(HELD_SECONDS)
+        page = recording.as_html(dark_mode=state.dark)
+    finally:
+        stop_server(server)
+    played = f"{len(rows)} of {len(scene):,} stances are played" if len(rows) < len(scene) else ""
+    return _dressed(page, scene, state, [played, frame.note])
+
+
+def _images(scene: Scene, row: int) -> dict[str, Image | None]:
+    if scene.run is None:
+        return {}
+    found: dict[str, Image | None] = {}
+    for robot in scene.robots:
+        try:
+            found[robot] = inspect.camera_image(scene.run, robot, scene.middle(row))
+        except ColocError:  # the viewer says it; the page is of what can be seen
+            found[robot] = None
+    return found
+
+
+def _caption(scene: Scene, frame: Frame) -> tuple[str, tuple[float, float, float]]:
+    """Which stance it is, and where that is written: over the middle of the team."""
+    there = frame.poses[np.isfinite(frame.poses).all(axis=1), :2]
+    if frame.row < 0 or not len(there):
+        return "", (0.0, 0.0, CAPTION_HEIGHT)
+    x, y = there.mean(axis=0)
+    return f"stance {scene.stances[frame.row].index}", (float(x), float(y), CAPTION_HEIGHT)
+
+
+def _dressed(page: str, scene: Scene, state: ViewState, notes: Sequence[str]) -> str:
+    """The page with its title, and a legend that folds away."""
+    title = html.escape(scene.title or "coloc-graph")
+    ink, paper = (f"rgb({r},{g},{b})" for r, g, b in (palette.ink(state.dark), palette.paper(state.dark)))
+    lines = (f"ellipses and wedges: {state.k_sigma:g} sigma", *notes)
+    box = (
+        '<details open style="position:fixed;z-index:5;bottom:56px;left:10px;max-width:300px;padding:.4em .7em;'
+        f'border-radius:6px;font:14px/1.4 sans-serif;color:{ink};background:{paper};opacity:.9">'
+        f'<summary style="cursor:pointer"><b>{title}</b></summary>{legend(scene)}'
+        f'<div style="font-size:.8em;padding:0 .8em">{"<br>".join(line for line in lines if line)}</div></details>'
+    )
+    head, tail = page.rsplit("</body>", 1)
+    return f"{head}{box}</body>{tail}".replace("<title>Viser</title>", f"<title>{title}</title>", 1)
