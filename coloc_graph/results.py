@@ -51,9 +51,11 @@ MEASUREMENT_COLUMNS = (
 )
 
 
-def assess(solution: Solution) -> tuple[Accuracy, dict[str, NDArray[np.float64]]] | None:
-    """A solution against its run's truth, with the true poses in its world; None where the run has no truth."""
-    truth = read_truth(solution.run.path)
+def assess(
+    solution: Solution, truth_path: str | Path | None = None
+) -> tuple[Accuracy, dict[str, NDArray[np.float64]]] | None:
+    """A solution against its run's truth, or that of another, with the true poses in its world; None without truth."""
+    truth = read_truth(solution.run.path if truth_path is None else truth_path)
     if not truth:
         return None
     on_floor = solution.run.team.floor is not None

@@ -1,4 +1,5 @@
-"""Who the robots are: `Camera`, `Mount`, `Markers`, `Slip`, `Robot`, `Floor`, `Team`, and the file team.toml.
+"""Who the robots are: `Camera`, `Mount`, `Markers`, `Slip`, `Devices`, `Robot`,
+`Floor`, `Team`, and the file team.toml.
 
 Fields carry the unit a person writes (`tilt_deg`); metres where a name says nothing. Tolerances (`*_sigma*`)
 are one standard deviation: what a simulated truth is drawn from and what the estimators take as a prior.
@@ -231,10 +232,30 @@ class Slip(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
             )
 
 
+class Devices(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a robot's own program opens, and where the robot is put down.
+
+    `camera` is a source of images ("v4l2:/dev/video0"), `wheels` the serial port of its Create, of `model` 1 or 2
+    (found out where it is not said). `start` is x, y [m] and yaw [deg] at the beginning, on a floor whose x axis is
+    the way ahead; without one, where the formation has it.
+    """
+
+    camera: str | None = None
+    wheels: str | None = None
+    model: int | None = None
+    start: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.model not in (None, 1, 2):
+            raise ValueError(f"there is no Create {self.model}; `model` is 1 or 2, or is left out")
+        if self.start is not None and not all(map(math.isfinite, self.start)):
+            raise ValueError("`start` holds a number that is not finite")
+
+
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A body with a camera, its mount, and markers (none on a robot that is never watched).
 
-    As an anchor it stays put exactly, or, with a `slip`, within that.
+    As an anchor it stays put exactly, or, with a `slip`, within that. `devices` are for its own program.
     """
 
     name: str
@@ -242,6 +263,7 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     mount: Mount
     markers: Markers | None = None
     slip: Slip | None = None
+    devices: Devices | None = None
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", self.name):

@@ -180,7 +180,8 @@ def test_a_record_that_was_cut_off_goes_on_and_the_old_one_is_kept(tmp_path):
             record.take(detections("A", 1e9 + n / 30, 8))
         record.complete(Stance(0, 1e9, 1e9 + 2, ("A", "B"), ("C",)))
     path.write_bytes(path.read_bytes()[:-3000])
-    with continued(path, team)[0] as record:
+    record, _ = continued(path, team)
+    with record:
         assert record.take(detections("A", 1e9 + 100)).time == 1e9 + 100
     kept, run = open_run(tmp_path / "run.1.mcap"), open_run(path)
     assert kept.warnings and not run.warnings

@@ -78,6 +78,8 @@ def most_likely_pose(
         J = (residuals[1 : 1 + len(width)] - residuals[1 + len(width) :]).T / (2 * width)
         A = np.concatenate([J, np.diag(precision)])
         r = np.concatenate([residuals[0], precision * unknowns[free]])
+        if not (np.isfinite(A).all() and np.isfinite(r).all()):
+            break  # so far off that it has no logarithm
         step = -np.linalg.lstsq(A, r, rcond=None)[0]
         if not np.abs(step).max() < 1.0:
             break

@@ -21,6 +21,16 @@ class JoinedOdometry:
         self._last: Planar | None = None
         self._unsure: tuple[float, float, float] | None = None
 
+    def begin_at(self, pose: Planar) -> None:
+        """Go on from a pose that was recorded: what comes next is in an unknown frame."""
+        self._last = pose
+        self._unsure = DROVE
+
+    def align(self, pose: Planar) -> None:
+        """A sample that was recorded before came again: it is where this goes on, in the frame that it comes in."""
+        if self._last is not None:
+            self._T, self._unsure = compose(self._last, inverse(pose)), None
+
     def restart(self, *, moving: bool) -> None:
         """What comes next is in a new frame; `moving` says whether the robot may have driven in between."""
         if self._last is not None:

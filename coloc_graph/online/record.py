@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Self, TypeVar
 
 from coloc_graph.errors import RunError
-from coloc_graph.run import Detections, Image, Motion, OdometrySample, Planes, RunWriter, Stance, open_run
+from coloc_graph.run import Detections, Image, Motion, OdometrySample, Planes, Run, RunWriter, Stance, open_run
 from coloc_graph.run.schemas import to_ns, to_seconds
 from coloc_graph.team import Team
 
@@ -67,6 +67,16 @@ class Record:
         """A time as it will be read from the run."""
         return to_seconds(to_ns(time))
 
+    def last_odometry(self, robot: str) -> OdometrySample | None:
+        """The newest that is known of a robot's wheels."""
+        return self._odometry[robot][-1] if self._odometry[robot] else None
+
+    def newest(self) -> float:
+        """The time of the newest of all [UTC s]; 0 where there is nothing."""
+        seen = [kept[-1].time for kept in self._detections.values() if kept]
+        rolled = [kept[-1].time for kept in self._odometry.values() if kept]
+        return max([*seen, *rolled], default=0.0)
+
     def has_detections(self, robot: str) -> bool:
         """A team in the field sends what it detected."""
         return True
@@ -99,19 +109,17 @@ def _between(kept: Sequence[T], start: float | None, end: float | None) -> Seque
     return kept[first:last]
 
 
-def continued(path: str | Path, team: Team) -> tuple[Record, tuple[Stance, ...]]:
+def continued(path: str | Path, team: Team) -> tuple[Record, Run]:
     """A record that goes on where another ended, perhaps without warning, with all that could be read of it.
 
-    The old file is kept beside it with a number. `RunError` where it is of another team.
+    The old run, which is kept beside it with a number, comes back too. `RunError` where it is of another team.
     """
     path = Path(path)
-    number = next(n for n in range(1, 10_000) if not path.with_suffix(f".{n}.mcap").exists())
-    old_path = path.with_suffix(f".{number}.mcap")
-    old = open_run(path)
-    if old.team != team:
+    if open_run(path).team != team:
         raise RunError(f"{path}: is of another team, or of another description of it: begin in a new folder")
-    path.rename(old_path)
-    old = open_run(old_path)
+    number = next(n for n in range(1, 10_000) if not path.with_suffix(f".{n}.mcap").exists())
+    path.rename(path.with_suffix(f".{number}.mcap"))
+    old = open_run(path.with_suffix(f".{number}.mcap"))
     record = Record(path, team)
     for robot in team.names:
         for detections in old.detections(robot):
@@ -122,4 +130,4 @@ def continued(path: str | Path, team: Team) -> tuple[Record, tuple[Stance, ...]]
             record.moves(robot, motion.time, motion.moving)
     for stance in old.stances:
         record.complete(stance)
-    return record, old.stances
+    return record, old

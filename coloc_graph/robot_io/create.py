@@ -39,7 +39,8 @@ class Create:
     `model` is 1 or 2, or None to find out. `max_speed` [m/s] and `max_turn` [rad/s] bound every command. `stop_on`
     is a choice of "bump", "cliff", "wheel_drop", "charger". `full` asks for full mode, in which the robot does not
     stop by itself at a cliff, a dropped wheel or the charger. `robot` names the odometry's samples, one of which
-    comes every `odometry_period` [s] while it moves.
+    comes every `odometry_period` [s] while it moves; their times are `epoch` [s] ahead of the monotonic clock, by
+    default UTC as it is when the line opens.
 
     Methods raise `RobotError` where the robot does not answer, is lost, or was stopped for a reason that still
     holds; `recover` says that it may go on. Source: iRobot Create Open Interface specification.
@@ -56,6 +57,7 @@ class Create:
         stop_on: Collection[str] = ("wheel_drop", "cliff"),
         full: bool = False,
         odometry_period: float = 0.05,
+        epoch: float | None = None,
     ) -> None:
         if model not in (None, *WHEELS):
             raise InputError(f"there is no Create {model}: the model is 1, 2 or None to find out")
@@ -63,11 +65,11 @@ class Create:
             raise InputError(f"stop_on is a list of {', '.join(HAZARDS)}, not {stop_on}")
         if not (max_speed > 0 and max_turn > 0):
             raise InputError(f"limits are above 0, not {max_speed} m/s and {max_turn} rad/s")
-        self.port, self.max_speed, self.max_turn = port, max_speed, max_turn
+        self.port, self.max_speed, self.max_turn, self._epoch = port, max_speed, max_turn, epoch
         self._asked_model, self._stop_on = model, frozenset(stop_on)
         self._mode, self._robot, self._period = Mode.FULL if full else Mode.SAFE, robot, odometry_period
         self._line: CreateLine | None = None
-        self._feed = SensorFeed(2, robot, odometry_period)
+        self._feed = SensorFeed(2, robot, odometry_period, epoch)
 
     def open(self) -> Self:
         """Find the robot, have it stream and enter its mode. `RobotError` if it does not answer within a second a baud.
@@ -84,7 +86,7 @@ class Create:
         self._halted_at, self._halts, self._blames = 0.0, object(), object()  # new ones with each stop, each fault
         self._deadline: float | None = None
         self._commanded, self._hazards = (0, 0), set[str]()
-        self._feed = SensorFeed(line.model, self._robot, self._period)
+        self._feed = SensorFeed(line.model, self._robot, self._period, self._epoch)
         self._last_ask = time.monotonic()
         self._threads = [
             threading.Thread(target=self._alive, args=(work, line), name=f"{name} of {self.port}", daemon=True)
@@ -215,6 +217,11 @@ class Create:
     def fault(self) -> str | None:
         """Why it does not drive, None where it does."""
         return self._fault if self._line else "it is not open"
+
+    @property
+    def lost(self) -> bool:
+        """Whether its line is lost, or it is not open: open it anew."""
+        return self._line is None or self._line.lost is not None
 
     @property
     def frames(self) -> tuple[int, int]:

@@ -13,12 +13,12 @@ from coloc_graph.run.messages import OdometrySample
 class SensorFeed:
     """Made of frames by one thread with `take`, read by others. Times are UTC, the monotonic clock's steps."""
 
-    def __init__(self, model: int, robot: str, period: float) -> None:
+    def __init__(self, model: int, robot: str, period: float, epoch: float | None = None) -> None:
         self.state: CreateState | None = None
         self.sample: OdometrySample | None = None
         #: When the newest frame came [s, monotonic].
         self.last = time.monotonic()
-        self._epoch = time.time() - self.last
+        self._epoch = time.time() - self.last if epoch is None else epoch
         self._odometer = Odometer(robot, period)
         self._way = EncoderWay() if model == 2 else DeltaWay()
         self._samples: deque[OdometrySample] = deque(maxlen=20_000)

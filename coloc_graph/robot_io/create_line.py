@@ -1,6 +1,7 @@
 """The serial line to a Create: found, opened, written to and read from, each with a timeout; `CreateLine`."""
 
 import contextlib
+import select
 import threading
 import time
 
@@ -59,16 +60,23 @@ class CreateLine:
         if self.lost is None:
             held = self._lock.acquire(timeout=2 * WRITE)
             try:
-                self._serial.write(data)
+                self._write(data)
                 return
-            except serial.SerialTimeoutException as error:
-                raise RobotError(f"{self.port} takes no bytes: check the cable and its flow control") from error
             except (OSError, TypeError, ValueError) as error:
                 self.lost = self.lost or str(error)
             finally:
                 if held:
                     self._lock.release()
         raise RobotError(f"the line on {self.port} is lost ({self.lost}): check the cable and open it again")
+
+    def _write(self, data: bytes) -> None:
+        # pyserial's own timeout calls it one where this process was not run for so long, though all was written
+        until = time.monotonic() + WRITE
+        while data:
+            _, ready, _ = select.select([], [self._serial.fileno()], [], max(until - time.monotonic(), 0))
+            if not ready:
+                raise RobotError(f"{self.port} takes no bytes: check the cable and its flow control")
+            data = data[self._serial.write(data) or 0 :]
 
     def read(self) -> list[dict[int, int]]:
         """The frames that have come, after `READ` at most. `RobotError` where the line is lost."""
@@ -95,7 +103,7 @@ class CreateLine:
         return False
 
     def _opened(self, model: int) -> serial.Serial:
-        return serial.Serial(self.port, WHEELS[model].baud, timeout=READ, write_timeout=WRITE, exclusive=True)
+        return serial.Serial(self.port, WHEELS[model].baud, timeout=READ, write_timeout=0, exclusive=True)
 
     def close(self) -> None:
         """Let go of the port."""

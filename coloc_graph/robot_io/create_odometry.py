@@ -119,7 +119,8 @@ class Odometer:
 
     def _close(self, time: float) -> OdometrySample:
         floor = np.diag(np.square([FLOOR_METRES, FLOOR_METRES, FLOOR_RADIANS]))
-        sample = OdometrySample(self.robot, time, self.pose.copy(), self._covariance + floor)
+        covariance = (self._covariance + self._covariance.T) / 2 + floor
+        sample = OdometrySample(self.robot, time, self.pose.copy(), covariance)
         self._way, self._covariance, self._opened = np.zeros(3), np.zeros((3, 3)), time
         return sample
 

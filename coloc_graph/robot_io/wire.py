@@ -24,19 +24,19 @@ class WireError(ColocError):
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    def check(self) -> None:
+    def _check(self) -> None:
         """Raise ValueError where its fields contradict each other."""
 
 
 class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The marker centres in one image of a robot's camera, as `run.Detections`; `covariance` is (uu, uv, vv) [px^2].
 
-    `number` counts all samples of a session from 0, `stance` is the one that the image belongs to.
+    `number` counts all samples of a session from 0, `capture` is the one that the image belongs to.
     """
 
     session: str
     number: int
-    stance: int
+    capture: int
     stamp: int
     uv: list[tuple[float, float]]
     covariance: list[tuple[float, float, float]]
@@ -46,14 +46,14 @@ class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
     area: list[float]
 
     @classmethod
-    def of(cls, seen: Detections, *, session: str, number: int, stance: int, stamp: int) -> "Sample":
+    def of(cls, seen: Detections, *, session: str, number: int, capture: int, stamp: int) -> "Sample":
         """The message of what was detected at `stamp`; of more centres than it can hold the brightest."""
         order = np.argsort(-seen.peak, kind="stable")[:MOST_MARKERS]
         C = seen.covariance[order]
         return cls(
             session=session,
             number=number,
-            stance=stance,
+            capture=capture,
             stamp=stamp,
             uv=seen.uv[order].tolist(),
             covariance=np.stack([C[:, 0, 0], C[:, 0, 1], C[:, 1, 1]], axis=1).tolist(),
@@ -78,7 +78,7 @@ class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
             np.array(self.area, float),
         )
 
-    def check(self) -> None:
+    def _check(self) -> None:
         n = len(self.uv)
         if n > MOST_MARKERS or any(len(one) != n for one in (self.covariance, self.markers, self.flags, self.peak,
                                                              self.area)):  # fmt: skip
@@ -91,7 +91,7 @@ class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
             raise ValueError("a covariance is not positive definite")
         if any(not 0 <= flag < 16 for flag in self.flags) or any(len(marker) > 64 for marker in self.markers):
             raise ValueError("a flag or a marker's name is none")
-        _counted(self.number, self.stance)
+        _counted(self.number, self.capture)
 
 
 class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -114,7 +114,7 @@ class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
         """The record that it is, at a time [UTC s]."""
         return OdometrySample(robot, time, np.array(self.pose), _symmetric(self.covariance))
 
-    def check(self) -> None:
+    def _check(self) -> None:
         if not all(map(math.isfinite, (*self.pose, *self.covariance))) or max(map(abs, self.pose)) > 1e6:
             raise ValueError("it holds a number that is no place")
         if np.linalg.eigvalsh(_symmetric(self.covariance)).min() < -1e-12:
@@ -131,7 +131,7 @@ class Event(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
     kind: str
     text: str
 
-    def check(self) -> None:
+    def _check(self) -> None:
         _short(self.kind, self.text)
         _counted(self.number)
 
@@ -142,23 +142,23 @@ class Status(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
     session: str
     stamp: int
     phase: str
-    stance: int | None
+    capture: int | None
     moving: bool
     still_since: int | None
     fault: str | None
     camera_fault: str | None
     hazards: list[str]
 
-    def check(self) -> None:
+    def _check(self) -> None:
         if len(self.hazards) > 16:
             raise ValueError("it has too many hazards")
         _short(self.phase, self.fault or "", self.camera_fault or "", *self.hazards)
 
 
 class Capture(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
-    """Detect markers in each image, and send them as those of a stance."""
+    """Detect markers in each image, and send them as those of this capture, one attempt to measure a stance."""
 
-    stance: int
+    capture: int
 
 
 class EndCapture(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
@@ -166,9 +166,8 @@ class EndCapture(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class Drive(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
-    """Drive through places (x, y) [m] of your odometry frame at a speed [m/s], then turn to `yaw` [rad], if there is one.
-
-    `number` comes back in the event "arrived".
+    """Drive through places (x, y) [m] of your odometry frame at a speed [m/s], then turn to `yaw` [rad], if there is
+    one; `number` comes back in the event "arrived".
     """
 
     number: int
@@ -177,7 +176,7 @@ class Drive(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag
     speed: float
     backwards: bool = True
 
-    def check(self) -> None:
+    def _check(self) -> None:
         numbers = [v for place in self.places for v in place] + [self.yaw or 0.0]
         if len(self.places) > MOST_PLACES or not all(math.isfinite(v) and abs(v) < 1e6 for v in numbers):
             raise ValueError("its places are too many, or none")
@@ -204,8 +203,8 @@ class Command(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
     deadline: int
     body: Body
 
-    def check(self) -> None:
-        self.body.check()
+    def _check(self) -> None:
+        self.body._check()
         if len(self.id) > 64:
             raise ValueError("its id is too long")
 
@@ -217,7 +216,7 @@ class Reply(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
     ok: bool
     text: str = ""
 
-    def check(self) -> None:
+    def _check(self) -> None:
         _short(self.id, self.text)
 
 
@@ -241,7 +240,7 @@ def decode(data: bytes, kind: type[M]) -> M:
     try:
         message = msgspec.msgpack.decode(data, type=kind)
         if isinstance(message, _Message):
-            message.check()
+            message._check()
     except (ValueError, OverflowError, RecursionError, msgspec.MsgspecError) as error:
         raise WireError(f"what came is no {kind.__name__}: {error}") from error
     return message

@@ -1,0 +1,64 @@
+"""A mission as it is seen: in the viewer while it goes on, as a result when it is over."""
+
+import sys
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coloc_graph.online.coordinator import Heard
+    from coloc_graph.stance_solver import EnteredStance
+    from coloc_graph.team import Team
+
+
+@dataclass(frozen=True)
+class Told:
+    """Who hears of a mission; None where nobody looks."""
+
+    entered: "Callable[[EnteredStance], None] | None" = None
+    heard: "Callable[[Heard], None] | None" = None
+
+
+@contextmanager
+def watched(team: "Team", port: int | None, *, browser: bool) -> Iterator[Told]:
+    """A viewer that is fed while a mission goes on, at a `port`; no viewer without one."""
+    if port is None:
+        yield Told()
+        return
+    from coloc_graph.viewer import LivePoses, LiveStance, Scene, Viewer
+
+    with Viewer(Scene(team.names, (), team=team, title="a mission"), port=port) as viewer:
+        print(f"the viewer is at {viewer.url}", file=sys.stderr, flush=True)
+        if browser and sys.stdout.isatty():
+            webbrowser.open(viewer.url)
+        yield Told(
+            lambda one: viewer.publish(LiveStance(one.stance, one.estimate, one.measurements)),
+            lambda one: viewer.publish(LivePoses(one.time, one.T_world_body, one.note)),
+        )
+
+
+def report(folder: Path, truth_path: Path | None = None) -> None:
+    """Solve the record of a mission as it was solved on the way, write the result beside it, and print it."""
+    from coloc_graph.cli.accuracy import print_accuracy, print_calibration, print_last_poses, print_promised
+    from coloc_graph.cli.printing import warn
+    from coloc_graph.pipeline import SolveOptions, solve
+    from coloc_graph.results import assess, write_result
+    from coloc_graph.run import open_run
+
+    solution = solve(open_run(folder / "run.mcap"), SolveOptions(incremental=True))
+    write_result(solution, folder / "result")
+    warn(solution.warnings)
+    assessed = None if truth_path is None else assess(solution, truth_path)
+    if assessed is None:
+        print_last_poses(solution.estimate.trajectories)
+    else:
+        print_accuracy(assessed[0])
+        print_promised(solution.estimate.trajectories)
+    print_calibration(solution.estimate.calibration)
+    estimate = solution.estimate
+    agreement = f", chi2/dof {estimate.chi2 / estimate.dof:.2f}" if estimate.dof > 0 else ""
+    stances = len(solution.run.stances)
+    print(f"{stances} stances{agreement}; {folder / 'run.mcap'} is the record, {folder / 'result'} the result")

@@ -1,0 +1,635 @@
+"""The coordinator of a team in the field: who moves when, what is a stance, and what it says; `Coordinator`."""
+
+import contextlib
+import json
+import logging
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from coloc_graph.errors import ColocError, InputError, RobotError
+from coloc_graph.lie import floor_pose
+from coloc_graph.measurements import Sighting
+from coloc_graph.online.formation import STAGGER, Course, Formation, Planar
+from coloc_graph.online.phases import Change, Phase, Phases
+from coloc_graph.online.record import Record, continued
+from coloc_graph.online.roster import Member, Roster
+from coloc_graph.online.watch import InView, Precision, precision
+from coloc_graph.online.whereabouts import compose, inverse
+from coloc_graph.robot_io.link import CoordinatorLink, Tls
+from coloc_graph.robot_io.wire import Body, Capture, Drive, EndCapture, Event, Halt, Recover, Sample, Status, Wheels
+from coloc_graph.run import Run, Stance
+from coloc_graph.run.schemas import to_ns, to_seconds
+from coloc_graph.stance_solver import EnteredStance, SolveOptions, StanceSolver, measure_stance
+from coloc_graph.team import Team
+
+log = logging.getLogger(__name__)
+
+#: How often is looked what is to be done, and how often a stance's precision [s].
+TICK, JUDGED = 0.03, 0.7
+#: The permission to move is renewed so often while the coordinator is at work, which may take so long [s].
+RENEWED, AT_WORK = 0.1, 0.4
+#: How long a robot has to answer [s].
+ANSWER = 1.0
+#: Before a stance begins, all have stood for this long [s]; it is this much longer than what was seen in it.
+SETTLED, MARGIN = 0.25, 0.02
+#: How long things may take at most [s]: a drive, to find the mover, to get the last images, to be mended.
+DRIVE_TIME, LOOK_TIME, COLLECT_TIME, HOLD_TIME = 40.0, 4.0, 30.0, 120.0
+#: The mover may be out of a view for so long before it turns back [s].
+OUT_OF_VIEW = 0.6
+
+
+@dataclass(frozen=True)
+class MissionOptions:
+    """What a team is to do.
+
+    `goals` are x, y [m] of the way of the team's middle, on a floor whose x axis is the way ahead at the beginning;
+    it ends at the last one or after so many `stances`. A stance goes on until it measures all pairs to within
+    `place_sigma` [m] and `heading_sigma_deg`, with `least_points`, or for `longest` [s]. `speed` is the mover's and
+    that of a leap [m/s]. A stance does not begin where a clock is known worse than `clock_limit` [s]. Of one stance
+    `attempts` are made.
+    """
+
+    goals: tuple[tuple[float, float], ...] = ((7.2, 0.0),)
+    stances: int | None = None
+    mover: str | None = None
+    place_sigma: float = 0.003
+    heading_sigma_deg: float = 0.15
+    least_points: int = 150
+    longest: float = 40.0
+    speed: float = 0.3
+    clock_limit: float = 1e-3
+    attempts: int = 8
+    solve: SolveOptions = field(default_factory=SolveOptions)
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What observers of a mission are told: the time [UTC s], all robots' places (4, 4), and a line for people."""
+
+    time: float
+    T_world_body: dict[str, np.ndarray]
+    note: str
+
+
+class Coordinator:
+    """Leads a team along its goals; a context manager, at whose end all stand.
+
+    Writes into `folder`: run.mcap, the record, and mission.jsonl, what happened when. With `resume` it goes on where a
+    coordinator left off there. `entered` hears of each stance, `heard` twice a second of where all are.
+    Raises `InputError` where the mission cannot begin.
+    """
+
+    def __init__(
+        self,
+        team: Team,
+        folder: str | Path,
+        options: MissionOptions | None = None,
+        *,
+        listen: str = "tcp/127.0.0.1:7447",
+        tls: Tls | None = None,
+        resume: bool = False,
+        entered: Callable[[EnteredStance], None] | None = None,
+        heard: Callable[[Heard], None] | None = None,
+    ) -> None:
+        self.team, self.folder = team, Path(folder)
+        self.options = options or MissionOptions()
+        self.mover = self.options.mover or team.names[-1]
+        if team[self.mover].markers is None:
+            raise InputError(f"{self.mover} is to move and has no markers: give it some, or name another with --mover")
+        self.observers = tuple(name for name in team.names if name != self.mover)
+        if len(self.observers) < 2 or team.reference not in self.observers:
+            raise InputError(
+                f"a mission needs two robots that watch {self.mover}, and the reference {team.reference} among them"
+            )
+        self._entered, self._heard = entered, heard
+        starts, points = _in_world(team, self.mover, self.options.goals)
+        self.formation = Formation(Course(points), self.observers)
+        self._inbox: queue.SimpleQueue[tuple[str, object]] = queue.SimpleQueue()
+        self.solver = StanceSolver(team, self.options.solve)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / "run.mcap"
+        before: Run | None = None
+        if path.exists() and not resume:
+            raise InputError(f"{path} is there already: go on with --resume, or give another folder with --out")
+        epoch = time.time_ns() - time.monotonic_ns()
+        with contextlib.ExitStack() as undo:
+            if path.exists():
+                record, before = continued(path, team)
+                undo.enter_context(record)
+                epoch = max(epoch, to_ns(record.newest()) - time.monotonic_ns())  # time does not run backwards
+            else:
+                record = undo.enter_context(Record(path, team))
+            self.record = record
+            self._log = undo.enter_context((self.folder / "mission.jsonl").open("a", encoding="utf-8"))
+            self.phases = Phases(self._note_phase)
+            link = CoordinatorLink(
+                team,
+                listen=listen,
+                tls=tls,
+                on_sample=lambda name, one: self._inbox.put((name, one)),
+                on_wheels=lambda name, one: self._inbox.put((name, one)),
+                on_event=lambda name, one: self._inbox.put((name, one)),
+                on_status=lambda name, one: self._inbox.put((name, one)),
+                on_presence=lambda name, there: self._inbox.put((name, there)),
+            )
+            self.roster = Roster(record, starts, lambda name: link.clocks[name].to_coordinator, epoch)
+            self.link = undo.enter_context(link)
+            self._close = undo.pop_all()
+        self._places: dict[str, Planar] = {}  # where each robot of the stance's plan stands
+        self._tries = self._rounds = 0
+        self._capturing = self._ways = time.time_ns() // 1_000_000  # no number twice, of whatever coordinator
+        self._plan: tuple[int, str, Planar] | None = None  # the leap into a stance: its number, who, where to
+        self._patrol = np.zeros((0, 2))
+        self._stance: Stance | None = None
+        self._view: InView | None = None
+        self._expected: dict[str, int] = {}
+        self._out_since: float | None = None
+        self._judged = self._told = 0.0
+        self._precision: Precision | None = None
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="measuring")
+        self._judging: Future[Precision] | None = None
+        self._estimating: Future[EnteredStance] | None = None
+        self._ended_at = 0.0
+        self._in: list[Stance] = []
+        self._at_work = time.monotonic()
+        self._latencies: list[float] = []
+        if before is not None:
+            self._go_on(before)
+        self._ended = threading.Event()
+        self._holder = threading.Thread(target=self._hold_permission, name="permission to move", daemon=True)
+        self._holder.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._holder.join(1.0)
+        self._worker.shutdown(wait=True, cancel_futures=True)
+        self._halt_all()
+        self._close.__exit__(kind, error, trace)
+
+    @property
+    def stances(self) -> int:
+        """How many stances are in."""
+        return len(self._in)
+
+    @property
+    def latencies(self) -> tuple[float, ...]:
+        """Of each stance, from its last image to the estimate [s]."""
+        return tuple(self._latencies)
+
+    def run(self, stop: threading.Event) -> Phase:
+        """Lead the team until it is done, has failed, or `stop` is set; the last phase comes back."""
+        steps = {
+            Phase.GATHERING: self._gather,
+            Phase.SYNCHRONISING: self._synchronise,
+            Phase.PLACING: self._place,
+            Phase.LOOKING: self._look,
+            Phase.CAPTURING: self._capture,
+            Phase.TURNING_BACK: self._capture,
+            Phase.COLLECTING: self._collect,
+            Phase.ESTIMATING: self._estimate,
+            Phase.HOLDING: self._hold,
+        }
+        while self.phases.now in steps and not stop.is_set():
+            self._listen()
+            try:
+                trouble = self._trouble()
+                if trouble is None:
+                    steps[self.phases.now]()
+                else:
+                    self._hold_on(trouble)
+            except RobotError as error:
+                self._hold_on(str(error))
+            self._tell()
+        self._halt_all()
+        return self.phases.now
+
+    # what comes in
+
+    def _listen(self) -> None:
+        """Take in all that came, or wait a little for something."""
+        self._at_work = time.monotonic()
+        until = self._at_work + TICK
+        while True:
+            try:
+                name, one = self._inbox.get(timeout=max(until - time.monotonic(), 0.001))
+            except queue.Empty:
+                return
+            self._take(self.roster[name], one)
+            if time.monotonic() > until + 10 * TICK:
+                return
+
+    def _take(self, member: Member, one: object) -> None:
+        match one:
+            case Sample():
+                seen = self.roster.take_sample(member.name, one)
+                if one.capture == self._capturing and self._stance is not None:
+                    member.samples, member.newest = member.samples + 1, seen.time
+                    if self._view is not None:
+                        self._view.take(seen, self.roster[self.mover].whereabouts.place(seen.time))
+            case Wheels():
+                self.roster.take_wheels(member.name, one)
+            case Status():
+                if member.take_status(one):
+                    self._note("session", robot=member.name, session=one.session)
+                self.record.moves(member.name, self.roster.utc(time.monotonic_ns()), one.moving)
+            case Event():
+                self._note("event", robot=member.name, kind=one.kind, text=one.text)
+                member.arrived |= member.way is not None and (one.kind, one.text) == ("arrived", str(member.way.number))
+                member.stopped |= one.kind == "stopped"
+            case bool():
+                member.present = one
+                self._note("presence", robot=member.name, there=one)
+
+    # the phases
+
+    def _gather(self) -> None:
+        waits = self._waits_for()
+        if waits is None:
+            self._enter(Phase.SYNCHRONISING)
+
+    def _synchronise(self) -> None:
+        late = [name for name in self.team.names if not self.link.synchronised(name, self.options.clock_limit)]
+        if not late:
+            self._plan_stance()
+            self._enter(Phase.PLACING)
+        elif self._phase_lasted(HOLD_TIME):
+            self._fail(f"the clocks of {', '.join(late)} are not known to {1e3 * self.options.clock_limit:g} ms")
+
+    def _plan_stance(self) -> None:
+        """Who leaps where, and the mover's way; robots set off."""
+        k = self._next_index()
+        places = self.roster.places()
+        if self._plan is None or self._plan[0] != k:
+            self._plan = (k, *self.formation.next_leap(places)) if self.stances else None
+        if self._plan is not None:
+            _, leaper, to = self._plan
+            places[leaper] = to
+        self._places = {name: places[name] for name in self.observers}
+        self._view = InView(self.team, self.mover, self._places)
+        markers = self.team[self.mover].markers
+        assert markers is not None
+        left = bool((k + self._tries) % 2)
+        self._patrol = self.formation.patrol(self._places, list(self._view.views.values()), markers.p_body, left)
+        for member in self.roster.members.values():
+            member.arrived, member.way = True, None
+        if self._plan is not None:
+            self._drive(leaper, [to[:2]], to[2], backwards=False)
+        self._drive(self.mover, self._patrol[:1], None)
+
+    def _place(self) -> None:
+        self._drive_on()
+        if not all(member.arrived for member in self.roster.members.values()):
+            if self._phase_lasted(DRIVE_TIME):
+                raise RobotError(
+                    f"{self._under_way()} did not arrive within {DRIVE_TIME:.0f} s: see what is in the way"
+                )
+            return
+        if not self._stood(SETTLED):
+            return
+        k = self._next_index()
+        now = self.roster.utc(time.monotonic_ns())
+        self._places = {name: self.roster[name].whereabouts.place() for name in self.observers}
+        self._view = InView(self.team, self.mover, self._places)
+        self._stance = Stance(k, now, now, self.observers, (self.mover,), self._anchors())
+        self._rounds, self._out_since, self._judged, self._precision = 0, None, time.monotonic(), None
+        self._judging = None
+        self._capturing += 1
+        for name in self.observers:
+            self.roster[name].samples = 0
+            self._ask(name, Capture(capture=self._capturing))
+        self._enter(Phase.LOOKING)
+
+    def _look(self) -> None:
+        assert self._view is not None and self._stance is not None
+        missing = self._view.missing()
+        if not missing:
+            self._stance = replace(self._stance, start=self.roster.utc(time.monotonic_ns()))
+            self._drive(self.mover, self._patrol[1:], None)
+            self._enter(Phase.CAPTURING)
+        elif self._phase_lasted(LOOK_TIME):
+            raise RobotError(
+                f"{' and '.join(missing)} see nothing of {self.mover} where it should be: put the robots where they "
+                "are said to stand, clear what is between them, and check that its lights are on"
+            )
+
+    def _capture(self) -> None:
+        assert self._view is not None and self._stance is not None
+        now = time.monotonic()
+        missing = self._view.missing()
+        if not missing:
+            self._out_since = None
+            if self.phases.now == Phase.TURNING_BACK:
+                self._drive(self.mover, self._patrol, None)
+                self._enter(Phase.CAPTURING)
+        elif self._out_since is None:
+            self._out_since = now
+        elif now - self._out_since > OUT_OF_VIEW and self.phases.now == Phase.CAPTURING:
+            self._drive(self.mover, self._patrol[-1:], None)
+            self._enter(Phase.TURNING_BACK, f"{self.mover} left the view of {' and '.join(missing)}")
+        elif now - self._out_since > DRIVE_TIME / 2:
+            raise RobotError(f"{self.mover} did not come back into the view of {' and '.join(missing)}")
+        if self._judging is not None and self._judging.done():
+            self._precision, self._judging = self._judging.result(), None
+            if self._enough(self._precision):
+                self._end_capture("it is enough")
+                return
+        if self._judging is None and now - self._judged > JUDGED:
+            self._judged = now
+            so_far = replace(self._stance, end=self._last_image())
+            self._judging = self._worker.submit(precision, self.record, so_far, self.solver.options.frontend)
+        self._drive_on()
+        if self.roster[self.mover].arrived and self.phases.now == Phase.CAPTURING:
+            self._rounds += 1
+            order = self._patrol[::-1] if self._rounds % 2 else self._patrol
+            self._drive(self.mover, order, None)
+        if self.roster.utc(time.monotonic_ns()) - self._stance.start > self.options.longest:
+            self._end_capture(f"{self.options.longest:g} s are over")
+
+    def _enough(self, found: Precision) -> bool:
+        return (
+            found.points >= self.options.least_points
+            and found.place <= self.options.place_sigma
+            and found.heading <= math.radians(self.options.heading_sigma_deg)
+        )
+
+    def _end_capture(self, why: str) -> None:
+        self._ask(self.mover, Halt())
+        self._expected = {name: int(self._ask(name, EndCapture()) or 0) for name in self.observers}
+        self._enter(Phase.COLLECTING, why)
+
+    def _collect(self) -> None:
+        if any(self.roster[name].samples < expected for name, expected in self._expected.items()):
+            if self._phase_lasted(COLLECT_TIME):
+                raise RobotError(f"not all images of stance {self._next_index()} came within {COLLECT_TIME:.0f} s")
+            return
+        self._measure()
+
+    def _measure(self) -> None:
+        """Have the stance measured and entered."""
+        assert self._stance is not None
+        self._enter(Phase.ESTIMATING)
+        self._ended_at = self._last_image()
+        start, end = self._stance.start - MARGIN, self._ended_at + MARGIN
+        stance = replace(
+            self._stance, start=self.record.rounded(start), end=self.record.rounded(end), anchors=self._anchors()
+        )
+        self._estimating = self._worker.submit(self._enter_stance, stance)
+
+    def _enter_stance(self, stance: Stance) -> EnteredStance:
+        """In the worker's thread: measure a stance and enter it, unless it measures nothing."""
+        pairs = list(measure_stance(self.record, stance, self.solver.options))
+        unusable = [pair.homography.unusable for pair in pairs if pair.homography.unusable]
+        if len(unusable) == len(pairs):
+            raise RobotError(f"stance {stance.index} measures nothing: {unusable[0]}")
+        try:
+            return self.solver.enter(self.record, stance, pairs)
+        except ColocError as error:
+            raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
+
+    def _estimate(self) -> None:
+        if self._estimating is None or not self._estimating.done():
+            return
+        done, self._estimating = self._estimating, None
+        one = done.result()
+        stance = one.stance
+        self.record.complete(stance)
+        self._in.append(stance)
+        latency = self.roster.utc(time.monotonic_ns()) - self._ended_at
+        self._latencies.append(latency)
+        self._fix(one)
+        self._note(
+            "entered",
+            stance=stance.index,
+            anchors=stance.anchors,
+            latency=round(latency, 4),
+            points=min((len(p.correspondences) for p in one.pairs if p.correspondences is not None), default=0),
+            poses={name: np.round(pose.matrix(), 12).tolist() for name, pose in one.estimate.poses.items()},
+            refused=[str(refusal.measurement) for refusal in one.estimate.refused],
+        )
+        if self._entered is not None:
+            self._entered(one)
+        self._tries, self._stance, self._view = 0, None, None
+        if self._arrived_at_goal():
+            self._enter(Phase.DONE, f"{self.stances} stances")
+        else:
+            self._plan_stance()
+            self._enter(Phase.PLACING)
+
+    def _fix(self, one: EnteredStance) -> None:
+        """Where the robots are follows the estimate."""
+        seen = {m.seen: m.time for m in one.measurements if isinstance(m, Sighting)}
+        for name, pose in one.estimate.poses.items():
+            if name in one.stance.observers or name in seen:
+                T = pose.matrix()
+                place = float(T[0, 3]), float(T[1, 3]), math.atan2(T[1, 0], T[0, 0])
+                self.roster[name].whereabouts.fix(seen.get(name, one.stance.start), place)
+
+    def _hold(self) -> None:
+        waits = self._waits_for()
+        if waits is None:
+            self._enter(Phase.SYNCHRONISING)
+        elif self._phase_lasted(HOLD_TIME):
+            self._fail(f"nothing has changed for {HOLD_TIME:.0f} s: {waits}")
+
+    def _hold_on(self, why: str) -> None:
+        """Stop everything until it is mended; the stance that was under way is void, and tried again."""
+        self._stance = self._view = None
+        self._tries += 1
+        if self._tries >= self.options.attempts:
+            self._fail(f"{self._tries} attempts of stance {self._next_index()} went wrong, the last one: {why}")
+            return
+        self._enter(Phase.HOLDING, why)
+        self._halt_all()
+
+    def _fail(self, why: str) -> None:
+        self._enter(Phase.FAILED, why)
+
+    # what is asked
+
+    def _trouble(self) -> str | None:
+        """Why what is under way cannot go on."""
+        if self.phases.now in (Phase.GATHERING, Phase.SYNCHRONISING, Phase.HOLDING, Phase.COLLECTING, Phase.ESTIMATING):
+            return None  # all stand, and wait
+        for name, member in self.roster.members.items():
+            drives = name == self.mover or (self._plan is not None and self._plan[1] == name)
+            why = member.trouble(drives=drives)
+            if why is None and not self.link.synchronised(name, self.options.clock_limit):
+                why = f"the clock of {name} jumped, or is not known to {1e3 * self.options.clock_limit:g} ms any more"
+            if why is not None:
+                return why
+        if self._stance is not None:
+            moved = [n for n in self.observers if self.roster[n].whereabouts.moved_since(self._stance.start)]
+            if moved:
+                return f"{' and '.join(moved)} moved during stance {self._stance.index}"
+        return None
+
+    def _waits_for(self) -> str | None:
+        """What keeps all from beginning; robots that stopped for a reason are asked to go on, now and then."""
+        for name, member in self.roster.members.items():
+            why = member.trouble(drives=True)
+            if why is not None:
+                fault = member.status is not None and member.status.fault
+                if fault and member.present and time.monotonic() - self._judged > 1.0:
+                    self._judged = time.monotonic()
+                    with contextlib.suppress(RobotError):
+                        self._ask(name, Recover())
+                return why
+            if not member.whereabouts.known:
+                return f"the wheels of {name} have said nothing yet"
+        return None if self._phase_lasted(0.5) else "a moment"
+
+    def _anchors(self) -> tuple[str, ...]:
+        """Who watched in the stance before and has stood since by its wheels, and was not bumped."""
+        if not self.stances:
+            return ()
+        before = self._in[-1]
+        return tuple(
+            name
+            for name in self.observers
+            if name in before.observers and not self.roster[name].whereabouts.moved_since(before.end)
+        )
+
+    def _stood(self, seconds: float) -> bool:
+        """Whether all robots have stood for so long."""
+        for member in self.roster.members.values():
+            since = member.status.still_since if member.status is not None else None
+            if since is None or time.monotonic_ns() - member.to_coordinator(since) < seconds * 1e9:
+                return False
+        return True
+
+    def _last_image(self) -> float:
+        return max(self.roster[name].newest for name in self.observers)
+
+    def _next_index(self) -> int:
+        return self._in[-1].index + 1 if self._in else 0
+
+    def _arrived_at_goal(self) -> bool:
+        if self.options.stances is not None and self.stances >= self.options.stances:
+            return True
+        reached = self.formation.progress({n: self.roster[n].whereabouts.place() for n in self.observers})
+        return reached >= self.formation.course.length - STAGGER / 2
+
+    def _under_way(self) -> str:
+        return " and ".join(name for name, member in self.roster.members.items() if not member.arrived)
+
+    def _phase_lasted(self, seconds: float) -> bool:
+        return time.monotonic() - self.phases.since > seconds
+
+    # what is said
+
+    def _drive(
+        self, name: str, places: Iterable[Sequence[float]], yaw: float | None, *, backwards: bool = True
+    ) -> None:
+        """Send a robot through places in the world."""
+        member = self.roster[name]
+        own = [member.whereabouts.in_odometry((float(x), float(y), 0.0))[:2] for x, y in places]
+        last = None if yaw is None else member.whereabouts.in_odometry((0.0, 0.0, yaw))[2]
+        self._ways += 1
+        member.way = Drive(number=self._ways, places=own, yaw=last, speed=self.options.speed, backwards=backwards)
+        member.arrived = member.stopped = False
+        self._ask(name, member.way)
+
+    def _drive_on(self) -> None:
+        """Robots that stopped on their way, for want of a word in time, go on."""
+        for name, member in self.roster.members.items():
+            if member.stopped and not member.arrived and member.way is not None:
+                member.stopped = False
+                self._note("drives on", robot=name)
+                self._ask(name, member.way)
+
+    def _ask(self, name: str, body: Body) -> str:
+        """Ask a robot, which must answer and agree; what it says comes back."""
+        self._at_work = time.monotonic() + ANSWER
+        reply = self.link.ask(name, body, ANSWER)
+        self._at_work = time.monotonic()
+        if not reply.ok:
+            raise RobotError(f"{name} refuses: {reply.text}")
+        return reply.text
+
+    def _halt_all(self) -> None:
+        """Stop all robots, as far as they hear it; those that do not stop by themselves."""
+        for name, member in self.roster.members.items():
+            if member.present:
+                for body in (Halt(), EndCapture()):
+                    with contextlib.suppress(RobotError):
+                        self.link.ask(name, body, 0.3)
+
+    def _hold_permission(self) -> None:
+        """The thread that lets robots move as long as the coordinator is at work."""
+        while not self._ended.wait(RENEWED):
+            if time.monotonic() - self._at_work < AT_WORK:
+                self.link.hold()
+
+    # what is noted
+
+    def _enter(self, phase: Phase, why: str = "") -> None:
+        self.phases.enter(phase, self._next_index(), why)
+
+    def _note_phase(self, change: Change) -> None:
+        self._note("phase", phase=str(change.phase), stance=change.stance, why=change.why)
+
+    def _note(self, what: str, **more: object) -> None:
+        row = {"time": to_seconds(time.monotonic_ns() + self.roster.epoch), "what": what, **more}
+        self._log.write(json.dumps(row) + "\n")
+        self._log.flush()
+
+    def _tell(self) -> None:
+        """Tell who listens where all are, ten times a second."""
+        now = time.monotonic()
+        if self._heard is None or now - self._told < 0.1:
+            return
+        self._told = now
+        T = {name: floor_pose(*place) for name, place in self.roster.places().items()}
+        note = f"stance {self._next_index()}: {self.phases.now}"
+        if self.phases.now in (Phase.CAPTURING, Phase.TURNING_BACK) and self._precision is not None:
+            found = self._precision
+            note += f", {found.points} points"
+            if not found.why:
+                note += f", {1e3 * found.place:.1f} mm, {math.degrees(found.heading):.2f} deg"
+        self._heard(Heard(self.roster.utc(time.monotonic_ns()), T, note))
+
+    def _go_on(self, before: Run) -> None:
+        """Enter the stances of a run that ended, and find where the robots are."""
+        self.roster.go_on()
+        for stance in before.stances:
+            self._fix(self.solver.enter(before, stance))
+            self._in.append(stance)
+        self._note("resumed", stances=len(before.stances))
+        log.info("goes on after %d stances", len(before.stances))
+
+
+def _in_world(
+    team: Team, mover: str, goals: tuple[tuple[float, float], ...]
+) -> tuple[dict[str, Planar], tuple[tuple[float, float], ...]]:
+    """Where the robots begin, and the course, in the world, which is the reference's body at the beginning.
+
+    Both are given on a floor whose x axis is the way ahead and whose origin is the observers' middle.
+    """
+    formation = Formation(Course(((0.0, 0.0), (10.0, 0.0))), tuple(n for n in team.names if n != mover))
+    starts: dict[str, Planar] = {}
+    for n, name in enumerate(formation.observers):
+        starts[name] = formation.place(name, STAGGER * (n % 2))
+    starts[mover] = 1.28, 0.0, 0.0
+    for robot in team.robots:
+        if robot.devices is not None and robot.devices.start is not None:
+            x, y, yaw_deg = robot.devices.start
+            starts[robot.name] = x, y, math.radians(yaw_deg)
+    T_world_floor = inverse(starts[team.reference])
+    middle = np.mean([starts[name][:2] for name in formation.observers], axis=0)
+    points = [compose(T_world_floor, (float(x), float(y), 0.0))[:2] for x, y in ((middle[0], 0.0), *goals)]
+    return {name: compose(T_world_floor, place) for name, place in starts.items()}, tuple(points)

@@ -1,0 +1,296 @@
+"""A robot's own program: it sees, counts its wheels, drives where it is told to, and stops by itself."""
+
+import contextlib
+import logging
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from coloc_graph.errors import CameraError, ColocError, InputError, RobotError
+from coloc_graph.frontend import detector_for
+from coloc_graph.online.motion import Follower
+from coloc_graph.online.odometry_join import JoinedOdometry
+from coloc_graph.online.record import Record
+from coloc_graph.robot_io.camera import open_camera
+from coloc_graph.robot_io.camera_source import CameraSource, clock_ahead
+from coloc_graph.robot_io.create import Create
+from coloc_graph.robot_io.link import RobotLink, Tls
+from coloc_graph.robot_io.wire import (
+    Body,
+    Capture,
+    Drive,
+    EndCapture,
+    Event,
+    Halt,
+    Recover,
+    Sample,
+    Status,
+    Wheels,
+)
+from coloc_graph.run import Detections, OdometrySample
+from coloc_graph.run.schemas import to_seconds
+from coloc_graph.team import Team
+
+log = logging.getLogger(__name__)
+
+#: Control of the motion, and word of how it is [s].
+CONTROL, REPORT = 0.04, 0.1
+#: Without a word from the coordinator for this long it stops [s].
+LEASE = 0.3
+#: So long a camera may be without an image [s]; a lost one, or lost wheels, are opened again so often [s].
+NO_IMAGE, REOPEN = 1.0, 1.0
+
+
+class RobotProgram:
+    """One robot of a team, for as long as `run` runs; a context manager, at whose end the wheels stand still.
+
+    `camera` is a source of images, `wheels` a serial port (None: it only watches). What it sees and does is recorded
+    in `folder`, by its own clock. Raises `InputError`, `CameraError`, `RobotError` where it cannot begin.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        team: Team,
+        *,
+        connect: str,
+        folder: str | Path,
+        camera: str | None = None,
+        wheels: str | None = None,
+        model: int | None = None,
+        tls: Tls | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.robot, self.team, self._clock = team[name], team, clock
+        self.name = name
+        devices = self.robot.devices
+        spec = camera or (devices.camera if devices else None)
+        if spec is None:
+            raise InputError(f"robot {name} has no camera: give one with --camera, or in team.toml under devices")
+        port = wheels or (devices.wheels if devices else None)
+        model = model or (devices.model if devices else None)
+        self.session = uuid.uuid4().hex
+        self._epoch = time.time_ns() - clock()  # fixed: steps of the system's clock are not ours
+        self._lock = threading.RLock()
+        self._ended = threading.Event()
+        self._capture: int | None = None
+        self._seen = self._samples = self._rolled = self._events = self._drive = 0
+        self._follower: Follower | None = None
+        self._still_since: int | None = clock()
+        self._odometry = JoinedOdometry()
+        self._pose = (0.0, 0.0, 0.0)
+        self._wheels_fault: str | None = None
+        self._camera_fault: str | None = None
+        colours = {robot.markers.hue_deg for robot in team.robots if robot.markers and robot.name != name}
+        watched = next((robot.markers for robot in team.robots if robot.markers and robot.name != name), None)
+        if len(colours) > 1:
+            raise InputError("the robots' markers are of several colours, and a robot's program looks for one")
+        self._detect = detector_for(watched, self.robot.camera)
+        with contextlib.ExitStack() as undo:
+            self._camera: CameraSource = undo.enter_context(open_camera(spec, self.robot.camera, name, clock))
+            self._wheels: Create | None = None
+            if port is not None:
+                self._wheels = undo.enter_context(Create(port, model, robot=name, epoch=0.0))
+                self._wheels_fault = self._wheels.fault
+            self._record = undo.enter_context(Record(_new_file(Path(folder), name), team))
+            self._link = undo.enter_context(
+                RobotLink(name, connect=connect, handler=self._obey, session=self.session, tls=tls, clock=clock)
+            )
+            self._watcher = threading.Thread(target=self._watch, name=f"camera of {name}", daemon=True)
+            self._watcher.start()
+            undo.callback(self._end)
+            self._close = undo.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close.__exit__(kind, error, trace)
+
+    def _end(self) -> None:
+        self._ended.set()
+        self._halt()
+        self._watcher.join(2.0)
+
+    def run(self, stop: threading.Event) -> None:
+        """Control the wheels and report, until `stop` is set."""
+        report, reopened = 0.0, 0.0
+        while not stop.wait(CONTROL):
+            self._roll()
+            now = time.monotonic()
+            if self._wheels is not None and self._wheels_lost and now - reopened > REOPEN:
+                reopened = now
+                threading.Thread(target=self._reopen_wheels, name=f"wheels of {self.name}", daemon=True).start()
+            if now - report >= REPORT:
+                report = now
+                self._link.put(self._status())
+
+    def _obey(self, body: Body) -> str:
+        """Carry out a command; what comes back is told the coordinator. Raises `RobotError` where it cannot."""
+        with self._lock:
+            match body:
+                case Capture(capture=capture):
+                    self._capture, self._seen = capture, 0
+                case EndCapture():
+                    self._capture = None
+                    return str(self._seen)
+                case Drive():
+                    self._set_off(Follower(body.places, body.yaw, body.speed, backwards=body.backwards), body.number)
+                case Halt():
+                    self._halt()
+                case Recover():
+                    self._recover()
+        return ""
+
+    def _set_off(self, follower: Follower, number: int) -> None:
+        if self._wheels is None:
+            raise RobotError(f"robot {self.name} has no wheels: give their port with --wheels")
+        if self._wheels_fault is not None:
+            raise RobotError(f"robot {self.name} does not drive: {self._wheels_fault}")
+        self._follower, self._drive = follower, number
+
+    def _halt(self) -> None:
+        with self._lock:
+            self._follower = None
+            if self._wheels is not None:
+                with contextlib.suppress(RobotError):
+                    self._wheels.stop()
+
+    def _recover(self) -> None:
+        self._follower = None
+        if self._wheels is not None and not self._wheels_lost:
+            self._wheels.recover()
+            self._wheels_fault = self._wheels.fault
+
+    @property
+    def _wheels_lost(self) -> bool:
+        return self._wheels is not None and self._wheels.lost
+
+    def _reopen_wheels(self) -> None:
+        """After its line was lost: a new one, as soon as there is one."""
+        wheels = self._wheels
+        assert wheels is not None
+        with contextlib.suppress(ColocError):
+            wheels.close()
+            with self._lock:
+                for sample in wheels.take_odometry():
+                    self._take(self._odometry.take(sample))
+                self._odometry.restart(moving=True)
+            wheels.open()
+            self._wheels_fault = wheels.fault
+            self._tell("recovered", "the line to the wheels is back")
+
+    def _roll(self) -> None:
+        """One step of control: take what the wheels say, and steer or stop."""
+        wheels = self._wheels
+        if wheels is None:
+            return
+        with self._lock:
+            for sample in wheels.take_odometry():
+                self._take(self._odometry.take(sample))
+            fault = wheels.fault
+            if fault is not None and fault != self._wheels_fault:
+                self._tell("fault", fault)
+            self._wheels_fault = fault
+            moving = self._follower is not None or wheels.moving
+            self._record.moves(self.name, self._utc(self._clock()), moving)
+            if moving:
+                self._still_since = None
+            elif self._still_since is None:
+                self._still_since = self._clock()
+            if self._follower is None:
+                return
+            if time.monotonic_ns() - self._link.last_heard > LEASE * 1e9:
+                self._halt()
+                self._tell("stopped", f"no word from the coordinator for {LEASE} s")
+                return
+            try:
+                twist = self._follower.step(*self._pose)
+                if twist is None:
+                    self._halt()
+                    self._tell("arrived", str(self._drive))
+                else:
+                    wheels.drive(twist.v, twist.w)
+            except RobotError as error:
+                self._halt()
+                self._wheels_fault = wheels.fault
+                self._tell("fault", str(error))
+
+    def _take(self, sample: OdometrySample) -> None:
+        self._pose = tuple(map(float, sample.pose))  # type: ignore[assignment]
+        stamp = round(sample.time * 1e9) + clock_ahead(self._clock)
+        self._link.put(Wheels.of(sample, session=self.session, number=self._rolled, stamp=stamp))
+        self._rolled += 1
+        self._record.take(replace(sample, time=self._utc(stamp)))
+
+    def _watch(self) -> None:
+        """The camera's thread: what is in each image while a stance is captured, and whether images come."""
+        reopened = 0.0
+        while not self._ended.is_set():
+            try:
+                frame = self._camera.read(NO_IMAGE)
+                self._camera_fault = None
+            except CameraError as error:
+                self._camera_fault = str(error)
+                if self._camera.fault is not None and time.monotonic() - reopened > REOPEN:
+                    reopened = time.monotonic()
+                    with contextlib.suppress(CameraError):
+                        self._camera.reopen()
+                self._ended.wait(0.05)
+                continue
+            if self._capture is None:
+                continue
+            blobs = self._detect(frame.pixels)
+            stamp = frame.stamp_ns
+            seen = Detections(
+                self.name, self._utc(stamp), blobs.uv, blobs.covariance, ("",) * len(blobs.uv),
+                blobs.flags, blobs.peak, blobs.area,
+            )  # fmt: skip
+            with self._lock:
+                if self._capture is not None:
+                    number, capture = self._samples, self._capture
+                    self._link.put(Sample.of(seen, session=self.session, number=number, capture=capture, stamp=stamp))
+                    self._record.take(seen)
+                    self._samples += 1
+                    self._seen += 1
+
+    def _utc(self, stamp: int) -> float:
+        return to_seconds(stamp + self._epoch)
+
+    def _tell(self, kind: str, text: str) -> None:
+        log.info("%s: %s %s", self.name, kind, text)
+        with self._lock:
+            self._link.put(Event(session=self.session, number=self._events, stamp=self._clock(), kind=kind, text=text))
+            self._events += 1
+
+    def _status(self) -> Status:
+        with self._lock:
+            hazards: list[str] = []
+            if self._wheels is not None:
+                with contextlib.suppress(RobotError):
+                    hazards = list(self._wheels.state.hazards().values())
+            phase = "driving" if self._follower else "idle" if self._capture is None else "capturing"
+            return Status(
+                session=self.session,
+                stamp=self._clock(),
+                phase=phase,
+                capture=self._capture,
+                moving=self._still_since is None,
+                still_since=self._still_since,
+                fault=self._wheels_fault,
+                camera_fault=self._camera_fault,
+                hazards=hazards,
+            )
+
+
+def _new_file(folder: Path, name: str) -> Path:
+    """A file of the robot's that is not there yet: a program that begins anew never writes over what it recorded."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return next(path for n in range(100_000) if not (path := folder / f"{name}-{n}.mcap").exists())
