@@ -5,19 +5,17 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coloc_graph.viewer import palette
 from coloc_graph.viewer.motion import pose_at
 from coloc_graph.viewer.palette import Colours
-from coloc_graph.viewer.scene import Array, Index, Layer, Scene
-
-Float32 = NDArray[np.float32]
+from coloc_graph.viewer.prepared import Z_ODOMETRY, Z_SIGHTING, Float32, doubts_of, edges_of, links_of
+from coloc_graph.viewer.scene import TRUE, Array, Edges, Index, Layer, Links, Mask, Scene
 
 #: So many poses are drawn at most: while time moves, and once it rests.
-MOVING, RESTING = 2_400, 20_000
-#: Heights [m] over the floor: ellipses, rings, wedges, trajectories, edges.
-Z_ELLIPSE, Z_RING, Z_WEDGE, Z_WAY, Z_EDGE = 0.004, 0.006, 0.008, 0.010, 0.13
+MOVING, RESTING = 1_800, 20_000
+#: Heights [m] over the floor: ellipses, rings, wedges, trajectories.
+Z_ELLIPSE, Z_RING, Z_WEDGE, Z_WAY = 0.004, 0.006, 0.008, 0.010
 #: Dashes and gaps of what is refused, and of what is chained, are so long [m]; so many at most.
 DASH, MOST_DASHES = 0.06, 4_000
 WEDGE_REACH = 0.3
@@ -34,6 +32,8 @@ class ViewState:
     wedges: bool = True
     edges: bool = True
     stays: bool = True
+    sightings: bool = False
+    odometry: bool = False
     k_sigma: float = 3.0
     picked: int | None = None
     aside: float = 0.0
@@ -72,11 +72,13 @@ class Frame:
     edges_now: Lines
     refused: Lines
     picked: Lines
+    sightings: Lines
+    odometry: Lines
     ellipses: Batch
     wedges: Batch
     rings: Batch
     edge_ids: Index
-    edge_points: Array
+    edge_points: Float32
     note: str = field(default="")
 
 
@@ -95,27 +97,45 @@ def frame_of(scene: Scene, state: ViewState) -> Frame:
     rows = thinned_rows(row, most)
     base = scene.layers[0] if scene.layers else None
     poses = np.full((len(scene.robots), 4), np.nan)
-    ways, ellipses, wedges, rings, edge_parts = {}, NO_BATCH, NO_BATCH, NO_BATCH, _no_edges()
+    parts = _Parts()
     if base is not None and row >= 0:
         poses = np.concatenate([pose_at(scene, base, n, np.array([state.time])) for n in range(len(scene.robots))])
         for depth, layer in enumerate(scene.layers):
             if layer in shown:
-                ways[layer.name] = _way(scene, layer, rows, colours, state, depth)
-        if state.ellipses or state.wedges:
-            ellipses, wedges = _doubts(base, rows, colours, state)
+                parts.ways[layer.name] = _way(scene, layer, rows, colours, state, depth)
+        # the poses that the robots stand at are doubted whether or not their way is shown
+        drawn = [(base, scene.edges, 0)]
+        if scene.other is not None and scene.other in shown:
+            drawn.append((scene.other, scene.other_edges, len(scene.edges)))
+        for layer, edges, first in drawn:
+            if state.ellipses or state.wedges:
+                parts.doubt(layer, rows, colours, state)
+            if state.edges:
+                parts.tie(layer, edges, first, row, most, state)
         if state.stays:
-            rings = _rings(scene, base, row, most, colours, dark)
-        if state.edges:
-            edge_parts = _edges(scene, base, row, most, state)
+            parts.rings = _rings(scene, base, row, most, colours)
+        if state.sightings:
+            parts.lines["sightings"] = [_linked(base, scene.sightings, Z_SIGHTING, palette.SIGHTING, row, most, dark)]
+        if state.odometry:
+            parts.lines["odometry"] = [_linked(base, scene.odometry, Z_ODOMETRY, palette.ODOMETRY, row, most, dark)]
     count = row + 1
     note = "" if len(rows) >= count else (
         f"{len(rows):,} of {count:,} stances are drawn, the last {most // 2:,} among them"
         + ("" if state.rests else "; more when time rests")
     )  # fmt: skip
     return Frame(
-        row, poses, tuple(scene.roles(row, robot) for robot in scene.robots), ways, *edge_parts[:4],
-        ellipses if state.ellipses else NO_BATCH, wedges if state.wedges else NO_BATCH, rings, *edge_parts[4:], note,
-    )  # fmt: skip
+        row=row,
+        poses=poses,
+        roles=tuple(scene.roles(row, robot) for robot in scene.robots),
+        ways=parts.ways,
+        **{name: joined(lines) for name, lines in parts.lines.items()},
+        ellipses=_batch(parts.ellipses) if state.ellipses else NO_BATCH,
+        wedges=_batch(parts.wedges) if state.wedges else NO_BATCH,
+        rings=parts.rings,
+        edge_ids=np.concatenate([np.zeros(0, np.int64), *parts.edge_ids]),
+        edge_points=np.concatenate([np.zeros((0, 2, 3), np.float32), *parts.edge_points]),
+        note=note,
+    )
 
 
 def thinned_rows(row: int, most: int) -> Index:
@@ -123,150 +143,147 @@ def thinned_rows(row: int, most: int) -> Index:
     if row + 1 <= most:
         return np.arange(row + 1)
     recent = max(most // 2, 1)
-    early = np.linspace(0, row - recent, max(most - recent, 1)).round().astype(np.int64)
+    count = max(most - recent, 1)
+    early = np.arange(count) * (row - recent) // max(count - 1, 1)
     rows = np.concatenate([early, np.arange(row - recent + 1, row + 1)])
     return np.asarray(rows[np.append(True, np.diff(rows) > 0)])
 
 
 def _way(scene: Scene, layer: Layer, rows: Index, colours: Colours, state: ViewState, depth: int) -> Lines:
-    parts: list[Lines] = []
-    is_base = depth == 0
-    for number in range(len(scene.robots)):
-        points = layer.xyz[number, rows]
-        points = points[np.isfinite(points[:, 0])]
-        if is_base and len(points):  # and the way it is on now
-            start = scene.middle(int(rows[-1]))
-            if state.time > start:
-                steps = np.linspace(start, state.time, 24)
-                points = np.concatenate([points, pose_at(scene, layer, number, steps)[:, :3]])
-        if len(points) < 2:
-            continue
-        segments = np.stack([points[:-1], points[1:]], axis=1)
-        segments = segments[np.abs(segments[:, 1] - segments[:, 0]).max(axis=1) > 1e-6]
-        colour = colours[number]
-        if layer.name == "true":
-            colour = palette.ink(state.dark)
-        elif layer.aside:
-            colour = palette.faded(colour, state.dark, 0.25)
-        elif not is_base:
-            colour = palette.faded(colour, state.dark, 0.45)
-        if layer.name == "chained" or (layer.aside and not state.aside):
-            segments = dashed(segments)
-        parts.append(Lines(_f32(segments), np.broadcast_to(colour, (len(segments), 2, 3))))
-    if not parts:
-        return NO_LINES
-    points = np.concatenate([one.points for one in parts]).astype(np.float32)
-    points[..., 2] = Z_WAY + 0.001 * depth
+    xyz, there = layer.xyz[:, rows], layer.there[:, rows]
+    before = np.maximum.accumulate(np.where(there, np.arange(len(rows)), -1), axis=1)[:, :-1]
+    number, at = np.nonzero(there[:, 1:] & (before >= 0))
+    a, b = xyz[number, before[number, at]], xyz[number, at + 1]
+    moved = (a != b).any(axis=1)
+    number, segments = number[moved], np.stack([a[moved], b[moved]], axis=1)
+    if depth == 0 and len(rows) and state.time > (start := scene.middle(int(rows[-1]))):  # and the way it is on now
+        steps = np.linspace(start, state.time, 24)
+        for one in range(len(scene.robots)):
+            now = pose_at(scene, layer, one, steps)[:, :3]
+            if np.isfinite(now).all():
+                segments = np.concatenate([segments, np.stack([now[:-1], now[1:]], axis=1)])
+                number = np.append(number, np.full(len(now) - 1, one))
+    if layer.name == TRUE:
+        tints = np.broadcast_to(palette.ink(state.dark), colours.shape)
+    else:
+        tints = palette.faded(colours, state.dark, 0.25 if layer.aside else 0.45 if depth else 0.0)
+    points: Array | Float32 = segments
+    tint = tints[number]
+    if layer.name == "chained" or (layer.aside and not state.aside):
+        points, which = dashed(segments)
+        tint = tint[which]
+    raised = points.astype(np.float32)
+    raised[..., 2] = Z_WAY + 0.001 * depth
     if layer.aside:
-        points[..., 1] += state.aside
-    return Lines(points, np.concatenate([one.colours for one in parts]))
+        raised[..., 1] += state.aside
+    return Lines(raised, np.repeat(tint[:, None], 2, axis=1))
 
 
-def dashed(segments: Array) -> Array:
-    """Segments (n, 2, 3) cut into dashes, as they are where that would be too many."""
+def dashed(segments: Array | Float32) -> tuple[Array | Float32, Index]:
+    """Segments (n, 2, 3) cut into dashes, and of which each is one; as they are where that would be too many."""
     length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     count = np.maximum(np.ceil(length / (2 * DASH)).astype(int), 1)
     if not len(segments) or count.sum() > MOST_DASHES:
-        return segments
+        return segments, np.arange(len(segments))
     which = np.repeat(np.arange(len(segments)), count)
     step = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
     low = step / count[which]
     high = low + 0.55 / count[which]
     a, b = segments[which, 0], segments[which, 1] - segments[which, 0]
-    return np.stack([a + low[:, None] * b, a + high[:, None] * b], axis=1)
+    return np.stack([a + low[:, None] * b, a + high[:, None] * b], axis=1), which
 
 
-def _doubts(layer: Layer, rows: Index, colours: Colours, state: ViewState) -> tuple[Batch, Batch]:
-    """Ellipses of x, y and wedges of the heading at all places."""
-    number, at = np.nonzero(layer.arrived[:, rows])
-    at = rows[at]
-    covariance, sigma = layer.covariance[number, at], layer.yaw_sigma[number, at]
-    known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(sigma)
-    number, at, covariance, sigma = number[known], at[known], covariance[known], sigma[known]
-    if not len(number):
-        return NO_BATCH, NO_BATCH
-    places, angle = layer.xyz[number, at], layer.yaw[number, at]
-    axes, direction = ellipse_axes(covariance)
-    axes = np.maximum(state.k_sigma * axes, 1e-5)
-    flat = np.ones((len(axes), 1))
-    half = np.tan(np.minimum(state.k_sigma * sigma, 1.2))[:, None]
-    colour = colours[number]
-    ellipses = Batch(about_z(direction), _raised(places, Z_ELLIPSE), _f32(np.concatenate([axes, flat], 1)), colour)
-    scale = np.concatenate([WEDGE_REACH * flat, WEDGE_REACH * np.maximum(half, 0.01), flat], axis=1)
-    return ellipses, Batch(about_z(angle), _raised(places, Z_WEDGE), _f32(scale), colour)
+class _Parts:
+    """A frame while it is put together, of one result or of two."""
+
+    def __init__(self) -> None:
+        self.ways: dict[str, Lines] = {}
+        self.lines: dict[str, list[Lines]] = {
+            name: [] for name in ("edges", "edges_now", "refused", "picked", "sightings", "odometry")
+        }
+        self.ellipses: list[Batch] = []
+        self.wedges: list[Batch] = []
+        self.rings = NO_BATCH
+        self.edge_ids: list[Index] = []
+        self.edge_points: list[Float32] = []
+
+    def doubt(self, layer: Layer, rows: Index, colours: Colours, state: ViewState) -> None:
+        """Ellipses of x, y and wedges of the heading at all places of a layer."""
+        drawn = doubts_of(layer)
+        number, at = np.nonzero(drawn.known[:, rows])
+        at = rows[at]
+        places = layer.xyz[number, at].astype(np.float32)
+        places[:, 1] += state.aside if layer.aside else 0.0
+        axes = np.ones((2, len(at), 3), np.float32)
+        axes[0, :, :2] = np.maximum(state.k_sigma * drawn.axes[number, at], 1e-5)
+        half = np.tan(np.minimum(state.k_sigma * layer.yaw_sigma[number, at], 1.2))
+        axes[1, :, 0], axes[1, :, 1] = WEDGE_REACH, WEDGE_REACH * np.maximum(half, 0.01)
+        colour = palette.faded(colours, state.dark, 0.5 if layer.aside else 0.0)[number]
+        self.ellipses.append(Batch(drawn.of_place[number, at], _raised(places, Z_ELLIPSE), axes[0], colour))
+        self.wedges.append(Batch(drawn.of_heading[number, at], _raised(places, Z_WEDGE), axes[1], colour))
+
+    def tie(self, layer: Layer, edges: Edges, first: int, row: int, most: int, state: ViewState) -> None:
+        """Edges so far, those of this stance, the refused ones dashed, and the one that is picked."""
+        drawn = edges_of(layer, edges, state.dark)
+        ids = thinned_rows(int(np.searchsorted(edges.rows, row, side="right")) - 1, most)
+        ids = ids[drawn.there[ids]]
+        ends = drawn.ends[ids]
+        ends[..., 1] += state.aside if layer.aside else 0.0
+        used = edges.used[ids]
+        now = np.arange(len(ids)) >= np.searchsorted(edges.rows[ids], row)  # they are in the order of the stances
+        self._add("edges", ends, drawn.past[ids], used & ~now, dashes=layer.aside and not state.aside)
+        self._add("edges_now", ends, drawn.now[ids], used & now, dashes=layer.aside and not state.aside)
+        grey = np.broadcast_to(palette.grey(state.dark), (len(ids), 3))
+        self._add("refused", ends, grey, ~used, dashes=True)
+        picked = ids == (-1 if state.picked is None else state.picked - first)
+        self._add("picked", ends, np.broadcast_to(palette.PICKED, (len(ids), 3)), picked)
+        self.edge_ids.append(ids + first)
+        self.edge_points.append(ends)
+
+    def _add(self, name: str, ends: Float32, colours: Colours, which: Mask, *, dashes: bool = False) -> None:
+        if not which.any():
+            return
+        points: Array | Float32 = ends[which]
+        tints = colours[which]
+        if dashes:
+            points, of = dashed(points)
+            tints = tints[of]
+        self.lines[name].append(Lines(np.asarray(points, np.float32), np.repeat(tints[:, None], 2, axis=1)))
 
 
-def ellipse_axes(covariance: Array) -> tuple[Array, Array]:
-    """Semi-axes (n, 2) [m], the longer first, and the longer one's direction (n,) [rad] of covariances (n, 2, 2)."""
-    a, b, c = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
-    middle, spread = (a + b) / 2, np.hypot((a - b) / 2, c)
-    axes = np.sqrt(np.stack([middle + spread, middle - spread], axis=1).clip(min=0))
-    return axes, np.arctan2(c, (a - b) / 2) / 2
+def _linked(layer: Layer, links: Links, z: float, colour: Colours, row: int, most: int, dark: bool) -> Lines:
+    """Links so far, thinned as all else."""
+    ids = thinned_rows(int(np.searchsorted(links.rows_j, row, side="right")) - 1, most)
+    ends = links_of(layer, links, z)[ids]
+    ends = ends[np.isfinite(ends).all(axis=(1, 2))]
+    return Lines(ends, np.broadcast_to(palette.seen_on(colour, dark), (len(ends), 2, 3)))
 
 
-def _rings(scene: Scene, layer: Layer, row: int, most: int, colours: Colours, dark: bool) -> Batch:
+def _rings(scene: Scene, layer: Layer, row: int, most: int, colours: Colours) -> Batch:
     """A ring wherever a robot stayed put from one stance to the next, so far."""
-    stayed = scene.stayed[: np.searchsorted(scene.stayed[:, 1], row, side="right")]
-    stayed = stayed[thinned_rows(len(stayed) - 1, most)] if len(stayed) else stayed
-    number, at = stayed.T
+    count = int(np.searchsorted(scene.stayed[:, 1], row, side="right"))
+    number, at = scene.stayed[thinned_rows(count - 1, most)].T
     there = layer.there[number, at]
     number, at = number[there], at[there]
-    if not len(number):
-        return NO_BATCH
-    wxyz = about_z(np.zeros(len(number)))
-    return Batch(wxyz, _raised(layer.xyz[number, at], Z_RING), np.ones((len(number), 3), np.float32), colours[number])
+    wxyz = np.zeros((len(number), 4), np.float32)
+    wxyz[:, 0] = 1.0
+    places = layer.xyz[number, at].astype(np.float32)
+    return Batch(wxyz, _raised(places, Z_RING), np.ones((len(number), 3), np.float32), colours[number])
 
 
-def _no_edges() -> tuple[Lines, Lines, Lines, Lines, Index, Array]:
-    return NO_LINES, NO_LINES, NO_LINES, NO_LINES, np.zeros(0, np.int64), np.zeros((0, 2, 3))
+def joined(parts: Sequence[Lines]) -> Lines:
+    """Lines of several in one."""
+    return parts[0] if len(parts) == 1 else Lines(*map(np.concatenate, zip(NO_LINES, *parts, strict=True)))
 
 
-def _edges(
-    scene: Scene, layer: Layer, row: int, most: int, state: ViewState
-) -> tuple[Lines, Lines, Lines, Lines, Index, Array]:
-    """Edges so far, those of this stance, the refused ones dashed, and the one that is picked."""
-    edges = scene.edges
-    count = int(np.searchsorted(edges.rows, row, side="right"))
-    if not count:
-        return _no_edges()
-    ids = thinned_rows(count - 1, most)
-    ends = np.stack([layer.xyz[edges.i[ids], edges.rows[ids]], layer.xyz[edges.j[ids], edges.rows[ids]]], axis=1)
-    there = np.isfinite(ends).all(axis=(1, 2))
-    ids, ends = ids[there], ends[there]
-    ends[..., 2] = Z_EDGE
-    used, now = edges.used[ids], edges.rows[ids] == row
-    colours = palette.of_residuals(edges.sigmas[ids], state.dark)
-    past = palette.faded(colours, state.dark, 0.25)
-    refused = dashed(ends[~used])
-    picked = ids == (-1 if state.picked is None else state.picked)
-    return (
-        _lines(ends[used & ~now], past[used & ~now]),
-        _lines(ends[used & now], colours[used & now]),
-        _lines(refused, np.broadcast_to(palette.grey(state.dark), (len(refused), 3))),
-        _lines(ends[picked], np.broadcast_to(palette.PICKED, (int(picked.sum()), 3))),
-        ids,
-        ends,
-    )
+def _batch(parts: Sequence[Batch]) -> Batch:
+    return parts[0] if len(parts) == 1 else Batch(*map(np.concatenate, zip(NO_BATCH, *parts, strict=True)))
 
 
-def _lines(points: Array, colours: Colours) -> Lines:
-    return Lines(points.astype(np.float32), np.repeat(colours[:, None], 2, axis=1))
-
-
-def _raised(places: Array, z: float) -> Float32:
-    out = places.astype(np.float32)
+def _raised(places: Float32, z: float) -> Float32:
+    out = places.copy()
     out[:, 2] = z
     return out
-
-
-def _f32(values: Array) -> Float32:
-    return np.asarray(values, np.float32)
-
-
-def about_z(angle: Array) -> Float32:
-    """Quaternions (n, 4), w first, of turns (n,) [rad] about z."""
-    zero = np.zeros_like(angle)
-    return np.stack([np.cos(angle / 2), zero, zero, np.sin(angle / 2)], axis=-1).astype(np.float32)
 
 
 def pick(
@@ -288,7 +305,7 @@ def pick(
     return None if nearest is None else ("edge", int(frame.edge_ids[nearest]))
 
 
-def nearest_segment(segments: Array, origin: Array, direction: Array, most_deg: float) -> int | None:
+def nearest_segment(segments: Array | Float32, origin: Array, direction: Array, most_deg: float) -> int | None:
     """The segment (of n, 2, 3) that a ray with unit direction passes closest to, by the angle at its origin."""
     if not len(segments):
         return None

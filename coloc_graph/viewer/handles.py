@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from coloc_graph.lie import quaternion
 from coloc_graph.viewer import bodies, palette
-from coloc_graph.viewer.frame import NO_LINES, Batch, Frame, Lines, ViewState, about_z
+from coloc_graph.viewer.frame import NO_LINES, Batch, Frame, Lines, ViewState
 from coloc_graph.viewer.motion import extent
+from coloc_graph.viewer.prepared import about_z
 from coloc_graph.viewer.scene import TRUE, Scene
 
 #: Room about the data [m], and the largest floor that has lines every half metre.
@@ -79,7 +80,7 @@ class GraphView:
         add, none = self.server.scene, NO_LINES
         self._lines: dict[str, viser.LineSegmentsHandle] = {}
         for name, thickness in (("edges", 2.0), ("edges_now", 4.0), ("refused", 2.0), ("picked", 7.0),
-                                ("seen", 1.2), ("driven", 2.5)):  # fmt: skip
+                                ("sightings", 1.5), ("odometry", 1.5), ("seen", 1.2), ("driven", 2.5)):  # fmt: skip
             self._lines[name] = add.add_line_segments(
                 f"/{name}", none.points, none.colours, thickness=thickness, thickness_units="screen"
             )
@@ -155,7 +156,7 @@ class GraphView:
         ways = {f"way {name}": frame.ways.get(name, NO_LINES) for name in self.names}
         lines = ways | {
             "edges": frame.edges, "edges_now": frame.edges_now, "refused": frame.refused, "picked": frame.picked,
-            "seen": seen, "driven": driven,
+            "sightings": frame.sightings, "odometry": frame.odometry, "seen": seen, "driven": driven,
         }  # fmt: skip
         converted = {name: (one.points, palette.linear(one.colours)) for name, one in lines.items()}
         batches = {"ellipses": frame.ellipses, "wedges": frame.wedges, "rings": frame.rings}

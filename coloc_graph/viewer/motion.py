@@ -1,5 +1,7 @@
 """Where a robot is between two of its poses: by its wheels where there is odometry, else straight."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,11 +17,9 @@ def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
     that they lead from the one pose to the other.
     """
     out = np.full((len(time), 4), np.nan)
-    rows = layer.rows[number]
-    if not len(rows):
+    if not len(layer.rows[number]):
         return out
-    near = _rows_about(scene, rows, time)
-    keys, poses = _keys(scene, layer, number, near)
+    keys, poses = _keys(scene, layer, number)
     after = np.clip(np.searchsorted(keys, time, side="right"), 1, max(len(keys) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(keys) - 1)
@@ -57,15 +57,10 @@ def extent(scene: Scene, samples: int = 400) -> tuple[Array, Array]:
     return low, high
 
 
-def _rows_about(scene: Scene, rows: NDArray[np.int64], time: Array) -> NDArray[np.int64]:
-    """Of the rows at which a robot has a pose those that matter for these times."""
-    first = int(np.searchsorted(rows, scene.row_at(float(time[0])), side="right")) - 2
-    last = int(np.searchsorted(rows, scene.row_at(float(time[-1])), side="right")) + 2
-    return rows[max(first, 0) : last]
-
-
-def _keys(scene: Scene, layer: Layer, number: int, rows: NDArray[np.int64]) -> tuple[Array, Array]:
+@lru_cache(maxsize=64)
+def _keys(scene: Scene, layer: Layer, number: int) -> tuple[Array, Array]:
     """The times (k,) at which a robot is known to be somewhere, ascending, and where (k, 4)."""
+    rows = layer.rows[number]
     poses = np.concatenate([layer.xyz[number, rows], layer.yaw[number, rows, None]], axis=1)
     stands = scene.standing[number, rows]
     at = layer.times[number, rows]

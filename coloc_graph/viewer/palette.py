@@ -12,6 +12,8 @@ _LINEAR = np.rint(
     255 * np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
 ).astype(np.uint8)
 
+_FLAT = (0.7 * np.arange(256)).astype(np.uint8)
+
 
 def rgb(code: str) -> tuple[int, int, int]:
     """The colour of `#rrggbb`."""
@@ -25,6 +27,8 @@ _STOPS = np.array([rgb(code) for code in RESIDUAL_STOPS], float)
 STOPS_A_SIGMA = 2
 MOST_SIGMAS = (len(_STOPS) - 1) / STOPS_A_SIGMA
 PICKED: Colours = np.array([255, 0, 170], np.uint8)
+SIGHTING: Colours = np.array(rgb("#7b5ea7"), np.uint8)
+ODOMETRY: Colours = np.array(rgb("#8a6d3b"), np.uint8)
 
 
 def robot_colours(count: int, dark: bool = False) -> Colours:
@@ -68,7 +72,7 @@ def of_residuals(sigmas: NDArray[np.float64], dark: bool) -> Colours:
 
 def flat(colours: Colours) -> Colours:
     """Colours of what lies on the floor: the lights from above would wash them out."""
-    return np.asarray(0.7 * colours, np.uint8)
+    return np.asarray(_FLAT[colours])
 
 
 def linear(colours: Colours) -> Colours:

@@ -121,8 +121,22 @@ class Edges:
         return np.array([not why for why in self.why_not], bool)
 
 
+@dataclass(frozen=True, eq=False)
+class Links:
+    """What else ties poses: robots `i` at `rows_i` with robots `j` at `rows_j` (m,) each, in the order of `rows_j`."""
+
+    i: Index
+    rows_i: Index
+    j: Index
+    rows_j: Index
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+
 _NONE: Index = np.empty(0, np.int64)
 NO_EDGES = Edges(_NONE, _NONE, _NONE, np.empty(0), ())
+NO_LINKS = Links(_NONE, _NONE, _NONE, _NONE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +144,9 @@ class Scene:
     """All that is shown of a run and its estimates; immutable.
 
     `layers` are the estimates, the first being the one whose poses the robots stand at. `stayed` are the stay-put
-    constraints (q, 2): robot by number, row of the later stance. `team` is as stated and `calibrated` as it turned out.
+    constraints (q, 2): robot by number, row of the later stance. `sightings` (who sees, who is seen) and `odometry` are
+    what else ties poses. `other_edges` are those of the layer that is `aside`, in a comparison; they are numbered on
+    from `edges`. `team` is as stated and `calibrated` as it turned out. `notes` say what there is none of, and why.
     Without a `run` there are no images, marker tracks and inspections.
     """
 
@@ -138,6 +154,9 @@ class Scene:
     stances: tuple[Stance, ...]
     layers: tuple[Layer, ...] = ()
     edges: Edges = NO_EDGES
+    other_edges: Edges = NO_EDGES
+    sightings: Links = NO_LINKS
+    odometry: Links = NO_LINKS
     stayed: Index = field(default_factory=lambda: np.empty((0, 2), np.int64))
     team: Team | None = None
     calibrated: Team | None = None
@@ -145,6 +164,7 @@ class Scene:
     frontend: FrontendOptions = field(default_factory=FrontendOptions)
     wheels: Mapping[str, WheelTrack] = field(default_factory=dict)
     title: str = ""
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.stances)
@@ -187,6 +207,18 @@ class Scene:
             for robot in stance.movers:
                 out[number[robot], row] = False
         return out
+
+    @property
+    def other(self) -> Layer | None:
+        """The poses of another result, in a comparison."""
+        return next((layer for layer in self.layers if layer.aside), None)
+
+    def edge(self, number: int) -> tuple[Layer, Edges, int] | None:
+        """Of an edge by its number the layer between whose poses it is, its edges, and where among them."""
+        if 0 <= number < len(self.edges):
+            return self.layers[0], self.edges, number
+        number -= len(self.edges)
+        return (self.other, self.other_edges, number) if self.other and 0 <= number < len(self.other_edges) else None
 
     @property
     def true(self) -> Layer | None:

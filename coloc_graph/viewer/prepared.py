@@ -1,0 +1,79 @@
+"""What of a layer looks the same at any time: made once, so that a moment is picked out of it and not computed anew."""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.viewer import palette
+from coloc_graph.viewer.scene import Array, Edges, Index, Layer, Links, Mask
+
+Float32 = NDArray[np.float32]
+
+#: Heights [m] over the floor of edges, of sightings, and of odometry.
+Z_EDGE, Z_SIGHTING, Z_ODOMETRY = 0.13, 0.15, 0.05
+
+
+class Doubts:
+    """The ellipses and wedges of a layer for one sigma.
+
+    Where there are some, `known` (r, s); quaternions `of_place` and `of_heading` (r, s, 4); semi-axes `axes` (r, s, 2)
+    [m].
+    """
+
+    def __init__(self, layer: Layer) -> None:
+        finite = np.isfinite(layer.covariance).all(axis=(2, 3)) & np.isfinite(layer.yaw_sigma)
+        self.known = layer.arrived & finite
+        covariance = np.where(finite[..., None, None], layer.covariance, 0.0)
+        axes, direction = ellipse_axes(covariance)
+        self.axes = axes.astype(np.float32)
+        self.of_place, self.of_heading = about_z(direction), about_z(np.nan_to_num(layer.yaw))
+
+
+class DrawnEdges:
+    """Edges between the poses of a layer: `ends` (m, 2, 3) [m], whether both are `there` (m,), colours (m, 3)."""
+
+    def __init__(self, layer: Layer, edges: Edges, dark: bool) -> None:
+        self.ends = _ends(layer, edges.i, edges.rows, edges.j, edges.rows, Z_EDGE)
+        self.there: Mask = np.asarray(np.isfinite(self.ends).all(axis=(1, 2)))
+        self.now = palette.of_residuals(edges.sigmas, dark)
+        self.past = palette.faded(self.now, dark, 0.25)
+
+
+@lru_cache(maxsize=8)
+def doubts_of(layer: Layer) -> Doubts:
+    """Those of a layer."""
+    return Doubts(layer)
+
+
+@lru_cache(maxsize=8)
+def edges_of(layer: Layer, edges: Edges, dark: bool) -> DrawnEdges:
+    """Edges as they are drawn."""
+    return DrawnEdges(layer, edges, dark)
+
+
+@lru_cache(maxsize=8)
+def links_of(layer: Layer, links: Links, z: float) -> Float32:
+    """The ends (m, 2, 3) [m] of links, NaN where one has no pose."""
+    return _ends(layer, links.i, links.rows_i, links.j, links.rows_j, z)
+
+
+def _ends(layer: Layer, i: Index, rows_i: Index, j: Index, rows_j: Index, z: float) -> Float32:
+    ends = np.stack([layer.xyz[i, rows_i], layer.xyz[j, rows_j]], axis=1).astype(np.float32)
+    ends[..., 2] = np.where(np.isfinite(ends[..., 2]), z, np.nan)
+    return ends
+
+
+def ellipse_axes(covariance: Array) -> tuple[Array, Array]:
+    """Semi-axes (..., 2) [m], the longer first, and its direction (...) [rad] of covariances (..., 2, 2)."""
+    a, b, c = covariance[..., 0, 0], covariance[..., 1, 1], covariance[..., 0, 1]
+    middle, spread = (a + b) / 2, np.hypot((a - b) / 2, c)
+    axes = np.sqrt(np.stack([middle + spread, middle - spread], axis=-1).clip(min=0))
+    return axes, np.arctan2(c, (a - b) / 2) / 2
+
+
+def about_z(angle: Array) -> Float32:
+    """Quaternions (..., 4), w first, of turns (...) [rad] about z."""
+    out = np.zeros((*np.shape(angle), 4), np.float32)
+    out[..., 0], out[..., 3] = np.cos(angle / 2), np.sin(angle / 2)
+    return out
