@@ -98,3 +98,25 @@ def test_a_live_stance_appears_while_one_looks_at_an_old_one(short_solution, pag
         viewer.publish(scene_of_solution(short_solution))
         assert until(lambda: page.get_by_text("chained").first.is_visible())
         assert viewer.frame.row == 0
+
+
+def test_a_page_opens_from_its_file_and_plays(scene, page_of, tmp_path):
+    path = tmp_path / "view.html"
+    with Viewer(scene, port=0) as viewer:
+        viewer.export(path)
+    assert path.stat().st_size < 3e6
+    page = page_of(path.as_uri(), "/robots/A")
+    base, number = scene.layers[0], scene.robots.index("A")
+
+    def stands_at(row):
+        return np.allclose(place_of(page, "/robots/A"), base.xyz[number, row], atol=1e-3)
+
+    assert until(lambda: page.get_by_text("it is the anchor now").is_visible())
+    played = page.get_by_role("textbox").first
+    assert until(lambda: float(played.input_value()) > 0.2)  # by itself
+    played.fill(str(len(scene) - 1))
+    assert until(lambda: stands_at(len(scene) - 1))
+    played.fill("0")  # back to the first, where all is hidden and made anew
+    assert until(lambda: stands_at(0))
+    visible = "name => window.__viserMutable.nodeRefFromName[name].visible"
+    assert until(lambda: page.evaluate(visible, "/robots/A") and page.evaluate(visible, "/floor"))

@@ -1,6 +1,4 @@
-"""The page that plays a scene without a server: what is recorded in it, and a real browser that opens its file."""
-
-# ruff: noqa: F811  the fixtures' names are imported, and are arguments
+"""The page that plays a scene without a server: what is recorded in it."""
 
 import base64
 import re
@@ -10,12 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 import zstandard
-from browser import browser, page_of, place_of, until  # noqa: F401  fixtures
 
 from coloc_graph.lie import floor_pose
 from coloc_graph.run import open_run
 from coloc_graph.trajectory import Trajectory
-from coloc_graph.viewer import Scene, Viewer, empty_scene, export, scene_of_result
+from coloc_graph.viewer import Scene, empty_scene, export, scene_of_result
 from coloc_graph.viewer.frame import ViewState, frame_of
 from coloc_graph.viewer.scene import layer_of
 
@@ -88,26 +85,3 @@ def test_a_scene_without_a_way_is_a_page_that_stands(make, short):
     assert seconds == 0 and any(m.get("name") == "/floor" for _, m in messages)
     if make == "one stance":
         assert np.allclose(seen(messages, 0, "SetPositionMessage", "/robots/A", "position"), (1, 2, 0))
-
-
-@pytest.mark.slow
-def test_a_page_opens_from_its_file_and_plays(scene, page_of, tmp_path):
-    path = tmp_path / "view.html"
-    with Viewer(scene, port=0) as viewer:
-        viewer.export(path)
-    assert path.stat().st_size < 3e6
-    page = page_of(path.as_uri(), "/robots/A")
-    base, number = scene.layers[0], scene.robots.index("A")
-
-    def stands_at(row):
-        return np.allclose(place_of(page, "/robots/A"), base.xyz[number, row], atol=1e-3)
-
-    assert until(lambda: page.get_by_text("it is the anchor now").is_visible())
-    played = page.get_by_role("textbox").first
-    assert until(lambda: float(played.input_value()) > 0.2)  # by itself
-    played.fill(str(len(scene) - 1))
-    assert until(lambda: stands_at(len(scene) - 1))
-    played.fill("0")  # back to the first, where all is hidden and made anew
-    assert until(lambda: stands_at(0))
-    visible = "name => window.__viserMutable.nodeRefFromName[name].visible"
-    assert until(lambda: page.evaluate(visible, "/robots/A") and page.evaluate(visible, "/floor"))
