@@ -13,14 +13,22 @@ import numpy as np
 from coloc_graph.errors import ColocError
 from coloc_graph.run import Detections, OdometrySample
 
-#: Limits of what is taken: bytes of a message, marker centres in an image, places in a way, letters in a text.
-LARGEST, MOST_MARKERS, MOST_PLACES, LONGEST_TEXT = 256 * 1024, 64, 100, 2000
+#: Limits of what is taken: bytes of a message, marker centres in an image, places in a way.
+LARGEST, MOST_MARKERS, MOST_PLACES = 256 * 1024, 64, 100
+#: Letters in a text, and in the name of a session, a command, a marker.
+LONGEST_TEXT, LONGEST_NAME = 2000, 64
+#: Stamps [ns] are within, and numbers that count below.
+FARTHEST, HIGHEST = 2**62, 2**53
 
 M = TypeVar("M", bound=msgspec.Struct)
 
 
 class WireError(ColocError):
-    """A message is malformed, oversized, or says what cannot be."""
+    """A message is malformed, or says what cannot be."""
+
+
+class OversizedError(WireError):
+    """A message is larger than any that is sent."""
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -87,11 +95,13 @@ class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
             raise ValueError("it holds a number that is not finite")
         if any(abs(u) > 1e5 or abs(v) > 1e5 for u, v in self.uv):
             raise ValueError("a marker is far outside any image")
-        if any(not (a > 0 and c > 0 and a * c > b * b) for a, b, c in self.covariance):
+        if any(not (0 < a < 1e9 and 0 < c < 1e9 and a * c > b * b) for a, b, c in self.covariance):
             raise ValueError("a covariance is not positive definite")
-        if any(not 0 <= flag < 16 for flag in self.flags) or any(len(marker) > 64 for marker in self.markers):
-            raise ValueError("a flag or a marker's name is none")
+        if any(not 0 <= flag < 16 for flag in self.flags):
+            raise ValueError("a flag is none")
+        _named(self.session, *self.markers)
         _counted(self.number, self.capture)
+        _stamped(self.stamp)
 
 
 class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -115,11 +125,13 @@ class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return OdometrySample(robot, time, np.array(self.pose), _symmetric(self.covariance))
 
     def _check(self) -> None:
-        if not all(map(math.isfinite, (*self.pose, *self.covariance))) or max(map(abs, self.pose)) > 1e6:
+        if not all(math.isfinite(v) and abs(v) < 1e6 for v in (*self.pose, *self.covariance)):
             raise ValueError("it holds a number that is no place")
         if np.linalg.eigvalsh(_symmetric(self.covariance)).min() < -1e-12:
             raise ValueError("its covariance is not positive")
+        _named(self.session)
         _counted(self.number)
+        _stamped(self.stamp)
 
 
 class Event(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -132,8 +144,10 @@ class Event(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
     text: str
 
     def _check(self) -> None:
-        _short(self.kind, self.text)
+        _named(self.session, self.kind)
+        _short(self.text)
         _counted(self.number)
+        _stamped(self.stamp)
 
 
 class Status(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -152,13 +166,19 @@ class Status(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
     def _check(self) -> None:
         if len(self.hazards) > 16:
             raise ValueError("it has too many hazards")
-        _short(self.phase, self.fault or "", self.camera_fault or "", *self.hazards)
+        _named(self.session, self.phase)
+        _short(self.fault or "", self.camera_fault or "", *self.hazards)
+        _counted(self.capture or 0)
+        _stamped(self.stamp, self.still_since or 0)
 
 
 class Capture(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
     """Detect markers in each image, and send them as those of this capture, one attempt to measure a stance."""
 
     capture: int
+
+    def _check(self) -> None:
+        _counted(self.capture)
 
 
 class EndCapture(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
@@ -182,6 +202,7 @@ class Drive(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag
             raise ValueError("its places are too many, or none")
         if not 0 < self.speed <= 0.5:
             raise ValueError(f"its speed is {self.speed} m/s")
+        _counted(self.number)
 
 
 class Halt(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
@@ -205,8 +226,19 @@ class Command(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     def _check(self) -> None:
         self.body._check()
-        if len(self.id) > 64:
-            raise ValueError("its id is too long")
+        _named(self.id, self.session)
+        _stamped(self.deadline)
+
+
+class Hold(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A session of a robot may go on moving for a moment from `sent` on [ns by the robot's clock]."""
+
+    session: str
+    sent: int
+
+    def _check(self) -> None:
+        _named(self.session)
+        _stamped(self.sent)
 
 
 class Reply(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -217,15 +249,30 @@ class Reply(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
     text: str = ""
 
     def _check(self) -> None:
-        _short(self.id, self.text)
+        _named(self.id)
+        _short(self.text)
+
+
+class ClockQuestion(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What time is it? Asked at an instant of the coordinator's clock [ns]."""
+
+    asked: int
+
+    def _check(self) -> None:
+        _stamped(self.asked)
 
 
 class ClockReply(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When a question for the time came and when this was sent [ns]; `asked` is the stamp of the question."""
+    """When a question for the time came to a robot's session and when this was sent [ns]."""
 
+    session: str
     asked: int
     received: int
     sent: int
+
+    def _check(self) -> None:
+        _named(self.session)
+        _stamped(self.asked, self.received, self.sent)
 
 
 def encode(message: msgspec.Struct) -> bytes:
@@ -236,7 +283,7 @@ def encode(message: msgspec.Struct) -> bytes:
 def decode(data: bytes, kind: type[M]) -> M:
     """The message in bytes that came from outside; `WireError` where there is none of that kind."""
     if len(data) > LARGEST:
-        raise WireError(f"a {kind.__name__} of {len(data)} bytes is too large: {LARGEST} at most")
+        raise OversizedError(f"a {kind.__name__} of {len(data)} bytes is too large: {LARGEST} at most")
     try:
         message = msgspec.msgpack.decode(data, type=kind)
         if isinstance(message, _Message):
@@ -257,6 +304,16 @@ def _short(*texts: str) -> None:
         raise ValueError("a text is too long")
 
 
+def _named(*names: str) -> None:
+    if any(len(name) > LONGEST_NAME for name in names):
+        raise ValueError("a name is too long")
+
+
 def _counted(*numbers: int) -> None:
-    if any(not 0 <= number < 2**53 for number in numbers):
+    if any(not 0 <= number < HIGHEST for number in numbers):
         raise ValueError("a number that counts is none")
+
+
+def _stamped(*stamps: int) -> None:
+    if any(abs(stamp) >= FARTHEST for stamp in stamps):
+        raise ValueError("a stamp is none")

@@ -1,0 +1,31 @@
+"""coloc certificates DIR TEAM.toml."""
+
+import argparse
+
+
+def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """The command's arguments."""
+    command = commands.add_parser(
+        "certificates",
+        help="certificates for the link between the coordinator and the robots",
+        description="Makes an authority of the team's own, and a certificate and a private key for the coordinator and "
+        "each robot. Copy ca.pem, NAME.pem and NAME.key to robot NAME, keep ca.key off the robots, and give the folder "
+        "to `coloc coordinate` and `coloc robot` with --tls.",
+    )
+    command.add_argument("folder", metavar="DIR", help="where to write them")
+    command.add_argument("team", metavar="TEAM.toml")
+    command.add_argument("--days", type=int, default=365, help="how long they are good for (365)")
+    command.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make them, and say what goes where."""
+    from coloc_graph.robot_io.certificates import make_certificates
+    from coloc_graph.team import read_team
+
+    team = read_team(args.team)
+    make_certificates(args.folder, team.names, args.days)
+    for name in ("coordinator", *team.names):
+        print(f"for {name}: ca.pem, {name}.pem, {name}.key")
+    print(f"ca.key in {args.folder} signs others: keep it off the robots")
+    return 0
