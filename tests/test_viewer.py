@@ -19,8 +19,9 @@ from coloc_graph.backend import replay, smooth
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
 from coloc_graph.lie import floor_pose
+from coloc_graph.measurements import Odometry, Sighting
 from coloc_graph.pipeline import SolveOptions, solve
-from coloc_graph.run import Stance, open_run
+from coloc_graph.run import Stance, open_run, read_truth
 from coloc_graph.simulation import simulate
 from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer import (
@@ -33,13 +34,14 @@ from coloc_graph.viewer import (
     palette,
     scene_of_estimate,
     scene_of_result,
+    scene_of_run,
     scene_of_solution,
     with_other,
 )
 from coloc_graph.viewer.frame import MOVING, ViewState, dashed, frame_of, pick, thinned_rows
 from coloc_graph.viewer.live import LiveScene
 from coloc_graph.viewer.motion import pose_at
-from coloc_graph.viewer.plots import with_cursor
+from coloc_graph.viewer.plots import error_curves, residual_curves, with_cursor
 from coloc_graph.viewer.prepared import ellipse_axes
 from coloc_graph.viewer.scene import layer_of
 from coloc_graph.viewer.server import is_loopback, require_free, url_of
@@ -513,15 +515,67 @@ def test_another_result_is_compared_and_one_of_another_run_refused(scene, result
 
     both = with_other(scene, result)
     assert [layer.aside for layer in both.layers] == [False, False, True]
+    assert frame_of(scene, ViewState()) and both.beside.edges is both.other_edges
     beside, over = shown(both, aside=2.0), shown(both)
     name = both.layers[-1].name
     assert np.isclose(
         beside.ways[name].points[..., 1].mean() - shown(both).ways["joint"].points[..., 1].mean(), 2, atol=0.5
     )
     assert len(over.ways[name].points) > len(beside.ways[name].points)  # dashed where it lies over the first
+    # edges and ellipses of both
+    alone = shown(scene)
+    assert len(beside.edge_ids) == 2 * len(alone.edge_ids) and len(over.ellipses.wxyz) == 2 * len(alone.ellipses.wxyz)
+    own, others = np.split(beside.edge_points, 2)
+    assert np.allclose(others - own, (0, 2, 0), atol=1e-6)
+    # a click on one of the other's is one of the other's
+    number = int(beside.edge_ids[-1])
+    eye = np.array([-1.0, -4.0, 3.0])
+    assert pick(beside, eye, others[-1].mean(axis=0) - eye) == ("edge", number)
+    assert both.edge(number) == (both.beside, len(scene.edges) - 1) and both.edge(2) == (both, 2)
+    assert both.edge(2 * len(scene.edges)) is None
+    picked = shown(both, picked=number, aside=2.0).picked
+    assert np.allclose(picked.points[0], others[-1])
+    # and so are the curves
+    assert residual_curves(both)[1].shape == (2, len(scene)) and error_curves(both)[1].shape == (6, len(scene))
+    assert np.array_equal(*np.split(error_curves(both)[1], 2))
+    text = inspect.robot_report(both, 1, 4)
+    assert "| joint |" in text and "result: joint" in text
     write_result(short_solution, tmp_path / "other")
     with pytest.raises(InputError, match="is not the run that"):
         with_other(scene, tmp_path / "other")
+
+
+def test_sightings_and_odometry_are_read_back_as_what_they_were(scene, solutions):
+    solved = scene_of_solution(solutions["joint"])
+    measurements = solutions["joint"].estimate.graph.measurements
+    for name, kind in (("sightings", Sighting), ("odometry", Odometry)):
+        links, read = getattr(solved, name), getattr(scene, name)
+        assert len(links) == sum(isinstance(one, kind) for one in measurements) > 0
+        places = [
+            {
+                tuple(np.round([*base.xyz[i, a], *base.xyz[j, b]], 6))
+                for i, a, j, b in zip(one.i, one.rows_i, one.j, one.rows_j, strict=True)
+            }
+            for one, base in ((links, solved.layers[0]), (read, scene.layers[0]))
+        ]
+        assert places[0] == places[1]
+    off, on = shown(scene), shown(scene, sightings=True, odometry=True)
+    assert not len(off.sightings.points) and not len(off.odometry.points)
+    assert len(on.sightings.points) == len(scene.sightings) and len(on.odometry.points) == len(scene.odometry)
+    first = shown(scene, row=0, sightings=True, odometry=True)
+    assert len(first.sightings.points) == (scene.sightings.rows_j == 0).sum() and not len(first.odometry.points)
+
+
+def test_truth_that_does_not_cover_the_estimate_is_said_to_be_left_out(short, copied, tmp_path, monkeypatch, capsys):
+    partly = copied(short, tmp_path / "partly.mcap", truth=True)
+    run = open_run(partly)
+    late = {robot: one for robot, one in read_truth(partly).items() if robot != "B"}
+    monkeypatch.setattr("coloc_graph.viewer.sources.read_truth", lambda path: late)
+    drawn = scene_of_run(run)
+    assert drawn.true is None and len(drawn.notes) == 1
+    assert drawn.notes[0].startswith("the truth in the run is not shown: ") and "B" in drawn.notes[0]
+    with Viewer(drawn, port=0) as viewer:
+        assert viewer.wait_idle() and drawn.notes[0] in viewer.panel.status.content
 
 
 def test_images_that_are_missing_are_said(short, copied, tmp_path):

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.run import open_run
     from coloc_graph.viewer import Viewer, is_run, scene_of_result, scene_of_run, with_other
-    from coloc_graph.viewer.app import missing_images
+    from coloc_graph.viewer.app import left_out
     from coloc_graph.viewer.browser import require_browser, write_png
     from coloc_graph.viewer.server import is_loopback, require_free
 
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         scene = scene_of_result(args.path, args.run_path)
     if args.compare:
         scene = with_other(scene, args.compare)
-    warn([note for note in [missing_images(scene)] if note])
+    warn(left_out(scene))
     if not is_loopback(args.host) and not writes:
         warn([f"whoever reaches {args.host} can see and steer this viewer: it has no password"])
     with Viewer(scene, host="127.0.0.1" if writes else args.host, port=port, dark=args.dark) as viewer:

@@ -61,9 +61,9 @@ class Viewer:
         self._ways: tuple[Lines, Lines] = (NO_LINES, NO_LINES)
         self._measured: dict[tuple[int, str, str], PairMeasurement] = {}
         self._live = LiveScene(scene)
-        self._grown_at = self._plotted_at = 0.0
+        self._grown_at = self._plotted_at = self._aside = 0.0
         self._told: set[str] = set()
-        self._note = missing_images(scene)
+        self._note = "; ".join(left_out(scene))
         self.frame: Frame | None = None
         self.frame_seconds = self.frame_cpu_seconds = 0.0
         try:
@@ -233,6 +233,10 @@ class Viewer:
             self._dark = panel.dark.value
             panel.dress(self._dark)
             self.view.dress(scene, self._dark)
+        if panel.beside.value != bool(self._aside):
+            low, high = scene.bounds
+            self._aside = float(high[1] - low[1] + 1.0) if panel.beside.value else 0.0
+            self._frame_all()
         rests = time.perf_counter() - self._moved_at > UNTIL_REST
         state = self._state(rests)
         frame = self._brought_up_to_date(frame_of(scene, state))
@@ -251,7 +255,6 @@ class Viewer:
 
     def _state(self, rests: bool) -> ViewState:
         panel = self.panel
-        low, high = self._scene.bounds
         return ViewState(
             time=self._time,
             shown=panel.shown,
@@ -259,9 +262,11 @@ class Viewer:
             wedges=panel.wedges.value,
             edges=panel.edges.value,
             stays=panel.stays.value,
+            sightings=panel.sightings.value,
+            odometry=panel.odometry.value,
             k_sigma=float(panel.k_sigma.value),
             picked=self._picked[1] if self._picked and self._picked[0] == "edge" else None,
-            aside=float(high[1] - low[1] + 0.5) if panel.beside.value else 0.0,
+            aside=self._aside,
             dark=self._dark,
             rests=rests,
         )
@@ -275,7 +280,7 @@ class Viewer:
         while self._news:
             one = self._news.popleft()
             if isinstance(one, Scene):
-                grown, self._now = one, None
+                grown, self._now, self._note = one, None, "; ".join(left_out(one))
             else:
                 self._live.add(one)
                 grown = None
@@ -293,13 +298,19 @@ class Viewer:
         self.panel.adopt(self._scene)
         if at_end:
             self._time = self._scene.middle(len(self._scene) - 1)
-        initial_camera(self.server, self._scene)  # of who comes later, and of `reset view`
         if first and len(self._scene):
             set_value(self.panel.k_sigma, int(fitting_sigma(self._scene)))
-            position, look_at = camera_on(self._scene)
-            for client in self.server.get_clients().values():
-                client.camera.position, client.camera.look_at = position, look_at
+            self._frame_all()
+        else:
+            initial_camera(self.server, self._scene, self._aside)  # of who comes later, and of `reset view`
         self._grown_at = time.perf_counter()
+
+    def _frame_all(self) -> None:
+        """Turn all cameras to all of the data."""
+        initial_camera(self.server, self._scene, self._aside)
+        position, look_at = camera_on(self._scene, self._aside)
+        for client in self.server.get_clients().values():
+            client.camera.position, client.camera.look_at = position, look_at
 
     def _move(self, played: float) -> None:
         """Time, by what was asked for and by playing."""
@@ -370,14 +381,14 @@ class Viewer:
         if kind == "robot":
             self.panel.inspect(inspect.robot_report(scene, number, frame.row), None)
             return False
-        if number >= len(scene.edges):
+        if (edge := scene.edge(number)) is None:
             self._picked = None
             return False
-        found = self._worker.ask("edge", (number, id(scene)), lambda: inspect.examine(scene, number))
+        found = self._worker.ask("edge", (number, id(scene)), lambda: inspect.examine(*edge))
         if isinstance(found, Failure):
-            self.panel.inspect(f"{inspect.edge_report(scene, number, None)}\n\n{found.why}", None)
+            self.panel.inspect(f"{inspect.edge_report(*edge, None)}\n\n{found.why}", None)
             return False
-        self.panel.inspect(inspect.edge_report(scene, number, found), found.picture if found else None)
+        self.panel.inspect(inspect.edge_report(*edge, found), found.picture if found else None)
         return found is None
 
     def _follow(self, frame: Frame) -> None:
@@ -419,6 +430,11 @@ def fitting_sigma(scene: Scene) -> float:
     covariance = scene.layers[0].covariance[scene.layers[0].there]
     largest = float(np.sqrt(np.nanmax(covariance.trace(axis1=1, axis2=2), initial=0.0)))
     return next((k for k in (100.0, 30.0, 10.0) if k * largest < 0.3), 3.0) if largest > 0 else 3.0
+
+
+def left_out(scene: Scene) -> list[str]:
+    """What a scene cannot show, in words."""
+    return [one for one in (*scene.notes, missing_images(scene)) if one]
 
 
 def missing_images(scene: Scene) -> str:

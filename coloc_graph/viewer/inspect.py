@@ -20,7 +20,7 @@ from coloc_graph.run import Run
 from coloc_graph.team import Camera, Team
 from coloc_graph.viewer import palette
 from coloc_graph.viewer.frame import Lines
-from coloc_graph.viewer.scene import Array, Scene
+from coloc_graph.viewer.scene import Array, Layer, Scene
 
 Image = NDArray[np.uint8]
 
@@ -302,21 +302,9 @@ def _robot_lines(scene: Scene, number: int, row: int) -> Iterator[str]:
     if row < 0 or not scene.layers or not scene.layers[0].there[number, row]:
         yield "It has no pose here: nothing ties it to the reference."
         return
-    base = scene.layers[0]
-    x, y, z = base.xyz[number, row]
-    xy, heading = base.covariance[number, row], base.yaw_sigma[number, row]
-    rows = [("x, y", f"{x:.4f}, {y:.4f} m"), ("z", f"{1000 * z + 0.0:.1f} mm"),
-            ("heading", f"{np.rad2deg(base.yaw[number, row]):.2f} deg")]  # fmt: skip
-    if np.isfinite(xy).all():
-        rows += [
-            ("sigma x, y", f"{1000 * np.sqrt(xy[0, 0]):.2f}, {1000 * np.sqrt(xy[1, 1]):.2f} mm"),
-            ("correlation x, y", f"{_correlation(xy):.2f}"),
-            ("sigma heading", f"{np.rad2deg(heading):.3f} deg"),
-        ]
-    off = scene.errors(base)[number, row]
-    if np.isfinite(off):
-        rows.append(("off the truth", f"{1000 * off:.2f} mm"))
-    yield _table((base.name, ""), rows)
+    for layer in (scene.layers[0], scene.other):
+        if layer is not None and layer.there[number, row]:
+            yield _table((layer.name, ""), _pose_rows(scene, layer, number, row))
     if scene.team is None:
         return
     stated = scene.team[robot].mount
@@ -339,6 +327,23 @@ def _robot_lines(scene: Scene, number: int, row: int) -> Iterator[str]:
             )
         ],
     )
+
+
+def _pose_rows(scene: Scene, base: Layer, number: int, row: int) -> list[tuple[str, str]]:
+    x, y, z = base.xyz[number, row]
+    xy, heading = base.covariance[number, row], base.yaw_sigma[number, row]
+    rows = [("x, y", f"{x:.4f}, {y:.4f} m"), ("z", f"{1000 * z + 0.0:.1f} mm"),
+            ("heading", f"{np.rad2deg(base.yaw[number, row]):.2f} deg")]  # fmt: skip
+    if np.isfinite(xy).all():
+        rows += [
+            ("sigma x, y", f"{1000 * np.sqrt(xy[0, 0]):.2f}, {1000 * np.sqrt(xy[1, 1]):.2f} mm"),
+            ("correlation x, y", f"{_correlation(xy):.2f}"),
+            ("sigma heading", f"{np.rad2deg(heading):.3f} deg"),
+        ]
+    off = scene.errors(base)[number, row]
+    if np.isfinite(off):
+        rows.append(("off the truth", f"{1000 * off:.2f} mm"))
+    return rows
 
 
 def _correlation(C: Array) -> float:

@@ -1,5 +1,6 @@
 """The viewer's controls: sliders, switches, plots, legend, and the panel of what was clicked."""
 
+import html
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.viewer import palette
 from coloc_graph.viewer.frame import Frame
-from coloc_graph.viewer.plots import error_curves, residual_curve, with_cursor
+from coloc_graph.viewer.plots import error_curves, residual_curves, with_cursor
 from coloc_graph.viewer.scene import TRUE, Scene
 
 NOBODY = "nobody"
@@ -46,15 +47,20 @@ class Panel:
             self.edges = gui.add_checkbox("Edges", True)
             self.stays = gui.add_checkbox("Stay-put rings", True)
             self.markers = gui.add_checkbox("Marker ways", True)
+            self.sightings = gui.add_checkbox("Sightings", False, hint="where a robot was seen by another")
+            self.odometry = gui.add_checkbox("Odometry", False, hint="where wheels lead from pose to pose")
             self.beside = gui.add_checkbox("Side by side", False, visible=compares)
             self.dark = gui.add_checkbox("Dark", False)
         with gui.add_folder("Plots"):
             self._residual = gui.add_uplot(
-                *self._plot(["largest residual [sigma]"], ["#0072B2"]), title="Residual [sigma]", height=150,
+                *self._plot(["largest residual [sigma]"], ["#0072B2"], compares=compares),
+                title="Residual [sigma]", height=150,
                 scales={"x": uplot.Scale(time=False)}, legend=uplot.Legend(show=False),
             )  # fmt: skip
             self._error = gui.add_uplot(
-                *self._plot(list(scene.robots), [_hex(c) for c in palette.robot_colours(len(scene.robots))]),
+                *self._plot(
+                    list(scene.robots), [_hex(c) for c in palette.robot_colours(len(scene.robots))], compares=compares
+                ),
                 title="Error [mm]" if scene.true is not None else "Sigma [mm]", height=150,
                 scales={"x": uplot.Scale(time=False)}, legend=uplot.Legend(show=False),
             )  # fmt: skip
@@ -81,8 +87,8 @@ class Panel:
                 self._ask("time", self.time.value)
 
         for handle in (
-            self.play, self.k_sigma, self.ellipses, self.wedges, self.edges, self.stays, self.markers, self.beside,
-            self.dark, self.follow, self.speed,
+            self.play, self.k_sigma, self.ellipses, self.wedges, self.edges, self.stays, self.markers, self.sightings,
+            self.odometry, self.beside, self.dark, self.follow, self.speed,
         ):  # fmt: skip
             handle.on_update(lambda _: self._ask("changed", 0))
         for label, hotkey, what, value in (
@@ -110,7 +116,7 @@ class Panel:
                 self._layers[layer.name] = box
         if self._legend.content != (means := legend(scene)):
             self._legend.content = means
-        self._curves = residual_curve(scene), error_curves(scene)
+        self._curves = residual_curves(scene), error_curves(scene)
 
     @property
     def shown(self) -> frozenset[str]:
@@ -167,13 +173,19 @@ class Panel:
 
     @staticmethod
     def _plot(
-        labels: list[str], colours: list[str]
+        labels: list[str], colours: list[str], *, compares: bool
     ) -> tuple[tuple[NDArray[np.float64], ...], tuple[uplot.Series, ...]]:
-        empty = tuple(np.zeros(1) for _ in range(len(labels) + 2))
+        """Empty data, and a curve a label; in a comparison each once more, dashed, for the other result."""
         curves = [
             uplot.Series(label=label, stroke=c, width=2, points={"show": False})
             for label, c in zip(labels, colours, strict=True)
         ]
+        if compares:
+            curves += [
+                uplot.Series(label=f"{label}, other", stroke=c, width=2, dash=(7, 5), points={"show": False})
+                for label, c in zip(labels, colours, strict=True)
+            ]
+        empty = tuple(np.zeros(1) for _ in range(len(curves) + 2))
         cursor = uplot.Series(label="now", stroke="#8c959f", width=1, points={"show": False})
         return empty, (uplot.Series(label="stance"), *curves, cursor)
 
@@ -186,19 +198,26 @@ def set_value(handle: object, value: float | bool) -> None:
 def legend(scene: Scene) -> str:
     """What colours and strokes mean, as HTML."""
     robots = "".join(
-        f'<span style="color:{_hex(colour)};font-weight:600;margin-right:.7em">&#9679; {name}</span>'
+        f'<span style="color:{_hex(colour)};font-weight:600;margin-right:.7em">&#9679; {html.escape(name)}</span>'
         for name, colour in zip(scene.robots, palette.robot_colours(len(scene.robots)), strict=True)
     )
     stops = ", ".join(palette.RESIDUAL_STOPS)
+    of_what = scene.edges.of_what
+    if scene.beside is not None and scene.other_edges.of_what != of_what:
+        of_what += f" (of the other result: {scene.other_edges.of_what})"
     lines = [
         robots,
         f'edges <span style="display:inline-block;width:90px;height:8px;border-radius:4px;'
         f'background:linear-gradient(90deg,{stops})"></span> 0 to {palette.MOST_SIGMAS:.0f} sigma'
-        f"<br><small>{scene.edges.of_what}; grey dashes: refused</small>",
+        f"<br><small>{html.escape(of_what)}; grey dashes: refused</small>",
         "thick: estimate, pale: other methods (chained is dashed), black or white: truth",
         "ring: a robot stayed put there; bold ring: it is the anchor now",
         "discs and wedges: place and heading to so many sigmas",
+        f'<span style="color:{_hex(palette.SIGHTING)}">&#8212; sightings</span>, '
+        f'<span style="color:{_hex(palette.ODOMETRY)}">&#8212; odometry</span> (where switched on)',
     ]
+    if scene.other is not None:
+        lines.append(f"dashed, or at the side, and pale: {html.escape(scene.other.name)}; its curves are dashed")
     body = "".join(f'<div style="margin:.25em 0">{line}</div>' for line in lines)
     return f'<div style="padding:.2em .8em .5em;font-size:.8em;line-height:1.45">{body}</div>'
 

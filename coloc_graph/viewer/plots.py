@@ -8,25 +8,35 @@ from coloc_graph.viewer.scene import Array, Scene
 MOST_POINTS = 400
 
 
-def residual_curve(scene: Scene) -> tuple[Array, Array]:
-    """Stance numbers (n,) and the largest residual of each (n,) [sigma]."""
-    edges = scene.edges
-    known = np.isfinite(edges.sigmas) & edges.used
-    if not known.any():
-        return np.zeros(1), np.zeros(1)
-    rows, first = np.unique(edges.rows[known], return_index=True)
-    return _thinned(_numbers(scene)[rows], np.maximum.reduceat(edges.sigmas[known], first))
+def residual_curves(scene: Scene) -> tuple[Array, Array]:
+    """Stance numbers (n,) and the largest residual of each, (1, n) [sigma]; (2, n) in a comparison."""
+    every = (scene.edges,) if scene.beside is None else (scene.edges, scene.other_edges)
+    if not len(scene):
+        return np.zeros(1), np.zeros((len(every), 1))
+    x, filled = _numbers(scene), np.zeros((len(every), len(scene)))
+    for n, edges in enumerate(every):
+        known = np.isfinite(edges.sigmas) & edges.used
+        if known.any():
+            rows, first = np.unique(edges.rows[known], return_index=True)
+            filled[n] = np.interp(x, x[rows], np.maximum.reduceat(edges.sigmas[known], first))
+    return _thinned(x, filled)
 
 
 def error_curves(scene: Scene) -> tuple[Array, Array]:
-    """Stance numbers (n,) and what each robot is off the truth, (r, n) [mm]; without truth, its sigma."""
-    r = len(scene.robots)
+    """Stance numbers (n,) and what each robot is off the truth, (r, n) [mm]; without truth, its sigma.
+
+    In a comparison (2 r, n): those of the other result follow.
+    """
+    r = len(scene.robots) * (1 if scene.beside is None else 2)
     if not scene.layers or not len(scene):
         return np.zeros(1), np.zeros((r, 1))
-    base = scene.layers[0]
-    values = scene.errors(base)
-    if scene.true is None:
-        values = np.sqrt(base.covariance.trace(axis1=2, axis2=3).clip(min=0))
+    layers = [scene.layers[0], *([] if scene.other is None else [scene.other])]
+    values = np.concatenate(
+        [
+            scene.errors(one) if scene.true is not None else np.sqrt(one.covariance.trace(axis1=2, axis2=3).clip(min=0))
+            for one in layers
+        ]
+    )
     x, filled = _numbers(scene), np.zeros((r, len(scene)))
     for n in range(r):
         known = np.isfinite(values[n])

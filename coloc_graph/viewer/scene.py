@@ -145,8 +145,9 @@ class Scene:
 
     `layers` are the estimates, the first being the one whose poses the robots stand at. `stayed` are the stay-put
     constraints (q, 2): robot by number, row of the later stance. `sightings` (who sees, who is seen) and `odometry` are
-    what else ties poses. `other_edges` are those of the layer that is `aside`, in a comparison; they are numbered on
-    from `edges`. `team` is as stated and `calibrated` as it turned out. `notes` say what there is none of, and why.
+    what else ties poses. `beside` is the scene of another result, in a comparison: its first layer is `aside`, and its
+    edges are numbered on from `edges`. `team` is as stated and `calibrated` as it turned out. `notes` say what there is
+    none of, and why.
     Without a `run` there are no images, marker tracks and inspections.
     """
 
@@ -154,7 +155,6 @@ class Scene:
     stances: tuple[Stance, ...]
     layers: tuple[Layer, ...] = ()
     edges: Edges = NO_EDGES
-    other_edges: Edges = NO_EDGES
     sightings: Links = NO_LINKS
     odometry: Links = NO_LINKS
     stayed: Index = field(default_factory=lambda: np.empty((0, 2), np.int64))
@@ -165,6 +165,7 @@ class Scene:
     wheels: Mapping[str, WheelTrack] = field(default_factory=dict)
     title: str = ""
     notes: tuple[str, ...] = ()
+    beside: "Scene | None" = None
 
     def __len__(self) -> int:
         return len(self.stances)
@@ -213,12 +214,17 @@ class Scene:
         """The poses of another result, in a comparison."""
         return next((layer for layer in self.layers if layer.aside), None)
 
-    def edge(self, number: int) -> tuple[Layer, Edges, int] | None:
-        """Of an edge by its number the layer between whose poses it is, its edges, and where among them."""
+    @property
+    def other_edges(self) -> Edges:
+        """Its edges."""
+        return self.beside.edges if self.beside is not None else NO_EDGES
+
+    def edge(self, number: int) -> tuple["Scene", int] | None:
+        """Of an edge by its number the scene that it is of, and its number there; None where there is none."""
         if 0 <= number < len(self.edges):
-            return self.layers[0], self.edges, number
+            return self, number
         number -= len(self.edges)
-        return (self.other, self.other_edges, number) if self.other and 0 <= number < len(self.other_edges) else None
+        return (self.beside, number) if self.beside is not None and 0 <= number < len(self.beside.edges) else None
 
     @property
     def true(self) -> Layer | None:

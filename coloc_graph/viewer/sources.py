@@ -23,6 +23,7 @@ from coloc_graph.run import Run, Stance, open_run, read_truth
 from coloc_graph.team import read_team
 from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.scene import NO_EDGES, TRUE, Edges, Index, Layer, Scene, layer_of
+from coloc_graph.viewer.ties import ties_in, ties_on_disk
 
 #: What the methods' layers are called.
 NAMES = {"chain": "chained", "smooth": "smoothed", "joint": "joint"}
@@ -47,11 +48,15 @@ def scene_of_estimate(
     every = (estimate, *others)
     layers = [layer_of(NAMES[one.method], graph.robots, graph.stances, one.trajectories) for one in every]
     team = run.team if run is not None else None
+    true, notes = _true(run, graph.robots, graph.stances, estimate.trajectories)
+    sightings, odometry = ties_in(graph.measurements, graph.robots, graph.stances)
     return Scene(
         robots=graph.robots,
         stances=graph.stances,
-        layers=(*layers, *_true(run, graph.robots, graph.stances, estimate.trajectories)),
+        layers=(*layers, *true),
         edges=_edges(estimate, measurements),
+        sightings=sightings,
+        odometry=odometry,
         stayed=stayed(graph.robots, graph.stances, [(s.robot, s.after) for s in graph.stay_puts]),
         team=team,
         calibrated=estimate.calibration.of_team(team) if team is not None and estimate.calibration.rows else None,
@@ -59,6 +64,7 @@ def scene_of_estimate(
         frontend=frontend or FrontendOptions(),
         wheels=_wheels(run),
         title=run.path.name if run is not None else "",
+        notes=notes,
     )
 
 
@@ -110,14 +116,20 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
     name = NAMES.get(str(result.summary.get("method")), str(result.summary.get("method")))
     robots, stances = run.team.names, run.stances
     refined = result.path / "team.toml"
+    true, notes = _true(run, robots, stances, result.trajectories)
+    edges = _edges_on_disk(result.path / "measurements.csv", robots, stances)
+    pairs = {
+        (stances[row].index, frozenset((robots[i], robots[j])))
+        for row, i, j in zip(edges.rows.tolist(), edges.i.tolist(), edges.j.tolist(), strict=True)
+    }
+    sightings, odometry = ties_on_disk(result.path / "graph.g2o", pairs, robots, stances)
     return Scene(
         robots=robots,
         stances=stances,
-        layers=(
-            layer_of(name, robots, stances, result.trajectories),
-            *_true(run, robots, stances, result.trajectories),
-        ),
-        edges=_edges_on_disk(result.path / "measurements.csv", robots, stances),
+        layers=(layer_of(name, robots, stances, result.trajectories), *true),
+        edges=edges,
+        sightings=sightings,
+        odometry=odometry,
         stayed=stayed(robots, stances, _anchored(stances, result.summary.get("bumped", []))),
         team=run.team,
         calibrated=read_team(refined) if refined.exists() else None,
@@ -125,19 +137,21 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
         frontend=_frontend(result.path / "config.toml"),
         wheels=_wheels(run),
         title=result.path.absolute().name,
+        notes=notes,
     )
 
 
 def with_other(scene: Scene, path: str | Path) -> Scene:
-    """The scene with the layers of another result of the same run; `InputError` where it is of another run."""
+    """The scene with that of another result of the same run beside it; `InputError` where it is of another run."""
     if scene.run is None:
         raise InputError(f"{path} cannot be compared: there is no run that both could be of")
-    result = read_result(path)
-    result.require_run(scene.run.path)
-    method = str(result.summary.get("method"))
-    label = f"{result.path.absolute().name}: {NAMES.get(method, method)}"
-    other = layer_of(label, scene.robots, scene.stances, result.trajectories, aside=True)
-    return replace(scene, layers=(*scene.layers, other), title=f"{scene.title} and {result.path.absolute().name}")
+    other = scene_of_result(path, scene.run.path)
+    layer = replace(other.layers[0], name=f"{other.title}: {other.layers[0].name}", aside=True)
+    other = replace(other, layers=(layer, *other.layers[1:]))
+    return replace(
+        scene, layers=(*scene.layers, layer), beside=other, title=f"{scene.title} and {other.title}",
+        notes=tuple(dict.fromkeys((*scene.notes, *other.notes))),
+    )  # fmt: skip
 
 
 def is_run(path: str | Path) -> bool:
@@ -147,25 +161,19 @@ def is_run(path: str | Path) -> bool:
 
 def _true(
     run: Run | None, robots: Sequence[str], stances: Sequence[Stance], estimated: Mapping[str, Trajectory]
-) -> tuple[Layer, ...]:
-    """The true poses in the estimate's world; () where the run has none, or they do not cover the estimate."""
+) -> tuple[tuple[Layer, ...], tuple[str, ...]]:
+    """The true poses in the estimate's world, if there are any; and why not, where they do not cover the estimate."""
     if run is None or not any(len(one) for one in estimated.values()):
-        return ()
+        return (), ()
     truth = read_truth(run.path)
     if not truth:
-        return ()
+        return (), ()
     try:
         true = align(estimated, truth, run.team.reference, on_floor=run.team.floor is not None)
-    except InputError:
-        return ()
-    return (
-        layer_of(
-            TRUE,
-            robots,
-            stances,
-            {robot: replace(one, T_world_body=true[robot], covariances=None) for robot, one in estimated.items()},
-        ),
-    )
+    except InputError as error:
+        return (), (f"the truth in the run is not shown: {error}",)
+    trajectories = {robot: replace(one, T_world_body=true[robot], covariances=None) for robot, one in estimated.items()}
+    return (layer_of(TRUE, robots, stances, trajectories),), ()
 
 
 def _wheels(run: Run | None) -> dict[str, WheelTrack]:
