@@ -11,7 +11,20 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from coloc_graph._version import __version__
-from coloc_graph.cli import coordinate, demo, evaluate, experiment, export, import_, info, robot, simulate, solve, view
+from coloc_graph.cli import (
+    certificates,
+    coordinate,
+    demo,
+    evaluate,
+    experiment,
+    export,
+    import_,
+    info,
+    robot,
+    simulate,
+    solve,
+    view,
+)
 from coloc_graph.errors import ColocError
 
 
@@ -27,7 +40,10 @@ def parser() -> argparse.ArgumentParser:
     top = _Parser(prog="coloc", description="Where each robot of a team is, from cameras and LED markers alone.")
     top.add_argument("--version", action="version", version=f"coloc {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (demo, simulate, import_, info, solve, evaluate, view, export, experiment, coordinate, robot):
+    for module in (
+        *(demo, simulate, import_, info, solve, evaluate, view, export, experiment),
+        *(coordinate, robot, certificates),
+    ):
         module.add(commands)
     return top
 
