@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 CLEAR = float(chdtri(1, LEAST_CHANCE))
 #: So many steps at most lead to the optimum when something enters: a first stance with mounts a degree off takes 4.
 MOST_STEPS = 10
+#: A step that leaves more than this share of the worst chi2 has not brought it nearer.
+NEARER = 0.9
 
 
 class Entered(NamedTuple):
@@ -162,19 +164,20 @@ class LiveGraph:
     def _take_out(self, inside: dict[int, Entered]) -> list[tuple[Link, Agreement]]:
         """Take out what all others contradict, the worst first."""
         refused: list[tuple[Link, Agreement]] = []
-        converged = False
+        before = np.inf  # how far off the worst was a step ago; where no step brings it nearer, it is the optimum
         while inside:
             among = {index: self._agreement(one) for index, one in inside.items()}
             worst = min(among, key=lambda index: among[index].chance())
             if among[worst].chance() >= LEAST_CHANCE:
                 break
-            if not converged:
-                # what one step leaves of a residual counts many times over where little else checks it
+            if among[worst].chi2 < NEARER * before:
+                # what steps leave of a residual counts many times over where little else checks it
+                before = among[worst].chi2
                 self._linearise()
-                converged = True
                 continue
             refused.append((inside.pop(worst).link, among[worst]))
             self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [worst])
+            before = np.inf
         return refused
 
     def _agreement(self, one: Entered, *, inside: bool = True) -> Agreement:
