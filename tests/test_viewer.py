@@ -39,6 +39,7 @@ from coloc_graph.viewer import (
     with_other,
 )
 from coloc_graph.viewer.frame import MOVING, ViewState, dashed, frame_of, pick, thinned_rows
+from coloc_graph.viewer.handles import seen_size
 from coloc_graph.viewer.live import LiveScene
 from coloc_graph.viewer.motion import pose_at
 from coloc_graph.viewer.plots import error_curves, residual_curves, with_cursor
@@ -240,6 +241,37 @@ def test_a_ray_finds_the_edge_or_the_robot_it_passes(scene):
     for number, pose in enumerate(frame.poses):
         assert pick(frame, eye, np.add(pose[:3], (0, 0, 0.2)) - eye) == ("robot", number)
     assert pick(frame, eye, (0, 0, 1)) is None and pick(frame, eye, (0, -1, 0)) is None
+
+
+def test_robots_seen_from_afar_are_drawn_larger_are_met_as_drawn_and_it_is_said():
+    assert [seen_size(d) for d in (0.0, 25.0, 49.0, 51.0, 210.0, 1e9, np.nan)] == [1, 1, 1, 2, 8, 64, 1]
+    drawn = huge(2_000)
+    with Viewer(drawn, port=0) as viewer:
+        assert viewer.wait_idle()
+        size, name = viewer.view.size, viewer.view._names[0]
+        assert size >= 8 and viewer.view._bodies[0].scale == size and name.position[2] > 0.3 * size
+        assert f"robots are drawn {size:.0f} times as large" in viewer.panel.status.content
+        frame = viewer.frame
+        beside = frame.poses[0, :3] + (0.0, -1.0, 0.2 * size)  # where the large body is, and the real one is not
+        eye = np.add(beside, (-50.0, 0.0, 60.0))
+        assert pick(frame, eye, beside - eye, size=size) == ("robot", 0) != pick(frame, eye, beside - eye)
+        viewer.view.enlarge(1.0)
+        assert np.isclose(name.position[2], 0.35) and viewer.view._anchors[0].scale == 1
+
+
+def test_of_a_large_team_no_names_are_written_and_it_is_said():
+    robots = tuple(f"R{n}" for n in range(17))
+    made = (Stance(0, 0.0, 5.0, robots[:2], robots[2:]),)
+    paths = {
+        robot: Trajectory(
+            robot, np.zeros(1), floor_pose(0.6 * np.arange(1) + n, np.zeros(1), np.zeros(1)), np.arange(1)
+        )
+        for n, robot in enumerate(robots)
+    }
+    drawn = Scene(robots, made, (layer_of("joint", robots, made, paths),))
+    with Viewer(drawn, port=0) as viewer:
+        assert viewer.wait_idle() and not any(name.visible for name in viewer.view._names)
+        assert "no name is written: click one" in viewer.panel.status.content
 
 
 # inspection

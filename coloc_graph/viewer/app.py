@@ -19,7 +19,7 @@ from coloc_graph.run import Run
 from coloc_graph.viewer import inspect
 from coloc_graph.viewer.export import page_of
 from coloc_graph.viewer.frame import NO_LINES, Frame, Lines, ViewState, frame_of, pick
-from coloc_graph.viewer.handles import GraphView, Image, camera_on, initial_camera
+from coloc_graph.viewer.handles import MOST_NAMES, GraphView, Image, camera_on, initial_camera, seen_size
 from coloc_graph.viewer.live import LivePoses, LiveScene, LiveStance
 from coloc_graph.viewer.panel import NOBODY, Panel, set_value
 from coloc_graph.viewer.scene import Scene
@@ -74,6 +74,7 @@ class Viewer:
             self._dark = False
             initial_camera(self.server, scene)
             self.server.scene.on_click()(self._clicked)
+            self.server.on_client_connect(self._greet)
         except BaseException:
             stop_server(self.server)
             raise
@@ -162,7 +163,20 @@ class Viewer:
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         if self.frame is not None:
-            self.pick(pick(self.frame, event.ray_origin, event.ray_direction))
+            self.pick(pick(self.frame, event.ray_origin, event.ray_direction, size=self.view.size))
+
+    def _greet(self, client: viser.ClientHandle) -> None:
+        @client.camera.on_update
+        def _(_: viser.CameraHandle) -> None:
+            if self._size() != self.view.size:
+                self._wake()
+
+    def _size(self) -> float:
+        """How many times as large as they are robots are drawn, by whoever is nearest."""
+        eyes = [(client.camera.position, client.camera.look_at) for client in self.server.get_clients().values()]
+        if not eyes:
+            eyes = [camera_on(self._scene, self._aside)]
+        return seen_size(min(float(np.linalg.norm(eye - at)) for eye, at in eyes))
 
     # the render thread
 
@@ -221,7 +235,15 @@ class Viewer:
         return replace(frame, poses=now.over(scene.robots, frame.poses))
 
     def _tell(self, frame: Frame) -> None:
-        notes = (self._now.note if self._now is not None else "", frame.note, self._note)
+        notes = (
+            self._now.note if self._now is not None else "",
+            frame.note,
+            f"robots are drawn {self.view.size:.0f} times as large as they are, to be seen from afar"
+            if self.view.size > 1
+            else "",
+            f"of more than {MOST_NAMES} robots no name is written: click one" if len(frame.roles) > MOST_NAMES else "",
+            self._note,
+        )
         self.panel.tell(self._scene, frame, self._time, notes)
 
     def _step(self, played: float) -> bool:
@@ -232,11 +254,13 @@ class Viewer:
         if panel.dark.value != self._dark:
             self._dark = panel.dark.value
             panel.dress(self._dark)
-            self.view.dress(scene, self._dark)
+            self.view.dress(scene, self._dark, self._aside)
         if panel.beside.value != bool(self._aside):
             low, high = scene.bounds
             self._aside = float(high[1] - low[1] + 1.0) if panel.beside.value else 0.0
+            self.view.dress(scene, self._dark, self._aside)
             self._frame_all()
+        self.view.enlarge(self._size())
         rests = time.perf_counter() - self._moved_at > UNTIL_REST
         state = self._state(rests)
         frame = self._brought_up_to_date(frame_of(scene, state))
@@ -294,7 +318,7 @@ class Viewer:
             self._notify("A stance cannot be shown", str(error))
             return
         self.view.adopt(self._scene)
-        self.view.dress(self._scene, self._dark)
+        self.view.dress(self._scene, self._dark, self._aside)
         self.panel.adopt(self._scene)
         if at_end:
             self._time = self._scene.middle(len(self._scene) - 1)

@@ -54,7 +54,7 @@ def T_body_camera(robot: Robot | None) -> Array:
     return T
 
 
-def disc(sections: int = 40) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+def disc(sections: int = 28) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     """Vertices and faces of a unit disc in x, y, its face up."""
     angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(sections)], axis=1)
@@ -63,7 +63,7 @@ def disc(sections: int = 40) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     return np.vstack([rim, np.zeros(3)]).astype(np.float32), faces.astype(np.uint32)
 
 
-def ring(inner: float, outer: float, sections: int = 48) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+def ring(inner: float, outer: float, sections: int = 32) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     """Vertices and faces of a flat ring between two radii [m], its face up."""
     angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(sections)], axis=1)

@@ -13,7 +13,7 @@ from coloc_graph.viewer.prepared import Z_ODOMETRY, Z_SIGHTING, Float32, doubts_
 from coloc_graph.viewer.scene import TRUE, Array, Edges, Index, Layer, Links, Mask, Scene
 
 #: So many poses are drawn at most: while time moves, and once it rests.
-MOVING, RESTING = 1_800, 20_000
+MOVING, RESTING = 1_800, 9_000
 #: Heights [m] over the floor: ellipses, rings, wedges, trajectories.
 Z_ELLIPSE, Z_RING, Z_WEDGE, Z_WAY = 0.004, 0.006, 0.008, 0.010
 #: Dashes and gaps of what is refused, and of what is chained, are so long [m]; so many at most.
@@ -287,18 +287,18 @@ def _raised(places: Float32, z: float) -> Float32:
 
 
 def pick(
-    frame: Frame, origin: Sequence[float], direction: Sequence[float], most_deg: float = 1.5
+    frame: Frame, origin: Sequence[float], direction: Sequence[float], most_deg: float = 1.5, size: float = 1.0
 ) -> tuple[str, int] | None:
     """What a ray from the eye meets: ("robot", number) or ("edge", its number in the scene); None for nothing.
 
-    An edge is met within so many degrees at the eye, a robot within its body.
+    An edge is met within so many degrees at the eye, a robot within its body, `size` times as large as it is.
     """
     o, d = np.asarray(origin, float), np.asarray(direction, float)
     d = d / np.linalg.norm(d)
-    centres = frame.poses[:, :3] + (0.0, 0.0, 0.2)
+    centres = frame.poses[:, :3] + (0.0, 0.0, 0.2 * size)
     along = (centres - o) @ d
     off = np.linalg.norm(centres - o - along[:, None] * d, axis=1)
-    hit = np.flatnonzero((along > 0) & (off < ROBOT_REACH))  # NaN, of who is nowhere, is not
+    hit = np.flatnonzero((along > 0) & (off < ROBOT_REACH * size))  # NaN, of who is nowhere, is not
     if len(hit):
         return "robot", int(hit[np.argmin(along[hit])])
     nearest = nearest_segment(frame.edge_points, o, d, most_deg)

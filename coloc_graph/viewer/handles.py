@@ -17,6 +17,10 @@ from coloc_graph.viewer.scene import TRUE, Scene
 MARGIN, FINE = 2.0, 60.0
 #: How large a frustum is drawn [m].
 FRUSTUM = 0.14
+#: Robots are as large as they are from up to so far [m], and larger from farther away; so many times at most.
+NEAR, LARGEST = 25.0, 64.0
+#: Of teams that are larger nobody's name is written.
+MOST_NAMES = 16
 #: The camera at the beginning: its vertical field of view and how steeply it looks down [rad], what it is taken to be
 #: wide for its height, and the share of the picture that the data fill. Robots are so tall [m].
 FOV, PITCH, ASPECT, FILLED, TALL = float(np.radians(40)), float(np.radians(40)), 1.3, 0.85, 0.6
@@ -50,12 +54,15 @@ class GraphView:
 
     def _make_robots(self, scene: Scene) -> None:
         add = self.server.scene
-        self.robots, self._frustums, self._names, self._anchors = [], {}, [], []
+        self.robots, self._frustums, self._names, self._anchors, self._bodies = [], {}, [], [], []
+        self.size = 1.0
         for name, colour in zip(scene.robots, palette.robot_colours(len(scene.robots)), strict=True):
             robot = scene.team[name] if scene.team is not None else None
             path, tint = f"/robots/{name}", np.asarray(colour)
             self.robots.append(add.add_frame(path, show_axes=False, visible=False))
-            add.add_mesh_trimesh(f"{path}/body", bodies.robot_mesh(robot, colour), receive_shadow=False)
+            self._bodies.append(
+                add.add_mesh_trimesh(f"{path}/body", bodies.robot_mesh(robot, colour), receive_shadow=False)
+            )
             vertices, faces = bodies.ring(0.19, 0.215)
             self._anchors.append(
                 add.add_mesh_simple(
@@ -65,8 +72,11 @@ class GraphView:
             )  # fmt: skip
             top = bodies.T_body_camera(robot)[2, 3]
             self._names.append(
-                add.add_label(f"{path}/name", name, position=(0, 0, max(top, 0.2) + 0.1), anchor="bottom-center")
-            )
+                add.add_label(
+                    f"{path}/name", name, position=(0, 0, max(top, 0.2) + 0.1), anchor="bottom-center",
+                    visible=len(scene.robots) <= MOST_NAMES,
+                )
+            )  # fmt: skip
             if robot is not None:
                 T, camera = robot.mount.T_body_camera, robot.camera
                 self._frustums[name] = add.add_camera_frustum(
@@ -109,9 +119,10 @@ class GraphView:
                 )  # fmt: skip
                 self.names += (name,)
 
-    def dress(self, scene: Scene, dark: bool) -> None:
-        """The floor beneath a scene, as large as it, and in light or dark."""
+    def dress(self, scene: Scene, dark: bool, aside: float = 0.0) -> None:
+        """The floor beneath a scene, as large as it with what is moved `aside` [m], and in light or dark."""
         low, high = extent(scene)
+        high = high + np.array([0.0, aside])
         size = high - low + 2 * MARGIN
         if dark == self._dark and size.max() <= self._reach:
             return
@@ -176,6 +187,18 @@ class GraphView:
             for name, one in batches.items():
                 self._assign_batch(name, one, tints[name])
 
+    def enlarge(self, size: float) -> None:
+        """Draw the robots so many times as large as they are."""
+        if size == self.size:
+            return
+        share, self.size = size / self.size, size
+        with self.server.atomic():
+            for body, anchor, name in zip(self._bodies, self._anchors, self._names, strict=True):
+                body.scale = anchor.scale = size
+                name.position = share * name.position
+            for frustum in self._frustums.values():
+                frustum.scale, frustum.position = FRUSTUM * size, share * frustum.position
+
     def place(self, poses: NDArray[np.float64]) -> None:
         """Show the robots at poses (r, 4) of x, y, z, heading, and not at all where these are NaN."""
         turned = about_z(np.nan_to_num(poses[:, 3]))
@@ -208,6 +231,11 @@ class GraphView:
         self._sent[name] = key
         handle.batched_wxyzs, handle.batched_positions = one.wxyz, one.positions
         handle.batched_scales, handle.batched_colors = one.scales, colours
+
+
+def seen_size(distance: float) -> float:
+    """How many times as large as they are robots are drawn for an eye at so many metres; a power of two."""
+    return float(2 ** np.floor(np.log2(np.clip(distance / NEAR, 1.0, LARGEST)))) if np.isfinite(distance) else 1.0
 
 
 def initial_camera(server: viser.ViserServer, scene: Scene, aside: float = 0.0) -> None:
