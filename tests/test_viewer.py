@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,6 +43,7 @@ from coloc_graph.viewer.frame import MOVING, ViewState, dashed, frame_of, pick, 
 from coloc_graph.viewer.handles import seen_size
 from coloc_graph.viewer.live import LiveScene
 from coloc_graph.viewer.motion import pose_at
+from coloc_graph.viewer.panel import HANDS_OFF, set_value
 from coloc_graph.viewer.plots import error_curves, residual_curves, with_cursor
 from coloc_graph.viewer.prepared import ellipse_axes
 from coloc_graph.viewer.scene import layer_of
@@ -432,6 +434,31 @@ def test_live_poses_that_cannot_be_shown_are_named_and_the_others_shown(short_so
     with Viewer(empty_scene(short_solution.run, "joint"), port=0) as viewer:
         viewer.publish(poses)
         assert shows(viewer, "A", (1.0, 0.0, 0.0)) and viewer._told == {words}
+
+
+def test_an_arrow_key_that_moves_the_slider_which_has_the_focus_steps_once(scene):
+    """A browser sends both what the slider is and the command that is bound to the key."""
+    with Viewer(scene, port=0) as viewer:
+        panel = viewer.panel
+        somebody = SimpleNamespace(client="a browser", target=panel.stance)
+        viewer.go(0)
+        assert viewer.wait_idle() and viewer.frame.row == 0
+        set_value(panel.stance, 1)
+        panel._slid(somebody, "stance")
+        panel._struck("step", 1)
+        assert viewer.wait_idle() and viewer.frame.row == 1
+        time.sleep(HANDS_OFF)
+        panel._struck("step", 1)
+        assert viewer.wait_idle() and viewer.frame.row == 2 == panel.stance.value
+
+
+def test_a_slider_that_was_just_moved_is_not_moved_back_by_a_picture_from_before(scene):
+    with Viewer(scene, port=0) as viewer:
+        assert viewer.wait_idle()
+        last = viewer.frame.row
+        set_value(viewer.panel.stance, 1)  # as a browser does, before anybody has heard of it
+        viewer.pick(None)
+        assert viewer.wait_idle() and viewer.frame.row == last and viewer.panel.stance.value == 1
 
 
 # server and command

@@ -1,7 +1,9 @@
 """The viewer's controls: sliders, switches, plots, legend, and the panel of what was clicked."""
 
 import html
+import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import viser
@@ -17,6 +19,9 @@ NOBODY = "nobody"
 HELP = "Click an edge or a robot. Space plays, arrow keys step."
 WIDTH, INSPECTOR_WIDTH = 330, 480
 
+#: A slider is left to whoever moves it for so long; keys that move it while it has the focus do nothing else [s].
+HANDS_OFF = 0.25
+
 #: Called with what was asked for: ("stance", row), ("time", seconds), ("step", rows), ("play", 0), ("changed", 0).
 Ask = Callable[[str, float], None]
 
@@ -27,6 +32,8 @@ class Panel:
     def __init__(self, server: viser.ViserServer, scene: Scene, ask: Ask, k_sigma: float, *, compares: bool) -> None:
         self._gui, self._ask = server.gui, ask
         self._clicked = False
+        self._touched_at = -HANDS_OFF
+        self._led: dict[str, float] = {}
         gui = server.gui
         gui.configure_theme(brand_color=palette.rgb("#0072B2"), show_share_button=False, show_logo=False)
         gui.main_panel.dock_right()
@@ -76,19 +83,13 @@ class Panel:
 
     def _listen(self) -> None:
         # what this process sets itself comes without a client, and is no wish of anybody
-        @self.stance.on_update
-        def _(event: viser.GuiEvent[viser.GuiSliderHandle[int]]) -> None:
-            if event.client is not None:
-                self._ask("stance", self.stance.value)
-
-        @self.time.on_update
-        def _(event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
-            if event.client is not None:
-                self._ask("time", self.time.value)
-
+        for slider, what in (
+            (self.stance, "stance"), (self.time, "time"), (self.speed, "changed"), (self.k_sigma, "changed"),
+        ):  # fmt: skip
+            slider.on_update(lambda event, what=what: self._slid(event, what))  # type: ignore[misc]
         for handle in (
-            self.play, self.k_sigma, self.ellipses, self.wedges, self.edges, self.stays, self.markers, self.sightings,
-            self.odometry, self.beside, self.dark, self.follow, self.speed,
+            self.play, self.ellipses, self.wedges, self.edges, self.stays, self.markers, self.sightings,
+            self.odometry, self.beside, self.dark, self.follow,
         ):  # fmt: skip
             handle.on_update(lambda _: self._ask("changed", 0))
         for label, hotkey, what, value in (
@@ -97,7 +98,26 @@ class Panel:
             ("Last stance", "end", "step", 1 << 40),
         ):  # fmt: skip
             command = self._gui.add_command(label, hotkey=hotkey)  # type: ignore[arg-type]
-            command.on_trigger(lambda _, what=what, value=value: self._ask(what, value))  # type: ignore[misc]
+            command.on_trigger(lambda _, what=what, value=value: self._struck(what, value))  # type: ignore[misc]
+
+    def _slid(self, event: viser.GuiEvent[viser.GuiSliderHandle[Any]], what: str) -> None:
+        if event.client is not None:
+            self._touched_at = time.monotonic()
+        if event.client is not None or what == "changed":
+            self._ask(what, event.target.value)
+
+    def _struck(self, what: str, value: float) -> None:
+        """A key: an arrow that moves the slider which has the focus comes as a command too."""
+        if what != "step" or time.monotonic() - self._touched_at > HANDS_OFF:
+            self._ask(what, value)
+
+    def _lead(self, slider: viser.GuiSliderHandle[Any], what: str, value: float, tolerance: float) -> None:
+        """Move a slider along with the picture, but do not take it out of anybody's hand."""
+        if self._led.get(what) == value or time.monotonic() - self._touched_at < HANDS_OFF:
+            return
+        self._led[what] = value
+        if abs(slider.value - value) > tolerance:
+            set_value(slider, value)
 
     def adopt(self, scene: Scene) -> None:
         """Sliders and switches for a scene of the same robots: as long as it, a switch a trajectory."""
@@ -123,7 +143,7 @@ class Panel:
         """The trajectories that are switched on."""
         return frozenset(name for name, box in self._layers.items() if box.value)
 
-    def tell(self, scene: Scene, frame: Frame, time: float, notes: Sequence[str]) -> None:
+    def tell(self, scene: Scene, frame: Frame, moment: float, notes: Sequence[str]) -> None:
         """Sliders and the sentence at the top with the `notes` there are, as the picture is."""
         if not len(scene):
             self._say(f"**{scene.title}** no poses yet", notes)
@@ -132,11 +152,9 @@ class Panel:
         drivers = ", ".join(stance.movers) or "nobody"
         anchors = ", ".join(stance.anchors) or "nobody"
         self._say(f"**Stance {stance.index}** of {len(scene)}: {drivers} drives, {anchors} stayed put", notes)
-        at = round(min(max(time - float(scene.starts[0]), 0.0), self.time.max), 1)
-        if self.stance.value != frame.row:
-            set_value(self.stance, frame.row)
-        if abs(self.time.value - at) > 0.05:
-            set_value(self.time, at)
+        at = round(min(max(moment - float(scene.starts[0]), 0.0), self.time.max), 1)
+        self._lead(self.stance, "stance", frame.row, 0)
+        self._lead(self.time, "time", at, 0.05)
 
     def _say(self, what: str, notes: Sequence[str]) -> None:
         text = "\n\n".join([what, *(f"_{one}_" for one in notes if one)])
