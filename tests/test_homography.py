@@ -7,6 +7,7 @@ from scipy.stats import chi2
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend import PointPairs, fit_homography
+from coloc_graph.frontend.homography import persisting
 from coloc_graph.lie import sl3_vee
 
 SCENE = Scene()
@@ -65,6 +66,47 @@ def test_the_information_is_that_of_the_errors(fits, criterion):
 def test_the_errors_have_no_bias(fits, criterion):
     whitened = [np.linalg.cholesky(fit.information).T @ error(fit.H) for fit in fits[criterion]]
     assert np.abs(np.mean(whitened, axis=0)).max() < 4 / np.sqrt(400)
+
+
+def along_a_way(rng, rho, n=240):
+    """Points of a marker that goes to and fro before the cameras, whose errors last."""
+    uv = np.stack(SCENE.pixels(n, rng), axis=1)
+    rows = np.array_split(uv[np.argsort(uv[:, 0, 1])], 8)
+    uv = np.concatenate([row[np.argsort(row[:, 0, 0])][:: 1 - 2 * (k % 2)] for k, row in enumerate(rows)])
+    noise = rng.normal(size=uv.shape)
+    for k in range(1, n):
+        noise[k] = rho * noise[k - 1] + np.sqrt(1 - rho**2) * noise[k]
+    return pairs_of(*np.moveaxis(uv + NOISE * noise, 1, 0), NOISE)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.7])
+def test_points_whose_errors_last_say_less_by_as_much_as_they_err_more(rho):
+    rng = np.random.default_rng(11)
+    before, after, persistence = [], [], []
+    for _ in range(150):
+        pairs = along_a_way(rng, rho)
+        fit = fit_homography(pairs)
+        lasting = persisting(fit, pairs, np.zeros(len(pairs), int), np.arange(len(pairs)) / 30)
+        before.append(nees(fit) / 8)
+        after.append(nees(lasting) / 8)
+        persistence.append(lasting.persistence)
+        assert lasting.persistence >= 1 and np.array_equal(lasting.H, fit.H)
+        assert np.allclose(lasting.information * lasting.persistence, fit.information)
+    if rho:
+        assert np.mean(before) > 2.0 and 0.8 < np.mean(after) < 1.3
+        assert 0.6 < np.mean(persistence) / ((1 + rho) / (1 - rho)) < 1.1
+    else:
+        assert np.mean(np.array(persistence) == 1.0) > 0.97 and np.mean(after) == pytest.approx(1.0, abs=0.15)
+
+
+def test_only_points_of_one_marker_one_after_the_other_are_compared():
+    rng = np.random.default_rng(3)
+    pairs = along_a_way(rng, 0.7)
+    fit = fit_homography(pairs)
+    n = len(pairs)
+    shuffled = persisting(fit, pairs, np.zeros(n, int), rng.permutation(n).astype(float))
+    apart = persisting(fit, pairs, np.arange(n) % (n // 2), np.arange(n) / 30)
+    assert shuffled.persistence == 1.0 == apart.persistence
 
 
 def test_chi2_counts_one_a_degree_of_freedom(fits):

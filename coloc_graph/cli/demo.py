@@ -1,4 +1,4 @@
-"""coloc demo: the hallway from rendered images, solved, printed as the paper's Table II."""
+"""coloc demo: the hallway from rendered images, solved, printed as the paper's Table II; or led online."""
 
 import argparse
 
@@ -10,7 +10,13 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--stances", type=int, default=40)
     command.add_argument("--seed", type=int, default=0)
     command.add_argument("--no-browser", action="store_true", help="do not open the viewer")
-    command.set_defaults(run=run)
+    command.add_argument(
+        "--online",
+        action="store_true",
+        help="three programs of robots on simulated wheels and cameras drive the hallway by themselves",
+    )
+    command.add_argument("--port", type=int, default=8080, help="of the viewer, with --online (8080)")
+    command.set_defaults(run=lambda args: online(args) if args.online else run(args))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -57,3 +63,40 @@ def run(args: argparse.Namespace) -> int:
         with Viewer(scene_of_solution(solution), host="127.0.0.1", port=0) as viewer:  # any port that is free
             show(viewer, browser=True)
     return 0
+
+
+def online(args: argparse.Namespace) -> int:
+    """Have a simulated team lead itself down the hallway, watch it, print."""
+    import time
+    from pathlib import Path
+
+    from coloc_graph.cli.mission import report, watched
+    from coloc_graph.cli.running import until_signal
+    from coloc_graph.errors import InputError
+    from coloc_graph.online.coordinator import Coordinator, MissionOptions
+    from coloc_graph.online.phases import Phase
+    from coloc_graph.online.simulated_team import SimulatedTeam, field_team, free_address
+
+    out = Path(args.out) / "online"
+    if out.exists():
+        raise InputError(f"{out} is there already: remove it, or give another folder with --out")
+    team, address = field_team(), free_address()
+    options = MissionOptions(goals=((100.0, 0.0),), stances=args.stances, speed=0.4)
+    with until_signal() as stop, watched(team, args.port, browser=not args.no_browser) as told:
+        with SimulatedTeam(team, out / "field", connect=address, seed=args.seed) as field:
+            field.start()
+            began = time.monotonic()
+            coordinator = Coordinator(
+                team, out / "mission", options, listen=address, entered=told.entered, heard=told.heard
+            )
+            with coordinator:
+                phase = coordinator.run(stop)
+        if coordinator.stances == 0:
+            return 1
+        report(out / "mission", field.truth_path)
+        slowest = max(coordinator.latencies)
+        print(
+            f"{coordinator.stances} stances in {time.monotonic() - began:.0f} s; from the last image of a stance "
+            f"to its estimate at most {slowest:.2f} s; {field.truth_path} is the truth"
+        )
+    return 0 if phase == Phase.DONE else 1

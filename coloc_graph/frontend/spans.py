@@ -45,6 +45,7 @@ def _from_both_images(pairs: PointPairs, fit: HomographyFit) -> tuple[Array, Arr
     C_i, C_j = pairs.covariance_i, pairs.covariance_j
     if fit.dof > 0 and fit.chi2 > fit.dof + 3 * np.sqrt(2 * fit.dof):  # as the fit did with its information
         C_i, C_j = C_i * (fit.chi2 / fit.dof), C_j * (fit.chi2 / fit.dof)
+    C_i, C_j = C_i * fit.persistence, C_j * fit.persistence
     at = linearise(fit.H, pairs.x_i, pairs)
     B = at.by_z
     gain = C_i @ B.mT @ np.linalg.inv(C_j + B @ C_i @ B.mT)

@@ -27,7 +27,7 @@ from coloc_graph.frontend.correspondence import (
     span_samples,
 )
 from coloc_graph.frontend.detection import Blobs, detector_for
-from coloc_graph.frontend.homography import HomographyFit, fit_homography, shared_error
+from coloc_graph.frontend.homography import HomographyFit, fit_homography, persisting, shared_error
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
 from coloc_graph.frontend.refinement import Criterion
@@ -171,6 +171,7 @@ def _measured(
             "look for wrong marker names, reflections, or clocks that differ by more than "
             + ("the pairing window" if offset is None else "`clock_sigma` says")
         )
+    fit = persisting(fit, found.pairs, found.markers, found.times)
     measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
     if offset is not None:
         said = seen.run.team.clock_sigma

@@ -2,6 +2,7 @@
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +31,13 @@ def field_team(imperfections: Imperfections = FIELD, fps: float = FPS) -> Team:
     return new(
         team, clock_sigma=CLOCKS, robots=tuple(new(robot, camera=new(robot.camera, fps=fps)) for robot in team.robots)
     )
+
+
+def free_address() -> str:
+    """An address of this machine at which nobody listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 class SimulatedTeam:
