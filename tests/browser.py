@@ -48,7 +48,7 @@ def page_of(browser):
     assert not problems, problems
 
 
-def until(what, timeout=20.0):
+def until(what, timeout=60.0):
     """Whether something comes true in time."""
     ends = time.monotonic() + timeout
     while time.monotonic() < ends:

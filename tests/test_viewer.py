@@ -247,12 +247,13 @@ def test_a_ray_finds_the_edge_or_the_robot_it_passes(scene):
 
 def test_robots_seen_from_afar_are_drawn_larger_are_met_as_drawn_and_it_is_said():
     assert [seen_size(d) for d in (0.0, 25.0, 49.0, 51.0, 210.0, 1e9, np.nan)] == [1, 1, 1, 2, 8, 64, 1]
-    drawn = huge(2_000)
+    drawn = huge(4_000)
     with Viewer(drawn, port=0) as viewer:
         assert viewer.wait_idle()
         size, name = viewer.view.size, viewer.view._names[0]
-        assert size >= 8 and viewer.view._bodies[0].scale == size and name.position[2] > 0.3 * size
+        assert size >= 16 and viewer.view._bodies[0].scale == size and name.position[2] > 0.3 * size
         assert f"robots are drawn {size:.0f} times as large" in viewer.panel.status.content
+        assert [one.visible for one in viewer.view._names] == [True, False, False] and name.text == "A, B, C"
         frame = viewer.frame
         beside = frame.poses[0, :3] + (0.0, -1.0, 0.2 * size)  # where the large body is, and the real one is not
         eye = np.add(beside, (-50.0, 0.0, 60.0))

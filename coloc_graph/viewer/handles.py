@@ -19,8 +19,8 @@ MARGIN, FINE = 2.0, 60.0
 FRUSTUM = 0.14
 #: Robots are as large as they are from up to so far [m], and larger from farther away; so many times at most.
 NEAR, LARGEST = 25.0, 64.0
-#: Of teams that are larger nobody's name is written.
-MOST_NAMES = 16
+#: Of teams that are larger nobody's name is written; robots that are drawn larger than this have one label for all.
+MOST_NAMES, APART = 16, 8.0
 #: The camera at the beginning: its vertical field of view and how steeply it looks down [rad], what it is taken to be
 #: wide for its height, and the share of the picture that the data fill. Robots are so tall [m].
 FOV, PITCH, ASPECT, FILLED, TALL = float(np.radians(40)), float(np.radians(40)), 1.3, 0.85, 0.6
@@ -174,10 +174,14 @@ class GraphView:
         tints = {name: palette.linear(palette.flat(one.colours)) for name, one in batches.items()}
         with self.server.atomic():  # only assignments from here on
             self.place(frame.poses)
+            first = int(np.isfinite(frame.poses).all(axis=1).argmax())  # that is somewhere
             for number, handle in enumerate(self.robots):
                 role = frame.roles[number]
                 self._show(self._anchors[number], role == "anchor" and state.stays)
                 text = handle.name.rsplit("/", 1)[1] + (f"  {role}" if role else "")
+                if together := self.size > APART:
+                    text = ", ".join(one.name.rsplit("/", 1)[1] for one in self.robots)
+                self._show(self._names[number], len(self.robots) <= MOST_NAMES and (number == first or not together))
                 if self._labels.get(handle.name) != text:
                     self._names[number].text = self._labels[handle.name] = text
             for name, image in (images or {}).items():
