@@ -85,3 +85,13 @@ def test_a_scene_without_a_way_is_a_page_that_stands(make, short):
     assert seconds == 0 and any(m.get("name") == "/floor" for _, m in messages)
     if make == "one stance":
         assert np.allclose(seen(messages, 0, "SetPositionMessage", "/robots/A", "position"), (1, 2, 0))
+
+
+def test_from_afar_robots_are_drawn_larger_and_the_page_says_so(scene):
+    far = replace(scene.layers[0], xyz=scene.layers[0].xyz * 50)
+    page = export.page_of(replace(scene, layers=(far,), wheels={}), state_of(scene))
+    size = int(re.search(r"robots are drawn (\d+) times as large", page)[1])
+    _, messages = recorded(page)
+    said = [m["updates"] for _, m in messages if m.get("name") == "/robots/A/body" and "updates" in m]
+    assert size > 1 and {"scale": size} in said
+    assert "times as large" not in export.page_of(scene, state_of(scene))

@@ -10,7 +10,7 @@ import numpy as np
 from coloc_graph.errors import ColocError
 from coloc_graph.viewer import inspect, palette
 from coloc_graph.viewer.frame import Frame, ViewState, frame_of, thinned_rows
-from coloc_graph.viewer.handles import GraphView, Image, initial_camera
+from coloc_graph.viewer.handles import GraphView, Image, camera_on, initial_camera, seen_size
 from coloc_graph.viewer.panel import legend
 from coloc_graph.viewer.scene import Scene
 from coloc_graph.viewer.server import start_server, stop_server
@@ -38,13 +38,16 @@ def page_of(scene: Scene, state: ViewState) -> str:
     server = start_server("127.0.0.1", 0, scene.title)
     try:
         view = GraphView(server, scene, state.dark)
+        view.dress(scene, state.dark, state.aside)
         initial_camera(server, scene, state.aside)
+        eye, at = camera_on(scene, state.aside)
+        view.enlarge(seen_size(float(np.linalg.norm(eye - at))))
         caption = server.scene.add_label("/stance", "", anchor="bottom-center")
 
         def show(time: float, images: dict[str, Image | None] | None = None) -> Frame:
             frame = frame_of(scene, replace(state, time=time))
             view.apply(frame, state, images)
-            caption.text, caption.position = _caption(scene, frame)
+            caption.text, caption.position = _caption(scene, frame, view.size)
             return frame
 
         frame = show(scene.middle(0), _images(scene, 0))
@@ -64,7 +67,8 @@ def page_of(scene: Scene, state: ViewState) -> str:
     finally:
         stop_server(server)
     played = f"{len(rows)} of {len(scene):,} stances are played" if len(rows) < len(scene) else ""
-    return _dressed(page, scene, state, [played, frame.note])
+    enlarged = f"robots are drawn {view.size:.0f} times as large as they are" if view.size > 1 else ""
+    return _dressed(page, scene, state, [played, frame.note, enlarged])
 
 
 def _images(scene: Scene, row: int) -> dict[str, Image | None]:
@@ -79,13 +83,13 @@ def _images(scene: Scene, row: int) -> dict[str, Image | None]:
     return found
 
 
-def _caption(scene: Scene, frame: Frame) -> tuple[str, tuple[float, float, float]]:
+def _caption(scene: Scene, frame: Frame, size: float) -> tuple[str, tuple[float, float, float]]:
     """Which stance it is, and where that is written: over the middle of the team."""
     there = frame.poses[np.isfinite(frame.poses).all(axis=1), :2]
     if frame.row < 0 or not len(there):
-        return "", (0.0, 0.0, CAPTION_HEIGHT)
+        return "", (0.0, 0.0, size * CAPTION_HEIGHT)
     x, y = there.mean(axis=0)
-    return f"stance {scene.stances[frame.row].index}", (float(x), float(y), CAPTION_HEIGHT)
+    return f"stance {scene.stances[frame.row].index}", (float(x), float(y), size * CAPTION_HEIGHT)
 
 
 def _dressed(page: str, scene: Scene, state: ViewState, notes: Sequence[str]) -> str:
