@@ -8,7 +8,7 @@ import queue
 import threading
 import time
 import uuid
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -61,7 +61,7 @@ WAITING = 64
 class CoordinatorLink:
     """The coordinator's end; a context manager. Callbacks come on the link's threads, one at a time, and must be quick.
 
-    What a robot measured is handed over when something is known of its clock: `clocks` has it, by name. A robot's
+    What a robot measured is asked for when something is known of its clock: `clocks` has it, by name. A robot's
     messages come in order, none twice, `counts.missed` are lost for good. `exposed` lets others than this machine
     connect without certificates. Raises `InputError` for an address that does not do, `RobotError` where it cannot
     listen.
@@ -92,21 +92,11 @@ class CoordinatorLink:
         self._present = dict.fromkeys(team.names, False)
         self._sessions: dict[str, str] = {}
         self._next: OrderedDict[tuple[str, type, str], int] = OrderedDict()
-        self._early: dict[str, deque[Any]] = {name: deque(maxlen=CACHED) for name in team.names}
+        self._heard: dict[str, tuple[str, list[Any]]] = {}
         self._ended = threading.Event()
         self._session = LinkSession(listen, config_of(listen=listen, tls=tls, robots=team.names, exposed=exposed))
         session, keep = self._session.zenoh, self._session.keep
         try:
-            for kind, type_ in KEPT_KINDS.items():
-                keep(
-                    zenoh.ext.declare_advanced_subscriber(
-                        session,
-                        f"coloc/*/{kind}",
-                        self._taker(type_),
-                        history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
-                        recovery=zenoh.ext.RecoveryConfig(heartbeat=True),  # type: ignore[call-arg]
-                    )
-                )
             keep(session.declare_subscriber("coloc/*/status", self._taker(Status)))
             keep(session.declare_subscriber("coloc/*/time", at_once(self._take_time)))
             self._questions = {
@@ -133,6 +123,10 @@ class CoordinatorLink:
         """End it."""
         self._ended.set()
         self._comparer.join(2.0)
+        for _, subscribers in self._heard.values():
+            for one in subscribers:
+                with contextlib.suppress(zenoh.ZError):
+                    one.undeclare()
         self._session.close()
 
     @property
@@ -205,10 +199,7 @@ class CoordinatorLink:
                 self._counter.refuse(error, f"a {type_.__name__} of {robot}")
                 return
             with self._lock:
-                if isinstance(message, Status) or self.clocks[robot].known:
-                    self._hand_over(robot, message)
-                else:
-                    self._early[robot].append(message)
+                self._hand_over(robot, message)
 
         return take
 
@@ -237,11 +228,38 @@ class CoordinatorLink:
                 self._on_presence(robot, there)
 
     def _compare_clocks(self) -> None:
-        """The thread that asks robots for the time."""
+        """The thread that asks robots for the time, and for what they measured."""
         while not self._ended.wait(COMPARED):
             for robot in [robot for robot, there in self._present.items() if there]:
                 with contextlib.suppress(zenoh.ZError):
                     self._questions[robot].put(encode(ClockQuestion(asked=self._clock())))
+                    self._listen_to(robot)
+
+    def _listen_to(self, robot: str) -> None:
+        """Have what a session of a robot measured come, from its first on, once it has told its time.
+
+        Asked for session by session: what a subscriber that is there already hears first of a new publisher may be
+        newer than what that has kept for it.
+        """
+        session = self._sessions.get(robot)
+        before, subscribers = self._heard.get(robot, (None, []))
+        if session is None or session == before:
+            return
+        for one in subscribers:
+            one.undeclare()
+        self._heard[robot] = (
+            session,
+            [
+                zenoh.ext.declare_advanced_subscriber(
+                    self._session.zenoh,
+                    f"coloc/{robot}/{kind}",
+                    self._taker(type_),
+                    history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+                    recovery=zenoh.ext.RecoveryConfig(heartbeat=True),  # type: ignore[call-arg]
+                )
+                for kind, type_ in KEPT_KINDS.items()
+            ],
+        )
 
     def _take_time(self, sample: zenoh.Sample) -> None:
         heard, robot = self._clock(), robot_of(sample)
@@ -256,11 +274,7 @@ class CoordinatorLink:
         except ValueError as error:
             self._counter.add("malformed", f"the time of {robot} is refused: {error}")
         else:
-            with self._lock:
-                self._sessions[robot] = reply.session
-                early = self._early[robot]
-                while early:
-                    self._hand_over(robot, early.popleft())
+            self._sessions[robot] = reply.session
 
 
 class RobotLink:

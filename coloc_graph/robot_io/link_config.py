@@ -158,7 +158,8 @@ _RULES_OF_ROBOT = {
 
 def _require_address(address: str, tls: Tls | None) -> None:
     protocol, _, place = address.partition("/")
-    if protocol not in ("tcp", "tls") or ":" not in place:
+    host, _, port = place.rpartition(":")
+    if protocol not in ("tcp", "tls") or not host or not port.isdecimal() or int(port) > 65535:
         raise InputError(f"`{address}` is no address of a link; give tcp/HOST:PORT, or tls/HOST:PORT with certificates")
     if (protocol == "tls") != (tls is not None):
         raise InputError(f"{address} and certificates belong together: give tls/HOST:PORT with --tls, or neither")
