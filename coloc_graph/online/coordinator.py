@@ -27,7 +27,7 @@ from coloc_graph.online.watch import InView, Precision, precision
 from coloc_graph.online.whereabouts import compose, inverse
 from coloc_graph.robot_io.link import CoordinatorLink, Tls
 from coloc_graph.robot_io.wire import Body, Capture, Drive, EndCapture, Event, Halt, Recover, Sample, Status, Wheels
-from coloc_graph.run import Run, Stance
+from coloc_graph.run import Detections, Run, Stance
 from coloc_graph.run.schemas import to_ns, to_seconds
 from coloc_graph.stance_solver import EnteredStance, SolveOptions, StanceSolver, measure_stance
 from coloc_graph.team import Team
@@ -44,6 +44,8 @@ ANSWER = 1.0
 SETTLED, MARGIN = 0.25, 0.02
 #: How long things may take at most [s]: a drive, to find the mover, to get the last images, to be mended.
 DRIVE_TIME, LOOK_TIME, COLLECT_TIME, HOLD_TIME = 40.0, 4.0, 30.0, 120.0
+#: Each image moves where the mover is thought to be by this share towards where it is seen.
+FOLLOWED = 0.1
 #: The mover may be out of a view for so long before it turns back [s].
 OUT_OF_VIEW = 0.6
 
@@ -68,7 +70,7 @@ class MissionOptions:
     longest: float = 40.0
     speed: float = 0.3
     clock_limit: float = 1e-3
-    attempts: int = 8
+    attempts: int = 20
     solve: SolveOptions = field(default_factory=SolveOptions)
 
 
@@ -240,7 +242,7 @@ class Coordinator:
                 if one.capture == self._capturing and self._stance is not None:
                     member.samples, member.newest = member.samples + 1, seen.time
                     if self._view is not None:
-                        self._view.take(seen, self.roster[self.mover].whereabouts.place(seen.time))
+                        self._follow(self._view, seen)
             case Wheels():
                 self.roster.take_wheels(member.name, one)
             case Status():
@@ -254,6 +256,17 @@ class Coordinator:
             case bool():
                 member.present = one
                 self._note("presence", robot=member.name, there=one)
+
+    def _follow(self, view: InView, seen: Detections) -> None:
+        """Where the mover is thought to be follows what is seen of it: its wheels lose their way within a minute."""
+        whereabouts = self.roster[self.mover].whereabouts
+        thought = whereabouts.place(seen.time)
+        found = view.find(seen, thought)
+        if found is not None:
+            off = [FOLLOWED * (a - b) for a, b in zip(found, thought, strict=True)]
+            thought = thought[0] + off[0], thought[1] + off[1], thought[2] + off[2]
+            whereabouts.fix(seen.time, thought)
+        view.take(seen, thought)
 
     # the phases
 
@@ -323,7 +336,7 @@ class Coordinator:
             self._enter(Phase.CAPTURING)
         elif self._phase_lasted(LOOK_TIME):
             raise RobotError(
-                f"{' and '.join(missing)} see nothing of {self.mover} where it should be: put the robots where they "
+                f"{' and '.join(missing)} saw nothing of {self.mover} where it should be: put the robots where they "
                 "are said to stand, clear what is between them, and check that its lights are on"
             )
 

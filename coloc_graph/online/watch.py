@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from coloc_graph.common_view import View
 from coloc_graph.frontend import FrontendOptions, measure_pair
@@ -17,10 +18,16 @@ from coloc_graph.online.formation import Planar
 from coloc_graph.run import Detections, Image, OdometrySample, Planes, Recorded, Stance
 from coloc_graph.team import Team
 
+Array = NDArray[np.float64]
+
 #: A light this near to where a marker should be is taken for it [px]; places are known by wheels alone.
 GATE = 60.0
 #: The mover is in a view where so many of the images of this time [s] show all its markers.
 SHARE, LOOKED_AT = 0.5, 0.7
+#: Two lights are a mover's whose distance is its markers' to this share, and that are so far from all who stand [m].
+ALIKE, CLEAR = 0.15, 0.3
+#: A mover is no further from where its wheels have it than this [m], [rad].
+ASTRAY, TURNED = 0.8, 1.3
 
 
 class InView:
@@ -34,6 +41,7 @@ class InView:
             name: View(team[name].camera, floor_pose(*place) @ team[name].mount.T_body_camera)
             for name, place in observers.items()
         }
+        self._standing = dict(observers)
         self._seen: dict[str, deque[tuple[float, bool]]] = defaultdict(deque)
 
     def take(self, seen: Detections, mover: Planar) -> bool:
@@ -53,6 +61,37 @@ class InView:
             looked.popleft()
         return shows
 
+    def find(self, seen: Detections, expected: Planar) -> Planar | None:
+        """Where an image of one observer has the mover, not too far from where it is expected; None where it does not,
+        or leaves a choice. Two lights as far apart as its markers, and away from all who stand, are taken for it."""
+        view = self.views.get(seen.robot)
+        if view is None or len(self._p_markers) < 2 or len(seen.uv) < 2:
+            return None
+        places = _on_plane(view, seen.uv, float(self._p_markers[0, 2]))
+        model, first, second = self._p_markers[:2, :2], *np.triu_indices(len(places), 1)
+        arms = places[second] - places[first]
+        with np.errstate(invalid="ignore"):
+            alike = np.abs(np.hypot(*arms.T) / math.dist(*model) - 1) < ALIKE
+        arms, middles = arms[alike], (places[first] + places[second])[alike] / 2
+        # whichever of the two is the first marker
+        arms, middles = np.concatenate([arms, -arms]), np.concatenate([middles, middles])
+        along = model[1] - model[0]
+        yaw = np.arctan2(arms[:, 1], arms[:, 0]) - math.atan2(along[1], along[0])
+        off = (yaw - expected[2] + np.pi) % (2 * np.pi) - np.pi
+        c, s, (mx, my) = np.cos(yaw), np.sin(yaw), model.mean(axis=0)
+        xy = middles - np.stack([c * mx - s * my, s * mx + c * my], axis=1)
+        away = np.hypot(*(xy - expected[:2]).T)
+        others = [place[:2] for name, place in self._standing.items() if name != seen.robot]
+        clear = np.all([np.hypot(*(xy - place).T) > CLEAR for place in others], axis=0) if others else True
+        fits = np.flatnonzero((away < ASTRAY) & (np.abs(off) < TURNED) & clear)
+        if not len(fits):
+            return None
+        cost = away[fits] + 0.3 * np.abs(off[fits])
+        best = fits[np.argmin(cost)]
+        if len(fits) > 1 and np.partition(cost, 1)[1] < 2 * cost.min():
+            return None
+        return float(xy[best, 0]), float(xy[best, 1]), expected[2] + float(off[best])
+
     def missing(self) -> list[str]:
         """The observers whose newest images do not show the mover; those that have sent none are among them."""
         return [
@@ -60,6 +99,14 @@ class InView:
             for name in self.views
             if not self._seen[name] or np.mean([shows for _, shows in self._seen[name]]) < SHARE
         ]
+
+
+def _on_plane(view: View, uv: Array, height: float) -> Array:
+    """Places (n, 2) [m] in the world of pixels (n, 2), at a height above the floor [m]; NaN where the ray never is."""
+    rays = np.column_stack([view.camera.normalise(uv), np.ones(len(uv))]) @ view.T_world_camera[:3, :3].T
+    down = np.where(rays[:, 2] < -1e-3, rays[:, 2], np.nan)
+    reach = (height - view.T_world_camera[2, 3]) / down
+    return np.asarray(view.T_world_camera[:2, 3] + reach[:, None] * rays[:, :2])
 
 
 @dataclass(frozen=True)
