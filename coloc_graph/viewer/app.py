@@ -175,7 +175,8 @@ class Viewer:
         """How many times as large as they are robots are drawn, by whoever is nearest."""
         eyes = [(client.camera.position, client.camera.look_at) for client in self.server.get_clients().values()]
         if not eyes:
-            eyes = [camera_on(self._scene, self._aside)]
+            first = self.server.initial_camera
+            eyes = [(np.asarray(first.position), np.asarray(first.look_at))]
         return seen_size(min(float(np.linalg.norm(eye - at)) for eye, at in eyes))
 
     # the render thread

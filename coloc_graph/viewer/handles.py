@@ -40,6 +40,7 @@ class GraphView:
         self.server = server
         self.names: tuple[str, ...] = ()
         self._sent: dict[str, object] = {}
+        self._places: dict[int, NDArray[np.float64]] = {}
         self._images: dict[str, Image | None] = {}
         self._labels: dict[str, str] = {}
         self._visible: dict[str, bool] = {}
@@ -209,10 +210,14 @@ class GraphView:
         for number, (handle, pose) in enumerate(zip(self.robots, poses, strict=True)):
             there = bool(np.isfinite(pose).all())
             self._show(handle, there)
-            key = pose.tobytes()
-            if there and self._sent.get(handle.name) != key:
-                self._sent[handle.name] = key
-                handle.position, handle.wxyz = pose[:3], turned[number]
+            before = self._places.get(number)
+            if not there or (before is not None and np.array_equal(before, pose)):
+                continue
+            self._places[number] = pose
+            if before is None or not np.array_equal(before[:3], pose[:3]):
+                handle.position = pose[:3]
+            if before is None or before[3] != pose[3]:
+                handle.wxyz = turned[number]
 
     def _assign_lines(self, name: str, points: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
         key = (points.tobytes(), colours.tobytes()) if len(points) < 2000 else None
