@@ -18,6 +18,7 @@ from tcp_relay import Relay
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError, RobotError
 from coloc_graph.robot_io.certificates import make_certificates
+from coloc_graph.robot_io.in_order import AT_ONCE, TRIES, InOrder
 from coloc_graph.robot_io.link import CoordinatorLink, RobotLink
 from coloc_graph.robot_io.link_config import Tls, config_of, tls_of
 from coloc_graph.robot_io.wire import (
@@ -277,7 +278,38 @@ def test_what_robots_send_is_checked(pair, caplog):
     assert heard.link.counts.replayed == 1 and len(heard.events) == 1
     late = msgspec.structs.replace(heard.events[0][1], number=4)
     heard.link._taker(Event)(_Like("coloc/A/events", encode(late)))
-    assert heard.link.counts.missed == 3 and "3 Event of A are lost for good" in caplog.text
+    assert until(lambda: heard.link.counts.missed == 3)  # it was asked for them, and has none
+    assert len(heard.events) == 2 and "3 Event of A are lost for good" in caplog.text
+
+
+def test_what_zenoh_did_not_recover_is_asked_for(pair):
+    heard, robot = pair
+    robot.put_event("0")
+    assert until(lambda: len(heard.events) == 1)
+    for one in heard.link._heard["A"][1]:
+        one.undeclare()  # nothing comes by itself any more
+    for number in range(1, 300):
+        robot.put_event(str(number))
+    late = Event(session="first", number=300, stamp=1, kind="fault", text="300")
+    heard.link._taker(Event)(_Like("coloc/A/events", encode(late)))
+    assert until(lambda: len(heard.events) == 301)
+    assert [int(one.text) for _, one in heard.events] == list(range(301)) and heard.link.counts.missed == 0
+
+
+def test_numbers_are_put_in_order_and_asked_for():
+    order = InOrder(most=1000)
+    assert list(order.take(0, "0")) == ["0"] and order.missing() is None
+    assert list(order.take(2, "2")) == [] and list(order.take(600, "600")) == []
+    assert order.missing() == (1, 1)
+    assert list(order.take(1, "1")) == ["1", "2"]
+    assert order.missing() == (3, 2 + AT_ONCE)
+    assert list(order.take(2, "2")) == [] and list(order.take(600, "600")) == [] and order.again == 2
+    for _ in range(TRIES - 1):
+        assert list(order.asked(3, 2 + AT_ONCE)) == [] and order.lost == 0
+    assert list(order.asked(3, 2 + AT_ONCE)) == [] and order.lost == AT_ONCE
+    assert order.missing() == (3 + AT_ONCE, 2 + 2 * AT_ONCE)
+    small = InOrder(most=2)
+    assert [list(small.take(n, n)) for n in (5, 6, 7)] == [[], [], [5, 6, 7]] and small.lost == 5
 
 
 class _Deaf:

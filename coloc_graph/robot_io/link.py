@@ -9,7 +9,7 @@ import threading
 import time
 import uuid
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -20,6 +20,7 @@ import zenoh.ext
 from coloc_graph.errors import RobotError
 from coloc_graph.robot_io.clock import ClockFilter
 from coloc_graph.robot_io.commands import Commands
+from coloc_graph.robot_io.in_order import InOrder
 from coloc_graph.robot_io.link_config import Tls, config_of
 from coloc_graph.robot_io.link_counts import Counts, LinkCounter
 from coloc_graph.robot_io.link_session import FIRST, KEPT_KINDS, LinkSession, at_once, payload_of, robot_of
@@ -52,6 +53,8 @@ Clock = Callable[[], int]
 CACHED = 4000
 #: How often clocks are compared [s], and how often what was lost is noticed [s].
 COMPARED, NOTICED = 0.1, 0.2
+#: How often what zenoh's own recovery did not get is asked for [s].
+RECOVERED = 0.2
 #: A command is asked again so often until its deadline [s].
 AGAIN = 0.25
 #: So many commands wait at a robot at most; more are dropped, and asked again.
@@ -91,7 +94,7 @@ class CoordinatorLink:
         self._lock = threading.RLock()
         self._present = dict.fromkeys(team.names, False)
         self._sessions: dict[str, str] = {}
-        self._next: OrderedDict[tuple[str, type, str], int] = OrderedDict()
+        self._orders: OrderedDict[tuple[str, type, str], InOrder] = OrderedDict()
         self._heard: dict[str, tuple[str, list[Any]]] = {}
         self._ended = threading.Event()
         self._session = LinkSession(listen, config_of(listen=listen, tls=tls, robots=team.names, exposed=exposed))
@@ -108,8 +111,12 @@ class CoordinatorLink:
         except BaseException:
             self._session.close()
             raise
-        self._comparer = threading.Thread(target=self._compare_clocks, name="clocks", daemon=True)
-        self._comparer.start()
+        self._threads = [
+            threading.Thread(target=work, name=name, daemon=True)
+            for work, name in ((self._compare_clocks, "clocks"), (self._recover, "recovery"))
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def __enter__(self) -> Self:
         return self
@@ -122,7 +129,8 @@ class CoordinatorLink:
     def close(self) -> None:
         """End it."""
         self._ended.set()
-        self._comparer.join(2.0)
+        for thread in self._threads:
+            thread.join(2.0)
         for _, subscribers in self._heard.values():
             for one in subscribers:
                 with contextlib.suppress(zenoh.ZError):
@@ -204,20 +212,63 @@ class CoordinatorLink:
         return take
 
     def _hand_over(self, robot: str, message: Any) -> None:
-        if not isinstance(message, Status):
-            key = robot, type(message), message.session
-            expected = self._next.get(key, message.number)
-            if message.number < expected:
-                self._counter.add("replayed")
-                return
-            if (gap := message.number - expected) > 0:
-                self._counter.add("missed", f"{gap} {type(message).__name__} of {robot} are lost for good", gap)
-            self._next[key] = message.number + 1
-            self._next.move_to_end(key)
-            while len(self._next) > 12 * len(self.team.names):
-                self._next.popitem(last=False)
-        self._counter.add("taken")
-        self._calls[type(message)](robot, message)
+        if isinstance(message, Status):
+            self._counter.add("taken")
+            self._calls[Status](robot, message)
+            return
+        key = robot, type(message), message.session
+        order = self._orders.get(key)
+        if order is None:
+            order = self._orders[key] = InOrder(CACHED)
+            while len(self._orders) > 12 * len(self.team.names):
+                self._orders.popitem(last=False)
+        self._call(key, order, order.take(message.number, message))
+
+    def _call(self, key: tuple[str, type, str], order: InOrder, messages: Iterator[Any]) -> None:
+        """Hand over messages whose turn it is, and count what is not among them."""
+        robot, type_, _ = key
+        lost, again = order.lost, order.again
+        for message in messages:
+            self._counter.add("taken")
+            self._calls[type_](robot, message)
+        if order.again > again:
+            self._counter.add("replayed", times=order.again - again)
+        if order.lost > lost:
+            count = order.lost - lost
+            self._counter.add("missed", f"{count} {type_.__name__} of {robot} are lost for good", count)
+
+    def _recover(self) -> None:
+        """The thread that asks robots for what is missing of what they measured, until it comes or is no more."""
+        while not self._ended.wait(RECOVERED):
+            for key, order in list(self._orders.items()):
+                robot, type_, session = key
+                with self._lock:
+                    missing = order.missing()
+                if missing is None or not self._present[robot] or self._sessions.get(robot) != session:
+                    continue
+                answered = self._ask_again(robot, type_, *missing)
+                with self._lock:
+                    if answered and self._present[robot]:
+                        self._call(key, order, order.asked(*missing))
+
+    def _ask_again(self, robot: str, type_: type[M], first: int, last: int) -> bool:
+        """Have what a robot keeps come again, by numbers; whether it answered."""
+        kind = next(kind for kind, one in KEPT_KINDS.items() if one is type_)
+        take = self._taker(type_)
+        try:
+            replies = self._session.zenoh.get(
+                f"coloc/{robot}/{kind}/@adv/pub/**?_sn={first}..{last}",
+                timeout=5.0,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            )
+            for one in replies:
+                if one.ok is None:
+                    return False
+                take(one.ok)
+        except zenoh.ZError:
+            return False
+        return True
 
     def _take_presence(self, sample: zenoh.Sample) -> None:
         robot = robot_of(sample)
