@@ -1,6 +1,7 @@
 """What the online system is made of: course and formation, driving, whereabouts, the record, phases."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,10 +10,12 @@ from coloc_graph.common_view import View
 from coloc_graph.errors import InputError, RunError
 from coloc_graph.lie import floor_pose
 from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Course, Formation
+from coloc_graph.online.ledger import Counted, Ledger, way_since
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_join import DROVE, STOOD, JoinedOdometry
 from coloc_graph.online.phases import FOLLOWS, Phase, Phases, as_dot
 from coloc_graph.online.record import Record, continued
+from coloc_graph.online.watch import InView
 from coloc_graph.online.whereabouts import Whereabouts, compose, inverse
 from coloc_graph.run import Detections, OdometrySample, Stance, open_run
 from coloc_graph.simulation.rig import reference_team
@@ -148,6 +151,50 @@ def test_odometry_goes_on_over_a_restart_and_admits_what_it_missed():
     assert np.allclose(joined.take(odometry("A", 3.0, 0.5, 0.0, 0.0)).pose, (1.0, 0.5, math.pi / 2))
     joined.restart(moving=True)
     assert np.allclose(np.sqrt(np.diag(joined.take(odometry("A", 4.0, 9.0, 9.0, 1.0)).covariance)), DROVE)
+
+
+def test_a_killed_program_s_wheels_are_counted_on_by_the_next(tmp_path):
+    ledger = Ledger(tmp_path / "A.wheels.json")
+    assert ledger.read() is None
+    counted = Counted("one", (65_500, 10), (1.0, 2.0, math.pi / 2))
+    ledger.write(counted)
+    assert ledger.read() == counted
+    way, sigmas = way_since(counted, (964, 1010))  # 1000 counts each, the left one over the top
+    metres = 1000 * math.pi * 0.072 / 508.8
+    assert way == pytest.approx((metres, 0.0, 0.0)) and sigmas[0] > 0.05 * metres
+    assert way_since(counted, (30_000, 30_000)) is None
+    assert way_since(counted, counted.ticks)[0] == (0.0, 0.0, 0.0)
+    (tmp_path / "A.wheels.json").write_text('{"frame": "one", "ticks": [1')
+    assert ledger.read() is None
+    joined = JoinedOdometry()
+    joined.go_on((1.0, 2.0, 0.0), sigmas)
+    first = joined.take(odometry("A", 5.0, 0.3, 0.0, 0.0))
+    assert np.allclose(first.pose, (1.0, 2.0, 0.0)) and np.allclose(np.sqrt(np.diag(first.covariance)), sigmas)
+
+
+def test_the_mover_is_found_in_an_image_where_its_wheels_lost_it():
+    team = reference_team()
+    places = {"A": FORMATION.place("A", 0.0), "B": FORMATION.place("B", STAGGER)}
+    view = InView(team, "C", places)
+    rng = np.random.default_rng(5)
+    found = 0
+    for _ in range(40):
+        true = float(rng.uniform(0.9, 1.6)), float(rng.uniform(-0.3, 0.3)), float(rng.uniform(-3, 3))
+        points = team["C"].markers.p_body @ floor_pose(*true)[:3, :3].T + (*true[:2], 0.0)
+        uv, inside = view.views["A"].project(points)
+        if not inside.all():
+            continue
+        lights = np.vstack([uv, rng.uniform((0, 0), (319, 100), (3, 2))])
+        seen = replace(detections("A", 1.0, len(lights)), uv=lights[rng.permutation(len(lights))])
+        thought = true[0] + 0.2, true[1] - 0.15, true[2] + 0.5
+        where = view.find(seen, thought)
+        if where is not None:
+            found += 1
+            assert where == pytest.approx(true, abs=1e-6)
+            assert view.take(seen, true)
+    assert found > 25
+    nothing = replace(seen, uv=seen.uv[:1])
+    assert view.find(nothing, true) is None and view.missing() == ["B"]
 
 
 def test_a_record_gives_back_what_its_run_holds(tmp_path):

@@ -252,7 +252,7 @@ class Coordinator:
             case Event():
                 self._note("event", robot=member.name, kind=one.kind, text=one.text)
                 member.arrived |= member.way is not None and (one.kind, one.text) == ("arrived", str(member.way.number))
-                member.stopped |= one.kind == "stopped"
+                member.stopped |= one.kind in ("stopped", "fault")
             case bool():
                 member.present = one
                 self._note("presence", robot=member.name, there=one)

@@ -21,11 +21,6 @@ class JoinedOdometry:
         self._last: Planar | None = None
         self._unsure: tuple[float, float, float] | None = None
 
-    def begin_at(self, pose: Planar) -> None:
-        """Go on from a pose that was recorded: what comes next is in an unknown frame."""
-        self._last = pose
-        self._unsure = DROVE
-
     def align(self, pose: Planar) -> None:
         """A sample that was recorded before came again: it is where this goes on, in the frame that it comes in."""
         if self._last is not None:
@@ -35,6 +30,10 @@ class JoinedOdometry:
         """What comes next is in a new frame; `moving` says whether the robot may have driven in between."""
         if self._last is not None:
             self._unsure = DROVE if moving or self._unsure == DROVE else STOOD
+
+    def go_on(self, pose: Planar, unsure: tuple[float, float, float]) -> None:
+        """What comes next, in a new frame, is at a pose that is known to these sigmas [m], [m], [rad]."""
+        self._last, self._unsure = pose, unsure
 
     def take(self, sample: OdometrySample) -> OdometrySample:
         """A sample in the frame that goes on."""

@@ -13,9 +13,11 @@ from typing import Self
 
 from coloc_graph.errors import CameraError, ColocError, InputError, RobotError
 from coloc_graph.frontend import detector_for
+from coloc_graph.online.ledger import Counted, Ledger, way_since
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_join import JoinedOdometry
 from coloc_graph.online.record import Record
+from coloc_graph.online.whereabouts import compose
 from coloc_graph.robot_io.camera import open_camera
 from coloc_graph.robot_io.camera_source import CameraSource, clock_ahead
 from coloc_graph.robot_io.create import Create
@@ -82,7 +84,9 @@ class RobotProgram:
         self._seen = self._samples = self._rolled = self._events = self._drive = 0
         self._follower: Follower | None = None
         self._still_since: int | None = clock()
-        self._odometry = JoinedOdometry()
+        self._odometry, self._frame = JoinedOdometry(), self.session
+        self._opening = False
+        self._ledger = Ledger(Path(folder) / f"{name}.wheels.json")
         self._pose = (0.0, 0.0, 0.0)
         self._wheels_fault: str | None = None
         self._camera_fault: str | None = None
@@ -97,6 +101,7 @@ class RobotProgram:
             if port is not None:
                 self._wheels = undo.enter_context(Create(port, model, robot=name, epoch=0.0))
                 self._wheels_fault = self._wheels.fault
+                self._go_on_counting()
             self._record = undo.enter_context(Record(_new_file(Path(folder), name), team))
             self._link = undo.enter_context(
                 RobotLink(name, connect=connect, handler=self._obey, session=self.session, tls=tls, clock=clock)
@@ -182,15 +187,29 @@ class RobotProgram:
             with self._lock:
                 for sample in wheels.take_odometry():
                     self._take(self._odometry.take(sample))
-                self._odometry.restart(moving=True)
+                self._opening = True
             wheels.open()
+            with self._lock:
+                self._go_on_counting()
             self._wheels_fault = wheels.fault
             self._tell("recovered", "the line to the wheels is back")
+        self._opening = False
+
+    def _go_on_counting(self) -> None:
+        """Join the odometry of a line that has just been opened to what was counted before, by whatever program."""
+        assert self._wheels is not None
+        before, ticks = self._ledger.read(), self._wheels.state.ticks
+        since = way_since(before, ticks) if before is not None and ticks is not None else None
+        if before is None or since is None:
+            self._odometry, self._frame = JoinedOdometry(), uuid.uuid4().hex
+            return
+        self._frame = before.frame
+        self._odometry.go_on(compose(before.pose, since[0]), since[1])
 
     def _roll(self) -> None:
         """One step of control: take what the wheels say, and steer or stop."""
         wheels = self._wheels
-        if wheels is None:
+        if wheels is None or self._opening:
             return
         with self._lock:
             for sample in wheels.take_odometry():
@@ -226,7 +245,9 @@ class RobotProgram:
     def _take(self, sample: OdometrySample) -> None:
         self._pose = tuple(map(float, sample.pose))  # type: ignore[assignment]
         stamp = round(sample.time * 1e9) + clock_ahead(self._clock)
-        self._link.put(Wheels.of(sample, session=self.session, number=self._rolled, stamp=stamp))
+        self._link.put(Wheels.of(sample, session=self.session, number=self._rolled, stamp=stamp, frame=self._frame))
+        if self._wheels is not None and not self._wheels.lost and (ticks := self._wheels.state.ticks) is not None:
+            self._ledger.write(Counted(self._frame, ticks, self._pose))
         self._rolled += 1
         self._record.take(replace(sample, time=self._utc(stamp)))
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from coloc_graph.online.formation import Planar
-from coloc_graph.online.odometry_join import JoinedOdometry
+from coloc_graph.online.odometry_join import DROVE, JoinedOdometry
 from coloc_graph.online.record import Record
 from coloc_graph.online.whereabouts import Whereabouts
 from coloc_graph.robot_io.wire import Drive, Sample, Status, Wheels
@@ -27,6 +27,8 @@ class Member:
     whereabouts: Whereabouts
     to_coordinator: Callable[[int], int]
     odometry: JoinedOdometry = field(default_factory=JoinedOdometry)
+    #: The odometry frame that its wheels' samples were in last.
+    frame: str | None = None
     present: bool = False
     status: Status | None = None
     heard: float = -math.inf
@@ -57,12 +59,9 @@ class Member:
 
     def take_status(self, status: Status) -> bool:
         """Take in how it is; whether it is a new session, whose program began anew."""
-        before = self.status
         self.status, self.heard = status, time.monotonic()
         if status.session == self.session:
             return False
-        if self.session is not None:
-            self.odometry.restart(moving=before is None or before.moving)
         self.session = status.session
         return True
 
@@ -90,6 +89,9 @@ class Roster:
             x, y, yaw = map(float, sample.pose)
             member.odometry.align((x, y, yaw))
             return
+        if member.frame is not None and wheels.frame != member.frame:
+            member.odometry.restart(moving=member.status is None or member.status.moving)
+        member.frame = wheels.frame
         kept = self.record.take(member.odometry.take(sample))
         assert isinstance(kept, OdometrySample)
         member.whereabouts.take(kept)
@@ -102,7 +104,7 @@ class Roster:
                 member.recorded = sample.time + SAME
             if (last := self.record.last_odometry(name)) is not None:
                 x, y, yaw = map(float, last.pose)
-                member.odometry.begin_at((x, y, yaw))
+                member.odometry.go_on((x, y, yaw), DROVE)
 
     def take_sample(self, name: str, sample: Sample) -> Detections:
         """Take in what a robot's camera saw."""

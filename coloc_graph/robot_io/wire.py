@@ -105,20 +105,24 @@ class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One sample of odometry, as `run.OdometrySample`; `covariance` is its upper triangle, row by row."""
+    """One sample of odometry, as `run.OdometrySample`; `covariance` is its upper triangle, row by row.
+
+    `frame` names the odometry frame that `pose` is in: another one where the wheels lost count.
+    """
 
     session: str
     number: int
     stamp: int
+    frame: str = ""
     pose: tuple[float, float, float]
     covariance: tuple[float, float, float, float, float, float]
 
     @classmethod
-    def of(cls, sample: OdometrySample, *, session: str, number: int, stamp: int) -> "Wheels":
+    def of(cls, sample: OdometrySample, *, session: str, number: int, stamp: int, frame: str = "") -> "Wheels":
         """The message of a sample taken at `stamp`."""
         x, y, yaw = map(float, sample.pose)
         upper = sample.covariance[np.triu_indices(3)].tolist()
-        return cls(session=session, number=number, stamp=stamp, pose=(x, y, yaw), covariance=tuple(upper))
+        return cls(session=session, number=number, stamp=stamp, frame=frame, pose=(x, y, yaw), covariance=tuple(upper))
 
     def sample(self, robot: str, time: float) -> OdometrySample:
         """The record that it is, at a time [UTC s]."""
@@ -129,7 +133,7 @@ class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
             raise ValueError("it holds a number that is no place")
         if np.linalg.eigvalsh(_symmetric(self.covariance)).min() < -1e-12:
             raise ValueError("its covariance is not positive")
-        _named(self.session)
+        _named(self.session, self.frame)
         _counted(self.number)
         _stamped(self.stamp)
 
