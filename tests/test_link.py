@@ -264,7 +264,8 @@ def test_permission_to_move_counts_from_when_it_was_sent(pair):
 def test_what_robots_send_is_checked(pair, caplog):
     heard, robot = pair
     with outsider(heard.address) as other:
-        other.put("coloc/A/status", b"\x00")
+        # what is put before it knows that somebody listens goes nowhere
+        assert until(lambda: other.put("coloc/A/status", b"\x00") or heard.link.counts.malformed >= 1)
         other.put("coloc/A/status", bytes(LARGEST + 1))
         other.put("coloc/Z/status", b"")
         other.put("coloc/**", b"\x00")
@@ -317,6 +318,20 @@ class _Deaf:
 
     def put(self, _):
         pass
+
+
+def test_what_a_program_that_ended_took_with_it_is_counted_and_holds_nothing_back():
+    with Heard(free_port()) as heard:
+        take = heard.link._taker(Event)
+        for session, number in (("one", 0), ("one", 2), ("one", 3), ("two", 0)):
+            event = Event(session=session, number=number, stamp=1, kind="fault", text="")
+            take(_Like("coloc/A/events", encode(event)))
+        time.sleep(0.5)
+        assert [(one.session, one.number) for _, one in heard.events] == [("one", 0), ("two", 0)]
+        heard.link._sessions["A"] = "two"
+        assert until(lambda: len(heard.events) == 4)
+        assert [one.number for _, one in heard.events if one.session == "one"] == [0, 2, 3]
+        assert heard.link.counts.missed == 1
 
 
 class _Like:

@@ -49,6 +49,12 @@ class InOrder:
             self._give_up(min(last + 1, min(self._held)))
             yield from self._turn()
 
+    def end(self) -> Iterator[Any]:
+        """What is missing will not come any more; all that is held comes out."""
+        while self._held:
+            self._give_up(min(self._held))
+            yield from self._turn()
+
     def _turn(self) -> Iterator[Any]:
         while self._next in self._held:
             self._tried = 0

@@ -240,11 +240,16 @@ class CoordinatorLink:
     def _recover(self) -> None:
         """The thread that asks robots for what is missing of what they measured, until it comes or is no more."""
         while not self._ended.wait(RECOVERED):
-            for key, order in list(self._orders.items()):
+            with self._lock:
+                orders = list(self._orders.items())
+            for key, order in orders:
                 robot, type_, session = key
                 with self._lock:
                     missing = order.missing()
-                if missing is None or not self._present[robot] or self._sessions.get(robot) != session:
+                    if missing is not None and self._sessions.get(robot, session) != session:
+                        self._call(key, order, order.end())  # who kept what is missing has ended
+                        continue
+                if missing is None or not self._present[robot] or robot not in self._sessions:
                     continue
                 answered = self._ask_again(robot, type_, *missing)
                 with self._lock:
@@ -305,7 +310,7 @@ class CoordinatorLink:
                     self._session.zenoh,
                     f"coloc/{robot}/{kind}",
                     self._taker(type_),
-                    history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+                    history=zenoh.ext.HistoryConfig(),
                     recovery=zenoh.ext.RecoveryConfig(heartbeat=True),  # type: ignore[call-arg]
                 )
                 for kind, type_ in KEPT_KINDS.items()
