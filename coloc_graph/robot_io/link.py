@@ -295,7 +295,8 @@ class CoordinatorLink:
         """Have what a session of a robot measured come, from its first on, once it has told its time.
 
         Asked for session by session: what a subscriber that is there already hears first of a new publisher may be
-        newer than what that has kept for it.
+        newer than what that has kept for it. Publishers are not detected by zenoh, which would send all that is kept
+        anew after each cut, more than a bad network carries within the lease.
         """
         session = self._sessions.get(robot)
         before, subscribers = self._heard.get(robot, (None, []))
