@@ -20,8 +20,8 @@ from coloc_graph.viewer.server import start_server, stop_server
 STANCE_SECONDS, MOST_SECONDS, HELD_SECONDS, STEP_SECONDS = 1.0, 60.0, 3.0, 0.1
 #: So many stances are played at most; of no more than so many each has its images and its robots' trails in each step.
 MOST_STANCES, IN_FULL = 240, 80
-#: Over the team [m].
-CAPTION_HEIGHT = 0.9
+#: The stance is written so high over the team [m], or at such a share of the distance it is seen from: over the names.
+CAPTION_HEIGHT, CAPTION_SHARE = 0.9, 0.1
 
 
 def page_of(scene: Scene, state: ViewState) -> str:
@@ -41,13 +41,15 @@ def page_of(scene: Scene, state: ViewState) -> str:
         view.dress(scene, state.dark, state.aside)
         initial_camera(server, scene, state.aside)
         eye, at = camera_on(scene, state.aside)
-        view.enlarge(seen_size(float(np.linalg.norm(eye - at))))
+        distance = float(np.linalg.norm(eye - at))
+        view.enlarge(seen_size(distance))
+        height = max(CAPTION_HEIGHT, CAPTION_SHARE * distance)
         caption = server.scene.add_label("/stance", "", anchor="bottom-center")
 
         def show(time: float, images: dict[str, Image | None] | None = None) -> Frame:
             frame = frame_of(scene, replace(state, time=time))
             view.apply(frame, state, images)
-            caption.text, caption.position = _caption(scene, frame, view.size)
+            caption.text, caption.position = _caption(scene, frame, height)
             return frame
 
         frame = show(scene.middle(0), _images(scene, 0))
@@ -68,7 +70,7 @@ def page_of(scene: Scene, state: ViewState) -> str:
         stop_server(server)
     played = f"{len(rows)} of {len(scene):,} stances are played" if len(rows) < len(scene) else ""
     enlarged = f"robots are drawn {view.size:.0f} times as large as they are" if view.size > 1 else ""
-    return _dressed(page, scene, state, [played, frame.note, enlarged])
+    return _dressed(page, scene, state, [played, frame.note.partition(";")[0], enlarged])
 
 
 def _images(scene: Scene, row: int) -> dict[str, Image | None]:
@@ -83,13 +85,13 @@ def _images(scene: Scene, row: int) -> dict[str, Image | None]:
     return found
 
 
-def _caption(scene: Scene, frame: Frame, size: float) -> tuple[str, tuple[float, float, float]]:
+def _caption(scene: Scene, frame: Frame, height: float) -> tuple[str, tuple[float, float, float]]:
     """Which stance it is, and where that is written: over the middle of the team."""
     there = frame.poses[np.isfinite(frame.poses).all(axis=1), :2]
     if frame.row < 0 or not len(there):
-        return "", (0.0, 0.0, size * CAPTION_HEIGHT)
+        return "", (0.0, 0.0, height)
     x, y = there.mean(axis=0)
-    return f"stance {scene.stances[frame.row].index}", (float(x), float(y), size * CAPTION_HEIGHT)
+    return f"stance {scene.stances[frame.row].index}", (float(x), float(y), height)
 
 
 def _dressed(page: str, scene: Scene, state: ViewState, notes: Sequence[str]) -> str:
