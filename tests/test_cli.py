@@ -18,7 +18,8 @@ from coloc_graph.pipeline import solve
 from coloc_graph.run import open_run
 
 COLOC = Path(sys.executable).with_name("coloc")
-COMMANDS = ["", "demo", "simulate", "import", "import tracks", "info", "solve", "evaluate", "experiment"]
+COMMANDS = ["", "demo", "simulate", "import", "import tracks", "info", "solve", "evaluate", "experiment", "view"]
+COMMANDS += ["export", "coordinate", "robot", "certificates"]
 
 
 def coloc(*arguments, cwd=None):

@@ -28,6 +28,9 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--clock-limit", type=float, default=1.0, metavar="MS", help="how well clocks are known (1)")
     command.add_argument("--listen", default="tcp/127.0.0.1:7447", help="tcp/ADDRESS:PORT, or tls/ADDRESS:PORT")
     command.add_argument("--tls", metavar="DIR", help="folder with its certificate, of `coloc certificates`")
+    command.add_argument(
+        "--exposed", action="store_true", help="listen for others than this machine without certificates"
+    )
     command.add_argument("--resume", action="store_true", help="go on with what is in --out")
     command.add_argument("--view", action="store_true", help="see it in the browser while it goes on")
     command.add_argument("--port", type=int, default=8080, help="of --view (8080)")
@@ -81,6 +84,7 @@ def run(args: argparse.Namespace) -> int:
             options,
             listen=args.listen,
             tls=tls_of(args.tls, "coordinator") if args.tls else None,
+            exposed=args.exposed,
             resume=args.resume,
             entered=told.entered,
             heard=told.heard,

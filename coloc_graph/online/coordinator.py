@@ -99,6 +99,7 @@ class Coordinator:
         *,
         listen: str = "tcp/127.0.0.1:7447",
         tls: Tls | None = None,
+        exposed: bool = False,
         resume: bool = False,
         entered: Callable[[EnteredStance], None] | None = None,
         heard: Callable[[Heard], None] | None = None,
@@ -138,6 +139,7 @@ class Coordinator:
                 team,
                 listen=listen,
                 tls=tls,
+                exposed=exposed,
                 on_sample=lambda name, one: self._inbox.put((name, one)),
                 on_wheels=lambda name, one: self._inbox.put((name, one)),
                 on_event=lambda name, one: self._inbox.put((name, one)),
@@ -288,7 +290,7 @@ class Coordinator:
         k = self._next_index()
         places = self.roster.places()
         if self._plan is None or self._plan[0] != k:
-            self._plan = (k, *self.formation.next_leap(places)) if self.stances else None
+            self._plan = (k, *self._next_leap(places)) if self.stances else None
         if self._plan is not None:
             _, leaper, to = self._plan
             places[leaper] = to
@@ -303,6 +305,16 @@ class Coordinator:
         if self._plan is not None:
             self._drive(leaper, [to[:2]], to[2], backwards=False)
         self._drive(self.mover, self._patrol[:1], None)
+
+    def _next_leap(self, places: dict[str, Planar]) -> tuple[str, Planar]:
+        """Who leaps, and where to: one that has left its place already, under an earlier coordinator, goes on."""
+        since = self._in[-1].end
+        left = [name for name in self.observers if self.roster[name].whereabouts.moved_since(since)]
+        if not left:
+            return self.formation.next_leap(places)
+        ways = self.formation.ways(places)
+        front = max(way for name, way in ways.items() if name != left[0])
+        return left[0], self.formation.place(left[0], front + STAGGER)
 
     def _place(self) -> None:
         self._drive_on()
