@@ -24,8 +24,14 @@ lint: $(VENV)/installed-dev
 types: $(VENV)/installed-dev
 	$(BIN)/mypy
 
+ifeq ($(ARGS),)
+unit: $(VENV)/installed-dev
+	$(BIN)/pytest --numprocesses 2 --dist loadfile -m "not realtime"
+	$(BIN)/pytest -m realtime
+else
 unit: $(VENV)/installed-dev
 	$(BIN)/pytest $(ARGS)
+endif
 
 bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/single_step.py
@@ -36,6 +42,8 @@ bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/frontend.py
 	$(BIN)/python benchmarks/clock_offset.py
 	$(BIN)/python benchmarks/viewer.py
+	$(BIN)/python benchmarks/link.py
+	$(BIN)/python benchmarks/online.py
 	$(BIN)/python benchmarks/backend.py $(if $(GRAPHS),--data $(GRAPHS))
 ifneq ($(DATA),)
 	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)

@@ -18,10 +18,10 @@ import numpy as np
 
 from coloc_graph.evaluation import Accuracy
 from coloc_graph.online.coordinator import Coordinator, MissionOptions
-from coloc_graph.online.simulated_team import SimulatedTeam, field_team, free_address
 from coloc_graph.pipeline import SolveOptions, solve
 from coloc_graph.results import assess
 from coloc_graph.run import open_run
+from coloc_graph.simulation.simulated_team import SimulatedTeam, field_team, free_address
 
 
 def figures(stances: int, seed: int, folder: Path) -> dict[str, object]:

@@ -10,6 +10,16 @@ from coloc_graph.results import write_result
 from coloc_graph.run import RunWriter, open_run, read_true_team, read_truth
 from coloc_graph.simulation import simulate
 
+#: What runs in real time, against devices, links and browsers: not beside other tests.
+REALTIME = ("camera", "create", "link", "link_network", "live_world", "online", "viewer_browser", "viewer_export")
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests that run in real time."""
+    for item in items:
+        if item.path.stem.removeprefix("test_") in REALTIME:
+            item.add_marker(pytest.mark.realtime)
+
 
 def copy_run(source, to, *, change=lambda record: record, stances=None, team=None, truth=False):
     """The run `source` written anew to `to`, without its truth unless asked for.

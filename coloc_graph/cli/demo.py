@@ -75,7 +75,7 @@ def online(args: argparse.Namespace) -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.online.coordinator import Coordinator, MissionOptions
     from coloc_graph.online.phases import Phase
-    from coloc_graph.online.simulated_team import SimulatedTeam, field_team, free_address
+    from coloc_graph.simulation.simulated_team import SimulatedTeam, field_team, free_address
 
     out = Path(args.out) / "online"
     if out.exists():
