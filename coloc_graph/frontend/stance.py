@@ -172,6 +172,7 @@ def _measured(
             + ("the pairing window" if offset is None else "`clock_sigma` says")
         )
     fit = persisting(fit, found.pairs, found.markers, found.times)
+    _require_determined(fit, len(found))
     measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
     if offset is not None:
         said = seen.run.team.clock_sigma
@@ -330,6 +331,16 @@ def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: M
         x_b.append(camera.normalise(tracks[b].uv[shared[:, 1]]))
     none = np.empty((0, 2))
     return distance_from_span(plane, np.concatenate([none, *x_a]), np.concatenate([none, *x_b]), markers)
+
+
+def _require_determined(fit: HomographyFit, points: int) -> None:
+    """Raise `DegenerateGeometry` where points leave a direction of the homography open, to rounding."""
+    try:
+        np.linalg.cholesky(fit.information)
+    except np.linalg.LinAlgError:
+        raise DegenerateGeometry(
+            f"{points} points do not determine the homography: let the moving robot drive further, and turn"
+        ) from None
 
 
 def _measurement(

@@ -241,7 +241,7 @@ class Coordinator:
         match one:
             case Sample():
                 seen = self.roster.take_sample(member.name, one)
-                if one.capture == self._capturing and self._stance is not None:
+                if seen is not None and one.capture == self._capturing and self._stance is not None:
                     member.samples, member.newest = member.samples + 1, seen.time
                     if self._view is not None:
                         self._follow(self._view, seen)

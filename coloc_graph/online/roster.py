@@ -42,6 +42,8 @@ class Member:
     stopped: bool = False
     #: What its wheels said up to then is recorded already [UTC s].
     recorded: float = -math.inf
+    #: And what its camera saw.
+    seen: float = -math.inf
 
     def trouble(self, *, drives: bool = False) -> str | None:
         """Why nothing can be done with it just now, in words."""
@@ -99,6 +101,8 @@ class Roster:
     def go_on(self) -> None:
         """After a coordinator began anew: go on from what is recorded of all wheels."""
         for name, member in self.members.items():
+            for detections in self.record.detections(name, 0.0, math.inf):
+                member.seen = detections.time + SAME
             for sample in self.record.odometry(name):
                 member.whereabouts.take(sample)
                 member.recorded = sample.time + SAME
@@ -106,9 +110,11 @@ class Roster:
                 x, y, yaw = map(float, last.pose)
                 member.odometry.go_on((x, y, yaw), DROVE)
 
-    def take_sample(self, name: str, sample: Sample) -> Detections:
-        """Take in what a robot's camera saw."""
+    def take_sample(self, name: str, sample: Sample) -> Detections | None:
+        """Take in what a robot's camera saw; None where it is recorded already."""
         member = self.members[name]
+        if self.utc(member.to_coordinator(sample.stamp)) <= member.seen:
+            return None
         seen = self.record.take(sample.detections(name, self.utc(member.to_coordinator(sample.stamp))))
         assert isinstance(seen, Detections)
         return seen
