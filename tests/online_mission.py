@@ -1,0 +1,93 @@
+"""A mission in the field of a simulation, to which things happen: what the tests of the online system share."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from tcp_relay import Relay
+
+from coloc_graph.simulation.simulated_team import SimulatedTeam, field_team, free_address
+
+
+class Mission:
+    """A coordinator and three robots, each in a process of its own, the robots behind a relay that can be cut."""
+
+    def __init__(self, folder: Path, stances: int, seed: int = 1) -> None:
+        self.folder, self.stances = folder, stances
+        self.listen = free_address()
+        self.relay = Relay(int(self.listen.rpartition(":")[2]))
+        self.field = SimulatedTeam(
+            field_team(), folder / "field", connect=f"tcp/127.0.0.1:{self.relay.port}", seed=seed
+        )
+        self.coordinator: subprocess.Popen | None = None
+        self.stops: dict[str, float] = {}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        if self.coordinator is not None and self.coordinator.poll() is None:
+            self.coordinator.send_signal(signal.SIGTERM)
+            self.coordinator.wait(20.0)
+        self.field.close()
+        self.relay.__exit__()
+
+    def start_coordinator(self, *more: str) -> None:
+        command = [sys.executable, "-m", "coloc_graph.cli", "coordinate", str(self.field.team_path)]
+        command += ["--out", str(self.folder / "mission"), "--stances", str(self.stances), "--goal", "100,0"]
+        command += ["--speed", "0.45", "--longest", "6", "--listen", self.listen, *more]
+        with (self.folder / "coordinator.log").open("ab") as log:
+            self.coordinator = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+
+    @property
+    def rows(self) -> list[dict]:
+        """All that happened so far, of mission.jsonl."""
+        path = self.folder / "mission" / "mission.jsonl"
+        if not path.exists():
+            return []
+        return [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
+
+    def phases(self) -> list[tuple[int, str, str]]:
+        return [(row["stance"], row["phase"], row["why"]) for row in self.rows if row["what"] == "phase"]
+
+    def wait_for(self, stance: int, phase: str, timeout: float = 120.0) -> None:
+        """Until a phase of a stance, or a later stance, is the newest."""
+        until = time.monotonic() + timeout
+        while time.monotonic() < until:
+            now = self.phases()[-1:]
+            if now and (now[0][0] > stance or now[0][1] in ("done", "failed") or now[0][:2] == (stance, phase)):
+                return
+            assert self.coordinator is None or self.coordinator.poll() is None, self.log()
+            time.sleep(0.05)
+        raise AssertionError(f"stance {stance} has not come to {phase} within {timeout} s\n{self.log()}")
+
+    def wait_moving(self, timeout: float = 10.0) -> None:
+        until = time.monotonic() + timeout
+        while time.monotonic() < until and not self.fastest() > 0.05:
+            time.sleep(0.02)
+
+    def fastest(self) -> float:
+        """The fastest wheel of all robots, as it truly turns [m/s]."""
+        return max(abs(speed) for pair in self.field.tell("speeds")["speeds"].values() for speed in pair)
+
+    def time_to_stand(self, name: str, timeout: float = 3.0) -> None:
+        """Measure how long it takes until all wheels stand."""
+        began = time.monotonic()
+        while self.fastest() > 0:
+            if time.monotonic() - began > timeout:
+                break
+            time.sleep(0.01)
+        self.stops[name] = time.monotonic() - began
+
+    def wait_end(self, timeout: float) -> int:
+        assert self.coordinator is not None
+        return self.coordinator.wait(timeout)
+
+    def log(self) -> str:
+        return "\n".join(
+            f"--- {path.name}\n{path.read_text()[-3000:]}"
+            for path in [*self.folder.glob("*.log"), *self.folder.glob("field/*.log")]
+        )

@@ -1,0 +1,129 @@
+"""A team leads itself down a hallway, with real processes, links, serial lines and images; and things happen to it."""
+
+import time
+
+import numpy as np
+import pytest
+from online_mission import Mission
+
+from coloc_graph.pipeline import SolveOptions, solve
+from coloc_graph.results import assess
+from coloc_graph.run import open_run
+from coloc_graph.simulation.simulated_team import field_team
+
+STANCES = 4
+#: What a wheel may turn on for after what let it go was cut off [s]; and what asking the world for it takes.
+STOP, ASKING = 0.5, 0.05
+
+
+@pytest.fixture(scope="module")
+def mission(tmp_path_factory):
+    """A short mission to which bad things happen, one after the other; it ends by itself."""
+    with Mission(tmp_path_factory.mktemp("online"), STANCES) as m:
+        m.field.start()
+        m.start_coordinator()
+
+        def in_mid_stance(stance):
+            m.wait_for(stance, "capturing")
+            m.wait_moving()
+
+        in_mid_stance(1)
+        m.field.kill("C")  # its wheels go on: nobody is left to stop them, until its program is back
+        m.field.start("C")
+        in_mid_stance(2)
+        m.relay.cut()
+        m.time_to_stand("the link is cut")
+        time.sleep(3.0)
+        m.relay.mend()
+        in_mid_stance(3)
+        time.sleep(1.5)
+        m.killed_at = time.time()
+        m.coordinator.kill()
+        m.coordinator.wait()
+        m.time_to_stand("the coordinator is gone")
+        m.start_coordinator("--resume")
+        m.code = m.wait_end(200.0)
+        m.field.close()
+        yield m
+
+
+def reasons(mission, stance):
+    return " | ".join(why for k, phase, why in mission.phases() if k == stance and phase == "holding")
+
+
+def test_the_mission_ends_by_itself_with_every_stance_once(mission):
+    assert mission.code == 0, mission.log()
+    run = open_run(mission.folder / "mission" / "run.mcap")
+    assert [stance.index for stance in run.stances] == list(range(STANCES))
+    entered = [row["stance"] for row in mission.rows if row["what"] == "entered"]
+    assert entered == list(range(STANCES))
+    assert not run.warnings
+    for before, stance in zip(run.stances, run.stances[1:], strict=False):
+        assert stance.anchors and set(stance.anchors) < set(stance.observers) and stance.start > before.end
+
+
+def test_what_happened_is_named(mission):
+    assert "C is not there" in reasons(mission, 1)
+    assert "not there" in reasons(mission, 2) or "has said nothing" in reasons(mission, 2)
+    assert any(row["what"] == "resumed" and row["stances"] == 3 for row in mission.rows)
+
+
+def test_wheels_stand_soon_after_they_are_let_go(mission):
+    assert len(mission.stops) == 2
+    assert max(mission.stops.values()) < STOP + ASKING, mission.stops
+
+
+def test_a_killed_coordinator_s_record_misses_half_a_second_at_most(mission):
+    cut_off = open_run(mission.folder / "mission" / "run.1.mcap")
+    assert len(cut_off.stances) == 3
+    last = max(one.time for robot in "AB" for one in cut_off.detections(robot))
+    assert mission.killed_at - last < 0.5 + 0.2  # and the image before that
+    goes_on = open_run(mission.folder / "mission" / "run.mcap")
+    for robot in "ABC":
+        before = [one.time for one in cut_off.odometry(robot)]
+        assert [one.time for one in goes_on.odometry(robot)][: len(before)] == before
+
+
+def test_the_record_solved_offline_is_what_was_known_online(mission):
+    online = {row["stance"]: row["poses"] for row in mission.rows if row["what"] == "entered"}
+    heard = []
+    solve(open_run(mission.folder / "mission" / "run.mcap"), SolveOptions(incremental=True), entered=heard.append)
+    assert len(heard) == STANCES
+    for one in heard:
+        poses = online[one.stance.index]
+        assert poses.keys() == one.estimate.poses.keys()
+        for robot, pose in one.estimate.poses.items():
+            assert np.abs(pose.matrix() - poses[robot]).max() < 1e-6
+
+
+def test_it_is_as_accurate_as_the_same_record_in_batch(mission):
+    run = open_run(mission.folder / "mission" / "run.mcap")
+    online, batch = (
+        assess(solve(run, SolveOptions(incremental=incremental)), mission.field.truth_path)[0]
+        for incremental in (True, False)
+    )
+    assert online.ate < 1.2 * batch.ate + 1e-4
+    for row in batch.robots:
+        if row.robot != "C":
+            assert row.true_length > 0.3 and abs(row.length_error) < 0.02
+    assert batch.ate < 0.05
+
+
+def test_robots_keep_records_of_their_own(mission):
+    team = field_team()
+    for name in team.names:
+        runs = [open_run(path) for path in sorted((mission.folder / "field" / "robots").glob(f"{name}-*.mcap"))]
+        assert len(runs) == (2 if name == "C" else 1)
+        assert all(run.team == team for run in runs)
+        assert sum(1 for run in runs for _ in run.odometry(name)) > 100
+    seen = sum(
+        1 for path in (mission.folder / "field" / "robots").glob("A-*.mcap") for _ in open_run(path).detections("A")
+    )
+    recorded = sum(1 for _ in open_run(mission.folder / "mission" / "run.mcap").detections("A"))
+    assert recorded <= seen < recorded + 600
+
+
+def test_figures_are_kept_of_each_stance(mission):
+    rows = [row for row in mission.rows if row["what"] == "entered"]
+    latencies = [row["latency"] for row in rows]
+    assert all(0 < latency < 10 for latency in latencies) and all(row["points"] >= 50 for row in rows)
