@@ -17,7 +17,8 @@ import time
 import numpy as np
 
 from coloc_graph.errors import RobotError
-from coloc_graph.robot_io.link import CoordinatorLink, RobotLink
+from coloc_graph.robot_io.link import CoordinatorLink
+from coloc_graph.robot_io.robot_link import RobotLink
 from coloc_graph.robot_io.wire import Halt, Sample
 from coloc_graph.simulation import reference_team
 

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from coloc_graph.evaluation import Accuracy
-from coloc_graph.online.coordinator import Coordinator, MissionOptions
+from coloc_graph.online.coordinator import Coordinator
+from coloc_graph.online.mission import MissionOptions
 from coloc_graph.pipeline import SolveOptions, solve
 from coloc_graph.results import assess
 from coloc_graph.run import open_run

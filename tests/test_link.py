@@ -19,8 +19,9 @@ from coloc_graph.cli import main
 from coloc_graph.errors import InputError, RobotError
 from coloc_graph.robot_io.certificates import make_certificates
 from coloc_graph.robot_io.in_order import AT_ONCE, TRIES, InOrder
-from coloc_graph.robot_io.link import CoordinatorLink, RobotLink
+from coloc_graph.robot_io.link import CoordinatorLink
 from coloc_graph.robot_io.link_config import Tls, config_of, tls_of
+from coloc_graph.robot_io.robot_link import RobotLink
 from coloc_graph.robot_io.wire import (
     LARGEST,
     Capture,
@@ -379,7 +380,7 @@ def test_what_is_measured_waits_for_the_clock():
 
 ROBOT = """
 import sys, time
-from coloc_graph.robot_io.link import RobotLink
+from coloc_graph.robot_io.robot_link import RobotLink
 from coloc_graph.robot_io.wire import Event
 with RobotLink("A", connect=sys.argv[1], handler=lambda body: "", session=sys.argv[2]) as link:
     for number in range(10**6):

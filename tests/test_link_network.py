@@ -63,7 +63,7 @@ def coordinator():
 
 def robot():
     """Measures until there is input; then says what it sent and did, and keeps it until there is more."""
-    from coloc_graph.robot_io.link import RobotLink
+    from coloc_graph.robot_io.robot_link import RobotLink
     from coloc_graph.robot_io.wire import Sample, Wheels
 
     done, sent = [], 0

@@ -1,16 +1,18 @@
 """What the online system is made of: course and formation, driving, whereabouts, the record, phases."""
 
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from coloc_graph.common_view import View
-from coloc_graph.errors import InputError, RunError
+from coloc_graph.errors import InputError, RobotError, RunError
 from coloc_graph.lie import floor_pose
 from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Course, Formation
 from coloc_graph.online.ledger import Counted, Ledger, way_since
+from coloc_graph.online.measuring import Measuring
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_join import DROVE, STOOD, JoinedOdometry
 from coloc_graph.online.phases import FOLLOWS, Phase, Phases, as_dot
@@ -19,6 +21,7 @@ from coloc_graph.online.watch import InView
 from coloc_graph.online.whereabouts import Whereabouts, compose, inverse
 from coloc_graph.run import Detections, OdometrySample, Stance, open_run
 from coloc_graph.simulation.rig import reference_team
+from coloc_graph.stance_solver import StanceSolver
 
 COURSE = Course(((0.0, 0.0), (3.0, 0.0), (3.0, 2.0)))
 FORMATION = Formation(Course(((0.0, 0.0), (5.0, 0.0))), ("A", "B"))
@@ -237,6 +240,41 @@ def test_a_record_that_was_cut_off_goes_on_and_the_old_one_is_kept(tmp_path):
     assert run.stances == kept.stances
     with pytest.raises(RunError, match="another team"):
         continued(path, reference_team((0.1, 0.0, 0.0, 0.0)))
+
+
+class Broken(Record):
+    """A record whose disk, or whoever reads it, fails."""
+
+    def detections(self, robot, start, end):
+        raise ZeroDivisionError("a fault of the program's own")
+
+
+def answer(ask):
+    until = time.monotonic() + 30
+    while time.monotonic() < until:
+        if (found := ask()) is not None:
+            return found
+        time.sleep(0.01)
+    raise AssertionError("nothing came of it")
+
+
+@pytest.mark.parametrize(("record", "why"), [(Record, "stance 0 measures nothing"), (Broken, "a fault of the program")])
+def test_a_stance_that_measures_nothing_and_a_fault_are_errors_of_the_stance(tmp_path, record, why):
+    team = reference_team()
+    stance = Stance(0, 1e9, 1e9 + 2, ("A", "B"), ("C",))
+    solver = StanceSolver(team)
+    with record(tmp_path / "run.mcap", team) as kept:
+        measuring = Measuring(kept, solver)
+        assert measuring.judged() is None and measuring.entered() is None and not measuring.judging
+        measuring.enter(stance)
+        with pytest.raises(RobotError, match=why):
+            answer(measuring.entered)
+        assert measuring.entered() is None and not solver.estimator.stances
+        measuring.judge(stance)
+        assert measuring.judging
+        if record is Record:
+            assert answer(measuring.judged).why
+        measuring.end()
 
 
 def test_phases_follow_each_other_as_drawn():

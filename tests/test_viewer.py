@@ -517,11 +517,24 @@ def test_a_closed_viewer_leaves_its_port():
     assert not viewer._thread.is_alive()
 
 
+def started(arguments, **more):
+    """A program as a user starts it: its output buffered, and Ctrl-C heard, which a shell's background job hands on."""
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    return subprocess.Popen(
+        arguments,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=buffered,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        **more,
+    )
+
+
 @pytest.mark.parametrize("command", ["view", "solve"])
 def test_ctrl_c_ends_it_without_a_word(command, result, short, tmp_path):
     of = {"view": [result], "solve": [short, "--out", tmp_path / "out", "--incremental", "--view"]}[command]
     arguments = [COLOC, command, *of, "--no-browser", "--port", "0"]
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = started(arguments, stdout=subprocess.PIPE)
     try:
         said = next(line for line in process.stderr if "viewer" in line)
         assert re.match(r"the viewer is at http://127\.0\.0\.1:\d+ \(Ctrl-C ends it\)", said)
@@ -538,7 +551,7 @@ def test_ctrl_c_ends_it_without_a_word(command, result, short, tmp_path):
 
 def test_ctrl_c_while_it_is_solved_says_that_there_is_no_result(hallway, tmp_path):
     arguments = [COLOC, "solve", hallway, "--out", tmp_path / "out", "--incremental", "--view", "--no-browser"]
-    process = subprocess.Popen([*arguments, "--port", "0"], stderr=subprocess.PIPE, text=True)
+    process = started([*arguments, "--port", "0"])
     try:
         assert any("measurements made" in line for line in process.stderr)  # some are, and not all
         process.send_signal(signal.SIGINT)

@@ -73,7 +73,8 @@ def online(args: argparse.Namespace) -> int:
     from coloc_graph.cli.mission import report, watched
     from coloc_graph.cli.running import until_signal
     from coloc_graph.errors import InputError
-    from coloc_graph.online.coordinator import Coordinator, MissionOptions
+    from coloc_graph.online.coordinator import Coordinator
+    from coloc_graph.online.mission import MissionOptions
     from coloc_graph.online.phases import Phase
     from coloc_graph.simulation.simulated_team import SimulatedTeam, field_team, free_address
 

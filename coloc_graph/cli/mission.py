@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from coloc_graph.online.coordinator import Heard
+    from coloc_graph.online.mission import Heard
     from coloc_graph.stance_solver import EnteredStance
     from coloc_graph.team import Team
 

@@ -1,6 +1,7 @@
 """coloc solve RUN --out DIR."""
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -118,6 +119,7 @@ def _solved(
         print_json(summarise(solution, accuracy))
     else:
         _print(solution, accuracy, args.out)
+    sys.stdout.flush()  # who reads a pipe does not wait until the viewer is closed
     return solution
 
 

@@ -7,9 +7,8 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -20,26 +19,25 @@ from coloc_graph.errors import ColocError, InputError, RobotError
 from coloc_graph.lie import floor_pose
 from coloc_graph.measurements import Sighting
 from coloc_graph.online.formation import STAGGER, Course, Formation, Planar
+from coloc_graph.online.measuring import Measuring
+from coloc_graph.online.mission import Heard, MissionOptions, in_world
+from coloc_graph.online.orders import Orders
 from coloc_graph.online.phases import Change, Phase, Phases
 from coloc_graph.online.record import Record, continued
 from coloc_graph.online.roster import Member, Roster
-from coloc_graph.online.watch import InView, Precision, precision
-from coloc_graph.online.whereabouts import compose, inverse
-from coloc_graph.robot_io.link import CoordinatorLink, Tls
-from coloc_graph.robot_io.wire import Body, Capture, Drive, EndCapture, Event, Halt, Recover, Sample, Status, Wheels
+from coloc_graph.online.watch import InView, Precision
+from coloc_graph.robot_io.link import CoordinatorLink
+from coloc_graph.robot_io.link_config import Tls
+from coloc_graph.robot_io.wire import Capture, EndCapture, Event, Halt, Recover, Sample, Status, Wheels
 from coloc_graph.run import Detections, Run, Stance
 from coloc_graph.run.schemas import to_ns, to_seconds
-from coloc_graph.stance_solver import EnteredStance, SolveOptions, StanceSolver, measure_stance
+from coloc_graph.stance_solver import EnteredStance, StanceSolver
 from coloc_graph.team import Team
 
 log = logging.getLogger(__name__)
 
 #: How often is looked what is to be done, and how often a stance's precision [s].
 TICK, JUDGED = 0.03, 0.7
-#: The permission to move is renewed so often while the coordinator is at work, which may take so long [s].
-RENEWED, AT_WORK = 0.1, 0.4
-#: How long a robot has to answer [s].
-ANSWER = 1.0
 #: Before a stance begins, all have stood for this long [s]; it is this much longer than what was seen in it.
 SETTLED, MARGIN = 0.25, 0.02
 #: How long things may take at most [s]: a drive, to find the mover, to get the last images, to be mended.
@@ -50,44 +48,11 @@ FOLLOWED = 0.1
 OUT_OF_VIEW = 0.6
 
 
-@dataclass(frozen=True)
-class MissionOptions:
-    """What a team is to do.
-
-    `goals` are x, y [m] of the way of the team's middle, on a floor whose x axis is the way ahead at the beginning;
-    it ends at the last one or after so many `stances`. A stance goes on until it measures all pairs to within
-    `place_sigma` [m] and `heading_sigma_deg`, with `least_points`, or for `longest` [s]. `speed` is the mover's and
-    that of a leap [m/s]. A stance does not begin where a clock is known worse than `clock_limit` [s]. Of one stance
-    `attempts` are made.
-    """
-
-    goals: tuple[tuple[float, float], ...] = ((7.2, 0.0),)
-    stances: int | None = None
-    mover: str | None = None
-    place_sigma: float = 0.003
-    heading_sigma_deg: float = 0.15
-    least_points: int = 150
-    longest: float = 40.0
-    speed: float = 0.3
-    clock_limit: float = 1e-3
-    attempts: int = 20
-    solve: SolveOptions = field(default_factory=SolveOptions)
-
-
-@dataclass(frozen=True, eq=False)
-class Heard:
-    """What observers of a mission are told: the time [UTC s], all robots' places (4, 4), and a line for people."""
-
-    time: float
-    T_world_body: dict[str, np.ndarray]
-    note: str
-
-
 class Coordinator:
     """Leads a team along its goals; a context manager, at whose end all stand.
 
     Writes into `folder`: run.mcap, the record, and mission.jsonl, what happened when. With `resume` it goes on where a
-    coordinator left off there. `entered` hears of each stance, `heard` twice a second of where all are.
+    coordinator left off there. `entered` hears of each stance, `heard` ten times a second of where all are.
     Raises `InputError` where the mission cannot begin.
     """
 
@@ -115,7 +80,7 @@ class Coordinator:
                 f"a mission needs two robots that watch {self.mover}, and the reference {team.reference} among them"
             )
         self._entered, self._heard = entered, heard
-        starts, points = _in_world(team, self.mover, self.options.goals)
+        starts, points = in_world(team, self.mover, self.options.goals)
         self.formation = Formation(Course(points), self.observers)
         self._inbox: queue.SimpleQueue[tuple[str, object]] = queue.SimpleQueue()
         self.solver = StanceSolver(team, self.options.solve)
@@ -149,9 +114,8 @@ class Coordinator:
             self.roster = Roster(record, starts, lambda name: link.clocks[name].to_coordinator, epoch)
             self.link = undo.enter_context(link)
             self._close = undo.pop_all()
-        self._places: dict[str, Planar] = {}  # where each robot of the stance's plan stands
         self._tries = self._rounds = 0
-        self._capturing = self._ways = time.time_ns() // 1_000_000  # no number twice, of whatever coordinator
+        self._capturing = time.time_ns() // 1_000_000  # no number twice, of whatever coordinator
         self._plan: tuple[int, str, Planar] | None = None  # the leap into a stance: its number, who, where to
         self._patrol = np.zeros((0, 2))
         self._stance: Stance | None = None
@@ -160,18 +124,13 @@ class Coordinator:
         self._out_since: float | None = None
         self._judged = self._told = 0.0
         self._precision: Precision | None = None
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="measuring")
-        self._judging: Future[Precision] | None = None
-        self._estimating: Future[EnteredStance] | None = None
+        self._measuring = Measuring(record, self.solver)
         self._ended_at = 0.0
         self._in: list[Stance] = []
-        self._at_work = time.monotonic()
         self._latencies: list[float] = []
         if before is not None:
             self._go_on(before)
-        self._ended = threading.Event()
-        self._holder = threading.Thread(target=self._hold_permission, name="permission to move", daemon=True)
-        self._holder.start()
+        self._orders = Orders(link, self.roster, self.options.speed, lambda name: self._note("drives on", robot=name))
 
     def __enter__(self) -> Self:
         return self
@@ -179,10 +138,8 @@ class Coordinator:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._ended.set()
-        self._holder.join(1.0)
-        self._worker.shutdown(wait=True, cancel_futures=True)
-        self._halt_all()
+        self._orders.end()
+        self._measuring.end()
         self._close.__exit__(kind, error, trace)
 
     @property
@@ -216,18 +173,18 @@ class Coordinator:
                     steps[self.phases.now]()
                 else:
                     self._hold_on(trouble)
-            except RobotError as error:
+            except ColocError as error:
                 self._hold_on(str(error))
             self._tell()
-        self._halt_all()
+        self._orders.halt_all()
         return self.phases.now
 
     # what comes in
 
     def _listen(self) -> None:
         """Take in all that came, or wait a little for something."""
-        self._at_work = time.monotonic()
-        until = self._at_work + TICK
+        self._orders.at_work()
+        until = time.monotonic() + TICK
         while True:
             try:
                 name, one = self._inbox.get(timeout=max(until - time.monotonic(), 0.001))
@@ -294,17 +251,17 @@ class Coordinator:
         if self._plan is not None:
             _, leaper, to = self._plan
             places[leaper] = to
-        self._places = {name: places[name] for name in self.observers}
-        self._view = InView(self.team, self.mover, self._places)
+        standing = {name: places[name] for name in self.observers}
+        self._view = InView(self.team, self.mover, standing)
         markers = self.team[self.mover].markers
         assert markers is not None
         left = bool((k + self._tries) % 2)
-        self._patrol = self.formation.patrol(self._places, list(self._view.views.values()), markers.p_body, left)
+        self._patrol = self.formation.patrol(standing, list(self._view.views.values()), markers.p_body, left)
         for member in self.roster.members.values():
             member.arrived, member.way = True, None
         if self._plan is not None:
-            self._drive(leaper, [to[:2]], to[2], backwards=False)
-        self._drive(self.mover, self._patrol[:1], None)
+            self._orders.drive(leaper, [to[:2]], to[2], backwards=False)
+        self._orders.drive(self.mover, self._patrol[:1])
 
     def _next_leap(self, places: dict[str, Planar]) -> tuple[str, Planar]:
         """Who leaps, and where to: one that has left its place already, under an earlier coordinator, goes on."""
@@ -317,7 +274,7 @@ class Coordinator:
         return left[0], self.formation.place(left[0], front + STAGGER)
 
     def _place(self) -> None:
-        self._drive_on()
+        self._orders.drive_on()
         if not all(member.arrived for member in self.roster.members.values()):
             if self._phase_lasted(DRIVE_TIME):
                 raise RobotError(
@@ -328,15 +285,15 @@ class Coordinator:
             return
         k = self._next_index()
         now = self.roster.utc(time.monotonic_ns())
-        self._places = {name: self.roster[name].whereabouts.place() for name in self.observers}
-        self._view = InView(self.team, self.mover, self._places)
+        standing = {name: self.roster[name].whereabouts.place() for name in self.observers}
+        self._view = InView(self.team, self.mover, standing)
         self._stance = Stance(k, now, now, self.observers, (self.mover,), self._anchors())
         self._rounds, self._out_since, self._judged, self._precision = 0, None, time.monotonic(), None
-        self._judging = None
+        self._measuring.forget()
         self._capturing += 1
         for name in self.observers:
             self.roster[name].samples = 0
-            self._ask(name, Capture(capture=self._capturing))
+            self._orders.ask(name, Capture(capture=self._capturing))
         self._enter(Phase.LOOKING)
 
     def _look(self) -> None:
@@ -344,7 +301,7 @@ class Coordinator:
         missing = self._view.missing()
         if not missing:
             self._stance = replace(self._stance, start=self.roster.utc(time.monotonic_ns()))
-            self._drive(self.mover, self._patrol[1:], None)
+            self._orders.drive(self.mover, self._patrol[1:])
             self._enter(Phase.CAPTURING)
         elif self._phase_lasted(LOOK_TIME):
             raise RobotError(
@@ -359,29 +316,29 @@ class Coordinator:
         if not missing:
             self._out_since = None
             if self.phases.now == Phase.TURNING_BACK:
-                self._drive(self.mover, self._patrol, None)
+                self._orders.drive(self.mover, self._patrol)
                 self._enter(Phase.CAPTURING)
         elif self._out_since is None:
             self._out_since = now
         elif now - self._out_since > OUT_OF_VIEW and self.phases.now == Phase.CAPTURING:
-            self._drive(self.mover, self._patrol[-1:], None)
+            self._orders.drive(self.mover, self._patrol[-1:])
             self._enter(Phase.TURNING_BACK, f"{self.mover} left the view of {' and '.join(missing)}")
         elif now - self._out_since > DRIVE_TIME / 2:
             raise RobotError(f"{self.mover} did not come back into the view of {' and '.join(missing)}")
-        if self._judging is not None and self._judging.done():
-            self._precision, self._judging = self._judging.result(), None
-            if self._enough(self._precision):
+        found = self._measuring.judged()
+        if found is not None:
+            self._precision = found
+            if self._enough(found):
                 self._end_capture("it is enough")
                 return
-        if self._judging is None and now - self._judged > JUDGED:
+        if not self._measuring.judging and now - self._judged > JUDGED:
             self._judged = now
-            so_far = replace(self._stance, end=self._last_image())
-            self._judging = self._worker.submit(precision, self.record, so_far, self.solver.options.frontend)
-        self._drive_on()
+            self._measuring.judge(replace(self._stance, end=self._last_image()))
+        self._orders.drive_on()
         if self.roster[self.mover].arrived and self.phases.now == Phase.CAPTURING:
             self._rounds += 1
             order = self._patrol[::-1] if self._rounds % 2 else self._patrol
-            self._drive(self.mover, order, None)
+            self._orders.drive(self.mover, order)
         if self.roster.utc(time.monotonic_ns()) - self._stance.start > self.options.longest:
             self._end_capture(f"{self.options.longest:g} s are over")
 
@@ -393,8 +350,8 @@ class Coordinator:
         )
 
     def _end_capture(self, why: str) -> None:
-        self._ask(self.mover, Halt())
-        self._expected = {name: int(self._ask(name, EndCapture()) or 0) for name in self.observers}
+        self._orders.ask(self.mover, Halt())
+        self._expected = {name: int(self._orders.ask(name, EndCapture()) or 0) for name in self.observers}
         self._enter(Phase.COLLECTING, why)
 
     def _collect(self) -> None:
@@ -413,24 +370,12 @@ class Coordinator:
         stance = replace(
             self._stance, start=self.record.rounded(start), end=self.record.rounded(end), anchors=self._anchors()
         )
-        self._estimating = self._worker.submit(self._enter_stance, stance)
-
-    def _enter_stance(self, stance: Stance) -> EnteredStance:
-        """In the worker's thread: measure a stance and enter it, unless it measures nothing."""
-        pairs = list(measure_stance(self.record, stance, self.solver.options))
-        unusable = [pair.homography.unusable for pair in pairs if pair.homography.unusable]
-        if len(unusable) == len(pairs):
-            raise RobotError(f"stance {stance.index} measures nothing: {unusable[0]}")
-        try:
-            return self.solver.enter(self.record, stance, pairs)
-        except ColocError as error:
-            raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
+        self._measuring.enter(stance)
 
     def _estimate(self) -> None:
-        if self._estimating is None or not self._estimating.done():
+        one = self._measuring.entered()
+        if one is None:
             return
-        done, self._estimating = self._estimating, None
-        one = done.result()
         stance = one.stance
         self.record.complete(stance)
         self._in.append(stance)
@@ -479,7 +424,7 @@ class Coordinator:
             self._fail(f"{self._tries} attempts of stance {self._next_index()} went wrong, the last one: {why}")
             return
         self._enter(Phase.HOLDING, why)
-        self._halt_all()
+        self._orders.halt_all()
 
     def _fail(self, why: str) -> None:
         self._enter(Phase.FAILED, why)
@@ -512,14 +457,14 @@ class Coordinator:
                 if fault and member.present and time.monotonic() - self._judged > 1.0:
                     self._judged = time.monotonic()
                     with contextlib.suppress(RobotError):
-                        self._ask(name, Recover())
+                        self._orders.ask(name, Recover())
                 return why
             if not member.whereabouts.known:
                 return f"the wheels of {name} have said nothing yet"
         return None if self._phase_lasted(0.5) else "a moment"
 
     def _anchors(self) -> tuple[str, ...]:
-        """Who watched in the stance before and has stood since by its wheels, and was not bumped."""
+        """Who watched in the stance before and, by its wheels, has stood since."""
         if not self.stances:
             return ()
         before = self._in[-1]
@@ -554,51 +499,6 @@ class Coordinator:
 
     def _phase_lasted(self, seconds: float) -> bool:
         return time.monotonic() - self.phases.since > seconds
-
-    # what is said
-
-    def _drive(
-        self, name: str, places: Iterable[Sequence[float]], yaw: float | None, *, backwards: bool = True
-    ) -> None:
-        """Send a robot through places in the world."""
-        member = self.roster[name]
-        own = [member.whereabouts.in_odometry((float(x), float(y), 0.0))[:2] for x, y in places]
-        last = None if yaw is None else member.whereabouts.in_odometry((0.0, 0.0, yaw))[2]
-        self._ways += 1
-        member.way = Drive(number=self._ways, places=own, yaw=last, speed=self.options.speed, backwards=backwards)
-        member.arrived = member.stopped = False
-        self._ask(name, member.way)
-
-    def _drive_on(self) -> None:
-        """Robots that stopped on their way, for want of a word in time, go on."""
-        for name, member in self.roster.members.items():
-            if member.stopped and not member.arrived and member.way is not None:
-                member.stopped = False
-                self._note("drives on", robot=name)
-                self._ask(name, member.way)
-
-    def _ask(self, name: str, body: Body) -> str:
-        """Ask a robot, which must answer and agree; what it says comes back."""
-        self._at_work = time.monotonic() + ANSWER
-        reply = self.link.ask(name, body, ANSWER)
-        self._at_work = time.monotonic()
-        if not reply.ok:
-            raise RobotError(f"{name} refuses: {reply.text}")
-        return reply.text
-
-    def _halt_all(self) -> None:
-        """Stop all robots, as far as they hear it; those that do not stop by themselves."""
-        for name, member in self.roster.members.items():
-            if member.present:
-                for body in (Halt(), EndCapture()):
-                    with contextlib.suppress(RobotError):
-                        self.link.ask(name, body, 0.3)
-
-    def _hold_permission(self) -> None:
-        """The thread that lets robots move as long as the coordinator is at work."""
-        while not self._ended.wait(RENEWED):
-            if time.monotonic() - self._at_work < AT_WORK:
-                self.link.hold()
 
     # what is noted
 
@@ -636,25 +536,3 @@ class Coordinator:
             self._in.append(stance)
         self._note("resumed", stances=len(before.stances))
         log.info("goes on after %d stances", len(before.stances))
-
-
-def _in_world(
-    team: Team, mover: str, goals: tuple[tuple[float, float], ...]
-) -> tuple[dict[str, Planar], tuple[tuple[float, float], ...]]:
-    """Where the robots begin, and the course, in the world, which is the reference's body at the beginning.
-
-    Both are given on a floor whose x axis is the way ahead and whose origin is the observers' middle.
-    """
-    formation = Formation(Course(((0.0, 0.0), (10.0, 0.0))), tuple(n for n in team.names if n != mover))
-    starts: dict[str, Planar] = {}
-    for n, name in enumerate(formation.observers):
-        starts[name] = formation.place(name, STAGGER * (n % 2))
-    starts[mover] = 1.28, 0.0, 0.0
-    for robot in team.robots:
-        if robot.devices is not None and robot.devices.start is not None:
-            x, y, yaw_deg = robot.devices.start
-            starts[robot.name] = x, y, math.radians(yaw_deg)
-    T_world_floor = inverse(starts[team.reference])
-    middle = np.mean([starts[name][:2] for name in formation.observers], axis=0)
-    points = [compose(T_world_floor, (float(x), float(y), 0.0))[:2] for x, y in ((middle[0], 0.0), *goals)]
-    return {name: compose(T_world_floor, place) for name, place in starts.items()}, tuple(points)

@@ -19,9 +19,10 @@ from coloc_graph.online.odometry_join import JoinedOdometry
 from coloc_graph.online.record import Record
 from coloc_graph.online.whereabouts import compose
 from coloc_graph.robot_io.camera import open_camera
-from coloc_graph.robot_io.camera_source import CameraSource, clock_ahead
+from coloc_graph.robot_io.camera_source import CameraSource, Frame, clock_ahead
 from coloc_graph.robot_io.create import Create
-from coloc_graph.robot_io.link import RobotLink, Tls
+from coloc_graph.robot_io.link_config import Tls
+from coloc_graph.robot_io.robot_link import RobotLink
 from coloc_graph.robot_io.wire import (
     Body,
     Capture,
@@ -266,21 +267,28 @@ class RobotProgram:
                         self._camera.reopen()
                 self._ended.wait(0.05)
                 continue
-            if self._capture is None:
-                continue
-            blobs = self._detect(frame.pixels)
-            stamp = frame.stamp_ns
-            seen = Detections(
-                self.name, self._utc(stamp), blobs.uv, blobs.covariance, ("",) * len(blobs.uv),
-                blobs.flags, blobs.peak, blobs.area,
-            )  # fmt: skip
-            with self._lock:
-                if self._capture is not None:
-                    number, capture = self._samples, self._capture
-                    self._link.put(Sample.of(seen, session=self.session, number=number, capture=capture, stamp=stamp))
-                    self._record.take(seen)
-                    self._samples += 1
-                    self._seen += 1
+            if self._capture is not None:
+                try:
+                    self._see(frame)
+                except Exception as error:  # a full disk, a fault of ours: the coordinator must hear of it
+                    log.exception("an image came to nothing")
+                    self._camera_fault = f"its images come to nothing ({error}): see its log"
+                    self._ended.wait(NO_IMAGE)
+
+    def _see(self, frame: Frame) -> None:
+        """Send and record what is in an image."""
+        blobs, stamp = self._detect(frame.pixels), frame.stamp_ns
+        seen = Detections(
+            self.name, self._utc(stamp), blobs.uv, blobs.covariance, ("",) * len(blobs.uv),
+            blobs.flags, blobs.peak, blobs.area,
+        )  # fmt: skip
+        with self._lock:
+            if self._capture is not None:
+                number, capture = self._samples, self._capture
+                self._link.put(Sample.of(seen, session=self.session, number=number, capture=capture, stamp=stamp))
+                self._record.take(seen)
+                self._samples += 1
+                self._seen += 1
 
     def _utc(self, stamp: int) -> float:
         return to_seconds(stamp + self._epoch)

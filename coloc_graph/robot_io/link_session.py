@@ -16,6 +16,9 @@ from coloc_graph.robot_io.wire import Event, Sample, Wheels
 
 #: What a robot sends and must not be lost, by the last part of its key.
 KEPT_KINDS: dict[str, type[msgspec.Struct]] = {"samples": Sample, "wheels": Wheels, "events": Event}
+#: What a robot keeps for one who does not hear it, messages of a kind: 40 s of samples at 100 a second, 200 s of
+#: odometry at 20 a second.
+CACHED = 4000
 #: Commands and the time overtake what was measured.
 FIRST: dict[str, Any] = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
 

@@ -1,0 +1,84 @@
+"""What is worked out while robots drive and while they wait, in a thread of its own; `Measuring`."""
+
+import logging
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+from coloc_graph.errors import ColocError, RobotError
+from coloc_graph.online.watch import Precision, precision
+from coloc_graph.run import Recorded, Stance
+from coloc_graph.stance_solver import EnteredStance, StanceSolver, measure_stance
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+class Measuring:
+    """Judges stances that go on, and enters those that are over; `solver` is its thread's alone meanwhile.
+
+    What was asked for is given once, when it is there. A failure, of whatever kind, is a `RobotError`: it voids a
+    stance, not a mission.
+    """
+
+    def __init__(self, record: Recorded, solver: StanceSolver) -> None:
+        self._record, self._solver = record, solver
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="measuring")
+        self._judging: Future[Precision] | None = None
+        self._entering: Future[EnteredStance] | None = None
+
+    def end(self) -> None:
+        """Wait for what is under way, and do no more."""
+        self._worker.shutdown(wait=True, cancel_futures=True)
+
+    @property
+    def judging(self) -> bool:
+        """Whether a judgement is under way, or has not been taken yet."""
+        return self._judging is not None
+
+    def judge(self, stance: Stance) -> None:
+        """Find how well a stance, as it is so far, measures its pairs."""
+        self._judging = self._worker.submit(precision, self._record, stance, self._solver.options.frontend)
+
+    def forget(self) -> None:
+        """What is judged just now is not wanted any more."""
+        self._judging = None
+
+    def judged(self) -> Precision | None:
+        """What was found; None while it is not."""
+        done = self._judging
+        if done is None or not done.done():
+            return None
+        self._judging = None
+        return _result(done, "judging the stance")
+
+    def enter(self, stance: Stance) -> None:
+        """Measure a stance and enter it."""
+        self._entering = self._worker.submit(self._enter, stance)
+
+    def entered(self) -> EnteredStance | None:
+        """The stance that is in; None while it is not."""
+        done = self._entering
+        if done is None or not done.done():
+            return None
+        self._entering = None
+        return _result(done, "the estimate")
+
+    def _enter(self, stance: Stance) -> EnteredStance:
+        pairs = list(measure_stance(self._record, stance, self._solver.options))
+        unusable = [pair.homography.unusable for pair in pairs if pair.homography.unusable]
+        if len(unusable) == len(pairs):
+            raise RobotError(f"stance {stance.index} measures nothing: {unusable[0]}")
+        try:
+            return self._solver.enter(self._record, stance, pairs)
+        except ColocError as error:
+            raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
+
+
+def _result(done: "Future[T]", what: str) -> T:
+    try:
+        return done.result()
+    except ColocError:
+        raise
+    except Exception as error:
+        log.exception("%s failed", what)
+        raise RobotError(f"{what} failed ({error!r})") from error
