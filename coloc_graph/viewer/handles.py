@@ -39,7 +39,7 @@ class GraphView:
     def __init__(self, server: viser.ViserServer, scene: Scene, dark: bool = False) -> None:
         self.server = server
         self.names: tuple[str, ...] = ()
-        self._sent: dict[str, object] = {}
+        self._sent: dict[str, NDArray[np.generic]] = {}
         self._places: dict[int, NDArray[np.float64]] = {}
         self._images: dict[str, Image | None] = {}
         self._labels: dict[str, str] = {}
@@ -220,26 +220,28 @@ class GraphView:
                 handle.wxyz = turned[number]
 
     def _assign_lines(self, name: str, points: NDArray[np.float32], colours: NDArray[np.uint8]) -> None:
-        key = (points.tobytes(), colours.tobytes()) if len(points) < 2000 else None
-        if key is not None and self._sent.get(name) == key:
-            return
-        self._sent[name] = key
         handle = self._lines[name]
         self._show(handle, bool(len(points)))
         if len(points):
-            handle.points, handle.colors = points, colours
+            self._send(handle, name, points=points, colors=colours)
 
     def _assign_batch(self, name: str, one: Batch, colours: NDArray[np.uint8]) -> None:
         handle = self._batches[name]
         self._show(handle, bool(len(one.wxyz)))
-        if not len(one.wxyz):
-            return
-        key = tuple(part.tobytes() for part in (*one[:3], colours)) if len(colours) < 2000 else None
-        if key is not None and self._sent.get(name) == key:
-            return
-        self._sent[name] = key
-        handle.batched_wxyzs, handle.batched_positions = one.wxyz, one.positions
-        handle.batched_scales, handle.batched_colors = one.scales, colours
+        if len(one.wxyz):
+            self._send(
+                handle, name, batched_wxyzs=one.wxyz, batched_positions=one.positions,
+                batched_scales=one.scales, batched_colors=colours,
+            )  # fmt: skip
+
+    def _send(self, handle: viser.SceneNodeHandle, name: str, **parts: NDArray[np.generic]) -> None:
+        """Assign what is not as it was; to compare costs a tenth of sending."""
+        for part, value in parts.items():
+            key = f"{name} {part}"
+            before = self._sent.get(key)
+            if before is None or before.shape != value.shape or not (before == value).all():
+                setattr(handle, part, value)
+                self._sent[key] = value
 
 
 def seen_size(distance: float) -> float:

@@ -20,12 +20,15 @@ def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
     if not len(layer.rows[number]):
         return out
     keys, poses = _keys(scene, layer, number)
-    after = np.clip(np.searchsorted(keys, time, side="right"), 1, max(len(keys) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(keys) - 1)
-    gap = keys[after] - keys[before]
-    share = np.clip((time - keys[before]) / np.where(gap > 0, gap, 1.0), 0, 1)
+    after = np.searchsorted(keys, time, side="right")
+    before = np.maximum(after - 1, 0)
+    after = np.minimum(np.maximum(after, 1), len(keys) - 1)
+    since, gap = time - keys[before], keys[after] - keys[before]
     a, b = poses[before], poses[after]
+    if (since <= 0).all() or (a == b).all():  # it stands, as at most times that are looked at
+        out[:] = a
+        return out
+    share = np.clip(since / np.where(gap > 0, gap, 1.0), 0, 1)
     turn = _wrapped(b[:, 3] - a[:, 3])
     out[:, :3] = a[:, :3] + share[:, None] * (b[:, :3] - a[:, :3])
     out[:, 3] = a[:, 3] + share * turn
