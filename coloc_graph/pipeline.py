@@ -140,8 +140,8 @@ def _incrementally(
     graph = solver.estimator.graph
     _require_ties(run, graph, solver.measured)
     estimate = solver.estimator.estimate()
-    if estimate.refused:  # or was it that an anchor was pushed? An estimator looks at one stance at a time
-        estimate = replace(estimate, bumped=BATCH[options.method](graph).bumped)
+    # what was refused, was it that an anchor was pushed? An estimator looks at one stance at a time
+    estimate = replace(estimate, bumped=solver.estimator.bumps())
     frontend, updates = zip(*solver.seconds, strict=True)
     return _Solved(estimate, solver.measured, solver.warnings, sum(frontend), updates)
 

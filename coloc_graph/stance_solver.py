@@ -9,7 +9,7 @@ from typing import get_args
 
 from coloc_graph.backend import Estimator, Method, StanceEstimate, loosened
 from coloc_graph.backend.graph import Places, slips_of
-from coloc_graph.errors import InputError
+from coloc_graph.errors import ColocError, InputError
 from coloc_graph.frontend import (
     FrontendOptions,
     PairMeasurement,
@@ -93,6 +93,15 @@ class Motions:
         self._there: set[str] = set()
         self._last: dict[str, tuple[int, float]] = {}  # each robot's last pose: its stance, its time
         self._samples: dict[str, list[OdometrySample]] = {robot: [] for robot in team.names}  # from there on
+        self._earlier: tuple[Stance | None, set[str], dict[str, tuple[int, float]]] | None = None
+
+    def withdraw(self) -> None:
+        """Forget the last stance; once, until another has come."""
+        assert self._before is not None and self._earlier is not None
+        self._places.forget(self._earlier[0], self._before)
+        self._before, self._there, self._last = self._earlier
+        self._samples = {robot: [] for robot in self.team.names}  # they are read again
+        self._earlier = None
 
     def of_stance(self, run: Recorded, stance: Stance, measured: Sequence[PairMeasurement]) -> list[Measurement]:
         """Those of a stance, whose pairs are all `measured`."""
@@ -117,6 +126,7 @@ class Motions:
         wheels: Mapping[str, WheelTrack],
     ) -> list[Odometry]:
         before = self._before
+        self._earlier = before, self._there, dict(self._last)
         self._places.accept(self._places.after(before, stance))
         held = [r for r in stance.anchors if before and r in self._there and Places.stays(r, before, stance)]
         posed = (robot for m in measured if m.relative_pose for robot, _ in m.relative_pose.ends)
@@ -179,7 +189,20 @@ class StanceSolver:
         before = next(reversed(self.estimator.stances), None)
         # before the first nobody can have stayed, whatever it says
         here = stance if before else replace(stance, anchors=())
-        said = self.estimator.add(here, made, after=before.index if before else None)
+        try:
+            said = self.estimator.add(here, made, after=before.index if before else None)
+        except ColocError:
+            if self.team.floor is not None:
+                self._motions.withdraw()
+            raise
         self.seconds.append((measured - started, time.perf_counter() - measured))
         self.measured += shared
         return EnteredStance(here, said, made, shared)
+
+    def withdraw(self) -> None:
+        """Take the last stance out again, as if it had never come; `EstimationError` where it is the first."""
+        index = self.estimator.withdraw().index
+        if self.team.floor is not None:
+            self._motions.withdraw()
+        self.measured = tuple(one for one in self.measured if one.homography.stance != index)
+        self.seconds.pop()

@@ -171,6 +171,26 @@ def test_revoking_what_ties_a_robot_unties_it_and_it_can_come_back():
     assert largest_difference(estimator.estimate(), whole, whole.graph.nodes) < 1e-6
 
 
+def test_a_withdrawn_stance_is_as_if_it_had_never_come_and_can_come_again():
+    made = team_of(4, 8, seed=3, wrong=0.1)
+    whole, estimator = fed(made), Estimator(made.robots[0], made.robots, made.floor)
+    before = None
+    for stance in made.stances:
+        earlier = state_of(estimator) if before is not None else None
+        follows = None if before is None else before.index
+        estimator.add(stance, of_stance(made, stance.index), after=follows)
+        if earlier is not None:
+            assert estimator.withdraw() == stance
+            assert_same(earlier, state_of(estimator), atol=1e-4)  # ISAM2 linearised elsewhere
+            estimator.add(stance, of_stance(made, stance.index), after=follows)
+        before = stance
+    assert {id(one.measurement) for one in estimator.refused} == {id(one.measurement) for one in whole.refused}
+    assert largest_difference(estimator.estimate(), whole.estimate(), whole.graph.nodes) < 1e-6
+    with pytest.raises(EstimationError, match="the first stance"):
+        for _ in made.stances:
+            estimator.withdraw()
+
+
 def test_wrong_homographies_are_refused_before_they_enter_and_leave_no_trace():
     made = team_of(6, 20, seed=1, wrong=0.1)
     estimator = fed(made)

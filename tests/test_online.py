@@ -1,5 +1,6 @@
 """A team leads itself down a hallway, with real processes, links, serial lines and images; and things happen to it."""
 
+import signal
 import time
 
 import numpy as np
@@ -11,14 +12,14 @@ from coloc_graph.results import assess
 from coloc_graph.run import open_run
 from coloc_graph.simulation.simulated_team import field_team
 
-STANCES = 4
+STANCES = 12
 #: What a wheel may turn on for after what let it go was cut off [s]; and what asking the world for it takes.
 STOP, ASKING = 0.5, 0.05
 
 
 @pytest.fixture(scope="module")
 def mission(tmp_path_factory):
-    """A short mission to which bad things happen, one after the other; it ends by itself."""
+    """A mission to which bad things happen, one after the other; it ends by itself."""
     with Mission(tmp_path_factory.mktemp("online"), STANCES) as m:
         m.field.start()
         m.start_coordinator()
@@ -27,14 +28,17 @@ def mission(tmp_path_factory):
             m.wait_for(stance, "capturing")
             m.wait_moving()
 
+        def cut(seconds):
+            m.relay.cut()
+            m.time_to_stand(f"the link is cut for {seconds} s")
+            time.sleep(seconds)
+            m.relay.mend()
+
         in_mid_stance(1)
         m.field.kill("C")  # its wheels go on: nobody is left to stop them, until its program is back
         m.field.start("C")
         in_mid_stance(2)
-        m.relay.cut()
-        m.time_to_stand("the link is cut")
-        time.sleep(3.0)
-        m.relay.mend()
+        cut(3.0)
         in_mid_stance(3)
         time.sleep(1.5)
         m.killed_at = time.time()
@@ -42,6 +46,27 @@ def mission(tmp_path_factory):
         m.coordinator.wait()
         m.time_to_stand("the coordinator is gone")
         m.start_coordinator("--resume")
+        m.wait_for(4, "placing")
+        m.pushed = {4: m.push_anchor(4.0, 3.0)}
+        m.wait_for(5, "placing")
+        m.pushed[5] = m.push_anchor(12.0, 14.0)  # it sees the mover where it is not
+        in_mid_stance(6)
+        time.sleep(2.0)
+        m.push("A", 3.0, -3.0)
+        in_mid_stance(7)
+        m.start_robot_that_can_jump("A")
+        in_mid_stance(8)
+        m.field.programs["A"].send_signal(signal.SIGUSR1)
+        in_mid_stance(9)
+        m.field.tell("freeze B")
+        time.sleep(3.0)
+        m.field.tell("thaw B")
+        in_mid_stance(10)
+        m.field.tell("hangup C")
+        time.sleep(2.0)
+        m.field.tell("plug C")
+        in_mid_stance(11)
+        cut(10.0)
         m.code = m.wait_end(200.0)
         m.field.close()
         yield m

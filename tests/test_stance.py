@@ -1,5 +1,7 @@
 """One stance of a real run, from its file to the relative pose, at both depths."""
 
+import dataclasses
+
 import gtsam
 import numpy as np
 import pytest
@@ -86,6 +88,22 @@ def test_clocks_50_ms_apart_give_the_right_pose_or_none(tmp_path, runs):
     if found.homography.unusable is None:
         xi = gtsam.Pose3.Logmap(found.relative_pose.T_i_j.between(gtsam.Pose3(runs["tracks"][1])))
         assert xi @ np.linalg.solve(found.relative_pose.covariance, xi) < chi2.ppf(1 - 6e-5, 6)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
+def test_an_observer_that_is_bumped_while_a_stance_is_taken_is_named(tmp_path, hallway, copied, share):
+    first = open_run(hallway).stances[0]
+    since = first.start + share * (first.end - first.start)
+
+    def bumped(record):
+        if not isinstance(record, Detections) or record.robot != "A" or record.time < since:
+            return record
+        return dataclasses.replace(record, uv=record.uv + np.array([12.0, -5.0]))
+
+    run = open_run(copied(hallway, tmp_path / "run.mcap", change=bumped, stances=[first]))
+    why = measure_pair(run, first, "A", "B", FrontendOptions()).homography.unusable
+    assert "A or B was bumped while the stance was taken" in why
+    assert float(why.split(" s after")[0]) == pytest.approx(since - first.start, abs=0.1 * (first.end - first.start))
 
 
 def write(tmp_path, paths, team=None, planes=None):

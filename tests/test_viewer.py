@@ -397,13 +397,13 @@ def test_robots_are_shown_where_they_are_between_stances(short_solution):
         assert shows(viewer, "A", (1.0, 2.0, 0.5)) and "on its way" in viewer.panel.status.content
         replay(short_solution.estimate.graph, "joint", lambda *one: viewer.publish(LiveStance(*one)))
         assert viewer.wait_idle() and len(viewer.scene) == 3 and viewer.frame.row == 2
-        edges = viewer.view._sent["edges"]
+        edges = viewer.view._sent["edges points"]
         stood = viewer.frame.poses.copy()
         viewer.publish(LivePoses(1.0, {"B": at(1.5, 2.5, -0.5)}, "stance 3: capturing, 112 points"))
         assert shows(viewer, "B", (1.5, 2.5, -0.5))
         assert "stance 3: capturing, 112 points" in viewer.panel.status.content
         assert np.array_equal(viewer.frame.poses[0], stood[0])  # who is not named stands where the graph has it
-        assert viewer.view._sent["edges"] is edges  # the graph was not touched
+        assert viewer.view._sent["edges points"] is edges  # the graph was not touched
         viewer.go(0)  # whoever looks at what was sees it
         base = viewer.scene.layers[0]
         assert shows(viewer, "B", [*base.xyz[1, 0, :2], base.yaw[1, 0]])

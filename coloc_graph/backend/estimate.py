@@ -38,14 +38,18 @@ class Bump:
     T_before_after: gtsam.Pose3
     sigmas: float
 
-    def __str__(self) -> str:
+    @property
+    def what(self) -> str:
+        """What happened, in words."""
         stay, moved = self.stay_put, self.T_before_after
         far, turned = float(np.linalg.norm(moved.translation())), abs(np.rad2deg(moved.rotation().yaw()))
         return (
             f"robot {stay.robot} was bumped between stances {stay.before} and {stay.after}, where it should have "
-            f"stayed put: it moved by {100 * far:.1f} cm and turned by {turned:.1f} deg ({self.sigmas:.0f} sigmas); "
-            f"do not name it as an anchor of stance {stay.after}"
+            f"stayed put: it moved by {100 * far:.1f} cm and turned by {turned:.1f} deg ({self.sigmas:.0f} sigmas)"
         )
+
+    def __str__(self) -> str:
+        return f"{self.what}; do not name it as an anchor of stance {self.stay_put.after}"
 
 
 @dataclass(frozen=True, eq=False)

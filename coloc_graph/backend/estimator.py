@@ -1,6 +1,6 @@
 """The estimate kept up to date while stances come in: ISAM2 with QR, and a log from which it can be rebuilt."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from coloc_graph.backend.calibration import Variables
 from coloc_graph.backend.checkpoint import Early
 from coloc_graph.backend.consistency import Agreement
 from coloc_graph.backend.entering import Entering, Sorter
-from coloc_graph.backend.estimate import Estimate, Refusal, StanceEstimate
+from coloc_graph.backend.estimate import Bump, Estimate, Refusal, StanceEstimate
 from coloc_graph.backend.factors import Factors, Method, require_rigs
 from coloc_graph.backend.graph import (
     Link,
@@ -139,6 +139,10 @@ class Estimator:
         optimised = joint if self.rigs else smooth
         return replace(optimised(kept, refuse=False, start=values), graph=graph, refused=self.refused)
 
+    def bumps(self) -> tuple[Bump, ...]:
+        """The anchors that did not stay put, by all that is in; none while nothing is refused. It takes a batch."""
+        return (joint if self.rigs else smooth)(self.graph).bumped if self._refused else ()
+
     def add(
         self, stance: Stance, measurements: Iterable[Measurement] = (), *, after: int | None = None
     ) -> StanceEstimate:
@@ -190,19 +194,46 @@ class Estimator:
         """
         if not any(one is measurement for one in self._log):
             raise EstimationError(f"the {measurement} is not in, so that it cannot be taken out")
-        log, refused = self._log, self._refused
-        again = [one.measurement for key, one in refused.items() if key != id(measurement)]
-        self._log = [one for one in log if one is not measurement]
+        try:
+            self._take_out({id(measurement)})
+        except Exception:
+            self._rebuild()
+            raise
+        return self._at(next(reversed(self._stances.values())), self.refused)
+
+    def withdraw(self) -> Stance:
+        """Take the last stance out again with all that was measured in it and on the way to it, as if it had never
+        come; it comes back. `EstimationError` where it is the first."""
+        if len(self._stances) < 2:
+            raise EstimationError("the first stance is where the world is, and cannot be taken out: begin anew")
+        before, stance = list(self._stances.values())[-2:]
+        gone = {id(one) for one in self._log if any(index == stance.index for _, index in one.ends)}
+        del self._stances[stance.index]
+        self._places.forget(before, stance)
+        try:
+            self._take_out(gone)
+        except Exception:
+            self._places.accept(self._places.after(before, stance))
+            self._stances[stance.index] = stance
+            self._rebuild()
+            raise
+        self._instants = {node: at for node, at in self._instants.items() if node[1] != stance.index}
+        return stance
+
+    def _take_out(self, gone: Set[int]) -> None:
+        """Take measurements out, by identity, and try again what was refused; an exception spoils the graph."""
+        log, refused, loose = self._log, self._refused, self._loose
+        again = [one.measurement for key, one in refused.items() if key not in gone]
+        self._log = [one for one in log if id(one) not in gone]
+        self._refused = {key: one for key, one in refused.items() if key not in gone}
         try:
             self._rebuild()
             entering = self._entering([*self._loose, *again])
             self._refused = {id(one.measurement): one for one in self._update(entering)}
         except Exception:
-            self._log, self._refused = log, refused
-            self._rebuild()
+            self._log, self._refused, self._loose = log, refused, loose
             raise
         self._loose = entering.loose
-        return self._at(next(reversed(self._stances.values())), self.refused)
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint, whole or not at all, from which `resume` goes on."""

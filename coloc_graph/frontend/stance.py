@@ -27,6 +27,7 @@ from coloc_graph.frontend.correspondence import (
     span_samples,
 )
 from coloc_graph.frontend.detection import Blobs, detector_for
+from coloc_graph.frontend.fit_checks import require_agreement, require_determined
 from coloc_graph.frontend.homography import HomographyFit, fit_homography, persisting, shared_error
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
@@ -42,8 +43,6 @@ from coloc_graph.team import Camera, Markers
 
 Array = NDArray[np.float64]
 
-#: A homography that fewer of the points than this share agree on is not believed.
-LEAST_AGREEMENT = 0.5
 #: An offset of two clocks that is known no better than this share of what was known before is not observed.
 LEAST_OBSERVED = 0.5
 NOT_OBSERVABLE = (
@@ -165,14 +164,10 @@ def _measured(
 ) -> PairMeasurement:
     """The measurement that a fit is; raises `DegenerateGeometry` where it is none."""
     robot_i, robot_j, plane = seen.run.team[seen.robot_i], seen.run.team[seen.robot_j], seen.plane
-    if fit.inliers.mean() < LEAST_AGREEMENT:
-        raise DegenerateGeometry(
-            f"only {fit.inliers.sum()} of {len(found)} points agree on one homography: "
-            "look for wrong marker names, reflections, or clocks that differ by more than "
-            + ("the pairing window" if offset is None else "`clock_sigma` says")
-        )
+    pairing = "the pairing window" if offset is None else "`clock_sigma` says"
+    require_agreement(fit, found, f"{seen.robot_i} or {seen.robot_j}", pairing)
     fit = persisting(fit, found.pairs, found.markers, found.times)
-    _require_determined(fit, len(found))
+    require_determined(fit)
     measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
     if offset is not None:
         said = seen.run.team.clock_sigma
@@ -333,16 +328,6 @@ def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: M
     return distance_from_span(plane, np.concatenate([none, *x_a]), np.concatenate([none, *x_b]), markers)
 
 
-def _require_determined(fit: HomographyFit, points: int) -> None:
-    """Raise `DegenerateGeometry` where points leave a direction of the homography open, to rounding."""
-    try:
-        np.linalg.cholesky(fit.information)
-    except np.linalg.LinAlgError:
-        raise DegenerateGeometry(
-            f"{points} points do not determine the homography: let the moving robot drive further, and turn"
-        ) from None
-
-
 def _measurement(
     stance: Stance,
     robot_i: str,
@@ -354,12 +339,13 @@ def _measurement(
 ) -> HomographyMeasurement:
     roots = _bias_root(found.uv_i, camera_i), _bias_root(found.uv_j, camera_j)
     shared = shared_error(fit, found.pairs, found.markers, roots)
+    information = np.linalg.inv(np.linalg.inv(fit.information) + shared)
     return HomographyMeasurement(
         stance=stance.index,
         robot_i=robot_i,
         robot_j=robot_j,
         H_j_i=fit.H,
-        information=np.asarray(np.linalg.inv(np.linalg.inv(fit.information) + shared), float),
+        information=np.asarray((information + information.T) / 2, float),
         points=len(fit.inliers),
         inliers=int(fit.inliers.sum()),
         chi2=fit.chi2,

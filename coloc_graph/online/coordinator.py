@@ -7,7 +7,7 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +18,7 @@ import numpy as np
 from coloc_graph.errors import ColocError, InputError, RobotError
 from coloc_graph.lie import floor_pose
 from coloc_graph.measurements import Sighting
+from coloc_graph.online.bumps import displaced, pushed
 from coloc_graph.online.formation import STAGGER, Course, Formation, Planar
 from coloc_graph.online.measuring import Measuring
 from coloc_graph.online.mission import Heard, MissionOptions, in_world
@@ -118,6 +119,7 @@ class Coordinator:
         self._capturing = time.time_ns() // 1_000_000  # no number twice, of whatever coordinator
         self._plan: tuple[int, str, Planar] | None = None  # the leap into a stance: its number, who, where to
         self._patrol = np.zeros((0, 2))
+        self._awaited: Planar = (0.0, 0.0, 0.0)  # where the mover's wheels have it when a stance begins
         self._stance: Stance | None = None
         self._view: InView | None = None
         self._expected: dict[str, int] = {}
@@ -288,6 +290,7 @@ class Coordinator:
         standing = {name: self.roster[name].whereabouts.place() for name in self.observers}
         self._view = InView(self.team, self.mover, standing)
         self._stance = Stance(k, now, now, self.observers, (self.mover,), self._anchors())
+        self._awaited = self.roster[self.mover].whereabouts.place()
         self._rounds, self._out_since, self._judged, self._precision = 0, None, time.monotonic(), None
         self._measuring.forget()
         self._capturing += 1
@@ -304,6 +307,7 @@ class Coordinator:
             self._orders.drive(self.mover, self._patrol[1:])
             self._enter(Phase.CAPTURING)
         elif self._phase_lasted(LOOK_TIME):
+            self._note_bumped(displaced(self.roster, self._view, self._awaited))
             raise RobotError(
                 f"{' and '.join(missing)} saw nothing of {self.mover} where it should be: put the robots where they "
                 "are said to stand, clear what is between them, and check that its lights are on"
@@ -376,6 +380,9 @@ class Coordinator:
         one = self._measuring.entered()
         if one is None:
             return
+        if not isinstance(one, EnteredStance):
+            self._note_bumped(pushed(self.roster, one))
+            return
         stance = one.stance
         self.record.complete(stance)
         self._in.append(stance)
@@ -399,6 +406,14 @@ class Coordinator:
         else:
             self._plan_stance()
             self._enter(Phase.PLACING)
+
+    def _note_bumped(self, found: Iterable[tuple[str, str]]) -> None:
+        """Of robots that were pushed; it voids a stance (`RobotError`), in the next of which they are no anchors."""
+        said = dict(found)
+        for robot, text in said.items():
+            self._note("bumped", robot=robot, text=text)
+        if said:
+            raise RobotError("; ".join(said.values()))
 
     def _fix(self, one: EnteredStance) -> None:
         """Where the robots are follows the estimate."""

@@ -4,6 +4,7 @@ import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
+from coloc_graph.backend import Bump
 from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.online.watch import Precision, precision
 from coloc_graph.run import Recorded, Stance
@@ -24,7 +25,7 @@ class Measuring:
         self._record, self._solver = record, solver
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="measuring")
         self._judging: Future[Precision] | None = None
-        self._entering: Future[EnteredStance] | None = None
+        self._entering: Future[EnteredStance | list[Bump]] | None = None
 
     def end(self) -> None:
         """Wait for what is under way, and do no more."""
@@ -55,23 +56,30 @@ class Measuring:
         """Measure a stance and enter it."""
         self._entering = self._worker.submit(self._enter, stance)
 
-    def entered(self) -> EnteredStance | None:
-        """The stance that is in; None while it is not."""
+    def entered(self) -> EnteredStance | list[Bump] | None:
+        """The stance that is in; None while it is not; or the bumps of its anchors, and then it is not in."""
         done = self._entering
         if done is None or not done.done():
             return None
         self._entering = None
         return _result(done, "the estimate")
 
-    def _enter(self, stance: Stance) -> EnteredStance:
+    def _enter(self, stance: Stance) -> EnteredStance | list[Bump]:
         pairs = list(measure_stance(self._record, stance, self._solver.options))
         unusable = [pair.homography.unusable for pair in pairs if pair.homography.unusable]
         if len(unusable) == len(pairs):
             raise RobotError(f"stance {stance.index} measures nothing: {unusable[0]}")
         try:
-            return self._solver.enter(self._record, stance, pairs)
+            one = self._solver.enter(self._record, stance, pairs)
         except ColocError as error:
             raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
+        if not one.estimate.refused:
+            return one
+        # contradicted: was an anchor pushed on the way to here?
+        bumped = [bump for bump in self._solver.estimator.bumps() if bump.stay_put.after == stance.index]
+        if bumped:
+            self._solver.withdraw()
+        return bumped or one
 
 
 def _result(done: "Future[T]", what: str) -> T:

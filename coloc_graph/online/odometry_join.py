@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from coloc_graph.online.formation import Planar
-from coloc_graph.online.whereabouts import compose, inverse
+from coloc_graph.online.whereabouts import CARRIED, compose, inverse
 from coloc_graph.run import OdometrySample
 
 #: Where a robot may have gone while nobody counted: one that stood, one that drove [m], [m], [rad].
@@ -30,6 +30,10 @@ class JoinedOdometry:
         """What comes next is in a new frame; `moving` says whether the robot may have driven in between."""
         if self._last is not None:
             self._unsure = DROVE if moving or self._unsure == DROVE else STOOD
+
+    def carried(self) -> None:
+        """It was moved by what its wheels do not know: of the way to what comes next they know nothing."""
+        self._unsure = CARRIED
 
     def go_on(self, pose: Planar, unsure: tuple[float, float, float]) -> None:
         """What comes next, in a new frame, is at a pose that is known to these sigmas [m], [m], [rad]."""

@@ -110,6 +110,12 @@ class Roster:
                 x, y, yaw = map(float, last.pose)
                 member.odometry.go_on((x, y, yaw), DROVE)
 
+    def carried(self, name: str, place: Planar) -> None:
+        """A robot that stands was moved by what its wheels do not know, to a place in the world."""
+        member = self.members[name]
+        member.odometry.carried()
+        member.whereabouts.carry(self.utc(time.monotonic_ns()), place)
+
     def take_sample(self, name: str, sample: Sample) -> Detections | None:
         """Take in what a robot's camera saw; None where it is recorded already."""
         member = self.members[name]

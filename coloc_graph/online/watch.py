@@ -15,6 +15,7 @@ from coloc_graph.common_view import View
 from coloc_graph.frontend import FrontendOptions, measure_pair
 from coloc_graph.lie import floor_pose
 from coloc_graph.online.formation import Planar
+from coloc_graph.online.whereabouts import compose, inverse
 from coloc_graph.run import Detections, Image, OdometrySample, Planes, Recorded, Stance
 from coloc_graph.team import Team
 
@@ -28,6 +29,8 @@ SHARE, LOOKED_AT = 0.5, 0.7
 ALIKE, CLEAR = 0.15, 0.3
 #: A mover is no further from where its wheels have it than this [m], [rad].
 ASTRAY, TURNED = 0.8, 1.3
+#: Two observers that have the mover further apart than this do not both stand where they should [m].
+DISPLACED = 0.1
 
 
 class InView:
@@ -43,12 +46,14 @@ class InView:
         }
         self._standing = dict(observers)
         self._seen: dict[str, deque[tuple[float, bool]]] = defaultdict(deque)
+        self._newest: dict[str, Detections] = {}
 
     def take(self, seen: Detections, mover: Planar) -> bool:
         """Take in an image of one observer while the mover is thought to be there; whether it shows its markers."""
         view = self.views.get(seen.robot)
         if view is None:
             return False
+        self._newest[seen.robot] = seen
         T = floor_pose(*mover)
         uv, inside = view.project(self._p_markers @ T[:3, :3].T + T[:3, 3])
         shows = bool(inside.all() and len(seen.uv) >= len(uv))
@@ -92,6 +97,20 @@ class InView:
             return None
         return float(xy[best, 0]), float(xy[best, 1]), expected[2] + float(off[best])
 
+    def displaced(self, mover: Planar) -> dict[str, Planar]:
+        """Observers whose newest image shows the mover, which stands, plainly elsewhere than another's does, and where
+        they must be; the one that has it nearest to where it is thought to be, by its wheels, is taken at its word."""
+        found = {name: self.find(seen, mover) for name, seen in self._newest.items()}
+        places = {name: place for name, place in found.items() if place is not None}
+        if len(places) < 2:
+            return {}
+        right = min(places.values(), key=lambda place: _apart(place, mover))
+        return {
+            name: compose(compose(right, inverse(place)), self._standing[name])
+            for name, place in places.items()
+            if _apart(place, right) > DISPLACED
+        }
+
     def missing(self) -> list[str]:
         """The observers whose newest images do not show the mover; those that have sent none are among them."""
         return [
@@ -99,6 +118,11 @@ class InView:
             for name in self.views
             if not self._seen[name] or np.mean([shows for _, shows in self._seen[name]]) < SHARE
         ]
+
+
+def _apart(a: Planar, b: Planar) -> float:
+    """How far two places are from each other, a radian as much as 0.3 m [m]."""
+    return math.dist(a[:2], b[:2]) + 0.3 * abs(math.remainder(a[2] - b[2], 2 * math.pi))
 
 
 def _on_plane(view: View, uv: Array, height: float) -> Array:

@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 
 #: A robot whose wheels have told of less than this has not moved [m], [rad].
 STILL, STILL_TURN = 2e-3, 4e-3
+#: Where a robot may be that somebody pushed or carried [m], [m], [rad]; a sample that is known no better says that.
+CARRIED = (0.5, 0.5, 1.0)
 #: So much of the past is remembered [s].
 MEMORY = 600.0
 
@@ -46,12 +48,15 @@ class Whereabouts:
         self._poses: list[Planar] = []
         self._fix = Fix(-math.inf, start)
         self._T_world_odom: Planar | None = None
+        self._carried = -math.inf
 
     def take(self, sample: OdometrySample) -> None:
         """Take in what the wheels say; samples come in the order of time."""
         x, y, yaw = map(float, sample.pose)
         self._times.append(sample.time)
         self._poses.append((x, y, yaw))
+        if sample.covariance[0, 0] >= 0.99 * CARRIED[0] ** 2:
+            self._carried = sample.time
         if self._T_world_odom is None:
             self._tie()
         if len(self._times) > 2 and self._times[-1] - self._times[0] > 1.2 * MEMORY:
@@ -62,6 +67,11 @@ class Whereabouts:
         """Its pose at an instant is known now."""
         self._fix = Fix(time, place)
         self._tie()
+
+    def carry(self, time: float, place: Planar) -> None:
+        """It was moved before an instant by what its wheels do not know, to a place."""
+        self._carried = time
+        self.fix(time, place)
 
     def _tie(self) -> None:
         if self._times:
@@ -95,7 +105,9 @@ class Whereabouts:
         return compose(inverse(self._T_world_odom), place)
 
     def moved_since(self, time: float) -> bool:
-        """Whether its wheels have turned since an instant [s]."""
+        """Whether its wheels have turned, or it was carried, since an instant [s]."""
+        if self._carried > time:
+            return True
         if not self._times:
             return False
         then = self.odometry_at(time)
