@@ -16,7 +16,7 @@ from monte_carlo import MemoryRun, over_seeds, simulated
 
 from coloc_graph.frontend import FrontendOptions, fit_homography, measure_pair
 from coloc_graph.frontend.decomposition import decompose_with_normal
-from coloc_graph.frontend.stance import stance_plane
+from coloc_graph.frontend.stance_tracks import stance_plane
 
 BASELINES = (0.6, 0.8, 1.0, 1.2)
 ANGLES = (0, 10, 20, 30, 40)

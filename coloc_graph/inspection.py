@@ -11,7 +11,8 @@ import numpy as np
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.correspondence import PAIRING_WINDOW, correspond_roughly, pair_by_time
 from coloc_graph.frontend.plausibility import implausible
-from coloc_graph.frontend.stance import FrontendOptions, measure_pair, named_tracks, stance_plane
+from coloc_graph.frontend.stance import FrontendOptions, measure_pair
+from coloc_graph.frontend.stance_tracks import named_tracks, stance_plane
 from coloc_graph.run import Detections, Run, Stance
 
 

@@ -133,7 +133,7 @@ def _incrementally(
 ) -> _Solved:
     solver = StanceSolver(run.team, options)
     for stance in run.stances:
-        one = solver.enter(run, stance, measure(stance))
+        one = solver.enter(run, stance, solver.measure(run, stance, measure(stance)))
         if entered is not None:
             entered(one)
     _require_poses(run, options, solver.measured)

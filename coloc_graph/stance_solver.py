@@ -14,6 +14,7 @@ from coloc_graph.frontend import (
     FrontendOptions,
     PairMeasurement,
     Scale,
+    StanceTracks,
     WheelTrack,
     measure_pair,
     share_clock_offsets,
@@ -70,14 +71,18 @@ class SolveOptions:
         return dict(loosened(rigs, UNKNOWN_HEIGHT)) if self.by_span else rigs
 
 
-def measure_stance(run: Recorded, stance: Stance, options: SolveOptions) -> Iterator[PairMeasurement]:
-    """What each pair of observers measured in a stance, one after the other."""
+def measure_stance(
+    run: Recorded, stance: Stance, options: SolveOptions, tracks: StanceTracks | None = None
+) -> Iterator[PairMeasurement]:
+    """What each pair of observers measured in a stance, one after the other, but for the offset of their clocks, which
+    all stances know together: `share_clock_offsets`."""
     frontend = options.resolved().frontend
     assert frontend is not None
     # a joint estimate takes the scale from the spans by itself, and the heights for a start
     scale: Scale = "heights" if options.method == "joint" else frontend.scale
+    tracks = tracks or StanceTracks(run, stance, frontend.tracker)
     for pair in itertools.combinations(stance.observers, 2):
-        yield measure_pair(run, stance, *pair, replace(frontend, scale=scale))
+        yield measure_pair(run, stance, *pair, replace(frontend, scale=scale), tracks, alone=False)
 
 
 class Motions:
@@ -174,18 +179,31 @@ class StanceSolver:
         #: How long the front end and the estimator took, stance by stance [s].
         self.seconds: list[tuple[float, float]] = []
         self._motions = Motions(team, odometry=self.options.odometry)
+        self._measuring = 0.0
 
-    def enter(self, run: Recorded, stance: Stance, pairs: Iterable[PairMeasurement] | None = None) -> EnteredStance:
-        """Measure a stance (or take its `pairs` from whoever does) and enter it.
-
-        A stance without an anchor raises `MeasurementError`, but for the first.
-        """
+    def measure(
+        self, run: Recorded, stance: Stance, pairs: Iterable[PairMeasurement] | None = None
+    ) -> tuple[PairMeasurement, ...]:
+        """What the pairs of a stance measure, by what is known so far of their clocks; `pairs` come from
+        `measure_stance`, here or elsewhere."""
         started = time.perf_counter()
         alone = list(measure_stance(run, stance, self.options) if pairs is None else pairs)
         shared, self.warnings = share_clock_offsets(alone, self.team.clock_sigma, self.measured)
+        self._measuring = time.perf_counter() - started
+        return shared
+
+    def enter(
+        self, run: Recorded, stance: Stance, measured: tuple[PairMeasurement, ...] | None = None
+    ) -> EnteredStance:
+        """Enter a stance with what was measured in it, by `measure`.
+
+        A stance without an anchor raises `MeasurementError`, but for the first.
+        """
+        shared = self.measure(run, stance) if measured is None else measured
+        started = time.perf_counter()
         motions = [] if self.team.floor is None else self._motions.of_stance(run, stance, shared)
         made = (*(m.relative_pose for m in shared if m.relative_pose is not None), *motions)
-        measured = time.perf_counter()
+        entering = time.perf_counter()
         before = next(reversed(self.estimator.stances), None)
         # before the first nobody can have stayed, whatever it says
         here = stance if before else replace(stance, anchors=())
@@ -195,7 +213,7 @@ class StanceSolver:
             if self.team.floor is not None:
                 self._motions.withdraw()
             raise
-        self.seconds.append((measured - started, time.perf_counter() - measured))
+        self.seconds.append((self._measuring + entering - started, time.perf_counter() - entering))
         self.measured += shared
         return EnteredStance(here, said, made, shared)
 

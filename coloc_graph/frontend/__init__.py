@@ -15,6 +15,7 @@ from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.shared_clock import share_clock_offsets
 from coloc_graph.frontend.sighting import sight
 from coloc_graph.frontend.stance import FrontendOptions, PairMeasurement, Scale, measure_pair, sight_movers
+from coloc_graph.frontend.stance_tracks import StanceTracks
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.frontend.wheels import WheelTrack
 
@@ -30,6 +31,7 @@ __all__ = [
     "PairMeasurement",
     "PointPairs",
     "Scale",
+    "StanceTracks",
     "Threshold",
     "Track",
     "TrackerOptions",

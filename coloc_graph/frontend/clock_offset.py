@@ -68,22 +68,21 @@ class ClockFit:
 
     `fit.information` is that of H alone, with the offset's uncertainty in it; `information` (9, 9) that of H and
     the offset [s]; H changes by `by_offset` (8,) where the offset grows by 1 s. `found` has camera j's points at the
-    instants of camera i's. `offset` is what stance and prior know together, `evidence` what the stance alone does: None
-    where it knows nothing.
+    instants of camera i's. `offset` is what is known of it.
     """
 
     fit: HomographyFit
     found: Correspondences
     information: Array
     offset: ClockOffset
-    evidence: ClockOffset | None
     by_offset: Array
 
 
-def fit_with_offset(
-    tracks: "PairedTracks", start: Correspondences, prior: ClockOffset, criterion: Criterion = "reprojection"
-) -> ClockFit:
-    """H and the offset by maximum likelihood, from a search over the prior.
+def find_offset(
+    tracks: "PairedTracks", start: Correspondences, prior: ClockOffset
+) -> tuple[ClockOffset, ClockOffset | None]:
+    """The offset by maximum likelihood, from a search over the prior: with the prior, and what the tracks alone say
+    (None: nothing).
 
     `start` are correspondences whose covariances allow for the prior's sigma. Raises `DegenerateGeometry` where
     the clocks may differ by more than is searched, or the points do not determine a homography.
@@ -91,7 +90,7 @@ def fit_with_offset(
     require_searchable(prior)
     guess, H = _search(tracks, fit_homography(start.pairs).H, prior)
     evidence = _evidence(tracks, H, guess, prior)
-    return fit_at_offset(tracks, _combined(prior, evidence), criterion, evidence)
+    return _combined(prior, evidence), evidence
 
 
 def require_searchable(prior: ClockOffset) -> None:
@@ -107,7 +106,6 @@ def fit_at_offset(
     tracks: "PairedTracks",
     offset: ClockOffset,
     criterion: Criterion = "reprojection",
-    evidence: ClockOffset | None = None,
 ) -> ClockFit:
     """H with the offset at a value known to its sigma, which H's information then contains."""
     at = tracks.at(offset.value)
@@ -140,7 +138,7 @@ def fit_at_offset(
     joint[:8, 8] = joint[8, :8] = -information @ by_offset
     joint[8, 8] = by_offset @ information @ by_offset + 1 / offset.sigma**2
     whole = HomographyFit(H, marginal, fit.inliers, squared, chi2, fit.dof, iterations)
-    return ClockFit(whole, found, joint, offset, evidence, by_offset)
+    return ClockFit(whole, found, joint, offset, by_offset)
 
 
 def fuse(evidence: Sequence[ClockOffset], prior: ClockOffset) -> tuple[ClockOffset, float]:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.correspondence import Correspondences
 from coloc_graph.frontend.plane import on_plane
-from coloc_graph.frontend.stance import stance_plane
+from coloc_graph.frontend.stance_tracks import stance_plane
 from coloc_graph.measurements import Plane
 from coloc_graph.run import Recorded, Stance
 from coloc_graph.team import Camera

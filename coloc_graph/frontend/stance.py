@@ -1,6 +1,5 @@
 """One stance of a run: from its images or detections to the homography between two observers."""
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -9,36 +8,34 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.errors import DegenerateGeometry, InputError
+from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.clock_offset import (
-    ClockFit,
     ClockOffset,
     PairedTracks,
+    find_offset,
     fit_at_offset,
-    fit_with_offset,
     require_searchable,
 )
 from coloc_graph.frontend.correspondence import (
     Correspondences,
     correspond,
     correspond_roughly,
-    markers_of_movers,
     per_pixel,
     span_samples,
 )
-from coloc_graph.frontend.detection import Blobs, detector_for
 from coloc_graph.frontend.fit_checks import require_agreement, require_determined
 from coloc_graph.frontend.homography import HomographyFit, fit_homography, persisting, shared_error
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
-from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
+from coloc_graph.frontend.plane import distance_from_span
 from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.sighting import sight
 from coloc_graph.frontend.spans import marker_span
-from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
+from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
+from coloc_graph.frontend.tracking import Track, TrackerOptions
 from coloc_graph.frontend.wheels import WheelTrack
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose, Sighting
-from coloc_graph.run import Detections, Flag, Recorded, Stance
+from coloc_graph.run import Recorded, Stance
 from coloc_graph.team import Camera, Markers
 
 Array = NDArray[np.float64]
@@ -104,55 +101,63 @@ class _Seen:
 
 
 def measure_pair(
-    run: Recorded, stance: Stance, robot_i: str, robot_j: str, options: FrontendOptions
+    run: Recorded,
+    stance: Stance,
+    robot_i: str,
+    robot_j: str,
+    options: FrontendOptions,
+    tracks: StanceTracks | None = None,
+    *,
+    alone: bool = True,
 ) -> PairMeasurement:
     """The homography and relative pose between two observers in one stance; degenerate geometry is an answer.
 
-    Where the team's clocks are not said to agree (`Team.clock_sigma`), their offset is estimated with it.
+    `tracks` are those of the stance where they are made already. Where the team's clocks are not said to agree
+    (`Team.clock_sigma`), their offset is estimated with it; unless it is measured `alone`, what is measured is left to
+    `PairMeasurement.at_offset`.
     """
     found: Correspondences | None = None
     try:
         plane = stance_plane(run, stance, robot_i)
-        tracks_i = stance_tracks(run, stance, robot_i, options)
-        tracks_j = stance_tracks(run, stance, robot_j, options)
+        tracks = tracks or StanceTracks(run, stance, options.tracker)
+        tracks_i, tracks_j = tracks.of(robot_i, stance.end), tracks.of(robot_j, stance.end)
         seen = _Seen(run, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j)
         if run.team.clock_sigma > 0:
-            return _measure_with_clocks(seen)
+            return _measure_with_clocks(seen, alone)
         found = correspond(tracks_i, tracks_j, *seen.cameras)
         return _measured(seen, found, fit_homography(found.pairs, options.criterion))
     except DegenerateGeometry as why:
         return PairMeasurement(_unusable(stance, robot_i, robot_j, found, str(why)), None, found)
 
 
-def _measure_with_clocks(seen: _Seen) -> PairMeasurement:
+def _measure_with_clocks(seen: _Seen, alone: bool) -> PairMeasurement:
     prior = ClockOffset(0.0, seen.run.team.clock_sigma)
     require_searchable(prior)
     chosen, rough = correspond_roughly(seen.tracks_i, seen.tracks_j, *seen.cameras, prior.value, prior.sigma)
     tracks = PairedTracks(seen.tracks_i, seen.tracks_j, chosen, *seen.cameras)
-    again = partial(_measure_at_offset, seen, tracks)
+    again = partial(_measure_at_offset, seen, tracks, rough)
     try:
-        clock = fit_with_offset(tracks, rough, prior, seen.options.criterion)
+        offset, evidence = find_offset(tracks, rough, prior)
     except DegenerateGeometry as why:
         return PairMeasurement(
             _unusable(seen.stance, seen.robot_i, seen.robot_j, rough, str(why)), None, rough, None, again
         )
-    return replace(_measured_or_why(seen, clock), offset_evidence=clock.evidence, at_offset=again)
+    if alone:
+        return replace(again(offset), offset_evidence=evidence, at_offset=again)
+    open_yet = _unusable(seen.stance, seen.robot_i, seen.robot_j, rough, "the clocks' offset is not decided yet")
+    return PairMeasurement(open_yet, None, rough, evidence, again)
 
 
-def _measure_at_offset(seen: _Seen, tracks: PairedTracks, offset: ClockOffset) -> PairMeasurement:
+def _measure_at_offset(
+    seen: _Seen, tracks: PairedTracks, rough: Correspondences, offset: ClockOffset
+) -> PairMeasurement:
+    found = rough
     try:
         clock = fit_at_offset(tracks, offset, seen.options.criterion)
+        found = clock.found
+        return _measured(seen, found, clock.fit, clock.offset, clock.by_offset)
     except DegenerateGeometry as why:
-        return PairMeasurement(_unusable(seen.stance, seen.robot_i, seen.robot_j, None, str(why)), None, None)
-    return _measured_or_why(seen, clock)
-
-
-def _measured_or_why(seen: _Seen, clock: ClockFit) -> PairMeasurement:
-    try:
-        return _measured(seen, clock.found, clock.fit, clock.offset, clock.by_offset)
-    except DegenerateGeometry as why:
-        unusable = _unusable(seen.stance, seen.robot_i, seen.robot_j, clock.found, str(why))
-        return PairMeasurement(unusable, None, clock.found)
+        return PairMeasurement(_unusable(seen.stance, seen.robot_i, seen.robot_j, found, str(why)), None, found)
 
 
 def _measured(
@@ -211,37 +216,6 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
     return tuple(made)
 
 
-def stance_markers(run: Recorded, stance: Stance) -> Markers | None:
-    """The markers that are watched in a stance; None where no mover carries any.
-
-    Raises `DegenerateGeometry` where the movers' markers are at different heights.
-    """
-    carried = [markers for name in stance.movers if (markers := run.team[name].markers) is not None]
-    if len({one.height for one in carried}) > 1:
-        raise DegenerateGeometry(
-            "the movers' markers are at different heights, so that they share no plane: let one move at a time"
-        )
-    return carried[0] if carried else None
-
-
-def stance_plane(run: Recorded, stance: Stance, robot: str) -> Plane:
-    """The marker plane in a robot's camera: as stated for the stance, else from its mount and the movers.
-
-    Raises `DegenerateGeometry` where there is no such plane below the camera.
-    """
-    stated = run.planes.get(stance.index)
-    if stated is not None and robot in stated.planes:
-        *normal, d = stated.planes[robot]
-        normal_sigma, d_sigma = stated.sigmas.get(robot, (0.0, 0.0))
-        return Plane(N=np.array(normal), d=d, normal_sigma=normal_sigma, d_sigma=d_sigma)
-    markers = stance_markers(run, stance)
-    if markers is None:
-        raise DegenerateGeometry(
-            "no robot with markers moves, and no plane is stated: name the movers, or state the plane"
-        )
-    return plane_from_mount(run.team[robot].mount, markers, run.team.floor)
-
-
 def sight_movers(
     run: Recorded, stance: Stance, measured: Iterable[PairMeasurement], wheels: Mapping[str, WheelTrack]
 ) -> list[Sighting]:
@@ -271,50 +245,6 @@ def sight_movers(
             if sighting is not None and (before is None or np.trace(sighting.covariance) < np.trace(before.covariance)):
                 best[mover] = sighting
     return list(best.values())
-
-
-def stance_tracks(run: Recorded, stance: Stance, robot: str, options: FrontendOptions) -> list[Track]:
-    """The tracks of the movers' markers in one camera: from detections where the run has them, else from images.
-
-    Detections that name their marker are tracks already; the others, and images, go through the tracker.
-    """
-    detector = detector_for(stance_markers(run, stance), run.team[robot].camera)
-    count = sum(len(m.positions) for name in stance.movers if (m := run.team[name].markers))
-    tracker = MarkerTracker(robot, detector, replace(options.tracker, markers=max(count, 1)))
-    if run.has_detections(robot):
-        seen = list(run.detections(robot, stance.start, stance.end))
-        if all(marker for one in seen for marker in one.markers):
-            return named_tracks(robot, seen)
-        for one in seen:
-            tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
-    else:
-        camera = run.team[robot].camera
-        for image in run.images(robot, stance.start, stance.end):
-            if image.pixels.shape[:2] != (camera.height, camera.width):
-                raise InputError(
-                    f"{run.path}: stance {stance.index}: the images of {robot} are {image.pixels.shape[1]} x "
-                    f"{image.pixels.shape[0]} pixels and its camera is {camera.width} x {camera.height} in the team: "
-                    "correct the camera, and its calibration"
-                )
-            tracker.step(image)
-    plane = stance_plane(run, stance, robot)
-    spans = {m.span for name in stance.movers if (m := run.team[name].markers) and m.span}
-    return markers_of_movers(tracker.tracks(), run.team[robot].camera, plane, sorted(spans))
-
-
-def named_tracks(robot: str, detections: Iterable[Detections]) -> list[Track]:
-    """Tracks of detections that carry their marker's name; clipped and merged ones are left out."""
-    samples: dict[str, list[tuple[float, Array, Array, float]]] = defaultdict(list)
-    for one in detections:
-        whole = (one.flags & (Flag.CLIPPED | Flag.MERGED)) == 0
-        for index in np.flatnonzero(whole):
-            sample = (one.time, one.uv[index], one.covariance[index], float(one.peak[index]))
-            samples[one.markers[index]].append(sample)
-    tracks = []
-    for marker in sorted(samples):
-        times, uv, covariance, peak = zip(*samples[marker], strict=True)
-        tracks.append(Track(robot, marker, np.array(times), np.array(uv), np.array(covariance), np.array(peak)))
-    return tracks
 
 
 def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: Markers | None) -> Plane:

@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 #: How often is looked what is to be done, and how often a stance's precision [s].
 TICK, JUDGED = 0.03, 0.7
-#: Before a stance begins, all have stood for this long [s]; it is this much longer than what was seen in it.
+#: Before a stance begins, all have stood for this long [s]; it ends so much after what was seen last in it.
 SETTLED, MARGIN = 0.25, 0.02
 #: How long things may take at most [s]: a drive, to find the mover, to get the last images, to be mended.
 DRIVE_TIME, LOOK_TIME, COLLECT_TIME, HOLD_TIME = 40.0, 4.0, 30.0, 120.0
@@ -303,7 +303,7 @@ class Coordinator:
         assert self._view is not None and self._stance is not None
         missing = self._view.missing()
         if not missing:
-            self._stance = replace(self._stance, start=self.roster.utc(time.monotonic_ns()))
+            self._stance = replace(self._stance, start=self.record.rounded(self.roster.utc(time.monotonic_ns())))
             self._orders.drive(self.mover, self._patrol[1:])
             self._enter(Phase.CAPTURING)
         elif self._phase_lasted(LOOK_TIME):
@@ -370,10 +370,8 @@ class Coordinator:
         assert self._stance is not None
         self._enter(Phase.ESTIMATING)
         self._ended_at = self._last_image()
-        start, end = self._stance.start - MARGIN, self._ended_at + MARGIN
-        stance = replace(
-            self._stance, start=self.record.rounded(start), end=self.record.rounded(end), anchors=self._anchors()
-        )
+        end = self.record.rounded(self._ended_at + MARGIN)
+        stance = replace(self._stance, end=end, anchors=self._anchors())
         self._measuring.enter(stance)
 
     def _estimate(self) -> None:

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 from coloc_graph.backend import Bump
 from coloc_graph.errors import ColocError, RobotError
+from coloc_graph.frontend import FrontendOptions, StanceTracks
 from coloc_graph.online.watch import Precision, precision
 from coloc_graph.run import Recorded, Stance
 from coloc_graph.stance_solver import EnteredStance, StanceSolver, measure_stance
@@ -25,6 +26,7 @@ class Measuring:
         self._record, self._solver = record, solver
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="measuring")
         self._judging: Future[Precision] | None = None
+        self._tracks: tuple[float, StanceTracks] | None = None
         self._entering: Future[EnteredStance | list[Bump]] | None = None
 
     def end(self) -> None:
@@ -38,7 +40,7 @@ class Measuring:
 
     def judge(self, stance: Stance) -> None:
         """Find how well a stance, as it is so far, measures its pairs."""
-        self._judging = self._worker.submit(precision, self._record, stance, self._solver.options.frontend)
+        self._judging = self._worker.submit(self._judge, stance)
 
     def forget(self) -> None:
         """What is judged just now is not wanted any more."""
@@ -64,8 +66,19 @@ class Measuring:
         self._entering = None
         return _result(done, "the estimate")
 
+    def _judge(self, stance: Stance) -> Precision:
+        return precision(self._record, stance, self._solver.options.frontend, self._tracks_of(stance))
+
+    def _tracks_of(self, stance: Stance) -> StanceTracks:
+        """The tracks of a stance, which go on while it does."""
+        if self._tracks is None or self._tracks[0] != stance.start:
+            frontend = self._solver.options.frontend or FrontendOptions()
+            self._tracks = stance.start, StanceTracks(self._record, stance, frontend.tracker)
+        return self._tracks[1]
+
     def _enter(self, stance: Stance) -> EnteredStance | list[Bump]:
-        pairs = list(measure_stance(self._record, stance, self._solver.options))
+        made = measure_stance(self._record, stance, self._solver.options, self._tracks_of(stance))
+        pairs = self._solver.measure(self._record, stance, made)
         unusable = [pair.homography.unusable for pair in pairs if pair.homography.unusable]
         if len(unusable) == len(pairs):
             raise RobotError(f"stance {stance.index} measures nothing: {unusable[0]}")

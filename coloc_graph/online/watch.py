@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.common_view import View
-from coloc_graph.frontend import FrontendOptions, measure_pair
+from coloc_graph.frontend import FrontendOptions, StanceTracks, measure_pair
 from coloc_graph.lie import floor_pose
 from coloc_graph.online.formation import Planar
 from coloc_graph.online.whereabouts import compose, inverse
@@ -184,12 +184,14 @@ def exact(team: Team) -> Team:
     return new(team, robots=tuple(robots), floor=floor)
 
 
-def precision(record: Recorded, stance: Stance, options: FrontendOptions | None = None) -> Precision:
+def precision(
+    record: Recorded, stance: Stance, options: FrontendOptions | None = None, tracks: StanceTracks | None = None
+) -> Precision:
     """What a stance that may go on measures so far."""
     source = _Exact(record, exact(record.team))
     points, place, heading, why = 10**9, 0.0, 0.0, ""
     for i, j in combinations(stance.observers, 2):
-        one = measure_pair(source, stance, i, j, options or FrontendOptions())
+        one = measure_pair(source, stance, i, j, options or FrontendOptions(), tracks)
         points = min(points, len(one.correspondences) if one.correspondences is not None else 0)
         if one.relative_pose is None:
             why = one.homography.unusable or "no relative pose"

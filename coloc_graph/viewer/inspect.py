@@ -13,7 +13,7 @@ from coloc_graph.frontend.decomposition import choose_by_normal, decompose_svd
 from coloc_graph.frontend.homography import INLIER_GATE
 from coloc_graph.frontend.plane import on_plane
 from coloc_graph.frontend.refinement import squared_residuals
-from coloc_graph.frontend.stance import stance_plane
+from coloc_graph.frontend.stance_tracks import stance_plane
 from coloc_graph.frontend.tracking import Track
 from coloc_graph.lie import floor_pose, so3_log
 from coloc_graph.run import Run

@@ -1,0 +1,121 @@
+"""What the cameras saw in one stance: the plane of the markers, and their tracks."""
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import DegenerateGeometry, InputError
+from coloc_graph.frontend.correspondence import markers_of_movers
+from coloc_graph.frontend.detection import Blobs, detector_for
+from coloc_graph.frontend.plane import plane_from_mount
+from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
+from coloc_graph.measurements import Plane
+from coloc_graph.run import Detections, Flag, Recorded, Stance
+from coloc_graph.team import Markers
+
+Array = NDArray[np.float64]
+
+
+def stance_markers(run: Recorded, stance: Stance) -> Markers | None:
+    """The markers that are watched in a stance; None where no mover carries any.
+
+    Raises `DegenerateGeometry` where the movers' markers are at different heights.
+    """
+    carried = [markers for name in stance.movers if (markers := run.team[name].markers) is not None]
+    if len({one.height for one in carried}) > 1:
+        raise DegenerateGeometry(
+            "the movers' markers are at different heights, so that they share no plane: let one move at a time"
+        )
+    return carried[0] if carried else None
+
+
+def stance_plane(run: Recorded, stance: Stance, robot: str) -> Plane:
+    """The marker plane in a robot's camera: as stated for the stance, else from its mount and the movers.
+
+    Raises `DegenerateGeometry` where there is no such plane below the camera.
+    """
+    stated = run.planes.get(stance.index)
+    if stated is not None and robot in stated.planes:
+        *normal, d = stated.planes[robot]
+        normal_sigma, d_sigma = stated.sigmas.get(robot, (0.0, 0.0))
+        return Plane(N=np.array(normal), d=d, normal_sigma=normal_sigma, d_sigma=d_sigma)
+    markers = stance_markers(run, stance)
+    if markers is None:
+        raise DegenerateGeometry(
+            "no robot with markers moves, and no plane is stated: name the movers, or state the plane"
+        )
+    return plane_from_mount(run.team[robot].mount, markers, run.team.floor)
+
+
+class StanceTracks:
+    """The tracks of the movers' markers in the observers' cameras: from detections where the run has them, else from
+    images. Made once a camera; of a stance that goes on they go on too.
+
+    Detections that name their marker are tracks already; the others, and images, go through the tracker.
+    """
+
+    def __init__(self, run: Recorded, stance: Stance, options: TrackerOptions | None = None) -> None:
+        self._run, self._stance = run, stance
+        self._markers = stance_markers(run, stance)
+        count = sum(len(m.positions) for name in stance.movers if (m := run.team[name].markers))
+        self._options = replace(options or TrackerOptions(), markers=max(count, 1))
+        self._trackers: dict[str, MarkerTracker] = {}
+        self._taken: dict[str, int] = defaultdict(int)
+        self._made: dict[str, tuple[float, list[Track]]] = {}
+
+    def of(self, robot: str, end: float | None = None) -> list[Track]:
+        """Those of an observer, up to an instant (default: the stance's end), which never goes back.
+
+        `DegenerateGeometry` where the movers' markers share no plane that the camera is above.
+        """
+        end = self._stance.end if end is None else end
+        made = self._made.get(robot)
+        if made is None or made[0] != end:
+            self._made[robot] = made = end, self._of(robot, end)
+        return made[1]
+
+    def _of(self, robot: str, end: float) -> list[Track]:
+        run, stance, camera = self._run, self._stance, self._run.team[robot].camera
+        tracker = self._trackers.get(robot)
+        if tracker is None:
+            tracker = MarkerTracker(robot, detector_for(self._markers, camera), self._options)
+            self._trackers[robot] = tracker
+        if run.has_detections(robot):
+            seen = list(run.detections(robot, stance.start, end))
+            if all(marker for one in seen for marker in one.markers):
+                return named_tracks(robot, seen)
+            for one in seen[self._taken[robot] :]:
+                tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
+            self._taken[robot] = len(seen)
+        else:
+            for number, image in enumerate(run.images(robot, stance.start, end)):
+                if image.pixels.shape[:2] != (camera.height, camera.width):
+                    raise InputError(
+                        f"{run.path}: stance {stance.index}: the images of {robot} are {image.pixels.shape[1]} x "
+                        f"{image.pixels.shape[0]} pixels and its camera is {camera.width} x {camera.height} in the "
+                        "team: correct the camera, and its calibration"
+                    )
+                if number >= self._taken[robot]:
+                    tracker.step(image)
+                    self._taken[robot] = number + 1
+        plane = stance_plane(run, stance, robot)
+        spans = {m.span for name in stance.movers if (m := run.team[name].markers) and m.span}
+        return markers_of_movers(tracker.tracks(), camera, plane, sorted(spans))
+
+
+def named_tracks(robot: str, detections: Iterable[Detections]) -> list[Track]:
+    """Tracks of detections that carry their marker's name; clipped and merged ones are left out."""
+    samples: dict[str, list[tuple[float, Array, Array, float]]] = defaultdict(list)
+    for one in detections:
+        whole = (one.flags & (Flag.CLIPPED | Flag.MERGED)) == 0
+        for index in np.flatnonzero(whole):
+            sample = (one.time, one.uv[index], one.covariance[index], float(one.peak[index]))
+            samples[one.markers[index]].append(sample)
+    tracks = []
+    for marker in sorted(samples):
+        times, uv, covariance, peak = zip(*samples[marker], strict=True)
+        tracks.append(Track(robot, marker, np.array(times), np.array(uv), np.array(covariance), np.array(peak)))
+    return tracks
