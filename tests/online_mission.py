@@ -36,15 +36,6 @@ class Mission:
         self.field.close()
         self.relay.__exit__()
 
-    def start_robot_that_can_jump(self, name: str) -> None:
-        """Instead of a robot's program one whose clock jumps when it is told to."""
-        self.field.kill(name)
-        field, program = self.field, Path(__file__).with_name("jumping_clock.py")
-        command = [sys.executable, str(program), name, str(field.team_path), str(field.folder / "robots")]
-        command += [field.connect, f"world:{field.about['socket']}", field.about["ports"][name]]
-        with (field.folder / f"{name}.log").open("ab") as log:
-            field.programs[name] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-
     def push_anchor(self, cm: float, deg: float) -> str:
         """Push the observer that stands while another leaps; its name."""
         until = time.monotonic() + 10.0

@@ -7,20 +7,19 @@ from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.correspondence import Correspondences
 from coloc_graph.frontend.homography import HomographyFit
 
-Array = NDArray[np.float64]
-
 #: A homography that fewer of the points than this share agree on is not believed.
 LEAST_AGREEMENT = 0.5
 #: Directions of a homography are open that points determine by less than this share of others (eigenvalues).
 DETERMINED = 1e-10
-#: From some instant on so much larger or smaller a share of the points agrees, and so many at least are on either
-#: side: then it is not noise, but an observer that moved.
-BROKEN, LEAST_SIDE = 0.7, 8
+#: From some instant on so much larger or smaller a share of the points agrees, so many at least are on either side,
+#: and those that do not agree go so far through the image [px]: then it is not noise, nor a light that stands somewhere
+#: else, but an observer that moved.
+BROKEN, LEAST_SIDE, FAR = 0.7, 12, 60.0
 
 
 def require_agreement(fit: HomographyFit, found: Correspondences, who: str, pairing: str) -> None:
     """Raise `DegenerateGeometry` where the points do not agree on one homography; `pairing` is what paired them."""
-    _require_still(fit.inliers, found.times, who)
+    _require_still(fit.inliers, found, who)
     if fit.inliers.mean() < LEAST_AGREEMENT:
         raise DegenerateGeometry(
             f"only {fit.inliers.sum()} of {len(found)} points agree on one homography: "
@@ -28,8 +27,9 @@ def require_agreement(fit: HomographyFit, found: Correspondences, who: str, pair
         )
 
 
-def _require_still(agree: NDArray[np.bool_], times: Array, who: str) -> None:
+def _require_still(agree: NDArray[np.bool_], found: Correspondences, who: str) -> None:
     """Raise `DegenerateGeometry` where points agree (n,) until an instant and then no more, or the other way round."""
+    times = found.times
     order = np.argsort(times, kind="stable")
     so_far, n = np.cumsum(agree[order]), len(agree)
     before = np.arange(LEAST_SIDE, n - LEAST_SIDE + 1)
@@ -37,7 +37,8 @@ def _require_still(agree: NDArray[np.bool_], times: Array, who: str) -> None:
         return
     step = so_far[before - 1] / before - (so_far[-1] - so_far[before - 1]) / (n - before)
     at = int(np.argmax(np.abs(step) * np.sqrt(before * (n - before))))
-    if abs(step[at]) > BROKEN:
+    side = order[: before[at]] if step[at] < 0 else order[before[at] :]
+    if abs(step[at]) > BROKEN and np.ptp(found.uv_i[side], axis=0).max() > FAR:
         when = times[order[before[at]]] - times[order[0]]
         raise DegenerateGeometry(
             f"{when:.1f} s after the first points, others begin that agree on another homography: {who} was bumped "
