@@ -41,8 +41,8 @@ def _require_still(agree: NDArray[np.bool_], found: Correspondences, who: str) -
     if abs(step[at]) > BROKEN and np.ptp(found.uv_i[side], axis=0).max() > FAR:
         when = times[order[before[at]]] - times[order[0]]
         raise DegenerateGeometry(
-            f"{when:.1f} s after the first points, others begin that agree on another homography: {who} was bumped "
-            "while the stance was taken; take it again"
+            f"{when:.1f} s after the first points, others begin that agree on another homography: {who} was bumped, or "
+            "a clock stepped, while the stance was taken; take it again"
         )
 
 
