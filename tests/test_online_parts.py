@@ -200,6 +200,38 @@ def test_the_mover_is_found_in_an_image_where_its_wheels_lost_it():
     assert view.find(nothing, true) is None and view.missing() == ["B"]
 
 
+def test_an_observer_that_was_pushed_is_told_by_where_it_has_the_mover():
+    team, mover = reference_team(), (1.25, 0.05, 0.4)
+    said = {"A": FORMATION.place("A", 0.0), "B": FORMATION.place("B", STAGGER)}
+    push = compose(said["B"], (0.06, -0.05, 0.2))
+    points = team["C"].markers.p_body @ floor_pose(*mover)[:3, :3].T + (*mover[:2], 0.0)
+    view, truly = InView(team, "C", said), InView(team, "C", said | {"B": push})
+    for robot in "AB":
+        uv, inside = truly.views[robot].project(points)
+        assert inside.all()
+        for one in (view, truly):
+            one.take(replace(detections(robot, 1.0), uv=uv), mover)
+    thought = mover[0] + 0.03, mover[1] - 0.02, mover[2] + 0.05
+    moved = view.displaced(thought)
+    assert moved.keys() == {"B"} and moved["B"] == pytest.approx(push, abs=1e-6)
+    assert truly.displaced(thought) == {}
+
+
+def test_a_robot_that_was_carried_is_no_anchor_in_the_record_either():
+    joined, seen, resumed = JoinedOdometry(), Whereabouts((0.0, 0.0, 0.0)), Whereabouts((0.0, 0.0, 0.0))
+    for n in range(3):
+        sample = joined.take(odometry("A", float(n), 0.0, 0.0, 0.0))
+        seen.take(sample)
+        resumed.take(sample)
+    assert not seen.moved_since(1.0)
+    joined.carried()
+    seen.carry(2.5, (0.1, 0.0, 0.2))
+    assert seen.moved_since(1.0) and not seen.moved_since(2.6) and seen.place() == pytest.approx((0.1, 0.0, 0.2))
+    resumed.take(joined.take(odometry("A", 3.0, 0.0, 0.0, 0.0)))
+    resumed.take(joined.take(odometry("A", 4.0, 0.0, 0.0, 0.0)))
+    assert resumed.moved_since(1.0) and not resumed.moved_since(3.0)
+
+
 def test_a_record_gives_back_what_its_run_holds(tmp_path):
     team = reference_team()
     with Record(tmp_path / "run.mcap", team) as record:

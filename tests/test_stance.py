@@ -8,8 +8,9 @@ import pytest
 from msgspec.structs import replace
 from scipy.stats import chi2
 
-from coloc_graph.errors import InputError
-from coloc_graph.frontend import FrontendOptions, measure_pair
+from coloc_graph.errors import DegenerateGeometry, InputError
+from coloc_graph.frontend import FrontendOptions, fit_homography, measure_pair
+from coloc_graph.frontend.fit_checks import require_agreement, require_determined
 from coloc_graph.lie import se3_inverse
 from coloc_graph.run import Detections, Image, Planes, RunWriter, Stance, open_run, read_truth
 from coloc_graph.simulation import EPOCH, Imperfections, reference_team, simulate
@@ -104,6 +105,29 @@ def test_an_observer_that_is_bumped_while_a_stance_is_taken_is_named(tmp_path, h
     why = measure_pair(run, first, "A", "B", FrontendOptions()).homography.unusable
     assert "A or B was bumped, or a clock stepped, while the stance was taken" in why
     assert float(why.split(" s after")[0]) == pytest.approx(since - first.start, abs=0.1 * (first.end - first.start))
+
+
+@pytest.mark.parametrize("when", [1, -1])
+def test_points_of_a_robot_that_stood_are_no_homography_and_no_bump(hallway, when):
+    run = open_run(hallway)
+    found = measure_pair(run, run.stances[0], "A", "B", FrontendOptions()).correspondences
+    order, n = np.argsort(found.times), len(found)
+    stood = order[::when][: int(0.6 * n)]
+    uv = found.uv_i.copy()
+    uv[stood] = np.where(found.markers[stood, None] == found.markers[0], (100.0, 80.0), (140.0, 90.0))
+    fit = dataclasses.replace(fit_homography(found.pairs), inliers=np.isin(np.arange(n), stood))
+    with pytest.raises(DegenerateGeometry, match="hardly moved"):
+        require_agreement(fit, dataclasses.replace(found, uv_i=uv), "A or B", "")
+
+
+def test_a_homography_with_an_open_direction_is_none(hallway):
+    run = open_run(hallway)
+    fit = fit_homography(measure_pair(run, run.stances[0], "A", "B", FrontendOptions()).correspondences.pairs)
+    require_determined(fit)
+    values, vectors = np.linalg.eigh(fit.information)
+    values[0] *= 1e-12
+    with pytest.raises(DegenerateGeometry, match="do not determine the homography"):
+        require_determined(dataclasses.replace(fit, information=(vectors * values) @ vectors.T))
 
 
 def write(tmp_path, paths, team=None, planes=None):

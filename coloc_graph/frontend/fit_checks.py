@@ -12,8 +12,8 @@ LEAST_AGREEMENT = 0.5
 #: Directions of a homography are open that points determine by less than this share of others (eigenvalues).
 DETERMINED = 1e-10
 #: From some instant on so much larger or smaller a share of the points agrees, so many at least are on either side,
-#: and those that do not agree go so far through the image [px]: then it is not noise, nor a light that stands somewhere
-#: else, but an observer that moved.
+#: and a marker goes so far through the image on either [px]: then it is neither noise nor a light that stands, but an
+#: observer that moved.
 BROKEN, LEAST_SIDE, FAR = 0.7, 12, 60.0
 
 
@@ -37,13 +37,29 @@ def _require_still(agree: NDArray[np.bool_], found: Correspondences, who: str) -
         return
     step = so_far[before - 1] / before - (so_far[-1] - so_far[before - 1]) / (n - before)
     at = int(np.argmax(np.abs(step) * np.sqrt(before * (n - before))))
-    side = order[: before[at]] if step[at] < 0 else order[before[at] :]
-    if abs(step[at]) > BROKEN and np.ptp(found.uv_i[side], axis=0).max() > FAR:
-        when = times[order[before[at]]] - times[order[0]]
+    if abs(step[at]) <= BROKEN:
+        return
+    agreeing, other = order[: before[at]], order[before[at] :]
+    if step[at] < 0:
+        agreeing, other = other, agreeing
+    if _travel(found, other) <= FAR:
+        return
+    if _travel(found, agreeing) <= FAR:
         raise DegenerateGeometry(
-            f"{when:.1f} s after the first points, others begin that agree on another homography: {who} was bumped, or "
-            "a clock stepped, while the stance was taken; take it again"
+            f"the {len(agreeing)} points that agree are of a moving robot that hardly moved, and determine nothing: "
+            "let it drive further, or begin the stance when it sets off"
         )
+    when = times[order[before[at]]] - times[order[0]]
+    raise DegenerateGeometry(
+        f"{when:.1f} s after the first points, others begin that agree on another homography: {who} was bumped, or "
+        "a clock stepped, while the stance was taken; take it again"
+    )
+
+
+def _travel(found: Correspondences, which: NDArray[np.int64]) -> float:
+    """How far the marker that goes furthest goes in image i, in some of the points [px]."""
+    uv, markers = found.uv_i[which], found.markers[which]
+    return max(float(np.ptp(uv[markers == one], axis=0).max()) for one in np.unique(markers))
 
 
 def require_determined(fit: HomographyFit) -> None:
