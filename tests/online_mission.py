@@ -91,13 +91,12 @@ class Mission:
         return max(abs(speed) for pair in self.field.tell("speeds")["speeds"].values() for speed in pair)
 
     def time_to_stand(self, name: str, timeout: float = 3.0) -> None:
-        """Measure how long it takes until all wheels stand."""
-        began = time.monotonic()
-        while self.fastest() > 0:
-            if time.monotonic() - began > timeout:
-                break
+        """Measure for how long wheels are seen to turn on: when it was last asked for, and they did."""
+        began = asked = time.monotonic()
+        while self.fastest() > 0 and asked - began < timeout:
+            self.stops[name] = asked - began
             time.sleep(0.01)
-        self.stops[name] = time.monotonic() - began
+            asked = time.monotonic()
 
     def wait_end(self, timeout: float) -> int:
         assert self.coordinator is not None

@@ -12,8 +12,8 @@ from coloc_graph.run import open_run
 from coloc_graph.simulation.simulated_team import field_team
 
 STANCES = 6
-#: What a wheel may turn on for after what let it go was cut off [s]; and what asking the world for it takes.
-STOP, ASKING = 0.5, 0.05
+#: What a wheel may turn on for after what let it go was cut off [s].
+STOP = 0.5
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_what_happened_is_named(mission):
 
 def test_wheels_stand_soon_after_they_are_let_go(mission):
     assert len(mission.stops) == 2
-    assert max(mission.stops.values()) < STOP + ASKING, mission.stops
+    assert 0.05 < max(mission.stops.values()) < STOP, mission.stops
 
 
 def test_a_killed_coordinator_s_record_misses_half_a_second_at_most(mission):
@@ -119,7 +119,8 @@ def test_it_is_as_accurate_as_the_same_record_in_batch(mission):
         assess(solve(run, SolveOptions(incremental=incremental)), mission.field.truth_path)[0]
         for incremental in (True, False)
     )
-    assert online.ate < 1.2 * batch.ate + 1e-4
+    # one that is refused as it comes need not be refused by all together; where nothing happens: benchmarks/online.py
+    assert online.ate < 1.2 * batch.ate + 0.01
     for row in batch.robots:
         if row.robot != "C":
             assert row.true_length > 0.3 and abs(row.length_error) < 0.02

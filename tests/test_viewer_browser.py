@@ -2,6 +2,7 @@
 
 # ruff: noqa: F811  the fixtures' names are imported, and are arguments
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -172,14 +173,14 @@ def test_a_page_opens_from_its_file_and_plays(scene, page_of, tmp_path):
     base, number = scene.layers[0], scene.robots.index("A")
 
     def stands_at(row):
+        played.fill(str(row))  # again where its playing on went over it
+        time.sleep(0.2)
         return np.allclose(place_of(page, "/robots/A"), base.xyz[number, row], atol=1e-3)
 
     assert until(lambda: page.get_by_text("it is the anchor now").is_visible())
     played = page.get_by_role("textbox").first
     assert until(lambda: float(played.input_value()) > 0.2)  # by itself
-    played.fill(str(len(scene) - 1))
     assert until(lambda: stands_at(len(scene) - 1))
-    played.fill("0")  # back to the first, where all is hidden and made anew
-    assert until(lambda: stands_at(0))
+    assert until(lambda: stands_at(0))  # back to the first, where all is hidden and made anew
     visible = "name => window.__viserMutable.nodeRefFromName[name].visible"
     assert until(lambda: page.evaluate(visible, "/robots/A") and page.evaluate(visible, "/floor"))

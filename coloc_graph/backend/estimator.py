@@ -68,6 +68,7 @@ class Estimator:
         self._stances: dict[int, Stance] = {}
         self._log: list[Measurement] = []  # everything that ever came, the refused too
         self._refused: dict[int, Refusal] = {}  # by the measurement's identity
+        self._newly: set[int] = set()  # those refused since the last stance came, it included
         self._early: dict[int, Early] = {}
         self._loose: list[Link] = []  # what nothing ties to the reference
         self._instants: dict[Node, float] = {}  # when moving robots were sighted
@@ -195,7 +196,7 @@ class Estimator:
         if not any(one is measurement for one in self._log):
             raise EstimationError(f"the {measurement} is not in, so that it cannot be taken out")
         try:
-            self._take_out({id(measurement)})
+            self._take_out({id(measurement)}, set(self._refused))
         except Exception:
             self._rebuild()
             raise
@@ -211,7 +212,7 @@ class Estimator:
         del self._stances[stance.index]
         self._places.forget(before, stance)
         try:
-            self._take_out(gone)
+            self._take_out(gone, self._newly)
         except Exception:
             self._places.accept(self._places.after(before, stance))
             self._stances[stance.index] = stance
@@ -220,19 +221,23 @@ class Estimator:
         self._instants = {node: at for node, at in self._instants.items() if node[1] != stance.index}
         return stance
 
-    def _take_out(self, gone: Set[int]) -> None:
-        """Take measurements out, by identity, and try again what was refused; an exception spoils the graph."""
+    def _take_out(self, gone: Set[int], doubted: Set[int]) -> None:
+        """Take measurements out, by identity, and try again those of the refused that are `doubted`; an exception
+        spoils the graph."""
         log, refused, loose = self._log, self._refused, self._loose
-        again = [one.measurement for key, one in refused.items() if key not in gone]
+        left = {key: one for key, one in refused.items() if key not in gone}
         self._log = [one for one in log if id(one) not in gone]
-        self._refused = {key: one for key, one in refused.items() if key not in gone}
+        self._refused = left
         try:
             self._rebuild()
+            again = [one.measurement for key, one in left.items() if key in doubted]
             entering = self._entering([*self._loose, *again])
-            self._refused = {id(one.measurement): one for one in self._update(entering)}
+            found = {id(one.measurement): one for one in self._update(entering)}
+            self._refused = {key: one for key, one in left.items() if key not in doubted} | found
         except Exception:
             self._log, self._refused, self._loose = log, refused, loose
             raise
+        self._newly = set()
         self._loose = entering.loose
 
     def save(self, path: str | Path) -> None:
@@ -295,6 +300,7 @@ class Estimator:
         self._log += taken
         self._instants |= instants
         self._refused |= {id(one.measurement): one for one in refused}
+        self._newly = (set() if stance is not None else self._newly) | {id(one.measurement) for one in refused}
         self._loose = entering.loose
         return self._at(next(reversed(self._stances.values())), refused)
 
