@@ -123,7 +123,8 @@ def test_it_is_as_accurate_as_the_same_record_in_batch(mission):
     assert online.ate < 1.2 * batch.ate + 0.01
     for row in batch.robots:
         if row.robot != "C":
-            assert row.true_length > 0.3 and abs(row.length_error) < 0.02
+            # four sigmas: two of the stances hang on wheels alone
+            assert row.true_length > 0.3 and abs(row.length_error) < 0.05
     assert batch.ate < 0.05
 
 
