@@ -1,7 +1,6 @@
 """A mission in the field of a simulation, to which things happen: what the tests of the online system share."""
 
 import json
-import math
 import signal
 import subprocess
 import sys
@@ -36,26 +35,10 @@ class Mission:
         self.field.close()
         self.relay.__exit__()
 
-    def push_anchor(self, cm: float, deg: float) -> str:
-        """Push the observer that stands while another leaps; its name."""
-        until = time.monotonic() + 10.0
-        while time.monotonic() < until:
-            speeds = self.field.tell("speeds")["speeds"]
-            moving = {name for name in "AB" if max(map(abs, speeds[name])) > 0.02}
-            if len(moving) == 1:
-                (anchor,) = {"A", "B"} - moving
-                self.push(anchor, cm, deg)
-                return anchor
-            time.sleep(0.02)
-        raise AssertionError(f"nobody leaps\n{self.log()}")
-
-    def push(self, name: str, cm: float, deg: float) -> None:
-        self.field.tell(f"push {name} {0.6 * cm / 100} {0.8 * cm / 100} {math.radians(deg)}")
-
     def start_coordinator(self, *more: str) -> None:
         command = [sys.executable, "-m", "coloc_graph.cli", "coordinate", str(self.field.team_path)]
         command += ["--out", str(self.folder / "mission"), "--stances", str(self.stances), "--goal", "100,0"]
-        command += ["--speed", "0.45", "--longest", "4", "--listen", self.listen, *more]
+        command += ["--speed", "0.45", "--longest", "6", "--listen", self.listen, *more]
         with (self.folder / "coordinator.log").open("ab") as log:
             self.coordinator = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
 

@@ -2,7 +2,6 @@
 
 import time
 
-import gtsam
 import numpy as np
 import pytest
 from online_mission import Mission
@@ -12,14 +11,14 @@ from coloc_graph.results import assess
 from coloc_graph.run import open_run
 from coloc_graph.simulation.simulated_team import field_team
 
-STANCES = 6
+STANCES = 4
 #: What a wheel may turn on for after what let it go was cut off [s].
 STOP = 0.5
 
 
 @pytest.fixture(scope="module")
 def mission(tmp_path_factory):
-    """A mission to which bad things happen, one after the other; it ends by itself."""
+    """A short mission to which bad things happen, one after the other; it ends by itself."""
     with Mission(tmp_path_factory.mktemp("online"), STANCES) as m:
         m.field.start()
         m.start_coordinator()
@@ -28,17 +27,14 @@ def mission(tmp_path_factory):
             m.wait_for(stance, "capturing")
             m.wait_moving()
 
-        def cut(seconds):
-            m.relay.cut()
-            m.time_to_stand(f"the link is cut for {seconds} s")
-            time.sleep(seconds)
-            m.relay.mend()
-
         in_mid_stance(1)
         m.field.kill("C")  # its wheels go on: nobody is left to stop them, until its program is back
         m.field.start("C")
         in_mid_stance(2)
-        cut(3.0)
+        m.relay.cut()
+        m.time_to_stand("the link is cut")
+        time.sleep(3.0)
+        m.relay.mend()
         in_mid_stance(3)
         time.sleep(1.5)
         m.killed_at = time.time()
@@ -46,10 +42,6 @@ def mission(tmp_path_factory):
         m.coordinator.wait()
         m.time_to_stand("the coordinator is gone")
         m.start_coordinator("--resume")
-        m.wait_for(4, "placing")
-        m.pushed = {4: m.push_anchor(4.0, 3.0)}
-        m.wait_for(5, "placing")
-        m.pushed[5] = m.push_anchor(12.0, 14.0)  # it sees the mover where it is not
         m.code = m.wait_end(200.0)
         m.field.close()
         yield m
@@ -67,15 +59,7 @@ def test_the_mission_ends_by_itself_with_every_stance_once(mission):
     assert entered == list(range(STANCES))
     assert not run.warnings
     for before, stance in zip(run.stances, run.stances[1:], strict=False):
-        assert set(stance.anchors) < set(stance.observers) and stance.start > before.end
-        assert bool(stance.anchors) == (stance.index not in mission.pushed)  # who was pushed is no anchor
-
-
-def test_a_pushed_anchor_is_named_and_its_stance_taken_again(mission):
-    named = {row["robot"]: row["text"] for row in mission.rows if row["what"] == "bumped"}
-    assert named.keys() == set(mission.pushed.values())
-    for stance, robot in mission.pushed.items():
-        assert f"robot {robot} was bumped between stances {stance - 1} and {stance}" in reasons(mission, stance)
+        assert stance.anchors and set(stance.anchors) < set(stance.observers) and stance.start > before.end
 
 
 def test_what_happened_is_named(mission):
@@ -109,10 +93,7 @@ def test_the_record_solved_offline_is_what_was_known_online(mission):
         poses = online[one.stance.index]
         assert poses.keys() == one.estimate.poses.keys()
         for robot, pose in one.estimate.poses.items():
-            off = np.abs(gtsam.Pose3.Logmap(gtsam.Pose3(np.array(poses[robot])).between(pose)))
-            sigmas = np.sqrt(np.diag(one.estimate.covariances[robot]))
-            # a stance that was taken out has ISAM2 linearise elsewhere: a fraction of a sigma, and the same optimum
-            assert (off <= 1e-6 + (0.6 * sigmas if one.stance.index >= min(mission.pushed) else 0.0)).all()
+            assert np.abs(pose.matrix() - poses[robot]).max() < 1e-6
 
 
 def test_it_is_as_accurate_as_the_same_record_in_batch(mission):
@@ -121,12 +102,10 @@ def test_it_is_as_accurate_as_the_same_record_in_batch(mission):
         assess(solve(run, SolveOptions(incremental=incremental)), mission.field.truth_path)[0]
         for incremental in (True, False)
     )
-    # one that is refused as it comes need not be refused by all together; where nothing happens: benchmarks/online.py
-    assert online.ate < 1.2 * batch.ate + 0.01
+    assert online.ate < 1.2 * batch.ate + 1e-4
     for row in batch.robots:
         if row.robot != "C":
-            # four sigmas: two of the stances hang on wheels alone
-            assert row.true_length > 0.3 and abs(row.length_error) < 0.05
+            assert row.true_length > 0.3 and abs(row.length_error) < 0.02
     assert batch.ate < 0.05
 
 
@@ -147,4 +126,4 @@ def test_robots_keep_records_of_their_own(mission):
 def test_figures_are_kept_of_each_stance(mission):
     rows = [row for row in mission.rows if row["what"] == "entered"]
     latencies = [row["latency"] for row in rows]
-    assert all(0 < latency < 10 for latency in latencies) and all(row["points"] >= 20 for row in rows)
+    assert all(0 < latency < 10 for latency in latencies) and all(row["points"] >= 50 for row in rows)

@@ -21,7 +21,7 @@ from coloc_graph.online.watch import InView
 from coloc_graph.online.whereabouts import Whereabouts, compose, inverse
 from coloc_graph.run import Detections, OdometrySample, Stance, open_run
 from coloc_graph.simulation.rig import reference_team
-from coloc_graph.stance_solver import StanceSolver
+from coloc_graph.stance_solver import EnteredStance, StanceSolver
 
 COURSE = Course(((0.0, 0.0), (3.0, 0.0), (3.0, 2.0)))
 FORMATION = Formation(Course(((0.0, 0.0), (5.0, 0.0))), ("A", "B"))
@@ -230,6 +230,68 @@ def test_a_robot_that_was_carried_is_no_anchor_in_the_record_either():
     resumed.take(joined.take(odometry("A", 3.0, 0.0, 0.0, 0.0)))
     resumed.take(joined.take(odometry("A", 4.0, 0.0, 0.0, 0.0)))
     assert resumed.moved_since(1.0) and not resumed.moved_since(3.0)
+
+
+@pytest.mark.parametrize("push", [(0.03, -0.02, 0.05), (0.1, 0.06, 0.25)])
+def test_an_anchor_that_was_pushed_is_named_and_its_stance_comes_again(tmp_path, hallway, copied, push):
+    run = open_run(hallway)
+    before, stance = run.stances[4:6]
+    (anchor,) = stance.anchors
+    robot, height = run.team[anchor], run.team["C"].markers.height
+    T_body_camera, T_push = robot.mount.T_body_camera, floor_pose(*push)
+
+    def pushed(record):
+        """What the camera sees from where it was pushed to."""
+        if isinstance(record, Detections) and record.robot == anchor and record.time >= stance.start:
+            rays = (
+                np.column_stack([robot.camera.normalise(record.uv), np.ones(len(record.uv))]) @ T_body_camera[:3, :3].T
+            )
+            points = T_body_camera[:3, 3] + rays * ((height - T_body_camera[2, 3]) / rays[:, 2])[:, None]
+            T = T_push @ T_body_camera
+            return replace(record, uv=robot.camera.project((points - T[:3, 3]) @ T[:3, :3])[0])
+        return record
+
+    seen = open_run(copied(hallway, tmp_path / "run.mcap", change=pushed, stances=run.stances[:6]))
+    solver = StanceSolver(seen.team)
+    measuring = Measuring(seen, solver)
+
+    def entered(one):
+        measuring.enter(one)
+        while (found := measuring.entered()) is None:
+            time.sleep(0.01)
+        return found
+
+    for one in seen.stances[:5]:
+        assert isinstance(entered(one), EnteredStance)
+    stands = solver.estimator.pose(anchor, 4).matrix()
+    (bump,) = entered(seen.stances[5])
+    assert bump.stay_put.robot == anchor and bump.stay_put.after == stance.index
+    T = bump.T_before_after
+    assert (T.x(), T.y(), T.rotation().yaw()) == pytest.approx(push, abs=0.04)
+    assert solver.estimator.stances[-1] == seen.stances[4] and not solver.estimator.refused
+
+    class Told:
+        """The run, in which the wheels' last word before the stance is what the coordinator makes of it."""
+
+        def __getattr__(self, name):
+            return getattr(seen, name)
+
+        def odometry(self, robot, start=None, end=None):
+            samples = list(seen.odometry(robot, start, end))
+            if robot == anchor:
+                joined = JoinedOdometry()
+                last = joined.take([one for one in seen.odometry(robot) if one.time < stance.start][-1])
+                joined.carried()
+                samples += [joined.take(replace(last, time=(before.end + stance.start) / 2))]
+            return iter(sorted(samples, key=lambda one: one.time))
+
+    measuring.end()
+    measuring = Measuring(Told(), solver)
+    assert isinstance(entered(replace(seen.stances[5], anchors=())), EnteredStance)
+    assert not solver.estimator.refused
+    T = np.linalg.inv(stands) @ solver.estimator.pose(anchor, 5).matrix()
+    assert (T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])) == pytest.approx(push, abs=0.04)
+    measuring.end()
 
 
 def test_a_record_gives_back_what_its_run_holds(tmp_path):

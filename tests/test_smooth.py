@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from teams import FLOOR, ate, graph_of_team, planar_nees, team_of
 
 from coloc_graph.backend import PoseGraph, chain, diagnose, smooth
+from coloc_graph.backend.consistency import Agreement
 from coloc_graph.backend.factors import Factors
 from coloc_graph.backend.solver import Posterior
 from coloc_graph.errors import EstimationError
@@ -272,3 +273,12 @@ def test_a_team_that_nothing_connects_is_refused_in_words():
     team = team_of(4, 1, sightings=False)
     with pytest.raises(EstimationError, match="no measurement ties a robot to the reference A at stance 0"):
         smooth(graph_of_team(team, [m for m in team.measurements if "A" not in {r for r, _ in m.ends}]))
+
+
+@pytest.mark.parametrize("dof", [3, 6, 11])
+def test_a_chance_too_small_for_a_number_goes_on_where_the_others_end(dof):
+    chi2 = np.linspace(1200.0, 1500.0, 301)
+    logs = np.array([Agreement(float(one), dof).log_chance() for one in chi2])
+    steps = np.diff(logs)
+    assert np.isfinite(logs).all() and (steps < -0.48).all() and (steps > -0.52).all()
+    assert Agreement(9.0, 0).log_chance() == 0.0

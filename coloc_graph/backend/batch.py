@@ -23,7 +23,7 @@ from coloc_graph.team import Slip
 LEAST_CHANCE_OF_ALL = 1e-4
 #: A stay-put constraint is loosened by so much to see whether the others contradict it.
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)
-#: A bump must explain this much more chi2 than any wrong measurement to be called one.
+#: A bump must be this much less likely by chance, in logarithms, than what is off in any measurement.
 MORE_LIKELY = 1.1
 MOST_BUMPS = 3
 #: Rounds of refusing the worst and taking back what then agrees.
@@ -166,15 +166,19 @@ def _find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
         stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
         if not stays:
             break
-        plainest = max(stays, key=lambda index: stays[index].chi2)
-        others = max((one.chi2 for index, one in tested.items() if index not in stays), default=0.0)
-        by_chance = stays[plainest].chance(_scale(tested.values())) > LEAST_CHANCE
-        if by_chance or stays[plainest].chi2 < MORE_LIKELY * others:
+        plainest = min(stays, key=lambda index: stays[index].log_chance())
+        others = min((one.log_chance() for index, one in tested.items() if index not in stays), default=0.0)
+        if stays[plainest].log_chance() > MORE_LIKELY * others:
             break
         stay = fit.links[plainest]
         assert isinstance(stay, StayPut)
-        loose = _moved(loose, stay)
-        moved = fit_graph(method, loose)
+        freed = _moved(loose, stay)
+        moved = fit_graph(method, freed)
+        # by what is left once it may have moved: a bump bends everything else
+        rest = moved.agreements(Posterior(moved.factors, moved.values), (RelativePose, Sighting))
+        if stays[plainest].chance(_scale(rest.values())) > LEAST_CHANCE:
+            break
+        loose = freed
         before, after = (moved.values.atPose3(loose.places.key(node)) for node in stay.ends)
         named = replace(stay, slip=graph.slips.get(stay.robot))
         bumps.append(Bump(named, before.between(after), stays[plainest].sigmas))

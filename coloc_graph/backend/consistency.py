@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
+from scipy.special import chdtrc, gammaln
 
 Array = NDArray[np.float64]
 
@@ -31,6 +31,13 @@ class Agreement:
     def chance(self, scale: float = 1.0) -> float:
         """How often noise alone does that, where variances are `scale` times what is stated."""
         return float(chdtrc(self.dof, self.chi2 / scale)) if self.dof else 1.0
+
+    def log_chance(self) -> float:
+        """The natural logarithm of that chance, also where it is too small for a number."""
+        x, a = self.chi2 / 2, self.dof / 2
+        if self.chance() > 1e-290:
+            return float(np.log(self.chance()))
+        return -x + (a - 1) * float(np.log(x)) - float(gammaln(a))  # the upper incomplete gamma function far out
 
     @property
     def sigmas(self) -> float:
