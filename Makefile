@@ -44,6 +44,7 @@ bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/viewer.py
 	$(BIN)/python benchmarks/link.py
 	$(BIN)/python benchmarks/online.py
+	$(BIN)/python benchmarks/bumps.py
 	$(BIN)/python benchmarks/backend.py $(if $(GRAPHS),--data $(GRAPHS))
 ifneq ($(DATA),)
 	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)

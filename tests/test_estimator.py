@@ -99,6 +99,16 @@ def test_a_stance_gives_where_its_robots_stand(team):
         assert np.array_equal(found.covariances[robot], estimator.covariance(robot))
 
 
+def test_a_stance_agrees_with_those_before_by_what_chi2_rises_when_it_comes(team):
+    estimator = Estimator("A", team.robots, team.floor)
+    for stance in team.stances:
+        before = estimator.estimate() if estimator.stances else None
+        off = estimator.add(stance, of_stance(team, stance.index)).agreement
+        if before is not None:
+            rise = estimator.estimate().chi2 - before.chi2
+            assert off.chi2 == pytest.approx(rise, rel=0.05, abs=0.05) and 1e-4 < off.chance() < 1
+
+
 def test_late_measurements_give_the_same_as_those_in_time(team):
     late = [m for m in team.measurements if isinstance(m, RelativePose) and m.stance in (2, 5)][::2]
     held = set(map(id, late))

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from scipy.special import chdtri
 
-from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, innovation
+from coloc_graph.backend.consistency import LEAST_CHANCE, UNCHECKED, Agreement, innovation
 from coloc_graph.backend.estimate import Bump, Estimate, Refusal, make_estimate
 from coloc_graph.backend.factors import Method, require_rigs
 from coloc_graph.backend.fit import Fit, fit_graph
@@ -23,8 +23,8 @@ from coloc_graph.team import Slip
 LEAST_CHANCE_OF_ALL = 1e-4
 #: A stay-put constraint is loosened by so much to see whether the others contradict it.
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)
-#: A bump must be this much less likely by chance, in logarithms, than what is off in any measurement.
-MORE_LIKELY = 1.1
+#: A measurement is to blame, and no bump, where noise alone makes it explain so much more less often than this.
+LEAST_CHANCE_OF_EITHER = 1e-3
 MOST_BUMPS = 3
 #: Rounds of refusing the worst and taking back what then agrees.
 ROUNDS = 20
@@ -59,7 +59,7 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
     refused: tuple[Refusal, ...] = ()
     bumped: tuple[Bump, ...] = ()
     if refuse and _is_suspicious(fit, posterior):
-        bumped = _find_bumps(method, graph)
+        bumped = _bumps(method, graph)
         for bump in bumped:
             graph = _moved(graph, bump.stay_put)
         refused = _find_wrong(method, graph)
@@ -146,8 +146,8 @@ def _innovation(fit: Fit, posterior: Posterior, link: Link) -> Agreement:
     i, j = map(fit.graph.places.key, link.ends)
     factor = fit.factors_of.of_link(link, i, j)
     if not all(map(fit.values.exists, factor.keys())):
-        return Agreement(0.0, 0)
-    return innovation(factor, fit.values, posterior.joint(list(factor.keys())))
+        return UNCHECKED
+    return innovation([factor], fit.values, posterior.joint(list(factor.keys())))
 
 
 def _agrees(fit: Fit, posterior: Posterior, link: Link, scale: float) -> bool:
@@ -155,8 +155,16 @@ def _agrees(fit: Fit, posterior: Posterior, link: Link, scale: float) -> bool:
     return _innovation(fit, posterior, link).chance(scale) >= LEAST_CHANCE
 
 
-def _find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
-    """The anchors that did not stay put, the plainest first; none where a wrong measurement explains more."""
+def find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
+    """The anchors that did not stay put, the plainest first; none where a wrong measurement explains more.
+
+    Where a bump and a wrong measurement explain the same, as they may in a stance that nothing has followed yet, it is
+    a bump.
+    """
+    return with_stack(len(graph.nodes), lambda: _bumps(method, graph))
+
+
+def _bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
     slips = {robot: graph.slips.get(robot, TEST_SLIP) for robot in graph.robots}
     loose = replace(graph, slips=slips)
     bumps: list[Bump] = []
@@ -167,8 +175,7 @@ def _find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
         if not stays:
             break
         plainest = min(stays, key=lambda index: stays[index].log_chance())
-        others = min((one.log_chance() for index, one in tested.items() if index not in stays), default=0.0)
-        if stays[plainest].log_chance() > MORE_LIKELY * others:
+        if stays[plainest].chance() > LEAST_CHANCE:
             break
         stay = fit.links[plainest]
         assert isinstance(stay, StayPut)
@@ -176,8 +183,16 @@ def _find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
         moved = fit_graph(method, freed)
         # by what is left once it may have moved: a bump bends everything else
         rest = moved.agreements(Posterior(moved.factors, moved.values), (RelativePose, Sighting))
-        if stays[plainest].chance(_scale(rest.values())) > LEAST_CHANCE:
+        scale = _scale(rest.values())
+        if stays[plainest].chance(scale) > LEAST_CHANCE:
             break
+        others = {index: one for index, one in tested.items() if index not in stays}
+        if others:
+            wrong = min(others, key=lambda index: others[index].log_chance())
+            without = fit_graph(method, loose.without([fit.links[wrong]]))
+            more = Agreement(max(moved.chi2 - without.chi2, 0.0), max(moved.dof - without.dof, 1))
+            if more.chance(scale) < LEAST_CHANCE_OF_EITHER:
+                break
         loose = freed
         before, after = (moved.values.atPose3(loose.places.key(node)) for node in stay.ends)
         named = replace(stay, slip=graph.slips.get(stay.robot))

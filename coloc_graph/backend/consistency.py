@@ -3,6 +3,7 @@
 Source: W. Baarda, "A Testing Procedure for Use in Geodetic Networks", 1968.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -45,27 +46,42 @@ class Agreement:
         return float(np.sqrt(self.chi2))
 
 
-def agreement(factor: gtsam.NonlinearFactor, values: gtsam.Values, joint: Array) -> Agreement:
-    """The standardised residual of a between-factor that is in a fit, by the joint covariance (12, 12) of its poses.
+#: Of what nothing can contradict.
+UNCHECKED = Agreement(0.0, 0)
+
+
+def agreement(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, joint: Array) -> Agreement:
+    """The standardised residual of factors that are in a fit, by the joint covariance of their `keys_of`.
 
     The covariance of a whitened residual e = A x - b after the fit is I - A P A^T: e^T (I - A P A^T)^-1 e is chi2
-    distributed, and is what the sum of squares falls by when the measurement is left out.
+    distributed, and is what the sum of squares falls by when they are left out.
     """
-    A, b = _whitened(factor, values)
+    A, b = _whitened(factors, values)
     checked, directions = np.linalg.eigh(np.eye(len(b)) - A @ joint @ A.T)
     kept = checked > LEAST_CHECKED
     along = directions.T @ b
     return Agreement(float((along[kept] ** 2 / checked[kept]).sum()), int(kept.sum()))
 
 
-def innovation(factor: gtsam.NonlinearFactor, values: gtsam.Values, joint: Array) -> Agreement:
-    """The same of a between-factor that is not in the fit: e^T (I + A P A^T)^-1 e."""
-    A, b = _whitened(factor, values)
+def innovation(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, joint: Array) -> Agreement:
+    """The same of factors that are not in the fit: e^T (I + A P A^T)^-1 e."""
+    A, b = _whitened(factors, values)
     return Agreement(float(b @ np.linalg.solve(np.eye(len(b)) + A @ joint @ A.T, b)), len(b))
 
 
-def _whitened(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> tuple[Array, Array]:
-    """Whitened Jacobian (m, 12) and residual (m,), of the rows that weigh."""
-    A, b = factor.linearize(values).jacobian()
+def keys_of(factors: Iterable[gtsam.NonlinearFactor]) -> list[int]:
+    """What factors are on, each once, as it first comes."""
+    return list(dict.fromkeys(int(key) for factor in factors for key in factor.keys()))  # noqa: SIM118
+
+
+def _whitened(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values) -> tuple[Array, Array]:
+    """Whitened Jacobian (m, n) by all of their keys, and residual (m,), of the rows that weigh."""
+    linear = gtsam.GaussianFactorGraph()
+    for factor in factors:
+        linear.push_back(factor.linearize(values))
+    ordering = gtsam.Ordering()
+    for key in keys_of(factors):
+        ordering.push_back(key)
+    A, b = linear.jacobian(ordering)
     weighing = np.abs(A).max(axis=1) > 0
     return A[weighing], np.asarray(b)[weighing]

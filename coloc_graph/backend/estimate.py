@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.calibration import Calibration, Variables
+from coloc_graph.backend.consistency import UNCHECKED, Agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.graph import PoseGraph, StayPut
 from coloc_graph.backend.solver import Posterior
@@ -150,7 +151,8 @@ class Estimate:
 class StanceEstimate:
     """Where the robots of one stance stand: `poses` T_world_body, and `covariances` (6, 6) in GTSAM's tangent.
 
-    Robots that nothing ties to the reference are `untied`. `refused` is what was refused in this call.
+    Robots that nothing ties to the reference are `untied`. `refused` is what was refused in this call, and `agreement`
+    says how all that it took in, together, agrees with what was in before.
     """
 
     stance: int
@@ -158,6 +160,7 @@ class StanceEstimate:
     covariances: Mapping[str, Array]
     untied: tuple[str, ...] = ()
     refused: tuple[Refusal, ...] = ()
+    agreement: Agreement = UNCHECKED
 
 
 def make_estimate(

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend import checkpoint
-from coloc_graph.backend.batch import joint, smooth
+from coloc_graph.backend.batch import find_bumps, joint, smooth
 from coloc_graph.backend.calibration import Variables
 from coloc_graph.backend.checkpoint import Early
-from coloc_graph.backend.consistency import Agreement
+from coloc_graph.backend.consistency import UNCHECKED, Agreement
 from coloc_graph.backend.entering import Entering, Sorter
 from coloc_graph.backend.estimate import Bump, Estimate, Refusal, StanceEstimate
 from coloc_graph.backend.factors import Factors, Method, require_rigs
@@ -141,8 +141,8 @@ class Estimator:
         return replace(optimised(kept, refuse=False, start=values), graph=graph, refused=self.refused)
 
     def bumps(self) -> tuple[Bump, ...]:
-        """The anchors that did not stay put, by all that is in; none while nothing is refused. It takes a batch."""
-        return (joint if self.rigs else smooth)(self.graph).bumped if self._refused else ()
+        """The anchors that did not stay put, by all that is in, the refused too; it takes a few batches."""
+        return find_bumps(self.method, self.graph)
 
     def add(
         self, stance: Stance, measurements: Iterable[Measurement] = (), *, after: int | None = None
@@ -200,7 +200,7 @@ class Estimator:
         except Exception:
             self._rebuild()
             raise
-        return self._at(next(reversed(self._stances.values())), self.refused)
+        return self._at(next(reversed(self._stances.values())), self.refused, UNCHECKED)
 
     def withdraw(self) -> Stance:
         """Take the last stance out again with all that was measured in it and on the way to it, as if it had never
@@ -232,7 +232,7 @@ class Estimator:
             self._rebuild()
             again = [one.measurement for key, one in left.items() if key in doubted]
             entering = self._entering([*self._loose, *again])
-            found = {id(one.measurement): one for one in self._update(entering)}
+            found = {id(one.measurement): one for one in self._update(entering)[0]}
             self._refused = {key: one for key, one in left.items() if key not in doubted} | found
         except Exception:
             self._log, self._refused, self._loose = log, refused, loose
@@ -291,7 +291,7 @@ class Estimator:
         try:
             instants = self._checked(taken)
             entering = self._entering(links)
-            refused = self._update(entering)
+            refused, agreement = self._update(entering)
         except Exception:
             if stance is not None:
                 self._places.forget(before, stance)
@@ -302,7 +302,7 @@ class Estimator:
         self._refused |= {id(one.measurement): one for one in refused}
         self._newly = (set() if stance is not None else self._newly) | {id(one.measurement) for one in refused}
         self._loose = entering.loose
-        return self._at(next(reversed(self._stances.values())), refused)
+        return self._at(next(reversed(self._stances.values())), refused, agreement)
 
     def _require_anchor(self, stance: Stance, taken: tuple[Measurement, ...]) -> None:
         if not stance.anchors and not any(isinstance(one, Odometry) and one.after == stance.index for one in taken):
@@ -326,13 +326,14 @@ class Estimator:
         live = self._live
         return Sorter(live.factors_of, self._keys, live.tied, reference, live.pose, live.errors).sort(links)
 
-    def _update(self, entering: Entering) -> tuple[Refusal, ...]:
+    def _update(self, entering: Entering) -> tuple[tuple[Refusal, ...], Agreement]:
         """Put poses and links into the graph, without those that all others contradict; all of it or nothing."""
         try:
-            return tuple(_refusal(link, off) for link, off in self._live.enter(entering))
+            outcome = self._live.enter(entering)
         except Exception as failure:
             self._rebuild()
             raise EstimationError(f"the graph cannot take this in, and is as it was: {failure}") from failure
+        return tuple(_refusal(link, off) for link, off in outcome.refused), outcome.agreement
 
     def _rebuild(self) -> None:
         """The graph anew from the log without what was refused: after a failure, a revocation, from a checkpoint."""
@@ -353,7 +354,7 @@ class Estimator:
                 return key
         raise EstimationError(f"robot {robot} has no pose{'' if stance is None else f' at stance {stance}'}")
 
-    def _at(self, stance: Stance, refused: tuple[Refusal, ...]) -> StanceEstimate:
+    def _at(self, stance: Stance, refused: tuple[Refusal, ...], agreement: Agreement) -> StanceEstimate:
         keys = {robot: self._places.key((robot, stance.index)) for robot in self.robots}
         tied = {robot: key for robot, key in keys.items() if key in self._live.tied}
         return StanceEstimate(
@@ -362,4 +363,5 @@ class Estimator:
             {robot: self._live.covariance(key) for robot, key in tied.items()},
             tuple(robot for robot in stance.observers if robot not in tied),
             refused,
+            agreement,
         )

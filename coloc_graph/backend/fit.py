@@ -64,7 +64,7 @@ class Fit:
                 self.factors_of.rows(link, factor), LOOKED_INTO
             ):
                 continue
-            found[index] = agreement(factor, self.values, posterior.joint(list(factor.keys())))
+            found[index] = agreement([factor], self.values, posterior.joint(list(factor.keys())))
         return found
 
 

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from coloc_graph.backend.calibration import ANCHORED, is_calibration
 from coloc_graph.backend.chain import spanning_tree
-from coloc_graph.backend.consistency import LEAST_CHANCE, Agreement, agreement, innovation
+from coloc_graph.backend.consistency import LEAST_CHANCE, UNCHECKED, Agreement, agreement, innovation, keys_of
 from coloc_graph.backend.entering import Entering
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.fit import fit_graph
@@ -32,6 +32,13 @@ class Entered(NamedTuple):
 
     link: Link
     factor: gtsam.NonlinearFactor
+
+
+class Outcome(NamedTuple):
+    """What was left out, and how all that went in agrees with what was there."""
+
+    refused: list[tuple[Link, Agreement]]
+    agreement: Agreement
 
 
 class LiveGraph:
@@ -64,8 +71,8 @@ class LiveGraph:
         """Everything, with all changes carried out."""
         return self.isam.calculateBestEstimate()
 
-    def enter(self, entering: Entering) -> list[tuple[Link, Agreement]]:
-        """Put poses and links in; what all others contradict is left out, and comes back."""
+    def enter(self, entering: Entering) -> Outcome:
+        """Put poses and links in, without what all others contradict."""
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for key, pose in entering.start.items():
             is_reference = not self.tied and not values.size()
@@ -86,12 +93,13 @@ class LiveGraph:
         refused = self._enter_far([Entered(tie[0], far[id(tie)]) for tie in entering.far], inside)
         if entering.far or not clear:
             refused += self._take_out(inside)
+        together = self._agreement([self.isam.getFactorsUnsafe().at(index) for index in (*indices[:first], *inside)])
         for key in entering.start:
             if not np.isfinite(self.isam.calculateEstimatePose3(key).translation()).all():
                 raise EstimationError("a pose came out as not finite")
         self.tied |= entering.start.keys()
         self._anchor()
-        return refused
+        return Outcome(refused, together)
 
     def _anchor(self) -> None:
         """Once a mount's tilts are known well enough, spans that come in are taken apart for it as it is."""
@@ -151,7 +159,7 @@ class LiveGraph:
         passed: list[Entered] = []
         factors = gtsam.NonlinearFactorGraph()
         for one in far:
-            off = self._agreement(one, inside=False)
+            off = self._agreement([one.factor], inside=False)
             if off.chance() < LEAST_CHANCE:
                 refused.append((one.link, off))
             else:
@@ -166,7 +174,7 @@ class LiveGraph:
         refused: list[tuple[Link, Agreement]] = []
         before = np.inf  # how far off the worst was a step ago; where no step brings it nearer, it is the optimum
         while inside:
-            among = {index: self._agreement(one) for index, one in inside.items()}
+            among = {index: self._agreement([one.factor]) for index, one in inside.items()}
             worst = min(among, key=lambda index: among[index].chance())
             if among[worst].chance() >= LEAST_CHANCE:
                 break
@@ -180,12 +188,13 @@ class LiveGraph:
             before = np.inf
         return refused
 
-    def _agreement(self, one: Entered, *, inside: bool = True) -> Agreement:
-        values = gtsam.Values()
-        keys = list(map(int, one.factor.keys()))
+    def _agreement(self, factors: list[gtsam.NonlinearFactor], *, inside: bool = True) -> Agreement:
+        if not factors:
+            return UNCHECKED
+        values, keys = gtsam.Values(), keys_of(factors)
         for key in keys:
             values.insert(key, self._known(key))
-        return (agreement if inside else innovation)(one.factor, values, joint_covariance(self.isam, keys))
+        return (agreement if inside else innovation)(factors, values, joint_covariance(self.isam, keys))
 
 
 def rebuilt(graph: PoseGraph, method: Method) -> tuple[LiveGraph, tuple[Link, ...]]:

@@ -11,6 +11,9 @@ from coloc_graph.online.watch import Precision, precision
 from coloc_graph.run import Recorded, Stance
 from coloc_graph.stance_solver import EnteredStance, StanceSolver, measure_stance
 
+#: What noise alone puts this far off less often contradicts what is known.
+CONTRADICTED = 1e-4
+
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
@@ -86,7 +89,7 @@ class Measuring:
             one = self._solver.enter(self._record, stance, pairs)
         except ColocError as error:
             raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
-        if not one.estimate.refused:
+        if not one.estimate.refused and one.estimate.agreement.chance() > CONTRADICTED:
             return one
         # contradicted: was an anchor pushed on the way to here?
         bumped = [bump for bump in self._solver.estimator.bumps() if bump.stay_put.after == stance.index]
