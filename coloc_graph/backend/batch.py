@@ -23,8 +23,6 @@ from coloc_graph.team import Slip
 LEAST_CHANCE_OF_ALL = 1e-4
 #: A stay-put constraint is loosened by so much to see whether the others contradict it.
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)
-#: A measurement is to blame, and no bump, where noise alone makes it explain so much more less often than this.
-LEAST_CHANCE_OF_EITHER = 1e-3
 MOST_BUMPS = 3
 #: Rounds of refusing the worst and taking back what then agrees.
 ROUNDS = 20
@@ -191,7 +189,7 @@ def _bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
             wrong = min(others, key=lambda index: others[index].log_chance())
             without = fit_graph(method, loose.without([fit.links[wrong]]))
             more = Agreement(max(moved.chi2 - without.chi2, 0.0), max(moved.dof - without.dof, 1))
-            if more.chance(scale) < LEAST_CHANCE_OF_EITHER:
+            if more.chance(scale) < LEAST_CHANCE:
                 break
         loose = freed
         before, after = (moved.values.atPose3(loose.places.key(node)) for node in stay.ends)

@@ -152,7 +152,8 @@ class StanceEstimate:
     """Where the robots of one stance stand: `poses` T_world_body, and `covariances` (6, 6) in GTSAM's tangent.
 
     Robots that nothing ties to the reference are `untied`. `refused` is what was refused in this call, and `agreement`
-    says how all that it took in, together, agrees with what was in before.
+    says how all that it took in, together, agrees with what was in before; `residuals` are of the measurements that
+    came with the stance, in their order: RMS in units of their noise, NaN where an end of it has no pose.
     """
 
     stance: int
@@ -161,6 +162,7 @@ class StanceEstimate:
     untied: tuple[str, ...] = ()
     refused: tuple[Refusal, ...] = ()
     agreement: Agreement = UNCHECKED
+    residuals: tuple[float, ...] = ()
 
 
 def make_estimate(

@@ -129,6 +129,12 @@ class Estimator:
         """Covariance (6, 6) of that pose: GTSAM's tangent, rotation [rad] first, then translation [m], body frame."""
         return self._live.covariance(self._tied_key(robot, stance))
 
+    def residual(self, measurement: Measurement) -> float:
+        """How far a measurement is from where all stand now, RMS in units of its noise; NaN where an end of it has no
+        pose."""
+        i, j = self._keys(measurement)
+        return self._live.residual((measurement, i, j)) if i != j and {i, j} <= self._live.tied else float("nan")
+
     def estimate(self) -> Estimate:
         """All poses at all stances with their covariances, optimised to the end: what the method makes of it in batch.
 
@@ -302,7 +308,8 @@ class Estimator:
         self._refused |= {id(one.measurement): one for one in refused}
         self._newly = (set() if stance is not None else self._newly) | {id(one.measurement) for one in refused}
         self._loose = entering.loose
-        return self._at(next(reversed(self._stances.values())), refused, agreement)
+        said = self._at(next(reversed(self._stances.values())), refused, agreement)
+        return replace(said, residuals=tuple(map(self.residual, taken)))
 
     def _require_anchor(self, stance: Stance, taken: tuple[Measurement, ...]) -> None:
         if not stance.anchors and not any(isinstance(one, Odometry) and one.after == stance.index for one in taken):

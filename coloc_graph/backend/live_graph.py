@@ -10,7 +10,7 @@ from scipy.special import chdtri
 from coloc_graph.backend.calibration import ANCHORED, is_calibration
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.backend.consistency import LEAST_CHANCE, UNCHECKED, Agreement, agreement, innovation, keys_of
-from coloc_graph.backend.entering import Entering
+from coloc_graph.backend.entering import Entering, Tie
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.fit import fit_graph
 from coloc_graph.backend.graph import Link, PoseGraph
@@ -66,6 +66,14 @@ class LiveGraph:
         if key in self._calibrated:
             return np.asarray(self.isam.calculateEstimateVector(key))
         return self.factors_of.nominal(key)
+
+    def residual(self, tie: Tie) -> float:
+        """How far a link between tied keys is from what is known, RMS in units of its noise."""
+        factor = self.factors_of.of_link(*tie)
+        values = gtsam.Values()
+        for key in map(int, factor.keys()):
+            values.insert(key, self._known(key))
+        return float(np.sqrt(2 * factor.error(values) / self.factors_of.rows(tie[0], factor)))
 
     def values(self) -> gtsam.Values:
         """Everything, with all changes carried out."""

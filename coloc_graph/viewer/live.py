@@ -7,18 +7,16 @@ import numpy as np
 
 from coloc_graph.backend import StanceEstimate
 from coloc_graph.frontend import PairMeasurement
-from coloc_graph.lie import se3_inverse, so3_log
 from coloc_graph.measurements import Measurement, RelativePose, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.scene import Array, Scene, layer_of
-from coloc_graph.viewer.sources import NAMES, as_edges, stayed
+from coloc_graph.viewer.sources import as_edges, stayed
 
 #: What the layer is called where the scene it starts from has none.
 LIVE = "live"
-#: What live residuals are of; an estimator that calibrates mounts says no others while it runs.
-OF_PAIR = "of the relative pose, against the poses when it came in"
-OF_STATED_MOUNTS = "of the relative pose by mounts as stated, against the poses when it came in"
+#: What live residuals are of.
+OF_THEN = "of the measurement in the estimate when it came in"
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +86,11 @@ class LiveScene:
             if robot in stance.observers or robot in times:
                 time = times.get(robot, stance.start)
                 self._poses[robot][stance.index] = (time, pose.matrix(), said.covariances[robot])
+        # an estimate of a later stance, which had waited for this one, says nothing of this one's measurements
+        told = said.residuals if said.stance == stance.index else ()
+        residuals = {id(m): off for m, off in zip(one.measurements, told, strict=False)}
         self._found[stance.index] = [
-            (m.stance, m.robot_i, m.robot_j, self._off(m), refused.get(id(m), ""))
+            (m.stance, m.robot_i, m.robot_j, residuals.get(id(m), np.nan), refused.get(id(m), ""))
             for m in one.measurements
             if isinstance(m, RelativePose)
         ] + [
@@ -97,14 +98,6 @@ class LiveScene:
             for h in (pair.homography for pair in one.pairs)
             if h.unusable
         ]
-
-    def _off(self, one: RelativePose) -> float:
-        ends = [self._poses[robot].get(stance) for robot, stance in one.ends]
-        if ends[0] is None or ends[1] is None:
-            return float("nan")
-        off = se3_inverse(one.T_i_j.matrix()) @ se3_inverse(ends[0][1]) @ ends[1][1]
-        xi = np.concatenate([so3_log(off[:3, :3]), off[:3, 3]])
-        return float(np.sqrt(xi @ np.linalg.solve(one.covariance, xi) / 6))
 
     def scene(self) -> Scene:
         """Everything so far."""
@@ -124,6 +117,6 @@ class LiveScene:
             self._start,
             stances=stances,
             layers=(layer_of(self._name, robots, stances, trajectories),) if stances else (),
-            edges=as_edges(found, robots, stances, OF_STATED_MOUNTS if self._name == NAMES["joint"] else OF_PAIR),
+            edges=as_edges(found, robots, stances, OF_THEN),
             stayed=stayed(robots, stances, held),
         )
