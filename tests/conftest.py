@@ -11,7 +11,7 @@ from coloc_graph.run import RunWriter, open_run, read_true_team, read_truth
 from coloc_graph.simulation import simulate
 
 #: What runs in real time, against devices, links and browsers: not beside other tests.
-REALTIME = ("camera", "create", "link", "link_network", "live_world", "online", "viewer_browser", "viewer_export")
+REALTIME = ("camera", "create", "link", "live_world", "online", "viewer_browser", "viewer_export")
 
 
 def pytest_collection_modifyitems(items):

@@ -38,7 +38,7 @@ class Mission:
     def start_coordinator(self, *more: str) -> None:
         command = [sys.executable, "-m", "coloc_graph.cli", "coordinate", str(self.field.team_path)]
         command += ["--out", str(self.folder / "mission"), "--stances", str(self.stances), "--goal", "100,0"]
-        command += ["--speed", "0.45", "--longest", "6", "--listen", self.listen, *more]
+        command += ["--speed", "0.45", "--longest", "4", "--listen", self.listen, *more]
         with (self.folder / "coordinator.log").open("ab") as log:
             self.coordinator = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
 
@@ -68,6 +68,17 @@ class Mission:
         until = time.monotonic() + timeout
         while time.monotonic() < until and not self.fastest() > 0.05:
             time.sleep(0.02)
+
+    def anchor(self, timeout: float = 10.0) -> str:
+        """Of the observers the one that stands while the other leaps."""
+        until = time.monotonic() + timeout
+        while time.monotonic() < until:
+            turning = self.field.tell("speeds")["speeds"]
+            leaping = [name for name in "AB" if max(map(abs, turning[name])) > 0.05]
+            if leaping:
+                return "B" if leaping == ["A"] else "A"
+            time.sleep(0.03)
+        raise AssertionError(f"no observer leaps\n{self.log()}")
 
     def fastest(self) -> float:
         """The fastest wheel of all robots, as it truly turns [m/s]."""

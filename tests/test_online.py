@@ -11,7 +11,7 @@ from coloc_graph.results import assess
 from coloc_graph.run import open_run
 from coloc_graph.simulation.simulated_team import field_team
 
-STANCES = 4
+STANCES = 12
 #: What a wheel may turn on for after what let it go was cut off [s].
 STOP = 0.5
 
@@ -42,6 +42,17 @@ def mission(tmp_path_factory):
         m.coordinator.wait()
         m.time_to_stand("the coordinator is gone")
         m.start_coordinator("--resume")
+        m.wait_for(5, "placing")
+        m.pushed = m.anchor()
+        m.field.tell(f"push {m.pushed} 0.07 -0.05 0.12")
+        in_mid_stance(7)
+        m.field.tell("freeze A")
+        m.wait_for(7, "holding")
+        m.field.tell("thaw A")
+        in_mid_stance(9)
+        m.field.tell("hangup C")
+        m.wait_for(9, "holding")
+        m.field.tell("plug C")
         m.code = m.wait_end(200.0)
         m.field.close()
         yield m
@@ -59,13 +70,17 @@ def test_the_mission_ends_by_itself_with_every_stance_once(mission):
     assert entered == list(range(STANCES))
     assert not run.warnings
     for before, stance in zip(run.stances, run.stances[1:], strict=False):
-        assert stance.anchors and set(stance.anchors) < set(stance.observers) and stance.start > before.end
+        assert set(stance.anchors) < set(stance.observers) and stance.start > before.end
+        assert bool(stance.anchors) == (stance.index != 5)
 
 
 def test_what_happened_is_named(mission):
     assert "C is not there" in reasons(mission, 1)
     assert "not there" in reasons(mission, 2) or "has said nothing" in reasons(mission, 2)
     assert any(row["what"] == "resumed" and row["stances"] == 3 for row in mission.rows)
+    assert f"robot {mission.pushed} was bumped between stances 4 and 5" in reasons(mission, 5)
+    assert "A" in reasons(mission, 7) and "image" in reasons(mission, 7)
+    assert "C" in reasons(mission, 9)
 
 
 def test_wheels_stand_soon_after_they_are_let_go(mission):
