@@ -2,6 +2,7 @@
 
 import time
 
+import gtsam
 import numpy as np
 import pytest
 from online_mission import Mission
@@ -11,7 +12,8 @@ from coloc_graph.results import assess
 from coloc_graph.run import open_run
 from coloc_graph.simulation.simulated_team import field_team
 
-STANCES = 12
+#: How many stances, and before which an anchor is pushed.
+STANCES, PUSHED = 12, 5
 #: What a wheel may turn on for after what let it go was cut off [s].
 STOP = 0.5
 
@@ -42,7 +44,7 @@ def mission(tmp_path_factory):
         m.coordinator.wait()
         m.time_to_stand("the coordinator is gone")
         m.start_coordinator("--resume")
-        m.wait_for(5, "placing")
+        m.wait_for(PUSHED, "placing")
         m.pushed = m.anchor()
         m.field.tell(f"push {m.pushed} 0.07 -0.05 0.12")
         in_mid_stance(7)
@@ -71,14 +73,14 @@ def test_the_mission_ends_by_itself_with_every_stance_once(mission):
     assert not run.warnings
     for before, stance in zip(run.stances, run.stances[1:], strict=False):
         assert set(stance.anchors) < set(stance.observers) and stance.start > before.end
-        assert bool(stance.anchors) == (stance.index != 5)
+        assert bool(stance.anchors) == (stance.index != PUSHED)
 
 
 def test_what_happened_is_named(mission):
     assert "C is not there" in reasons(mission, 1)
     assert "not there" in reasons(mission, 2) or "has said nothing" in reasons(mission, 2)
     assert any(row["what"] == "resumed" and row["stances"] == 3 for row in mission.rows)
-    assert f"robot {mission.pushed} was bumped between stances 4 and 5" in reasons(mission, 5)
+    assert f"robot {mission.pushed} was bumped between stances {PUSHED - 1} and {PUSHED}" in reasons(mission, PUSHED)
     assert "A" in reasons(mission, 7) and "image" in reasons(mission, 7)
     assert "C" in reasons(mission, 9)
 
@@ -108,7 +110,13 @@ def test_the_record_solved_offline_is_what_was_known_online(mission):
         poses = online[one.stance.index]
         assert poses.keys() == one.estimate.poses.keys()
         for robot, pose in one.estimate.poses.items():
-            assert np.abs(pose.matrix() - poses[robot]).max() < 1e-6
+            if one.stance.index < PUSHED:
+                assert np.abs(pose.matrix() - poses[robot]).max() < 1e-6
+                continue
+            # once a stance was taken out, ISAM2 has linearised it elsewhere: far below what is not known
+            off = gtsam.Pose3(np.array(poses[robot])).localCoordinates(pose)[[2, 3, 4]]
+            sigmas = np.sqrt(np.diag(one.estimate.covariances[robot])[[2, 3, 4]])
+            assert (np.abs(off) < 0.5 * sigmas + 1e-6).all()
 
 
 def test_it_is_as_accurate_as_the_same_record_in_batch(mission):

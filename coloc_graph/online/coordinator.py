@@ -124,6 +124,7 @@ class Coordinator:
         self._view: InView | None = None
         self._expected: dict[str, int] = {}
         self._out_since: float | None = None
+        self._set_off = False  # whether the mover has, in the stance that goes on
         self._judged = self._told = 0.0
         self._precision: Precision | None = None
         self._measuring = Measuring(record, self.solver)
@@ -292,6 +293,7 @@ class Coordinator:
         self._stance = Stance(k, now, now, self.observers, (self.mover,), self._anchors())
         self._awaited = self.roster[self.mover].whereabouts.place()
         self._rounds, self._out_since, self._judged, self._precision = 0, None, time.monotonic(), None
+        self._set_off = False
         self._measuring.forget()
         self._capturing += 1
         for name in self.observers:
@@ -303,7 +305,6 @@ class Coordinator:
         assert self._view is not None and self._stance is not None
         missing = self._view.missing()
         if not missing:
-            self._stance = replace(self._stance, start=self.record.rounded(self.roster.utc(time.monotonic_ns())))
             self._orders.drive(self.mover, self._patrol[1:])
             self._enter(Phase.CAPTURING)
         elif self._phase_lasted(LOOK_TIME):
@@ -316,6 +317,13 @@ class Coordinator:
     def _capture(self) -> None:
         assert self._view is not None and self._stance is not None
         now = time.monotonic()
+        if not self._set_off:
+            # a stance begins when its mover sets off: what it is seen to do before counts many times over
+            status = self.roster[self.mover].status
+            self._set_off = status is not None and status.still_since is None
+            if not self._set_off and self._phase_lasted(LOOK_TIME):
+                raise RobotError(f"{self.mover} did not set off: see what holds it")
+            self._stance = replace(self._stance, start=self.record.rounded(self.roster.utc(time.monotonic_ns())))
         missing = self._view.missing()
         if not missing:
             self._out_since = None
