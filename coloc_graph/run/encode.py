@@ -1,5 +1,7 @@
 """Records to bytes, refusing what cannot be read back as it was meant."""
 
+import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import msgspec
@@ -62,8 +64,7 @@ def encode_record(record: Record, image_format: ImageFormat) -> tuple[str, str, 
 def encode_pose(time: float, T_world_body: Array) -> bytes:
     """A foxglove.PoseInFrame in frame `world`."""
     T = np.asarray(T_world_body, float)
-    rigid = T.shape == (4, 4) and np.isfinite(T).all()
-    if not rigid or abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() > 1e-6 or np.linalg.det(T[:3, :3]) < 0:
+    if T.shape != (4, 4) or not _is_rigid(T.tolist()):
         raise RunError(f"the true pose at {time} s is not a finite rigid transform (4, 4); give T_world_body")
     w, x, y, z = quaternion(T[:3, :3])
     message = schemas.protobuf_type(schemas.POSE_IN_FRAME)(frame_id="world")
@@ -73,6 +74,21 @@ def encode_pose(time: float, T_world_body: Array) -> bytes:
     pose.orientation.x, pose.orientation.y, pose.orientation.z = x, y, z
     pose.orientation.w = w
     return bytes(message.SerializeToString(deterministic=True))
+
+
+def _is_rigid(T: list[list[float]]) -> bool:
+    """Whether the rows of a transform are finite, and the first three of its columns those of a rotation."""
+    if not all(math.isfinite(value) for row in T for value in row):
+        return False
+    a, b, c = zip(*(row[:3] for row in T[:3]), strict=True)
+    cross = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    # two unit vectors at right angles, and the third what they make
+    off = (_dot(a, a) - 1, _dot(b, b) - 1, _dot(a, b))
+    return all(abs(one) <= 1e-6 for one in (*off, *(u - v for u, v in zip(cross, c, strict=True))))
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _robot(record: Detections | Image | OdometrySample | Motion, kind: str) -> str:
