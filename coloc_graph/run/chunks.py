@@ -2,7 +2,7 @@
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -69,14 +69,15 @@ def damaged(path: Path, offset: int, what: str) -> RunError:
 def records(path: Path, data: bytes, offset: int) -> Iterator[tuple[int, memoryview]]:
     """(opcode, body) of the records in `data`, which is at (or, compressed, in the chunk at) `offset`."""
     view = memoryview(data)
-    at = 0
-    while at < len(view):
-        opcode, length = HEAD.unpack_from(view, at) if at + HEAD.size <= len(view) else (0, 0)
+    at, end = 0, len(view)
+    while at < end:
+        opcode, length = HEAD.unpack_from(view, at) if at + HEAD.size <= end else (0, 0)
         at += HEAD.size
-        if not opcode or at + length > len(view):
+        until = at + length
+        if not opcode or until > end:
             raise damaged(path, offset, "what is in it is not a row of records")
-        yield opcode, view[at : at + length]
-        at += length
+        yield opcode, view[at:until]
+        at = until
 
 
 def stream(body: memoryview) -> ReadDataStream:
@@ -125,17 +126,21 @@ def _decompress(name: bytes, data: bytes, size: int) -> bytes:
     return data
 
 
-def messages(path: Path, file: BinaryIO, chunk: ChunkInfo) -> Iterator[Message]:
-    """The messages in a chunk, in the order in which they were written."""
+def messages(
+    path: Path, file: BinaryIO, chunk: ChunkInfo, channels: Collection[int] | None = None
+) -> Iterator[Message]:
+    """The messages of some channels (None: of all) in a chunk, in the order of writing; all are checked."""
+    start, end = chunk.start, chunk.end
     for opcode, body in records(path, decompressed(path, file, chunk), chunk.offset):
         if opcode != Opcode.MESSAGE:
             continue
         if len(body) < _MESSAGE.size:
             raise damaged(path, chunk.offset, "a message without a head")
         channel, _, ns, _ = _MESSAGE.unpack_from(body)
-        if not chunk.start <= ns <= chunk.end:
+        if not start <= ns <= end:
             raise damaged(path, chunk.offset, "a message outside of its chunk's time")
-        yield Message(channel, ns, body[_MESSAGE.size :])
+        if channels is None or channel in channels:
+            yield Message(channel, ns, body[_MESSAGE.size :])
 
 
 def learn(path: Path, file: BinaryIO, chunk: ChunkInfo, known: Definitions) -> None:

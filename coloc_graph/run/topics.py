@@ -48,10 +48,9 @@ def _messages(index: Index, topic: str, channels: Collection[int], chunks: Itera
         with index.path.open("rb") as file:
             for chunk in chunks:
                 count = 0
-                for message in messages(index.path, file, chunk):
-                    if message.channel in channels:
-                        count += 1
-                        yield message
+                for message in messages(index.path, file, chunk, channels):
+                    count += 1
+                    yield message
                 if count != sum(chunk.counts.get(channel, 0) for channel in channels):
                     raise damaged(index.path, chunk.offset, f"not as many messages of {topic} as its index says")
     except OSError as error:
