@@ -9,6 +9,9 @@ from coloc_graph.viewer.scene import Layer, Scene
 
 Array = NDArray[np.float64]
 
+#: So far before an observer is what it watches [m].
+AHEAD = 1.5
+
 
 def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
     """x, y, z [m] and heading [rad] of a robot, (n, 4), at ascending times (n,); NaN where it has no pose at all.
@@ -48,7 +51,8 @@ def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
 
 
 def extent(scene: Scene, samples: int = 400) -> tuple[Array, Array]:
-    """Least and greatest x, y [m] of all poses and of the ways between them; as `Scene.bounds` without any."""
+    """Least and greatest x, y [m] of all poses, of the ways between them, and of what the last observers have before
+    them; as `Scene.bounds` without any."""
     low, high = scene.bounds
     if not scene.layers or not len(scene):
         return low, high
@@ -57,6 +61,12 @@ def extent(scene: Scene, samples: int = 400) -> tuple[Array, Array]:
         way = pose_at(scene, scene.layers[0], number, times)[:, :2]
         if np.isfinite(way).all():
             low, high = np.minimum(low, way.min(axis=0)), np.maximum(high, way.max(axis=0))
+    layer = scene.layers[0]
+    for number in map(scene.robots.index, scene.stances[-1].observers):
+        x, y, _ = layer.xyz[number, -1]
+        before = np.array([x + AHEAD * np.cos(layer.yaw[number, -1]), y + AHEAD * np.sin(layer.yaw[number, -1])])
+        if np.isfinite(before).all():
+            low, high = np.minimum(low, before), np.maximum(high, before)
     return low, high
 
 
