@@ -45,6 +45,7 @@ bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/link.py
 	$(BIN)/python benchmarks/online.py
 	$(BIN)/python benchmarks/bumps.py
+	$(BIN)/python benchmarks/many_runs.py
 	$(BIN)/python benchmarks/backend.py $(if $(GRAPHS),--data $(GRAPHS))
 ifneq ($(DATA),)
 	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)

@@ -29,12 +29,12 @@ from coloc_graph.evaluation import Accuracy, align, evaluate
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import write_g2o
 from coloc_graph.exchange.tum import read_tum, write_tum
-from coloc_graph.pipeline import Solution
+from coloc_graph.pipeline import Solution, SolveOptions
 from coloc_graph.run import read_truth, run_id
 from coloc_graph.team import without_none, write_team
 from coloc_graph.trajectory import Trajectory
 
-SUMMARY = "summary.json"
+SUMMARY, CONFIG = "summary.json", "config.toml"
 MEASUREMENT_COLUMNS = (
     *(
         "stance",
@@ -107,7 +107,7 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
         (part / "measurements.csv").write_text(_measurements(solution), encoding="utf-8")
         if solution.estimate.calibration.rows:
             write_team(solution.estimate.calibration.of_team(solution.run.team), part / "team.toml")
-        (part / "config.toml").write_text(tomli_w.dumps(_config(solution)), encoding="utf-8")
+        (part / CONFIG).write_text(tomli_w.dumps(_config(solution)), encoding="utf-8")
         (part / "report.html").write_text(render_report(solution, accuracy, true), encoding="utf-8")
         run_path = os.path.relpath(solution.run.path.absolute(), out.absolute())
         summary = summarise(solution, accuracy) | {"run": run_path, "run_id": run_id(solution.run.path)}
@@ -215,9 +215,14 @@ def _cell(value: float) -> str:
 def _config(solution: Solution) -> dict[str, Any]:
     return {
         "version": __version__,
-        "options": dataclasses.asdict(solution.options),
+        "options": options_of(solution.options),
         "team": without_none(msgspec.to_builtins(solution.run.team)),
     }
+
+
+def options_of(options: SolveOptions) -> dict[str, Any]:
+    """Options as they are in config.toml."""
+    return dataclasses.asdict(options)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,10 @@
-"""coloc solve RUN --out DIR."""
+"""coloc solve RUN|FOLDER --out DIR."""
 
 import argparse
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coloc_graph.cli.printing import counted, print_json, progress, warn
@@ -16,9 +17,9 @@ if TYPE_CHECKING:
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """The command's arguments."""
-    command = commands.add_parser("solve", help="estimate the poses of a run")
-    command.add_argument("run_path", metavar="RUN", help="the run (.mcap)")
-    command.add_argument("--out", required=True, metavar="DIR", help="folder for the result")
+    command = commands.add_parser("solve", help="estimate the poses of a run, or of each run in a folder")
+    command.add_argument("run_path", metavar="RUN|FOLDER", help="the run (.mcap), or a folder of runs")
+    command.add_argument("--out", required=True, metavar="DIR", help="folder for the result, or for one of each run")
     command.add_argument(
         "--method",
         choices=("chain", "smooth", "joint"),
@@ -38,6 +39,8 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--port", type=int, default=8080, help="of --view (8080)")
     command.add_argument("--no-browser", action="store_true", help="with --view, do not open a browser")
     command.add_argument("--without-odometry", action="store_true", help="leave out what the wheels say")
+    command.add_argument("--processes", type=int, metavar="N", help="of a folder, so many at a time (one a core)")
+    command.add_argument("--cluster", metavar="ADDRESS", help="of a folder, by the Dask scheduler at tcp://HOST:PORT")
     command.add_argument("--json", action="store_true", help="print the summary as JSON")
     command.set_defaults(run=run)
 
@@ -46,21 +49,27 @@ def run(args: argparse.Namespace) -> int:
     """Solve, write, print; with --view, show."""
     from dataclasses import replace
 
+    from coloc_graph.cli.solve_many import solve_folder
     from coloc_graph.cli.view import announce, show
+    from coloc_graph.errors import InputError
     from coloc_graph.pipeline import SolveOptions
     from coloc_graph.results import require_place
     from coloc_graph.run import open_run
 
-    require_place(args.out)  # before the work, not after it
-    if args.view:
-        from coloc_graph.viewer.server import require_free
-
-        require_free("127.0.0.1", args.port)
     options = SolveOptions(
         method=args.method, odometry=not args.without_odometry, incremental=args.incremental
     ).resolved()
     assert options.frontend is not None
     options = replace(options, frontend=replace(options.frontend, scale=args.scale))
+    if Path(args.run_path).is_dir():
+        return solve_folder(args, options)
+    if args.processes is not None or args.cluster is not None:
+        raise InputError(f"{args.run_path} is not a folder of runs; --processes and --cluster are for one")
+    require_place(args.out)  # before the work, not after it
+    if args.view:
+        from coloc_graph.viewer.server import require_free
+
+        require_free("127.0.0.1", args.port)
     with _earlier_result_named(args.out):
         logged = open_run(args.run_path)
     if not args.view:

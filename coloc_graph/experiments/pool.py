@@ -1,15 +1,11 @@
 """Work spread over processes, in order; and the checks that all experiments share."""
 
-import signal
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from typing import TypeVar, get_args
-
-import cv2
 
 from coloc_graph.errors import InputError
 from coloc_graph.simulation.world import Depth
+from coloc_graph.workers import workers
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -37,18 +33,10 @@ def spread(
         for item in items:
             take(work(item))
         return results
-    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_begin)
-    try:
-        for future in [pool.submit(work, item) for item in items]:
+    with workers(processes) as executor:
+        for future in [executor.submit(work, item) for item in items]:
             take(future.result())
-    finally:
-        pool.shutdown(cancel_futures=True)
     return results
-
-
-def _begin() -> None:
-    cv2.setNumThreads(1)  # the processes are what is parallel
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker without a traceback of its own
 
 
 def check(depth: str, seed: int, runs: int, processes: int) -> None:
