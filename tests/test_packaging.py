@@ -22,14 +22,14 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 #: The layers from the bottom: a part imports itself and what is in the rows above it, never beside or below it.
 LAYERS = [
     {"_version", "errors", "lie", "trajectory", "measurements"},
-    {"team"},
+    {"team", "workers"},
     {"run", "common_view"},
     {"frontend", "backend", "robot_io", "evaluation"},
     {"simulation", "stance_solver"},
     {"exchange", "pipeline", "inspection"},
     {"report", "online"},
     {"results"},
-    {"experiments", "viewer"},
+    {"experiments", "viewer", "many_runs"},
     {"cli"},
 ]
 RANK = {part: rank for rank, parts in enumerate(LAYERS) for part in parts}

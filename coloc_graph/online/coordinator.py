@@ -340,7 +340,7 @@ class Coordinator:
         found = self._measuring.judged()
         if found is not None:
             self._precision = found
-            if self._enough(found):
+            if found.suffices(self.options):
                 self._end_capture("it is enough")
                 return
         if not self._measuring.judging and now - self._judged > JUDGED:
@@ -353,13 +353,6 @@ class Coordinator:
             self._orders.drive(self.mover, order)
         if self.roster.utc(time.monotonic_ns()) - self._stance.start > self.options.longest:
             self._end_capture(f"{self.options.longest:g} s are over")
-
-    def _enough(self, found: Precision) -> bool:
-        return (
-            found.points >= self.options.least_points
-            and found.place <= self.options.place_sigma
-            and found.heading <= math.radians(self.options.heading_sigma_deg)
-        )
 
     def _end_capture(self, why: str) -> None:
         self._orders.ask(self.mover, Halt())

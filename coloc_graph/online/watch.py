@@ -15,6 +15,7 @@ from coloc_graph.common_view import View
 from coloc_graph.frontend import FrontendOptions, StanceTracks, measure_pair
 from coloc_graph.lie import floor_pose
 from coloc_graph.online.formation import Planar
+from coloc_graph.online.mission import MissionOptions
 from coloc_graph.online.whereabouts import compose, inverse
 from coloc_graph.run import Detections, Image, OdometrySample, Planes, Recorded, Stance
 from coloc_graph.team import Team
@@ -142,6 +143,14 @@ class Precision:
     place: float
     heading: float
     why: str = ""
+
+    def suffices(self, options: MissionOptions) -> bool:
+        """Whether a mission asks for no more."""
+        return (
+            self.points >= options.least_points
+            and self.place <= options.place_sigma
+            and self.heading <= math.radians(options.heading_sigma_deg)
+        )
 
 
 @dataclass(frozen=True, eq=False)
