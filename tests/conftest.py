@@ -14,6 +14,11 @@ from coloc_graph.simulation import simulate
 REALTIME = ("camera", "create", "link", "live_world", "online", "viewer_browser", "viewer_export")
 
 
+def pytest_addoption(parser):
+    """The whole of what takes too long for every time."""
+    parser.addoption("--whole", action="store_true", help="a mission of 12 stances to which all happens: four minutes")
+
+
 def pytest_collection_modifyitems(items):
     """Mark the tests that run in real time."""
     for item in items:

@@ -38,7 +38,7 @@ class Mission:
     def start_coordinator(self, *more: str) -> None:
         command = [sys.executable, "-m", "coloc_graph.cli", "coordinate", str(self.field.team_path)]
         command += ["--out", str(self.folder / "mission"), "--stances", str(self.stances), "--goal", "100,0"]
-        command += ["--speed", "0.45", "--longest", "5", "--listen", self.listen, *more]
+        command += ["--speed", "0.45", "--longest", "6", "--listen", self.listen, *more]
         with (self.folder / "coordinator.log").open("ab") as log:
             self.coordinator = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
 
