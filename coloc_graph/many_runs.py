@@ -43,8 +43,19 @@ def runs_in(folder: str | Path) -> list[Path]:
 
 
 def places_of(runs: Sequence[Path], folder: str | Path, out: str | Path) -> list[Path]:
-    """Where the result of each run in a folder goes: as it is called there, without its ending."""
-    return [Path(out) / path.relative_to(folder).with_suffix("") for path in runs]
+    """Where the result of each run in a folder goes: as it is called there, without its ending.
+
+    `InputError` where one result would lie in another, which is replaced as a whole when its run is solved again.
+    """
+    places = [Path(out) / path.relative_to(folder).with_suffix("") for path in runs]
+    run_at = dict(zip(places, runs, strict=True))
+    for run, place in zip(runs, places, strict=True):
+        for above in place.parents:
+            if above in run_at:
+                raise InputError(
+                    f"{run}: its result would lie in that of {run_at[above]}; give the run or its folder another name"
+                )
+    return places
 
 
 def solve_runs(
@@ -97,7 +108,8 @@ def solve_one(run: Path, out: Path, options: SolveOptions) -> Outcome:
         write_result(solve(open_run(run), options), out)
         return Outcome(run, out, _summary(out))
     except ColocError as error:
-        return Outcome(run, out, {}, failed=str(error))
+        earlier = f"; {out} still holds an earlier result" if holds_result(out) else ""
+        return Outcome(run, out, {}, failed=f"{error}{earlier}")
     except OSError as error:
         return Outcome(run, out, {}, failed=f"the system says: {error.strerror} {error.filename or ''}".strip())
     except Exception as error:

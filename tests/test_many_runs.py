@@ -112,6 +112,21 @@ def test_what_a_folder_cannot_have_is_one_sentence(folder, tmp_path, capsys, mon
     assert words in capsys.readouterr().err
 
 
+def test_no_result_lies_in_another(folder, tmp_path, capsys):
+    (folder / "a").mkdir()
+    shutil.copy(folder / "a.mcap", folder / "a" / "c.mcap")
+    assert main(["solve", str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert "its result would lie in that of" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_run_that_has_become_bad_leaves_its_earlier_result_and_says_so(folder, tmp_path):
+    out, one = tmp_path / "out", partial(workers, 1)
+    solved(folder, out, one)
+    (folder / "a.mcap").write_bytes((folder / "bad.mcap").read_bytes())
+    again = solved(folder, out, one)["a"]
+    assert "still holds an earlier result" in again.failed and (out / "a" / "summary.json").is_file()
+
+
 def test_an_empty_folder_and_processes_for_one_run_are_one_sentence(tmp_path, short, capsys):
     with pytest.raises(InputError, match=r"holds no run \(.mcap\)"):
         runs_in(tmp_path)

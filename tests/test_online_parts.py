@@ -232,7 +232,11 @@ def test_a_robot_that_was_carried_is_no_anchor_in_the_record_either():
     assert resumed.moved_since(1.0) and not resumed.moved_since(3.0)
 
 
-@pytest.mark.parametrize("push", [(0.03, -0.02, 0.05), (0.1, 0.06, 0.25), (0.1, 0.1, 0.035)])
+#: A push that contradicts no single measurement, but all of its stance together.
+SMALL = (0.0, 0.0, -0.05)
+
+
+@pytest.mark.parametrize("push", [(0.03, -0.02, 0.05), (0.1, 0.06, 0.25), (0.1, 0.1, 0.035), SMALL])
 def test_an_anchor_that_was_pushed_is_named_and_its_stance_comes_again(tmp_path, hallway, copied, push):
     run = open_run(hallway)
     before, stance = run.stances[4:6]
