@@ -42,7 +42,7 @@ from coloc_graph.viewer import (
 from coloc_graph.viewer.frame import MOVING, ViewState, dashed, frame_of, pick, thinned_rows
 from coloc_graph.viewer.handles import seen_size
 from coloc_graph.viewer.live import LiveScene
-from coloc_graph.viewer.motion import pose_at
+from coloc_graph.viewer.motion import extent, pose_at
 from coloc_graph.viewer.panel import HANDS_OFF, set_value
 from coloc_graph.viewer.plots import error_curves, residual_curves, with_cursor
 from coloc_graph.viewer.prepared import ellipse_axes
@@ -682,3 +682,12 @@ def test_the_cursor_is_a_line_at_the_slider():
     x, curve, spike = with_cursor(np.arange(5.0), np.array([1.0, 2, 3, 4, 5]), 2.0)
     assert (np.diff(x) >= 0).all() and np.isfinite(curve).all() and spike.max() == 5 and x[spike.argmax()] == 2
     assert np.isclose(curve[spike.argmax()], 3)
+
+
+def test_the_camera_frames_what_the_last_observers_watch():
+    stance = Stance(0, 0.0, 5.0, ("A", "B"), (), ())
+    paths = {name: Trajectory(name, np.zeros(1), floor_pose(0.0, y, 0.0)[None], np.zeros(1, int), np.eye(6)[None] * 1e-6)
+             for name, y in (("A", 0.0), ("B", 0.6))}  # fmt: skip
+    layer = layer_of("joint", ("A", "B"), (stance,), paths)
+    low, high = extent(Scene(("A", "B"), (stance,), (layer,)))
+    assert high[0] > 1.0 and (low <= 0.0).all() and high[1] >= 0.6
