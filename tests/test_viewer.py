@@ -686,7 +686,7 @@ def test_the_cursor_is_a_line_at_the_slider():
 
 def test_the_camera_frames_what_the_last_observers_watch():
     stance = Stance(0, 0.0, 5.0, ("A", "B"), (), ())
-    paths = {name: Trajectory(name, np.zeros(1), floor_pose(0.0, y, 0.0)[None], np.zeros(1, int), np.eye(6)[None] * 1e-6)
+    paths = {name: Trajectory(name, np.zeros(1), floor_pose(0.0, y, 0.0)[None], np.zeros(1, int), np.eye(6)[None])
              for name, y in (("A", 0.0), ("B", 0.6))}  # fmt: skip
     layer = layer_of("joint", ("A", "B"), (stance,), paths)
     low, high = extent(Scene(("A", "B"), (stance,), (layer,)))
