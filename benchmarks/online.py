@@ -8,11 +8,14 @@ time: about ten seconds a stance.
 
 import argparse
 import json
+import os
 import statistics
 import tempfile
 import threading
 import time
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `coloc` does, before numpy is there
 
 import numpy as np
 

@@ -140,6 +140,22 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
                     break
         return np.where((moved < 1e-9)[:, None], np.stack([x, y], axis=1), np.nan)
 
+    def per_pixel(self, x: ArrayLike) -> Array:
+        """How far one pixel to the right, and one down, go at normalised coordinates x (n, 2): (n, 2, 2)."""
+        at = np.asarray(x, float)
+        seen_by_x = np.broadcast_to(np.eye(2), (len(at), 2, 2))
+        if self.distortion:
+            step = 1e-6
+            sides = [
+                np.stack(self._distort(*(at + off).T), -1) - np.stack(self._distort(*(at - off).T), -1)
+                for off in ((step, 0.0), (0.0, step))
+            ]
+            seen_by_x = np.stack(sides, axis=-1) / (2 * step)
+        (a, b), (c, d) = np.moveaxis(seen_by_x, 0, -1)
+        with np.errstate(all="ignore"):
+            inverse = np.array([[d / self.fx, -b / self.fy], [-c / self.fx, a / self.fy]]) / (a * d - b * c)
+        return np.moveaxis(inverse, -1, 0)
+
 
 class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How the camera sits on the body: `T_body_camera`, with tolerances.

@@ -50,6 +50,8 @@ def parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    # our matrices are small: threads of BLAS would only wait for each other, and take the cores from those who work
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     args = parser().parse_args(arguments)
     try:
         code = int(args.run(args))

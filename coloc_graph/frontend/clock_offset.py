@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.stats import chi2 as chi2_distribution
 
 from coloc_graph.errors import DegenerateGeometry
@@ -191,13 +191,13 @@ class PairedTracks:
         self._samples = Samples([s[0] for s in seen_j], [s[1] for s in seen_j], [s[2] for s in seen_j])
         self._uv_j = np.concatenate([s[3] for s in seen_j])
         sizes = [len(seen_i[a][0]) for a, _ in chosen]
-        self._track = np.repeat(np.array([of_j.index(b) for _, b in chosen], np.int64), sizes)
-        self._markers = np.repeat(np.array([a for a, _ in chosen], np.int64), sizes)
-        self.times, self.x_i, self.covariance_i, self._uv_i = (
-            np.concatenate([seen_i[a][part] for a, _ in chosen]) for part in range(4)
-        )
-        n, C = len(self._samples), self._samples.covariance
-        self._noise = sparse.bsr_array((C, np.arange(n), np.arange(n + 1)), shape=(2 * n, 2 * n))
+        track = np.repeat(np.array([of_j.index(b) for _, b in chosen], np.int64), sizes)
+        markers = np.repeat(np.array([a for a, _ in chosen], np.int64), sizes)
+        times, x_i, covariance_i, uv_i = (np.concatenate([seen_i[a][part] for a, _ in chosen]) for part in range(4))
+        # in camera j's order, so that points that share its samples are neighbours
+        order = np.lexsort((times, track))
+        self._track, self._markers, self.times = track[order], markers[order], times[order]
+        self.x_i, self.covariance_i, self._uv_i = x_i[order], covariance_i[order], uv_i[order]
 
     def __len__(self) -> int:
         return len(self.times)
@@ -220,10 +220,26 @@ class PairedTracks:
         pairs = self.pairs(at, which)
         return Correspondences(self._uv_i[which], uv_j, self.times[which], self._markers[which], pairs)
 
-    def noise_j(self, at: _At, which: NDArray[np.int64]) -> sparse.csc_array:
-        """Covariance (2k, 2k) of camera j's points `which`, which share samples."""
-        wide = sparse.kron(at.interpolated.position[which], sparse.eye_array(2), format="csr")
-        return sparse.csc_array(wide @ self._noise @ wide.T)
+    def noise_j(self, at: _At, which: NDArray[np.int64]) -> Array:
+        """Covariance of camera j's points `which` (k,), which share samples: the lower band (width, 2k), as LAPACK has
+        it."""
+        columns, weights = _padded(at.interpolated.position[which])
+        C, k = self._samples.covariance[columns], len(which)
+        blocks = []
+        for apart in range(k):
+            same = columns[apart:, :, None] == columns[: k - apart, None, :]
+            if not same.any():
+                break
+            alike = (same * weights[: k - apart, None, :]).sum(axis=2) * weights[apart:]
+            blocks.append((alike[:, :, None, None] * C[apart:]).sum(axis=1))
+        band = np.zeros((2 * len(blocks), 2 * k))
+        for apart, M in enumerate(blocks):
+            there = 2 * len(M)
+            band[2 * apart, :there] = M[:, [0, 1], [0, 1]].ravel()
+            band[2 * apart + 1, :there:2] = M[:, 1, 0]
+            if apart:
+                band[2 * apart - 1, 1:there:2] = M[:, 0, 1]
+        return band
 
     def speed(self, at: _At, which: NDArray[np.int64]) -> Array:
         """The exact derivative (k, 2) of points by the offset, with all its noise [1/s]."""
@@ -242,6 +258,14 @@ class PairedTracks:
             for matrix in (at.interpolated.position, at.interpolated.derivative, at.interpolated.slope)
         )
         return position, derivative, slope
+
+
+def _padded(rows: sparse.csr_array) -> tuple[NDArray[np.int64], Array]:
+    """Columns and values (k, w) of rows with up to w entries; where a row has fewer, a column again, with 0."""
+    first, count = rows.indptr[:-1, None], np.diff(rows.indptr)[:, None]
+    n = np.arange(int(count.max(initial=1)))
+    at = first + np.minimum(n, np.maximum(count - 1, 0))
+    return rows.indices[at].astype(np.int64), np.where(n < count, rows.data[at], 0.0)
 
 
 def _finite(track: Track, camera: Camera) -> tuple[Array, Array, Array, Array]:
@@ -278,24 +302,28 @@ class _System:
         p, self._by_z, self.A = _parts(H, self._z)
         self._r_i, self._C_i = tracks.x_i[which] - self._z, tracks.covariance_i[which]
         self.residual = (at.x[which] - p - (self._by_z @ self._r_i[..., None])[..., 0]).ravel()
-        k = len(which)
         from_i = self._by_z @ self._C_i @ self._by_z.swapaxes(1, 2)
-        own = sparse.bsr_array((from_i, np.arange(k), np.arange(k + 1)), shape=(2 * k, 2 * k))
-        self._factor = splu((tracks.noise_j(at, which) + own).tocsc(), permc_spec="MMD_AT_PLUS_A")
+        band = tracks.noise_j(at, which)
+        band[0] += from_i[:, [0, 1], [0, 1]].ravel()
+        band[1, ::2] += from_i[:, 1, 0]
+        self._factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
         self.slope = at.slope[which]
-        flat = self.A.reshape(2 * k, 8)
-        self._weighted = self._factor.solve(np.column_stack([flat, self.residual, self.slope.ravel()]))
+        flat = self.A.reshape(-1, 8)
+        self._weighted = self._solve(np.column_stack([flat, self.residual, self.slope.ravel()]))
         self.by_H = flat.T @ self._weighted[:, :8]
         self.score_H = flat.T @ self._weighted[:, 8]
         self.by_H_offset = flat.T @ self._weighted[:, 9]
         self.chi2 = float(self.residual @ self._weighted[:, 8])
+
+    def _solve(self, right: Array) -> Array:
+        return np.asarray(cho_solve_banded((self._factor, True), right, check_finite=False))
 
     def moved(self, step: Array, offset: float = 0.0, speed: Array | None = None) -> Array:
         """The points' places z (k, 2) once H and the offset have taken a step."""
         left = self.residual - self.A.reshape(-1, 8) @ step
         if speed is not None:
             left = left + offset * speed.ravel()
-        back = self._by_z.swapaxes(1, 2) @ self._factor.solve(left).reshape(-1, 2, 1)
+        back = self._by_z.swapaxes(1, 2) @ self._solve(left).reshape(-1, 2, 1)
         return np.asarray(self._z + self._r_i + (self._C_i @ back)[..., 0])
 
     def offset_equation(self, speed: Array, drawn: tuple[Array, Array, Array]) -> tuple[float, float, float, float]:
@@ -306,7 +334,7 @@ class _System:
         gain = np.linalg.solve(self.by_H, self.by_H_offset)
         across = self._weighted[:, 9] - self._weighted[:, :8] @ gain
         position, derivative, slope = drawn
-        weighted = self._factor.solve(slope)
+        weighted = self._solve(slope)
         projected = weighted - self._weighted[:, :8] @ np.linalg.solve(self.by_H, flat.T @ weighted)
         made = (projected * derivative).sum(axis=0)
         information = float(across @ speed.ravel() - made.mean())

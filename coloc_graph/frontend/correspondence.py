@@ -211,15 +211,9 @@ class _Candidates:
 
 def normalised(track: Track, camera: Camera) -> tuple[Array, Array]:
     """A track in normalised coordinates (n, 2), with covariances (n, 2, 2)."""
-    J = per_pixel(track.uv, camera)
-    return camera.normalise(track.uv), J @ track.covariance @ J.swapaxes(1, 2)
-
-
-def per_pixel(uv: Array, camera: Camera) -> Array:
-    """The lens's scale at pixels (n, 2): how far one pixel to the right, and one down, go, (n, 2, 2)."""
-    step = 0.5
-    sides = [camera.normalise(uv + off) - camera.normalise(uv - off) for off in ((step, 0.0), (0.0, step))]
-    return np.stack(sides, axis=-1) / (2 * step)
+    x = camera.normalise(track.uv)
+    J = camera.per_pixel(x)
+    return x, J @ track.covariance @ J.swapaxes(1, 2)
 
 
 def _speed(times: Array, x: Array) -> Array:

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.frontend.correspondence import pair_by_time, per_pixel
+from coloc_graph.frontend.correspondence import pair_by_time
 from coloc_graph.frontend.relative_pose import mounted, turned_normal
 from coloc_graph.frontend.tracking import Track
 from coloc_graph.frontend.wheels import WheelTrack
@@ -60,7 +60,8 @@ def sight(
     pose, covariance = _pose(observer, markers, plane, uv[best], noise)
     T_observer_seen = gtsam.Pose3(floor_pose(pose[1], pose[2], pose[0]))
     bias = observer.camera.bias_px**2 * np.eye(2)
-    J = per_pixel(uv[best], observer.camera)
+    x = observer.camera.normalise(uv[best])
+    J = observer.camera.per_pixel(x)
     return Sighting(
         stance=stance.index,
         observer=observer.name,
@@ -68,7 +69,7 @@ def sight(
         time=float(times[best]),
         T_observer_seen=T_observer_seen,
         covariance=covariance,
-        x_markers=observer.camera.normalise(uv[best]),
+        x_markers=x,
         x_covariance=J @ (noise + bias) @ J.mT,
     )
 

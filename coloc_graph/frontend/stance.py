@@ -20,7 +20,6 @@ from coloc_graph.frontend.correspondence import (
     Correspondences,
     correspond,
     correspond_roughly,
-    per_pixel,
     span_samples,
 )
 from coloc_graph.frontend.fit_checks import require_agreement, require_determined
@@ -198,7 +197,7 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
     if not (seen.plane.normal_from_mount and seen.plane.d_from_mount):
         return ()
     robot, movers = seen.run.team[seen.robot_i], seen.stance.movers
-    bias = _bias_root(found.uv_i, robot.camera)
+    bias = _bias_root(found.uv_i, found.pairs.x_i, robot.camera)
     bias = bias if robot.camera.bias_px > 0 else bias[..., :0]
     named = {track.marker: number for number, track in enumerate(seen.tracks_i) if track.marker}
     made = []
@@ -267,8 +266,9 @@ def _measurement(
     camera_i: Camera,
     camera_j: Camera,
 ) -> HomographyMeasurement:
-    roots = _bias_root(found.uv_i, camera_i), _bias_root(found.uv_j, camera_j)
-    shared = shared_error(fit, found.pairs, found.markers, roots)
+    pairs = found.pairs
+    roots = _bias_root(found.uv_i, pairs.x_i, camera_i), _bias_root(found.uv_j, pairs.x_j, camera_j)
+    shared = shared_error(fit, pairs, found.markers, roots)
     information = np.linalg.inv(np.linalg.inv(fit.information) + shared)
     return HomographyMeasurement(
         stance=stance.index,
@@ -284,13 +284,14 @@ def _measurement(
     )
 
 
-def _bias_root(uv: Array, camera: Camera) -> Array:
-    """Square root (n, 2, 6) of the covariance of a camera's bias: an error that is smooth over the image.
+def _bias_root(uv: Array, x: Array, camera: Camera) -> Array:
+    """Square root (n, 2, 6) of the covariance of a camera's bias at points, in pixels and normalised (n, 2): an error
+    that is smooth over the image.
 
     It has a part that is the same everywhere and one that grows across the points, each `bias_px` large.
     """
     across = (uv - uv.mean(axis=0)) / np.maximum(uv.std(axis=0), 1.0)
-    root = camera.bias_px * per_pixel(uv, camera)
+    root = camera.bias_px * camera.per_pixel(x)
     return np.concatenate([root, across[:, :1, None] * root, across[:, 1:, None] * root], axis=2)
 
 

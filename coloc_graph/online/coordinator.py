@@ -37,8 +37,8 @@ from coloc_graph.team import Team
 
 log = logging.getLogger(__name__)
 
-#: How often is looked what is to be done, and how often a stance's precision [s].
-TICK, JUDGED = 0.03, 0.7
+#: How often is looked what is to be done, while all wait for the estimate too, and how often a stance's precision [s].
+TICK, SOON, JUDGED = 0.03, 0.004, 0.7
 #: Before a stance begins, all have stood for this long [s]; it ends so much after what was seen last in it.
 SETTLED, MARGIN = 0.25, 0.02
 #: How long things may take at most [s]: a drive, to find the mover, to get the last images, to be mended.
@@ -187,7 +187,7 @@ class Coordinator:
     def _listen(self) -> None:
         """Take in all that came, or wait a little for something."""
         self._orders.at_work()
-        until = time.monotonic() + TICK
+        until = time.monotonic() + (SOON if self.phases.now in (Phase.COLLECTING, Phase.ESTIMATING) else TICK)
         while True:
             try:
                 name, one = self._inbox.get(timeout=max(until - time.monotonic(), 0.001))
