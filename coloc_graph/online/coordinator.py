@@ -355,8 +355,9 @@ class Coordinator:
             self._end_capture(f"{self.options.longest:g} s are over")
 
     def _end_capture(self, why: str) -> None:
-        self._orders.ask(self.mover, Halt())
-        self._expected = {name: int(self._orders.ask(name, EndCapture()) or 0) for name in self.observers}
+        orders = {self.mover: Halt(), **dict.fromkeys(self.observers, EndCapture())}
+        said = self._orders.ask_each(orders)
+        self._expected = {name: int(said[name] or 0) for name in self.observers}
         self._enter(Phase.COLLECTING, why)
 
     def _collect(self) -> None:

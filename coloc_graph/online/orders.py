@@ -3,7 +3,8 @@
 import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 from coloc_graph.errors import RobotError
 from coloc_graph.online.roster import Roster
@@ -49,6 +50,11 @@ class Orders:
         if not reply.ok:
             raise RobotError(f"{name} refuses: {reply.text}")
         return reply.text
+
+    def ask_each(self, orders: Mapping[str, Body]) -> dict[str, str]:
+        """Ask several robots at once, and what each says."""
+        with ThreadPoolExecutor(len(orders), thread_name_prefix="orders") as threads:
+            return dict(zip(orders, threads.map(self.ask, orders.keys(), orders.values()), strict=True))
 
     def drive(
         self, name: str, places: Iterable[Sequence[float]], yaw: float | None = None, *, backwards: bool = True
