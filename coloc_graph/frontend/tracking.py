@@ -1,10 +1,15 @@
-"""Markers followed through the images of one camera (paper, section V).
+"""Markers followed through the images of one camera (paper, section V), however many there are.
 
-Each track searches a patch (40x40 by default) centred at x_k + (x_k - x_{k-1}); the full frame is searched to
-start, after a loss, and from time to time for markers that came into view.
+Each track is a Kalman filter of nearly constant speed. The detections of an image go to the tracks by the most likely
+assignment of all at once, where a detection may be false and a marker missed. Where two assignments are about as
+likely, both tracks end there, and others begin: what passes for one marker is one.
+
+In images each track searches a patch (40x40 by default) centred where its marker should be; the full frame is searched
+to start, after a loss, and from time to time for markers that came into view.
 """
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -13,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from coloc_graph.frontend.detection import Blobs, Candidate, Detector, Pixels
+from coloc_graph.frontend.kalman import PointFilters
 from coloc_graph.run.messages import Flag, Image
 
 Array = NDArray[np.float64]
@@ -21,6 +27,15 @@ Array = NDArray[np.float64]
 DOUBTFUL = np.uint8(Flag.CLIPPED | Flag.MERGED)
 #: A light that keeps within so many pixels stands still.
 STILL_PX = 3.0
+#: Squared distance, in units of what is uncertain, beyond which a detection is not a track's.
+GATE = 25.0
+#: Logarithms of likelihood ratios: above, a track is of a light and of no false detections; below, two assignments are
+#: about as likely as each other.
+CONFIRMED, AMBIGUOUS = 22.0, 3.0
+#: Two lights this near to each other may be seen as one [px].
+TOUCHING = 6.0
+#: How well a candidate's place is known before it is measured [px].
+ROUGHLY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,30 +64,44 @@ class Track:
 
 @dataclass(frozen=True)
 class TrackerOptions:
-    """`patch` [px] is the side of the search patch; `patience` the frames a track survives unseen."""
+    """`patch` [px] is the side of the search patch; a track ends unseen for more than `patience` frames and `patience_s`.
+
+    Of a marker's image `detected` is the chance that it is found; false detections come `clutter` [1/px^2] an image.
+    `acceleration` [px^2/s^3] is the spectral density of how markers change their speed, `speed` [px/s] what is usual.
+    """
 
     patch: int = 40
     patience: int = 3
     reacquire_every: float = 0.25  # s, at which the full frame is searched for markers that came into view
     markers: int = 2  # with fewer live tracks than this the full frame is searched
-    still_after: int = 50  # frames after which a light that stands still is parked
+    still_after: int = 50  # frames, and `still_s`, after which a light that stands still is parked
+    still_s: float = 4.5
+    patience_s: float = 0.3
+    detected: float = 0.95
+    clutter: float = 5e-5
+    acceleration: float = 3e4
+    speed: float = 200.0
 
 
 @dataclass(slots=True)
 class _Live:
-    """A track that goes on: rough centres to predict with, and what each sample is measured from in the end."""
+    """A track that goes on: rough centres, and what each sample is measured from in the end.
+
+    `score` is the logarithm of how much more likely it is of a light than of false detections.
+    """
 
     times: list[float] = field(default_factory=list)
     uv: list[tuple[float, float]] = field(default_factory=list)
     samples: list[Candidate | int] = field(default_factory=list)
     misses: int = 0
+    score: float = 0.0
+    confirmed: bool = False
 
-    def predict(self, time: float) -> tuple[float, float]:
-        (u, v) = self.uv[-1]
-        if len(self.uv) < 2 or self.times[-1] <= self.times[-2]:
-            return u, v
-        ahead = (time - self.times[-1]) / (self.times[-1] - self.times[-2])
-        return u + (u - self.uv[-2][0]) * ahead, v + (v - self.uv[-2][1]) * ahead
+    def take(self, time: float, place: tuple[float, float], sample: Candidate | int) -> None:
+        self.times.append(time)
+        self.uv.append(place)
+        self.samples.append(sample)
+        self.misses = 0
 
 
 class MarkerTracker:
@@ -86,7 +115,8 @@ class MarkerTracker:
         self.robot = robot
         self._detector = detector
         self._options = options or TrackerOptions()
-        self._live: list[_Live] = []
+        self._filters = PointFilters(self._options.acceleration, self._options.speed)
+        self._live: list[_Live] = []  # in the order of the filters
         self._ended: list[_Live] = []
         self._parked: list[_Live] = []
         self._taken: list[tuple[Array, Array, float]] = []
@@ -94,23 +124,25 @@ class MarkerTracker:
 
     def step(self, image: Image) -> None:
         """Take in the next image."""
-        predicted = [track.predict(image.time) for track in self._live]
+        self._filters.predict(image.time)
         full = self._search_all(image.time)
-        found = self._detector.find(image.pixels) if full else self._in_patches(image.pixels, predicted)
+        found = self._detector.find(image.pixels) if full else self._in_patches(image.pixels)
         found = [one for one in found if not one.clipped]
-        self._advance(image.time, predicted, [one.uv for one in found], found, births=full)
+        uv = np.array([one.uv for one in found]).reshape(-1, 2)
+        self._advance(image.time, uv, np.broadcast_to(ROUGHLY**2 * np.eye(2), (len(uv), 2, 2)), found, births=full)
 
     def take(self, time: float, blobs: Blobs) -> None:
         """Take in what a detector elsewhere found in the whole of the next image."""
-        predicted = [track.predict(time) for track in self._live]
+        self._filters.predict(time)
         whole = blobs[(blobs.flags & DOUBTFUL) == 0]
         numbers = range(len(self._taken), len(self._taken) + len(whole))
         self._taken += zip(whole.uv, whole.covariance, whole.peak.tolist(), strict=True)
-        self._advance(time, predicted, [(u, v) for u, v in whole.uv.tolist()], list(numbers), births=True)
+        self._advance(time, whole.uv, whole.covariance, list(numbers), births=True)
 
     def tracks(self) -> list[Track]:
         """All tracks so far, ended or live, oldest first; their samples are measured now, all at once."""
-        lives = sorted(self._ended + self._parked + self._live, key=lambda live: live.times[0])
+        lives = [live for live in self._ended + self._parked + self._live if live.confirmed and live.times]
+        lives.sort(key=lambda live: live.times[0])
         candidates = [one for live in lives for one in live.samples if isinstance(one, Candidate)]
         if not candidates:
             return [self._track(live, [self._taken[one] for one in live.samples]) for live in lives]  # type: ignore[index]
@@ -144,11 +176,11 @@ class MarkerTracker:
             or any(track.misses for track in self._live)
         )
 
-    def _in_patches(self, pixels: Pixels, predicted: list[tuple[float, float]]) -> list[Candidate]:
+    def _in_patches(self, pixels: Pixels) -> list[Candidate]:
         height, width = pixels.shape[:2]
         half = self._options.patch // 2
         found: list[Candidate] = []
-        for centre in predicted:
+        for centre in self._filters.place.tolist():
             u, v = round(centre[0]), round(centre[1])
             box = (max(u - half, 0), max(v - half, 0), min(u + half, width), min(v + half, height))
             if box[2] - box[0] >= 3 and box[3] - box[1] >= 3:
@@ -161,64 +193,122 @@ class MarkerTracker:
         return found
 
     def _advance(
-        self,
-        time: float,
-        predicted: list[tuple[float, float]],
-        places: list[tuple[float, float]],
-        samples: Sequence[Candidate | int],
-        *,
-        births: bool,
+        self, time: float, uv: Array, covariance: Array, samples: Sequence[Candidate | int], *, births: bool
     ) -> None:
-        taken = set()
-        for track, index in zip(self._live, self._assigned(predicted, places), strict=True):
-            if index is None:
-                track.misses += 1
-            else:
-                self._extend(track, time, places[index], samples[index])
-                taken.add(index)
+        places: list[tuple[float, float]] = [(u, v) for u, v in uv.tolist()]
+        free = [index for index, place in enumerate(places) if not self._is_parked(place)]
+        if len(free) < len(places):
+            uv, covariance = uv[free], covariance[free]
+        tracks, found = self._assigned(uv, covariance)
+        if len(tracks):
+            self._filters.update(tracks, uv[found], covariance[found])
+        for track, index in zip(tracks.tolist(), found.tolist(), strict=True):
+            self._live[track].take(time, places[free[index]], samples[free[index]])
         if births:
-            for index in sorted(set(range(len(places))) - taken):
-                if not self._is_parked(places[index]):
+            taken = set(found.tolist())
+            new = [index for index in range(len(free)) if index not in taken]
+            if new:
+                self._filters.add(uv[new], covariance[new])
+                for index in new:
                     self._live.append(_Live())
-                    self._extend(self._live[-1], time, places[index], samples[index])
-            self._park()
+                    self._live[-1].take(time, places[free[index]], samples[free[index]])
             self._searched = time
-        if any(track.misses > self._options.patience for track in self._live):
-            self._ended += [track for track in self._live if track.misses > self._options.patience]
-            self._live = [track for track in self._live if track.misses <= self._options.patience]
+        self._end(time, births=births)
 
-    def _assigned(self, predicted: list[tuple[float, float]], places: list[tuple[float, float]]) -> list[int | None]:
-        """For each track the blob it goes on to: the least total distance, none farther than half a patch."""
-        if not predicted or not places:
-            return [None] * len(predicted)
-        gate = self._options.patch / 2
-        near = [[math.dist(one, place) < gate for place in places] for one in predicted]
-        if all(sum(row) <= 1 for row in near) and all(sum(column) <= 1 for column in zip(*near, strict=True)):
-            return [row.index(True) if any(row) else None for row in near]  # nothing to decide
-        distance = np.hypot(*(np.array(predicted)[:, None] - np.array(places)[None]).transpose(2, 0, 1))
-        rows, columns = linear_sum_assignment(np.minimum(distance, gate))
-        chosen = {int(r): int(c) for r, c in zip(rows, columns, strict=True) if near[r][c]}
-        return [chosen.get(row) for row in range(len(predicted))]
+    def _assigned(self, uv: Array, covariance: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Tracks (k,) and the detections (k,) that they go on with; what that means for their scores."""
+        options, n = self._options, len(self._live)
+        missed = math.log(1 - options.detected)
+        none = np.zeros(0, np.int64)
+        if not n or not len(uv):
+            for track in self._live:
+                track.misses += 1
+                track.score += missed
+            return none, none
+        squared, determinant = self._filters.against(uv, covariance)
+        gain = (
+            math.log(options.detected / (2 * math.pi * options.clutter)) - 0.5 * np.log(determinant) - 0.5 * squared
+        )
+        near = squared < GATE
+        worth = np.where(near, gain - missed, 0.0)  # against a missed marker and a false detection
+        tracks, found = linear_sum_assignment(worth, maximize=True)
+        good = near[tracks, found] & (worth[tracks, found] > 0)
+        tracks, found = tracks[good], found[good]
+        if (near.sum(axis=0) > 1).any():
+            self._cut(worth, tracks, found)
+            keep = self._apart(tracks, found, near)
+            tracks, found = tracks[keep], found[keep]
+        seen = np.zeros(n, bool)
+        seen[tracks] = True
+        gained = np.full(n, missed)
+        gained[tracks] = gain[tracks, found]
+        for row, (one, is_seen) in enumerate(zip(gained.tolist(), seen.tolist(), strict=True)):
+            if is_seen and self._live[row].confirmed and self._live[row].score < 0:
+                self._begin_anew(row)  # unseen for so long that it may be anything
+            track = self._live[row]
+            track.misses += not is_seen
+            track.score = min(track.score + one, 2 * CONFIRMED)
+            track.confirmed |= track.score > CONFIRMED
+        return tracks, found
 
-    def _park(self) -> None:
-        """Set aside the lights that have not moved for `still_after` frames."""
-        going: list[_Live] = []
-        for track in self._live:
-            still = len(track.uv) >= self._options.still_after
-            if still:
-                recent = np.array(track.uv[-self._options.still_after :])
-                still = bool(np.ptp(recent, axis=0).max() < STILL_PX)
-            (self._parked if still else going).append(track)
-        self._live = going
+    def _cut(self, worth: Array, tracks: NDArray[np.int64], found: NDArray[np.int64]) -> None:
+        """End the tracks that could as well have gone on with each other's detections; others go on in their place."""
+        own = worth[tracks, found]
+        other = worth[tracks[:, None], found[None]]
+        lost = own[:, None] + own[None] - other - other.T
+        swapped = (other > 0) & (other.T > 0) & (lost < AMBIGUOUS)
+        np.fill_diagonal(swapped, False)
+        for row in tracks[swapped.any(axis=1)].tolist():
+            self._begin_anew(row)
+
+    def _begin_anew(self, row: int) -> None:
+        """End a track where its filter goes on, perhaps with another light."""
+        if self._live[row].confirmed:
+            self._ended.append(self._live[row])
+        self._live[row] = _Live()
+
+    def _apart(
+        self, tracks: NDArray[np.int64], found: NDArray[np.int64], near: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Which assignments hold: a detection that may be two markers in one is neither's."""
+        missing = np.ones(len(self._live), bool)
+        missing[tracks] = False
+        lost = [row for row in np.flatnonzero(missing).tolist() if self._live[row].confirmed]
+        keep = np.ones(len(tracks), bool)
+        for row in lost:
+            touching = np.abs(self._filters.place[tracks] - self._filters.place[row]).max(axis=1) < TOUCHING
+            keep &= ~(touching & near[row, found])
+        return keep
+
+    def _end(self, time: float, *, births: bool) -> None:
+        """End the tracks that have not been seen for long, and park the lights that have not moved for long."""
+        options, keep = self._options, np.ones(len(self._live), bool)
+        for row, track in enumerate(self._live):
+            unseen = time - track.times[-1] if track.times else math.inf
+            gone = track.misses > options.patience and unseen > options.patience_s
+            if gone or (not track.confirmed and (track.score < 0 or track.misses > options.patience)):
+                if track.confirmed:
+                    self._ended.append(track)
+                keep[row] = False
+            elif births and self._still(track):
+                self._parked.append(track)
+                keep[row] = False
+        if not keep.all():
+            self._filters.keep(keep)
+            self._live = [track for track, kept in zip(self._live, keep.tolist(), strict=True) if kept]
+
+    def _still(self, track: _Live) -> bool:
+        """Whether a track has not moved for long."""
+        options = self._options
+        if len(track.uv) < options.still_after or track.times[-1] - track.times[0] < options.still_s:
+            return False
+        first = min(bisect_left(track.times, track.times[-1] - options.still_s), len(track.uv) - options.still_after)
+        (u, v), (u0, v0) = track.uv[-1], track.uv[first]
+        if max(abs(u - u0), abs(v - v0)) >= STILL_PX:
+            return False
+        return bool(np.ptp(np.array(track.uv[first:]), axis=0).max() < STILL_PX)
 
     def _is_parked(self, place: tuple[float, float]) -> bool:
         return any(
             max(abs(place[0] - track.uv[-1][0]), abs(place[1] - track.uv[-1][1])) < STILL_PX for track in self._parked
         )
-
-    @staticmethod
-    def _extend(track: _Live, time: float, place: tuple[float, float], sample: Candidate | int) -> None:
-        track.times.append(time)
-        track.uv.append(place)
-        track.samples.append(sample)
-        track.misses = 0

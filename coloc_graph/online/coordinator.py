@@ -29,7 +29,7 @@ from coloc_graph.online.roster import Member, Roster
 from coloc_graph.online.watch import InView, Precision
 from coloc_graph.robot_io.link import CoordinatorLink
 from coloc_graph.robot_io.link_config import Tls
-from coloc_graph.robot_io.wire import Capture, EndCapture, Event, Halt, Recover, Sample, Status, Wheels
+from coloc_graph.robot_io.wire import Body, Capture, EndCapture, Event, Halt, Recover, Sample, Status, Wheels
 from coloc_graph.run import Detections, Run, Stance
 from coloc_graph.run.schemas import to_ns, to_seconds
 from coloc_graph.stance_solver import EnteredStance, StanceSolver
@@ -355,7 +355,7 @@ class Coordinator:
             self._end_capture(f"{self.options.longest:g} s are over")
 
     def _end_capture(self, why: str) -> None:
-        orders = {self.mover: Halt(), **dict.fromkeys(self.observers, EndCapture())}
+        orders: dict[str, Body] = {self.mover: Halt(), **dict.fromkeys(self.observers, EndCapture())}
         said = self._orders.ask_each(orders)
         self._expected = {name: int(said[name] or 0) for name in self.observers}
         self._enter(Phase.COLLECTING, why)

@@ -1,0 +1,128 @@
+"""Many markers followed in detections that are missed, false and merged: is a track of one marker, and how fast is it.
+
+    python benchmarks/tracking.py [--seeds 20] [--movers 5] [--seconds 60] [--json]
+
+Robots with two lights each drive about before the reference pair of cameras at 100 fps, 2 % of the lights missed and 5
+false detections an image. Beside the tracker: the assignment of each image by itself to where lights were last
+(nearest, all at once), which knows no speed.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from coloc_graph.common_view import View
+from coloc_graph.frontend.detection import Blobs, Detector
+from coloc_graph.frontend.tracking import MarkerTracker, Track
+from coloc_graph.lie import floor_pose
+from coloc_graph.simulation.crowd import Faults, Seen, crowd
+from coloc_graph.simulation.rig import reference_team
+from coloc_graph.simulation.scenarios import single_step
+
+
+def views() -> list[View]:
+    """The reference pair, 0.8 m apart."""
+    team = reference_team()
+    return [
+        View(team[name].camera, floor_pose(*pose) @ team[name].mount.T_body_camera)
+        for name, pose in zip("AB", single_step().poses, strict=True)
+    ]
+
+
+def follow(seen: Seen) -> tuple[list[Track], float]:
+    """The tracks of one camera, and how long they took [s]."""
+    blobs = [(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area)) for one in seen.images]
+    began = time.process_time()
+    tracker = MarkerTracker("A", Detector())
+    for when, found in blobs:
+        tracker.take(when, found)
+    tracks = tracker.tracks()
+    return tracks, time.process_time() - began
+
+
+def nearest(seen: Seen, gate: float = 20.0, patience: int = 30) -> list[Track]:
+    """Each image's detections to the places where lights were last; the least total distance."""
+    live: list[tuple[list[float], list[np.ndarray]]] = []
+    ended = []
+    for one in seen.images:
+        uv = one.uv[one.flags == 0]
+        apart = np.array([np.linalg.norm(uv - places[-1], axis=1) for _, places in live]).reshape(len(live), len(uv))
+        rows, columns = linear_sum_assignment(np.minimum(apart, gate))
+        good = apart[rows, columns] < gate
+        for row, column in zip(rows[good], columns[good], strict=True):
+            live[row][0].append(one.time)
+            live[row][1].append(uv[column])
+        for column in set(range(len(uv))) - set(columns[good].tolist()):
+            live.append(([one.time], [uv[column]]))
+        ended += [track for track in live if one.time - track[0][-1] > patience / 100]
+        live = [track for track in live if one.time - track[0][-1] <= patience / 100]
+    return [
+        Track("A", "", np.array(t), np.array(uv), np.zeros((len(t), 2, 2)), np.zeros(len(t)))
+        for t, uv in ended + live
+        if len(t) >= 8
+    ]
+
+
+def figures(tracks: Sequence[Track], seen: Seen) -> dict[str, float]:
+    """Of all samples in tracks: the share that is of the light that most of its track is of, and so on."""
+    number = {one.time: n for n, one in enumerate(seen.images)}
+    pure = total = swaps = false = 0
+    covered: dict[int, int] = {}
+    for track in tracks:
+        lights = np.empty(len(track), np.int64)
+        for n, (when, uv) in enumerate(zip(track.times.tolist(), track.uv, strict=True)):
+            k = number[when]
+            lights[n] = seen.lights[k][np.argmin(np.abs(seen.images[k].uv - uv).sum(axis=1))]
+        real = lights[lights >= 0]
+        total += len(track)
+        if len(real) < len(track) / 2:
+            false += 1
+            continue
+        values, counts = np.unique(real, return_counts=True)
+        pure += int(counts.max())
+        swaps += int((np.diff(real) != 0).sum())
+        covered[int(values[counts.argmax()])] = covered.get(int(values[counts.argmax()]), 0) + int(counts.max())
+    there = sum(int((one >= 0).sum()) for one in seen.lights)
+    return {
+        "purity_percent": 100 * pure / max(total, 1),
+        "swaps": swaps,
+        "false_tracks": false,
+        "covered_percent": 100 * sum(covered.values()) / there,
+        "tracks_a_light": len(tracks) / len({int(n) for one in seen.lights for n in one if n >= 0}),
+    }
+
+
+def main() -> None:
+    """Run it, print it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--movers", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    team, rows = reference_team(), []
+    assert team["C"].markers is not None
+    for seed in range(options.seeds):
+        both, _ = crowd(views(), team["C"].markers.p_body, movers=options.movers, seconds=options.seconds, seed=seed,
+                        faults=Faults())  # fmt: skip
+        for seen in both:
+            tracks, taken = follow(seen)
+            row = {"seed": seed} | figures(tracks, seen)
+            row["times_real_time_both"] = options.seconds / taken / len(both)
+            row |= {f"nearest_{name}": value for name, value in figures(nearest(seen), seen).items()}
+            rows.append(row)
+            if not options.json:
+                print("  ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
+    mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0] if name != "seed"}
+    mean["worst_purity_percent"] = min(row["purity_percent"] for row in rows)
+    mean["swaps_in_all"] = sum(row["swaps"] for row in rows)
+    mean["nearest_swaps_in_all"] = sum(row["nearest_swaps"] for row in rows)
+    print(json.dumps(mean, indent=2))
+
+
+if __name__ == "__main__":
+    main()
