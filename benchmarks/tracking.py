@@ -56,8 +56,7 @@ def nearest(seen: Seen, gate: float = 20.0, patience: int = 30) -> list[Track]:
         for row, column in zip(rows[good], columns[good], strict=True):
             live[row][0].append(one.time)
             live[row][1].append(uv[column])
-        for column in set(range(len(uv))) - set(columns[good].tolist()):
-            live.append(([one.time], [uv[column]]))
+        live += [([one.time], [uv[column]]) for column in set(range(len(uv))) - set(columns[good].tolist())]
         ended += [track for track in live if one.time - track[0][-1] > patience / 100]
         live = [track for track in live if one.time - track[0][-1] <= patience / 100]
     return [

@@ -6,7 +6,7 @@ from planar_scene import CAMERA, MARKERS, MOUNT, Scene, mounted
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend import Track, correspond, fit_homography, pair_by_time, plane_from_mount
-from coloc_graph.frontend.correspondence import markers_of_movers, span_samples
+from coloc_graph.frontend.bodies import markers_of_movers, span_samples
 
 T0 = 1_700_000_000.0
 SCENE = Scene()
@@ -180,16 +180,22 @@ def with_clutter():
     ]
 
 
+def numbers(tracks, one):
+    return next(n for n, track in enumerate(tracks) if track.uv is one.uv)
+
+
 def test_reflections_still_lights_and_strangers_are_not_markers_of_the_mover():
     clutter = with_clutter()
     kept = markers_of_movers(clutter, CAMERA, PLANE, [0.25])
-    assert [clutter.index(one) for one in kept] == [0, 3]
+    assert [numbers(clutter, one) for one in kept] == [0, 3]
+    assert [one.body for one in kept] == [0, 0]
 
 
 def test_without_a_span_all_that_moves_is_kept():
     clutter = with_clutter()
     kept = markers_of_movers(clutter, CAMERA, PLANE, [])
     assert [clutter.index(one) for one in kept] == [0, 1, 3, 4, 5]
+    assert {one.body for one in kept} == {-1}
 
 
 def test_the_span_binds_the_two_markers_at_all_their_instants_although_the_tilt_is_a_degree_off():

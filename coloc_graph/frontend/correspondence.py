@@ -1,24 +1,20 @@
 """Which samples of two cameras show the same marker at the same instant.
 
 Samples are paired by time (5 ms, paper section V). Tracks whose marker has a name pair by name. Tracks without
-one pair by what they do (spatio-temporal features, paper section III): of all ways to pair them, the one that a
-single homography explains best.
+one pair by what they do (`association`).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend.homography import fit_homography
+from coloc_graph.frontend.association import HIDDEN, HIDDEN_ALONE, SURE, associate
 from coloc_graph.frontend.interpolation import LONGEST_GAP
-from coloc_graph.frontend.plane import on_plane
-from coloc_graph.frontend.refinement import PointPairs, squared_residuals
+from coloc_graph.frontend.refinement import PointPairs
 from coloc_graph.frontend.tracking import Track
-from coloc_graph.measurements import Plane
 from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
@@ -28,6 +24,8 @@ PAIRING_WINDOW = 5e-3
 
 #: A light whose track stays in a box of this diagonal stands still [px].
 STILL = 8.0
+#: A marker nearer to the border than this may not be seen [px].
+BORDER = 6.0
 #: More than a float64 of UTC seconds is rounded by: a gap of the window itself is within it [s].
 CLOCK_GRAIN = 1e-6
 
@@ -68,10 +66,13 @@ def pair_by_time(times_i: Array, times_j: Array, window: float = PAIRING_WINDOW)
 
 
 def correspond(
-    tracks_i: Sequence[Track], tracks_j: Sequence[Track], camera_i: Camera, camera_j: Camera
+    tracks_i: Sequence[Track], tracks_j: Sequence[Track], camera_i: Camera, camera_j: Camera, *, alone: bool = False
 ) -> Correspondences:
-    """The correspondences between two cameras' tracks; raises `DegenerateGeometry` where there are none."""
-    return _chosen(_Candidates(tracks_i, tracks_j, camera_i, camera_j), tracks_i, tracks_j)[1]
+    """The correspondences between two cameras' tracks; raises `DegenerateGeometry` where there are none.
+
+    Where one robot moves `alone`, what both cameras see at the same time is that.
+    """
+    return _chosen(Candidates(tracks_i, tracks_j, camera_i, camera_j, alone=alone), tracks_i, tracks_j)[1]
 
 
 def correspond_roughly(
@@ -81,28 +82,39 @@ def correspond_roughly(
     camera_j: Camera,
     offset: float,
     sigma: float,
+    *,
+    alone: bool = False,
 ) -> tuple[list[tuple[int, int]], Correspondences]:
     """The same for clocks that differ by `offset`, known to `sigma` [s]: which tracks (a, b) are one marker's.
 
     Nearest samples are paired and moved to the same instant; what the sigma makes of a marker's speed is in
     camera j's covariances. Raises `DegenerateGeometry` as `correspond` does.
     """
-    return _chosen(_Candidates(tracks_i, tracks_j, camera_i, camera_j, (offset, sigma)), tracks_i, tracks_j)
+    candidates = Candidates(tracks_i, tracks_j, camera_i, camera_j, (offset, sigma), alone=alone)
+    return _chosen(candidates, tracks_i, tracks_j)
 
 
 def _chosen(
-    candidates: "_Candidates", tracks_i: Sequence[Track], tracks_j: Sequence[Track]
+    candidates: "Candidates", tracks_i: Sequence[Track], tracks_j: Sequence[Track]
 ) -> tuple[list[tuple[int, int]], Correspondences]:
-    named = all(track.marker for track in (*tracks_i, *tracks_j))
-    chosen = list(candidates.indices) if named else _by_motion(candidates)
-    if not chosen and candidates.indices:
+    if not candidates.indices:
+        raise DegenerateGeometry(_why_none(tracks_i, tracks_j, candidates.window))
+    if all(track.marker for track in (*tracks_i, *tracks_j)):
+        return list(candidates.indices), candidates.join(list(candidates.indices))
+    found = associate(candidates)
+    pair = f"{tracks_i[0].robot} and {tracks_j[0].robot}"
+    if found is None:
         raise DegenerateGeometry(
-            f"no pairing of the tracks of {tracks_i[0].robot} and {tracks_j[0].robot} is explained by one homography: "
+            f"no pairing of the tracks of {pair} is explained by one homography: "
             "let the moving robot turn and drive further, and look for reflections"
         )
-    if not chosen:
-        raise DegenerateGeometry(_why_none(tracks_i, tracks_j, candidates.window))
-    return chosen, candidates.join(chosen)
+    if found.posterior < SURE:
+        raise DegenerateGeometry(
+            f"which tracks of {pair} are the same markers is ambiguous: {len(found.rivals) + 1} pairings are explained "
+            f"by one homography each, and the likeliest is right with a chance of {100 * found.posterior:.1f} % only: "
+            "let the moving robots turn and drive apart, or give markers names"
+        )
+    return list(found.chosen), candidates.join(found.chosen)
 
 
 def _why_none(tracks_i: Sequence[Track], tracks_j: Sequence[Track], window: float) -> str:
@@ -131,7 +143,7 @@ def _listed(names: set[str]) -> str:
     return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-class _Candidates:
+class Candidates:
     """All pairs of tracks that may be one marker: they share instants, and their names, where they have some.
 
     `clock` is the clocks' offset and its sigma [s], None for clocks that agree.
@@ -144,8 +156,14 @@ class _Candidates:
         camera_i: Camera,
         camera_j: Camera,
         clock: tuple[float, float] | None = None,
+        *,
+        alone: bool = False,
     ) -> None:
         self._i, self._j = list(tracks_i), list(tracks_j)
+        self._cameras = camera_i, camera_j
+        self._alone = alone
+        self.hidden = HIDDEN_ALONE if alone else HIDDEN
+        self.bodies = [track.body for track in tracks_i], [track.body for track in tracks_j]
         self._x_i = [normalised(track, camera_i) for track in self._i]
         self._x_j = [normalised(track, camera_j) for track in self._j]
         # where a lens cannot be inverted there is no ray, and one NaN would spoil the whole stance
@@ -166,14 +184,35 @@ class _Candidates:
                 if len(shared):
                     self.indices[a, b] = shared
 
-    def explained(self, H: Array, pairs: dict[tuple[int, int], PointPairs], gate: float) -> list[tuple[int, int]]:
-        """The pairs of tracks whose median squared residual is within the gate, the best first where two claim
-        the same sample."""
-        medians = {ab: float(np.median(squared_residuals(H, pair))) for ab, pair in pairs.items()}
+    def points(self, chosen: Sequence[tuple[int, int]]) -> PointPairs:
+        """All samples that some pairs of tracks share."""
+        return self.join(chosen).pairs
+
+    def visible(self, H_j_i: Array) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.bool_]]]:
+        """Of each sample of each track of i whether j would have seen it, and of those of j whether i would."""
+        camera_i, camera_j = self._cameras
+        if self._alone:
+            return _while_seen(self._i, self._j), _while_seen(self._j, self._i)
+        return (
+            [_in_view(camera_j, H_j_i, x) for x, _ in self._x_i],
+            [_in_view(camera_i, np.linalg.inv(H_j_i), x) for x, _ in self._x_j],
+        )
+
+    def covered(self, chosen: Sequence[tuple[int, int]]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.bool_]]]:
+        """Of each sample of each track of i, and of j, whether it lies between those that a chosen pair shares."""
+        in_i, in_j = ([np.zeros(len(track), bool) for track in tracks] for tracks in (self._i, self._j))
+        for a, b in chosen:
+            m, n = self.indices[a, b].T
+            in_i[a][m.min() : m.max() + 1] = True
+            in_j[b][n.min() : n.max() + 1] = True
+        return in_i, in_j
+
+    def claimed(self, residuals: dict[tuple[int, int], float]) -> list[tuple[int, int]]:
+        """Of some pairs of tracks those that do not claim a sample that one with a smaller residual has."""
         free_i = [np.ones(len(track), bool) for track in self._i]
         free_j = [np.ones(len(track), bool) for track in self._j]
         chosen: list[tuple[int, int]] = []
-        for a, b in sorted((ab for ab in medians if medians[ab] < gate), key=lambda ab: medians[ab]):
+        for a, b in sorted(residuals, key=lambda ab: residuals[ab]):
             m, n = self.indices[a, b].T
             if free_i[a][m].all() and free_j[b][n].all():
                 chosen.append((a, b))
@@ -181,6 +220,7 @@ class _Candidates:
         return sorted(chosen)
 
     def join(self, chosen: Sequence[tuple[int, int]]) -> Correspondences:
+        """What some pairs of tracks share."""
         parts = [(a, b, *self.indices[a, b].T) for a, b in chosen]
         uv_i = np.concatenate([self._i[a].uv[m] for a, _, m, _ in parts])
         uv_j = np.concatenate([self._j[b].uv[n] for _, b, _, n in parts])
@@ -209,6 +249,23 @@ class _Candidates:
         return x + slope * ahead[:, None], covariance + sigma**2 * slope[:, :, None] * slope[:, None, :]
 
 
+def _while_seen(tracks: Sequence[Track], others: Sequence[Track]) -> list[NDArray[np.bool_]]:
+    """Of each sample of some tracks whether any of the others goes on at the time."""
+    return [
+        np.any([(track.times >= one.times[0]) & (track.times <= one.times[-1]) for one in others], axis=0)
+        for track in tracks
+    ]
+
+
+def _in_view(camera: Camera, H: Array, x: Array) -> NDArray[np.bool_]:
+    """Which points x (n, 2) of another camera come to lie within a camera's image, and not at its border, by H."""
+    uv, inside = camera.project(np.column_stack([x, np.ones(len(x))]) @ H.T)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(
+            inside & (uv > BORDER).all(axis=1) & (uv < (camera.width - BORDER, camera.height - BORDER)).all(axis=1)
+        )
+
+
 def normalised(track: Track, camera: Camera) -> tuple[Array, Array]:
     """A track in normalised coordinates (n, 2), with covariances (n, 2, 2)."""
     x = camera.normalise(track.uv)
@@ -230,65 +287,3 @@ def _speed(times: Array, x: Array) -> Array:
 def _finite(normalised_track: tuple[Array, Array]) -> NDArray[np.bool_]:
     x, covariance = normalised_track
     return np.asarray(np.isfinite(x).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
-
-
-def _by_motion(candidates: _Candidates, least: int = 8, seeds: int = 24) -> list[tuple[int, int]]:
-    """The pairing of tracks that one homography explains best, most common samples first."""
-    by_size = sorted(candidates.indices, key=lambda ab: -len(candidates.indices[ab]))
-    pairs = {ab: candidates.join([ab]).pairs for ab in by_size}
-    best: list[tuple[int, int]] = []
-    best_inliers = 0
-    # one marker's track may be straight, and two tell more than one: couples after single pairs
-    large = [ab for ab in by_size if len(candidates.indices[ab]) >= least]
-    couples = [[p, q] for p, q in combinations(large, 2) if p[0] != q[0] and p[1] != q[1]]
-    for seed in [*([ab] for ab in large[:seeds]), *couples[:seeds]]:
-        if best and len(seed) > 1:
-            break
-        chosen, inliers = seed, 0
-        try:
-            for _ in range(3):
-                fit = fit_homography(candidates.join(chosen).pairs)
-                # a homography from one track extrapolates poorly: a wide gate first, the fit's own in the end
-                wide = len(chosen) == 1
-                again = candidates.explained(fit.H, pairs, 2500.0 if wide else 100.0)
-                inliers = int(fit.inliers.sum())
-                if again == sorted(chosen):
-                    break
-                chosen = again or seed
-        except DegenerateGeometry:
-            continue
-        if inliers > best_inliers:
-            best, best_inliers = chosen, inliers
-    return best
-
-
-def span_samples(
-    tracks: Sequence[Track], camera: Camera, plane: Plane, span: float, tolerance: float = 0.35
-) -> list[tuple[int, int, NDArray[np.int64]]]:
-    """Pairs of tracks of one camera that are two markers of one robot: (a, b, sample indices (n, 2)).
-
-    They are where their distance on the marker plane is the robot's `span` [m] for most of the time. The
-    tolerance is wide because a tilt that is wrong by a degree is 15 % of the distance at 2 m; a reflection in
-    the floor, seen as if on the marker plane, is off by more than half.
-    """
-    on_floor = [on_plane(camera.normalise(track.uv), plane) for track in tracks]
-    found = []
-    for a in range(len(tracks)):
-        for b in range(a + 1, len(tracks)):
-            shared = pair_by_time(tracks[a].times, tracks[b].times)
-            if len(shared) >= 2:
-                distance = np.linalg.norm(on_floor[a][shared[:, 0]] - on_floor[b][shared[:, 1]], axis=1)
-                if (np.abs(distance / span - 1) < tolerance).mean() > 0.8:  # NaN, above the horizon, is not close
-                    found.append((a, b, shared))
-    return found
-
-
-def markers_of_movers(tracks: Sequence[Track], camera: Camera, plane: Plane, spans: Sequence[float]) -> list[Track]:
-    """Of all tracks of a camera those that are markers of a moving robot.
-
-    Lights that do not move are not. Where robots carry two markers, the tracks that are bound by a span are;
-    tracks with no partner are kept only if no track has one.
-    """
-    moving = [track for track in tracks if len(track) >= 4 and track.extent > STILL]
-    bound = {index for span in spans for a, b, _ in span_samples(moving, camera, plane, span) for index in (a, b)}
-    return [moving[index] for index in sorted(bound)] if bound else moving

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.frontend.bodies import span_samples
 from coloc_graph.frontend.clock_offset import (
     ClockOffset,
     PairedTracks,
@@ -16,12 +17,7 @@ from coloc_graph.frontend.clock_offset import (
     fit_at_offset,
     require_searchable,
 )
-from coloc_graph.frontend.correspondence import (
-    Correspondences,
-    correspond,
-    correspond_roughly,
-    span_samples,
-)
+from coloc_graph.frontend.correspondence import Correspondences, correspond, correspond_roughly
 from coloc_graph.frontend.fit_checks import require_agreement, require_determined
 from coloc_graph.frontend.homography import HomographyFit, fit_homography, persisting, shared_error
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
@@ -95,6 +91,11 @@ class _Seen:
     tracks_j: list[Track]
 
     @property
+    def alone(self) -> bool:
+        """Whether one robot moves, and no other."""
+        return len(self.stance.movers) == 1
+
+    @property
     def cameras(self) -> tuple[Camera, Camera]:
         return self.run.team[self.robot_i].camera, self.run.team[self.robot_j].camera
 
@@ -123,7 +124,7 @@ def measure_pair(
         seen = _Seen(run, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j)
         if run.team.clock_sigma > 0:
             return _measure_with_clocks(seen, alone)
-        found = correspond(tracks_i, tracks_j, *seen.cameras)
+        found = correspond(tracks_i, tracks_j, *seen.cameras, alone=seen.alone)
         return _measured(seen, found, fit_homography(found.pairs, options.criterion))
     except DegenerateGeometry as why:
         return PairMeasurement(_unusable(stance, robot_i, robot_j, found, str(why)), None, found)
@@ -132,7 +133,9 @@ def measure_pair(
 def _measure_with_clocks(seen: _Seen, alone: bool) -> PairMeasurement:
     prior = ClockOffset(0.0, seen.run.team.clock_sigma)
     require_searchable(prior)
-    chosen, rough = correspond_roughly(seen.tracks_i, seen.tracks_j, *seen.cameras, prior.value, prior.sigma)
+    chosen, rough = correspond_roughly(
+        seen.tracks_i, seen.tracks_j, *seen.cameras, prior.value, prior.sigma, alone=seen.alone
+    )
     tracks = PairedTracks(seen.tracks_i, seen.tracks_j, chosen, *seen.cameras)
     again = partial(_measure_at_offset, seen, tracks, rough)
     try:

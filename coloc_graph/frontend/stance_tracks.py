@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry, InputError
-from coloc_graph.frontend.correspondence import markers_of_movers
+from coloc_graph.frontend.bodies import markers_of_movers
 from coloc_graph.frontend.detection import Blobs, detector_for
 from coloc_graph.frontend.plane import plane_from_mount
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
@@ -103,7 +103,7 @@ class StanceTracks:
                     self._taken[robot] = number + 1
         plane = stance_plane(run, stance, robot)
         spans = {m.span for name in stance.movers if (m := run.team[name].markers) and m.span}
-        return markers_of_movers(tracker.tracks(), camera, plane, sorted(spans))
+        return markers_of_movers(tracker.tracks(), camera, plane, sorted(spans), len(stance.movers))
 
 
 def named_tracks(robot: str, detections: Iterable[Detections]) -> list[Track]:

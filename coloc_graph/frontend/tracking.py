@@ -29,6 +29,8 @@ DOUBTFUL = np.uint8(Flag.CLIPPED | Flag.MERGED)
 STILL_PX = 3.0
 #: Squared distance, in units of what is uncertain, beyond which a detection is not a track's.
 GATE = 25.0
+#: By how much a detection must be nearer, so measured, had the speed changed at once, to be taken for that.
+JERKS = 12.0
 #: Logarithms of likelihood ratios: above, a track is of a light and of no false detections; below, two assignments are
 #: about as likely as each other.
 CONFIRMED, AMBIGUOUS = 22.0, 3.0
@@ -43,7 +45,8 @@ class Track:
     """One marker followed through time in one camera.
 
     `uv` (n, 2) [px] with `covariance` (n, 2, 2) [px^2] at `times` (n,) [s, the camera's clock]; `peak` (n,)
-    grey levels. `marker` is its name where its identity is known ("C/0"), or "".
+    grey levels. `marker` is its name where its identity is known ("C/0"), or "". Tracks of one camera with the same
+    `body` are markers of one robot; -1 where that is not known.
     """
 
     robot: str
@@ -52,6 +55,7 @@ class Track:
     uv: Array
     covariance: Array
     peak: Array
+    body: int = -1
 
     def __len__(self) -> int:
         return len(self.times)
@@ -64,10 +68,12 @@ class Track:
 
 @dataclass(frozen=True)
 class TrackerOptions:
-    """`patch` [px] is the side of the search patch; a track ends unseen for more than `patience` frames and `patience_s`.
+    """`patch` [px] is the side of the search patch; a track ends that is unseen for more than `patience` frames and
+    `patience_s`.
 
     Of a marker's image `detected` is the chance that it is found; false detections come `clutter` [1/px^2] an image.
-    `acceleration` [px^2/s^3] is the spectral density of how markers change their speed, `speed` [px/s] what is usual.
+    `acceleration` [px^2/s^3] is the spectral density of how markers change their speed, `jerk` [px/s] how they do at
+    once, now and then, `speed` [px/s] what is usual.
     """
 
     patch: int = 40
@@ -79,7 +85,8 @@ class TrackerOptions:
     patience_s: float = 0.3
     detected: float = 0.95
     clutter: float = 5e-5
-    acceleration: float = 3e4
+    acceleration: float = 3e3
+    jerk: float = 60.0
     speed: float = 200.0
 
 
@@ -115,7 +122,7 @@ class MarkerTracker:
         self.robot = robot
         self._detector = detector
         self._options = options or TrackerOptions()
-        self._filters = PointFilters(self._options.acceleration, self._options.speed)
+        self._filters = PointFilters(self._options.acceleration, self._options.jerk, self._options.speed)
         self._live: list[_Live] = []  # in the order of the filters
         self._ended: list[_Live] = []
         self._parked: list[_Live] = []
@@ -225,11 +232,10 @@ class MarkerTracker:
                 track.misses += 1
                 track.score += missed
             return none, none
-        squared, determinant = self._filters.against(uv, covariance)
-        gain = (
-            math.log(options.detected / (2 * math.pi * options.clutter)) - 0.5 * np.log(determinant) - 0.5 * squared
-        )
-        near = squared < GATE
+        squared, density, jerked = self._filters.against(uv, covariance)
+        off = np.minimum(squared, jerked + JERKS)
+        near = jerked < GATE
+        gain = math.log(options.detected / options.clutter) + density + 0.5 * (squared - off)
         worth = np.where(near, gain - missed, 0.0)  # against a missed marker and a false detection
         tracks, found = linear_sum_assignment(worth, maximize=True)
         good = near[tracks, found] & (worth[tracks, found] > 0)
@@ -249,6 +255,7 @@ class MarkerTracker:
             track.misses += not is_seen
             track.score = min(track.score + one, 2 * CONFIRMED)
             track.confirmed |= track.score > CONFIRMED
+        self._filters.jerk(tracks[off[tracks, found] < squared[tracks, found]])
         return tracks, found
 
     def _cut(self, worth: Array, tracks: NDArray[np.int64], found: NDArray[np.int64]) -> None:
@@ -267,9 +274,7 @@ class MarkerTracker:
             self._ended.append(self._live[row])
         self._live[row] = _Live()
 
-    def _apart(
-        self, tracks: NDArray[np.int64], found: NDArray[np.int64], near: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
+    def _apart(self, tracks: NDArray[np.int64], found: NDArray[np.int64], near: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which assignments hold: a detection that may be two markers in one is neither's."""
         missing = np.ones(len(self._live), bool)
         missing[tracks] = False

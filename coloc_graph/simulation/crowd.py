@@ -72,7 +72,8 @@ def wander(movers: int, seconds: float, area: tuple[float, float, float, float],
 
 
 def lights_of(poses: Array, times: Array, p_markers: Array) -> Array:
-    """Places (k, movers, m, 3) [m] of markers (m, 3) on robots at `times` (k,) [s] after the first of `wander`'s poses."""
+    """Places (k, movers, m, 3) [m] of markers (m, 3) on robots that go as `wander` has it (n, movers, 3), at `times`
+    (k,) [s] from its first pose on."""
     n, movers, _ = poses.shape
     at = np.clip(times / STEP, 0, n - 1)
     x, y = (np.stack([np.interp(at, np.arange(n), poses[:, r, c]) for r in range(movers)], 1) for c in range(2))
@@ -103,9 +104,7 @@ def detect(view: View, robot: str, p_lights: Array, times: Array, faults: Faults
         order = rng.permutation(len(found))
         none = np.zeros(len(found))
         covariance = np.broadcast_to(faults.noise_px**2 * np.eye(2), (len(found), 2, 2))
-        images.append(
-            Detections(robot, time, found[order], covariance, ("",) * len(found), flags[order], none, none)
-        )
+        images.append(Detections(robot, time, found[order], covariance, ("",) * len(found), flags[order], none, none))
         labels.append(np.concatenate([which[kept], np.full(len(wrong), -1)])[order].astype(np.int64))
     return Seen(images, labels)
 
@@ -134,10 +133,13 @@ def crowd(
     seed: int = 0,
     start: float = 1_700_000_000.0,
 ) -> tuple[list[Seen], Array]:
-    """What cameras (robots A, B, ...) detect of robots that wander in an area, and the lights' places (k, movers, m, 3)."""
+    """What cameras (of robots A, B, ...) detect of robots that wander in an area, and where the lights are, (k, movers,
+    m, 3)."""
     rng = np.random.default_rng(seed)
     times = np.arange(round(seconds * fps)) / fps
     p_lights = lights_of(wander(movers, seconds + STEP, area, rng), times, p_markers)
     names = [chr(ord("A") + n) for n in range(len(views))]
     faults = faults or Faults()
-    return [detect(v, name, p_lights, start + times, faults, rng) for v, name in zip(views, names, strict=True)], p_lights
+    return [
+        detect(v, name, p_lights, start + times, faults, rng) for v, name in zip(views, names, strict=True)
+    ], p_lights
