@@ -37,7 +37,7 @@ def follow(seen: Seen) -> tuple[list[Track], float]:
     """The tracks of one camera, and how long they took [s]."""
     blobs = [(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area)) for one in seen.images]
     began = time.process_time()
-    tracker = MarkerTracker("A", Detector())
+    tracker = MarkerTracker("A", Detector(), size=(320, 240))
     for when, found in blobs:
         tracker.take(when, found)
     tracks = tracker.tracks()

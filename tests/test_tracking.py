@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
+from coloc_graph.common_view import View
 from coloc_graph.frontend import Detector, MarkerTracker, TrackerOptions
+from coloc_graph.frontend.detection import Blobs
+from coloc_graph.lie import floor_pose
 from coloc_graph.run import Image
-from coloc_graph.simulation import Sensor, render, spots
+from coloc_graph.simulation import Sensor, reference_team, render, spots
+from coloc_graph.simulation.crowd import Faults, crowd
 
 T0 = 1_700_000_000.0
 SIZE = (320, 240)
@@ -131,3 +135,47 @@ def test_no_images_and_dark_images_give_no_track():
     for k in range(5):
         tracker.step(Image("A", T0 + k, np.zeros((240, 320), np.uint8)))
     assert tracker.tracks() == []
+
+
+def in_crowd(seed, **faults):
+    """The tracks of 5 robots in 10 s at 50 images a second, and the light of each of their samples."""
+    team = reference_team()
+    view = View(team["A"].camera, floor_pose(0.0, 0.4, -0.3) @ team["A"].mount.T_body_camera)
+    (seen,), _ = crowd([view], team["C"].markers.p_body, seconds=10.0, fps=50.0, seed=seed, faults=Faults(**faults))
+    tracker = MarkerTracker("A", Detector(), size=(320, 240))
+    for one in seen.images:
+        tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
+    number = {one.time: k for k, one in enumerate(seen.images)}
+    owners = []
+    for track in tracker.tracks():
+        own = []
+        for time, uv in zip(track.times.tolist(), track.uv, strict=True):
+            k = number[time]
+            own.append(seen.lights[k][np.argmin(np.abs(seen.images[k].uv - uv).sum(axis=1))])
+        owners.append(np.array(own))
+    return owners, sum(int((one >= 0).sum()) for one in seen.lights)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ten_markers_that_cross_merge_and_are_missed_are_each_themselves(seed):
+    owners, there = in_crowd(seed)
+    pure = sum(np.bincount(own + 1)[1:].max() for own in owners)
+    assert pure > 0.995 * sum(map(len, owners))
+    assert pure > 0.99 * there
+    assert all((own >= 0).mean() > 0.9 for own in owners)
+
+
+def test_false_detections_alone_make_no_track():
+    owners, _ = in_crowd(1, missed=1.0, false_detections=8.0)
+    assert owners == []
+
+
+def test_a_marker_that_stands_for_a_second_among_100_images_is_not_taken_for_a_lamp():
+    tracker = MarkerTracker("A", Detector(), TrackerOptions(markers=1))
+    for k in range(300):
+        u = 50.0 + min(k, 100) + max(k - 200, 0)
+        one = np.array([[u, 80.0]])
+        flags, none = np.zeros(1, np.uint8), np.full(1, 200.0)
+        tracker.take(T0 + 0.01 * k, Blobs(one, np.array([0.01 * np.eye(2)]), flags, none, none))
+    (track,) = tracker.tracks()
+    assert len(track) == 300

@@ -27,8 +27,8 @@ Pair = tuple[int, int]
 LEAST, FEW = 8, 24
 #: So many pairs, and couples of them, may be starts; so many that lead elsewhere are followed.
 SINGLES, COUPLES, TRIED = 200, 300, 16
-#: How likely a robot that is in a camera's view is not seen by it; where it is known to be the one that is seen; and one
-#: of its markers alone.
+#: How likely a robot that is in a camera's view is not seen by it; where it is known to be the one that is seen; and
+#: one of its markers alone.
 HIDDEN, HIDDEN_ALONE, HIDDEN_MARKER = 0.1, 1e-4, 0.003
 #: A robot counts as unseen for as much of the stance as it is, up to this share.
 LONG = 0.25

@@ -195,7 +195,7 @@ class Candidates:
             return _while_seen(self._i, self._j), _while_seen(self._j, self._i)
         return (
             [_in_view(camera_j, H_j_i, x) for x, _ in self._x_i],
-            [_in_view(camera_i, np.linalg.inv(H_j_i), x) for x, _ in self._x_j],
+            [_in_view(camera_i, np.asarray(np.linalg.inv(H_j_i), float), x) for x, _ in self._x_j],
         )
 
     def covered(self, chosen: Sequence[tuple[int, int]]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.bool_]]]:

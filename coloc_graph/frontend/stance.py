@@ -12,7 +12,6 @@ from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.bodies import span_samples
 from coloc_graph.frontend.clock_offset import (
     ClockOffset,
-    PairedTracks,
     find_offset,
     fit_at_offset,
     require_searchable,
@@ -21,6 +20,7 @@ from coloc_graph.frontend.correspondence import Correspondences, correspond, cor
 from coloc_graph.frontend.fit_checks import require_agreement, require_determined
 from coloc_graph.frontend.homography import HomographyFit, fit_homography, persisting, shared_error
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
+from coloc_graph.frontend.paired_tracks import PairedTracks
 from coloc_graph.frontend.plane import distance_from_span
 from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.frontend.relative_pose import relative_pose

@@ -81,7 +81,8 @@ class StanceTracks:
         run, stance, camera = self._run, self._stance, self._run.team[robot].camera
         tracker = self._trackers.get(robot)
         if tracker is None:
-            tracker = MarkerTracker(robot, detector_for(self._markers, camera), self._options)
+            size = camera.width, camera.height
+            tracker = MarkerTracker(robot, detector_for(self._markers, camera), self._options, size)
             self._trackers[robot] = tracker
         if run.has_detections(robot):
             seen = list(run.detections(robot, stance.start, end))

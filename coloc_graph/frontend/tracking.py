@@ -36,6 +36,8 @@ JERKS = 12.0
 CONFIRMED, AMBIGUOUS = 22.0, 3.0
 #: Two lights this near to each other may be seen as one [px].
 TOUCHING = 6.0
+#: A light that is missed so near to the border of the image has left it [px].
+RIM = 3.0
 #: How well a candidate's place is known before it is measured [px].
 ROUGHLY = 0.5
 
@@ -114,12 +116,19 @@ class _Live:
 class MarkerTracker:
     """Follows every blob of one camera; which of them are markers of a mover is decided later, with all in view.
 
-    Feed it images with `step`, or what was detected elsewhere with `take`, not both. Lights that stand still
-    for long are parked: they are no longer searched for, and reported as they were.
+    Feed it images with `step`, or what was detected elsewhere with `take`, not both; then the `size` of the images
+    (width, height) [px] tells when a marker has left. Lights that stand still for long are parked: they are no longer
+    searched for, and reported as they were.
     """
 
-    def __init__(self, robot: str, detector: Detector, options: TrackerOptions | None = None) -> None:
-        self.robot = robot
+    def __init__(
+        self,
+        robot: str,
+        detector: Detector,
+        options: TrackerOptions | None = None,
+        size: tuple[int, int] | None = None,
+    ) -> None:
+        self.robot, self._size = robot, size
         self._detector = detector
         self._options = options or TrackerOptions()
         self._filters = PointFilters(self._options.acceleration, self._options.jerk, self._options.speed)
@@ -132,6 +141,7 @@ class MarkerTracker:
     def step(self, image: Image) -> None:
         """Take in the next image."""
         self._filters.predict(image.time)
+        self._size = image.pixels.shape[1], image.pixels.shape[0]
         full = self._search_all(image.time)
         found = self._detector.find(image.pixels) if full else self._in_patches(image.pixels)
         found = [one for one in found if not one.clipped]
@@ -288,9 +298,10 @@ class MarkerTracker:
     def _end(self, time: float, *, births: bool) -> None:
         """End the tracks that have not been seen for long, and park the lights that have not moved for long."""
         options, keep = self._options, np.ones(len(self._live), bool)
+        left = self._beyond()
         for row, track in enumerate(self._live):
             unseen = time - track.times[-1] if track.times else math.inf
-            gone = track.misses > options.patience and unseen > options.patience_s
+            gone = (track.misses > options.patience and unseen > options.patience_s) or (track.misses and left[row])
             if gone or (not track.confirmed and (track.score < 0 or track.misses > options.patience)):
                 if track.confirmed:
                     self._ended.append(track)
@@ -301,6 +312,14 @@ class MarkerTracker:
         if not keep.all():
             self._filters.keep(keep)
             self._live = [track for track, kept in zip(self._live, keep.tolist(), strict=True) if kept]
+
+    def _beyond(self) -> list[bool]:
+        """Whether each light is so near to the border that it may have left the image, and another may come."""
+        if self._size is None:
+            return [False] * len(self._live)
+        place, size = self._filters.place, np.array(self._size)
+        out = np.any((place <= RIM - 0.5) | (place >= size - RIM - 0.5), axis=1)
+        return [bool(one) for one in out]
 
     def _still(self, track: _Live) -> bool:
         """Whether a track has not moved for long."""
