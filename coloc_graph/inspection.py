@@ -11,8 +11,8 @@ import numpy as np
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.correspondence import PAIRING_WINDOW, correspond_roughly, pair_by_time
 from coloc_graph.frontend.plausibility import implausible
-from coloc_graph.frontend.stance import FrontendOptions, measure_pair
-from coloc_graph.frontend.stance_tracks import named_tracks, stance_plane
+from coloc_graph.frontend.stance import FrontendOptions, little_in_common, measure_pair
+from coloc_graph.frontend.stance_tracks import StanceTracks, named_tracks, stance_plane
 from coloc_graph.run import Detections, Run, Stance
 
 
@@ -73,6 +73,7 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
             measurable = False
     if not measurable:
         return findings
+    tracks = StanceTracks(run, stance)
     for i, j in itertools.combinations(stance.observers, 2):
         if run.team.clock_sigma == 0 and not len(pair_by_time(times[i], times[j])):
             nearest = np.abs(times[i][:, None] - times[j][None]).min()
@@ -84,11 +85,13 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
                 )
             )
         elif i in named and j in named:
-            findings += [Finding(where, what) for what in _of_detections(run, stance, i, j, named)]
+            findings += [Finding(where, what) for what in _of_detections(run, stance, i, j, named, tracks)]
     return list(dict.fromkeys(findings))  # two pairs may find the same
 
 
-def _of_detections(run: Run, stance: Stance, i: str, j: str, named: dict[str, list[Detections]]) -> list[str]:
+def _of_detections(
+    run: Run, stance: Stance, i: str, j: str, named: dict[str, list[Detections]], tracks: StanceTracks
+) -> list[str]:
     """What is wrong with what two observers detected by name."""
     sigma = run.team.clock_sigma
     if sigma > 0:  # the search for the clocks' offset is for a solve
@@ -100,9 +103,9 @@ def _of_detections(run: Run, stance: Stance, i: str, j: str, named: dict[str, li
             return [f"{i} and {j}: {why}"]
         unlikely = implausible(run, stance, i, found)
         return [unlikely] if unlikely else []
-    measured = measure_pair(run, stance, i, j, FrontendOptions())
+    measured = measure_pair(run, stance, i, j, FrontendOptions(), tracks)
     what = []
-    if measured.homography.unusable:
+    if measured.homography.unusable and not little_in_common(measured.homography, stance):
         what.append(f"{i} and {j}: {measured.homography.unusable}")
     if measured.correspondences is not None:
         unlikely = implausible(run, stance, i, measured.correspondences)

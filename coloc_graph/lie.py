@@ -246,7 +246,10 @@ def _square_root(E: Array) -> Array:
     with np.errstate(all="ignore"):
         Y, W = E, np.broadcast_to(_IDENTITY, E.shape)
         for _ in range(12):
+            before = Y
             Y, W = (Y + _inverse(W)) / 2, (W + _inverse(Y)) / 2
+            if np.abs(Y - before).max(initial=0.0) < 1e-14:
+                break
         return Y
 
 

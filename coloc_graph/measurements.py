@@ -45,7 +45,8 @@ class HomographyMeasurement:
     What i's clock calls t, j's calls t + `time_offset` [s]; `time_offset_sigma` [s] is its standard deviation, which
     `information` contains (both 0 where the clocks are said to agree); `by_time_offset` (8,) is what the true
     homography is off by, in those coordinates, for each second that the true offset is larger. `warning` is None, or
-    what about the measurement is weaker than it looks, in words.
+    what about the measurement is weaker than it looks, in words. Where more than two observers saw the same markers
+    their homographies are not independent: `share` is the part of what the pair's points say that `information` takes.
     """
 
     stance: int
@@ -63,6 +64,7 @@ class HomographyMeasurement:
     time_offset_sigma: float = 0.0
     by_time_offset: Array | None = None
     warning: str | None = None
+    share: float = 1.0
 
     @property
     def residual(self) -> float:

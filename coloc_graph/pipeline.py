@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 
 from coloc_graph.backend import Estimate, Loose, PoseGraph, chain, diagnose, joint, smooth
 from coloc_graph.errors import EstimationError, InputError
-from coloc_graph.frontend import PairMeasurement, share_clock_offsets
+from coloc_graph.frontend import PairMeasurement, little_in_common, share_clock_offsets
 from coloc_graph.frontend.plausibility import implausible
 from coloc_graph.run import Run, Stance
 from coloc_graph.stance_solver import METHODS, EnteredStance, Motions, SolveOptions, StanceSolver, measure_stance
@@ -100,7 +100,7 @@ def solve(
             *run.warnings,
             *solved.clock_warnings,
             *_implausible(run, options, measured),
-            *_warnings(estimate, diagnose(estimate.graph), measured),
+            *_warnings(run, estimate, diagnose(estimate.graph), measured),
         ),
         seconds_frontend=solved.seconds_frontend,
         seconds_backend=time.perf_counter() - started - solved.seconds_frontend,
@@ -238,12 +238,15 @@ def _why_untied(loose: tuple[Loose, ...], measurements: Iterable[PairMeasurement
     return str(loose[0])
 
 
-def _warnings(estimate: Estimate, loose: Sequence[Loose], measurements: Sequence[PairMeasurement]) -> list[str]:
+def _warnings(
+    run: Run, estimate: Estimate, loose: Sequence[Loose], measurements: Sequence[PairMeasurement]
+) -> list[str]:
+    stances = {stance.index: stance for stance in run.stances}
     warnings = [
         f"stance {m.homography.stance}: {m.homography.robot_i} and {m.homography.robot_j} not used: "
         f"{m.homography.unusable}"
         for m in measurements
-        if m.homography.unusable
+        if m.homography.unusable and not little_in_common(m.homography, stances[m.homography.stance])
     ]
     warnings += [f"{part} (left out of the result)" for part in loose[:REASONS_NAMED]]
     if len(loose) > REASONS_NAMED:

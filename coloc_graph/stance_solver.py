@@ -19,6 +19,7 @@ from coloc_graph.frontend import (
     measure_pair,
     share_clock_offsets,
     sight_movers,
+    sight_standing,
 )
 from coloc_graph.measurements import Measurement, Odometry, Sighting
 from coloc_graph.run import OdometrySample, Recorded, Stance
@@ -112,6 +113,7 @@ class Motions:
         """Those of a stance, whose pairs are all `measured`."""
         wheels = {robot: self._wheels(run, robot, stance) for robot in self.team.names}
         sightings = sight_movers(run, stance, measured, wheels)
+        sightings += sight_standing(run, stance, measured, self._before)
         return [*sightings, *self._ways(stance, measured, sightings, wheels)]
 
     def _wheels(self, run: Recorded, robot: str, stance: Stance) -> WheelTrack:

@@ -142,6 +142,7 @@ def test_a_folder_and_a_missing_file_are_refused(tmp_path):
 def test_a_file_that_vanishes_while_it_is_read_is_a_sentence(tmp_path):
     run = open_run(everything(tmp_path / "run.mcap"))
     run.path.write_bytes(run.path.read_bytes()[:2000])
+    run._index.newest.clear()  # a run of one chunk, which opening it has read
     with pytest.raises(RunError, match="too short"):
         list(run.images("A"))
     run.path.unlink()

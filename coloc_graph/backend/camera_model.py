@@ -162,7 +162,8 @@ class HomographyModel:
         self.spans: tuple[SpanModel, ...] = ()
         if level is not None:
             near = zip(spans, self._lengths, strict=True)
-            self.spans = tuple(SpanModel.near(one, level.n, tilt_sigma, length) for one, length in near)
+            made = (SpanModel.near(one, level.n, tilt_sigma, length) for one, length in near)
+            self.spans = tuple(one.weighing(measured.share) for one in made)
         self._H_inverse: Array = np.asarray(np.linalg.inv(measured.H_j_i), float)
         b = measured.by_time_offset
         self._by_offset = np.zeros(8) if b is None else b

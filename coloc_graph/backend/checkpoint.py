@@ -96,6 +96,7 @@ class _Homography(msgspec.Struct, forbid_unknown_fields=True):
     time_offset_sigma: float
     by_time_offset: _Array | None
     warning: str | None
+    share: float = 1.0
 
 
 class _Measured(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):

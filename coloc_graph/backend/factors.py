@@ -60,6 +60,11 @@ def require_rigs(robots: Iterable[str], rigs: Mapping[str, Robot]) -> None:
             )
 
 
+def _share(link: Link) -> float:
+    """How much of a link's rows no other has: homographies of the same pixels share them."""
+    return link.homography.share if isinstance(link, RelativePose) and link.homography is not None else 1.0
+
+
 class Factors:
     """Makes the factors of a team on its floor; noise models that many share are made once.
 
@@ -84,7 +89,7 @@ class Factors:
         unknowns."""
         poses = len(poses_in(values))
         priors = 6 + (0 if self.floor is None else 3) * (poses - 1)
-        return priors + sum(self.rows(link, factor) for link, factor in links) - 6 * poses
+        return priors + round(sum(_share(link) * self.rows(link, factor) for link, factor in links)) - 6 * poses
 
     def rows(self, link: Link, factor: gtsam.NonlinearFactor) -> int:
         """How many numbers a link measures, of its factor."""

@@ -1,6 +1,7 @@
 """A graph's optimum: where the search starts, and, of a joint estimate, the mounts before all else."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -34,12 +35,12 @@ class Fit:
     values: gtsam.Values
     iterations: int
 
-    @property
+    @cached_property
     def chi2(self) -> float:
         """Of all rows that weigh."""
         return float(2 * self.factors.error(self.values))
 
-    @property
+    @cached_property
     def dof(self) -> int:
         """Rows that weigh, less unknowns."""
         return self.factors_of.dof(self.values, [(link, self.factor(n)) for n, link in enumerate(self.links)])

@@ -97,14 +97,14 @@ def optimise(factors: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> tupl
     GTSAM's optimiser returns the initial values without a word when it fails, so the answer is checked: the
     errors are finite, the error did not rise, and it iterated wherever there was something to gain.
     """
-    before = factors.error(initial)
+    optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, lm_parameters(initial.size()))
+    before = optimiser.error()
     if before < NOTHING_TO_GAIN:
         return initial, 0  # nothing contradicts anything; LM would only try out its dampings
     if not np.isfinite(before):
         raise EstimationError("the graph's error is not finite where the search starts: a measurement holds no number")
-    optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, lm_parameters(initial.size()))
     values = optimiser.optimize()
-    after = factors.error(values)
+    after = optimiser.error()
     if optimiser.iterations() >= MOST_ITERATIONS:
         raise EstimationError(f"the optimiser did not converge in {MOST_ITERATIONS} iterations (error {after:.6g})")
     if not np.isfinite(after) or after > before * (1 + 1e-9) + 1e-9:

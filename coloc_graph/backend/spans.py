@@ -5,7 +5,7 @@ plane that is nearly right, and then stays, so that the residual is a function o
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,6 +102,11 @@ class SpanModel:
             np.asarray(weights, float),
             np.asarray(np.einsum("an,nmk,nmkh->ah", weights, by_x, span.by_h[clear]), float),
         )
+
+    def weighing(self, share: float) -> "SpanModel":
+        """The same with a part of the information, where other pairs have the rest of it."""
+        root = math.sqrt(share)
+        return self if share == 1 else replace(self, weights=root * self.weights, by_h=root * self.by_h)
 
     def at(self, n: Array, span: float) -> tuple[Array, Array, Array]:
         """The residual (m,) but for h, and its derivatives by n (m, 3) and by the span (m,)."""

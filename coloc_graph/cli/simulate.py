@@ -9,11 +9,11 @@ from coloc_graph.cli.printing import progress
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """The command's arguments."""
     command = commands.add_parser("simulate", help="write a run of a simulated team, with truth in it")
-    command.add_argument("scenario", help="single-step, six-step or hallway")
+    command.add_argument("scenario", help="single-step, six-step, hallway or team")
     add_out(command)
     command.add_argument("--depth", choices=("tracks", "images"), default="tracks", help="marker centres, or images")
     command.add_argument("--seed", type=int, default=0)
-    command.add_argument("--stances", type=int, help="how many stances (hallway: 40)")
+    command.add_argument("--stances", type=int, help="how many stances (hallway: 40, team: 30)")
     command.add_argument("--points", type=int, help="correspondences a stance, at least 6")
     command.add_argument("--noise", type=float, help="of a marker centre, px (tracks; default 0.3)")
     command.add_argument("--mount-sigma", type=float, default=0.0, help="tilt and roll of the mounts, deg")
@@ -24,6 +24,8 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--time-jitter", type=float, default=0.0, help="of the instants of capture, s")
     command.add_argument("-l", type=float, help="single-step: distance between the observers, m")
     command.add_argument("--theta", type=float, help="single-step: angle between the observers, deg")
+    command.add_argument("--robots", type=int, help="team: how many robots; default 10")
+    command.add_argument("--at-once", type=int, help="team: how many of them move at once; default a quarter")
     command.add_argument("--fps", type=float, help="images a second (images; default 10)")
     command.add_argument("--image-format", choices=("jpeg", "png", "raw"), help="images; default jpeg")
     command.set_defaults(run=run)
@@ -59,6 +61,8 @@ def run(args: argparse.Namespace) -> int:
             imperfections=imperfections,
             l=args.l,
             theta_deg=args.theta,
+            robots=args.robots,
+            at_once=args.at_once,
             fps=10.0 if args.fps is None else args.fps,
             image_format=args.image_format or "jpeg",
             progress=report,

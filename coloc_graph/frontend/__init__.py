@@ -14,7 +14,15 @@ from coloc_graph.frontend.refinement import PointPairs, least_squares, refine
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.shared_clock import share_clock_offsets
 from coloc_graph.frontend.sighting import sight
-from coloc_graph.frontend.stance import FrontendOptions, PairMeasurement, Scale, measure_pair, sight_movers
+from coloc_graph.frontend.stance import (
+    FrontendOptions,
+    PairMeasurement,
+    Scale,
+    little_in_common,
+    measure_pair,
+    sight_movers,
+    sight_standing,
+)
 from coloc_graph.frontend.stance_tracks import StanceTracks
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.frontend.wheels import WheelTrack
@@ -46,6 +54,7 @@ __all__ = [
     "distance_from_span",
     "fit_homography",
     "least_squares",
+    "little_in_common",
     "measure_pair",
     "metric_scale",
     "most_likely_pose",
@@ -57,4 +66,5 @@ __all__ = [
     "share_clock_offsets",
     "sight",
     "sight_movers",
+    "sight_standing",
 ]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend.relative_pose import mounted, relative_pose, turned_normal
+from coloc_graph.frontend.relative_pose import eq2_pose, mounted, turned_normal
 from coloc_graph.lie import (
     across,
     floor_pose,
@@ -53,7 +53,7 @@ def most_likely_pose(
     that knows the floor takes this form. Tolerances of mounts and plane are priors of unknowns that are
     estimated along. Raises `DegenerateGeometry` where there is no baseline, or the search does not converge.
     """
-    start = relative_pose(measurement, mount_i, mount_j, plane)
+    start = eq2_pose(measurement, mount_i, mount_j, plane)
     model = (
         _on_floor(start, mount_i, mount_j, plane, floor)
         if floor is not None and plane.normal_from_mount

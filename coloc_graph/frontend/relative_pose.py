@@ -1,5 +1,7 @@
 """From a homography measurement to the pose of observer j in observer i, with a 6x6 covariance."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -27,27 +29,34 @@ def relative_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: M
     uncertain of the plane, and the tolerances of both mounts. Raises `DegenerateGeometry` where there is no
     baseline between the cameras.
     """
+    start = eq2_pose(measurement, mount_i, mount_j, plane)
     H = metric_scale(measurement.H_j_i)
-    _require_baseline(measurement, H)
-    _, _, N_both = decompose_svd(H)
-    which, normal_error = choose_by_normal(N_both, plane.N)
-
     root = _root_covariance(measurement, mount_i, mount_j, plane)
     # central differences along each column of the root, all decompositions in one call
     scale = 0.1
-    T_i_j, T_ci_cj = _poses(
+    T_i_j, _ = _poses(
         np.concatenate([np.zeros((1, len(root))), scale * root.T, -scale * root.T]), H, mount_i, mount_j, plane
     )
     off = se3_inverse(T_i_j[0]) @ T_i_j[1:]
     xi = np.concatenate([so3_log(off[:, :3, :3]), off[:, :3, 3]], axis=1)
     columns = (xi[: len(root.T)] - xi[len(root.T) :]) / (2 * scale)
     covariance = columns.T @ columns
+    return replace(start, covariance=(covariance + covariance.T) / 2)
+
+
+def eq2_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount, plane: Plane) -> RelativePose:
+    """The same without a covariance (NaN)."""
+    H = metric_scale(measurement.H_j_i)
+    _require_baseline(measurement, H)
+    _, _, N_both = decompose_svd(H)
+    which, normal_error = choose_by_normal(N_both, plane.N)
+    T_i_j, T_ci_cj = _poses(np.zeros((1, 17)), H, mount_i, mount_j, plane)
     return RelativePose(
         stance=measurement.stance,
         robot_i=measurement.robot_i,
         robot_j=measurement.robot_j,
         T_i_j=gtsam.Pose3(T_i_j[0]),
-        covariance=(covariance + covariance.T) / 2,
+        covariance=np.full((6, 6), np.nan),
         T_ci_cj=gtsam.Pose3(T_ci_cj[0]),
         solution=int(which),
         normal_error=float(normal_error),

@@ -1,6 +1,7 @@
 """Where a robot stands whose two markers a camera at rest sees: position and heading, with a covariance."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -71,6 +72,18 @@ def sight(
         covariance=covariance,
         x_markers=x,
         x_covariance=J @ (noise + bias) @ J.mT,
+    )
+
+
+def at_rest(track: Track, time: float) -> Track:
+    """A track of a marker that stands, as the one sample that all of its samples make, at a time [UTC s]."""
+    n = len(track)
+    return replace(
+        track,
+        times=np.array([time]),
+        uv=track.uv.mean(axis=0, keepdims=True),
+        covariance=track.covariance.mean(axis=0, keepdims=True) / n,
+        peak=track.peak.mean(keepdims=True),
     )
 
 

@@ -16,15 +16,17 @@ from coloc_graph.frontend.clock_offset import (
     fit_at_offset,
     require_searchable,
 )
-from coloc_graph.frontend.correspondence import Correspondences, correspond, correspond_roughly
+from coloc_graph.frontend.correspondence import PAIRING_WINDOW, Correspondences, correspond, correspond_roughly
 from coloc_graph.frontend.fit_checks import require_agreement, require_determined
 from coloc_graph.frontend.homography import HomographyFit, fit_homography, persisting, shared_error
+from coloc_graph.frontend.interpolation import LONGEST_GAP
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.paired_tracks import PairedTracks
-from coloc_graph.frontend.plane import distance_from_span
+from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
 from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.frontend.relative_pose import relative_pose
-from coloc_graph.frontend.sighting import sight
+from coloc_graph.frontend.shared_pixels import share
+from coloc_graph.frontend.sighting import at_rest, sight
 from coloc_graph.frontend.spans import marker_span
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
 from coloc_graph.frontend.tracking import Track, TrackerOptions
@@ -37,6 +39,8 @@ Array = NDArray[np.float64]
 
 #: An offset of two clocks that is known no better than this share of what was known before is not observed.
 LEAST_OBSERVED = 0.5
+#: Two of many observers that share fewer points than this have little in common.
+LITTLE_IN_COMMON = 30
 NOT_OBSERVABLE = (
     "the offset of the clocks is not observable: the mover drove at constant speed; let it stop and go "
     "(the offset is left at what the clocks are said to agree to)"
@@ -64,9 +68,9 @@ class PairMeasurement:
     """What one pair of observers measured in one stance, with what it was made of.
 
     Where `homography.unusable` says why, `relative_pose` is None; `correspondences` is None where there are
-    none. `tracks` are those of the movers' markers in both cameras, None where it did not come to that. Where clocks
-    are not said to agree, `offset_evidence` is what this stance alone knows of their offset (None: nothing), and
-    `at_offset` measures once more with an offset that is known from elsewhere.
+    none. `tracks` are those of the movers' markers in both cameras, None where it did not come to that; `standing`
+    those of robots that stand. Where clocks are not said to agree, `offset_evidence` is what this stance alone knows of
+    their offset (None: nothing), and `at_offset` measures once more with an offset that is known from elsewhere.
     """
 
     homography: HomographyMeasurement
@@ -75,6 +79,7 @@ class PairMeasurement:
     offset_evidence: ClockOffset | None = None
     at_offset: "Callable[[ClockOffset], PairMeasurement] | None" = None
     tracks: tuple[list[Track], list[Track]] | None = None
+    standing: tuple[list[Track], list[Track]] = ([], [])
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +94,7 @@ class _Seen:
     plane: Plane
     tracks_i: list[Track]
     tracks_j: list[Track]
+    others: list[list[Track]]  # of the stance's other observers
 
     @property
     def alone(self) -> bool:
@@ -98,6 +104,11 @@ class _Seen:
     @property
     def cameras(self) -> tuple[Camera, Camera]:
         return self.run.team[self.robot_i].camera, self.run.team[self.robot_j].camera
+
+
+def little_in_common(measured: HomographyMeasurement, stance: Stance) -> bool:
+    """Whether a measurement is none since the two see little in common, which in a team of many is nothing wrong."""
+    return len(stance.observers) > 2 and measured.points < LITTLE_IN_COMMON
 
 
 def measure_pair(
@@ -117,17 +128,20 @@ def measure_pair(
     `PairMeasurement.at_offset`.
     """
     found: Correspondences | None = None
+    tracks = tracks or StanceTracks(run, stance, options.tracker)
     try:
         plane = stance_plane(run, stance, robot_i)
-        tracks = tracks or StanceTracks(run, stance, options.tracker)
         tracks_i, tracks_j = tracks.of(robot_i, stance.end), tracks.of(robot_j, stance.end)
-        seen = _Seen(run, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j)
+        others = [tracks.of(name, stance.end) for name in stance.observers if name not in (robot_i, robot_j)]
+        seen = _Seen(run, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j, others)
         if run.team.clock_sigma > 0:
-            return _measure_with_clocks(seen, alone)
-        found = correspond(tracks_i, tracks_j, *seen.cameras, alone=seen.alone)
-        return _measured(seen, found, fit_homography(found.pairs, options.criterion))
+            made = _measure_with_clocks(seen, alone)
+        else:
+            found = correspond(tracks_i, tracks_j, *seen.cameras, alone=seen.alone)
+            made = _measured(seen, found, fit_homography(found.pairs, options.criterion))
     except DegenerateGeometry as why:
-        return PairMeasurement(_unusable(stance, robot_i, robot_j, found, str(why)), None, found)
+        made = PairMeasurement(_unusable(stance, robot_i, robot_j, found, str(why)), None, found)
+    return replace(made, standing=(tracks.standing(robot_i), tracks.standing(robot_j)))
 
 
 def _measure_with_clocks(seen: _Seen, alone: bool) -> PairMeasurement:
@@ -175,7 +189,11 @@ def _measured(
     require_agreement(fit, found, f"{seen.robot_i} or {seen.robot_j}", pairing)
     fit = persisting(fit, found.pairs, found.markers, found.times)
     require_determined(fit)
+    window = PAIRING_WINDOW if offset is None else LONGEST_GAP / 2
+    own = share(found, seen.tracks_i, seen.others, window)
+    fit = replace(fit, information=own * fit.information)
     measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
+    measurement = replace(measurement, share=own)
     if offset is not None:
         said = seen.run.team.clock_sigma
         measurement = replace(
@@ -247,6 +265,37 @@ def sight_movers(
             if sighting is not None and (before is None or np.trace(sighting.covariance) < np.trace(before.covariance)):
                 best[mover] = sighting
     return list(best.values())
+
+
+def sight_standing(
+    run: Recorded, stance: Stance, measured: Iterable[PairMeasurement], before: Stance | None
+) -> list[Sighting]:
+    """Where robots that stand saw others that stand, whose markers have names; nothing without a floor.
+
+    A stance is told by what came since the one `before`: two that have stood since then see no more of each other than
+    they did.
+    """
+    if run.team.floor is None or stance.index in run.planes:
+        return []
+    stayed = {name for name in stance.anchors if before is not None and name in before.observers}
+    tracks: dict[str, list[Track]] = {}
+    for one in measured:
+        for observer, seen in zip((one.homography.robot_i, one.homography.robot_j), one.standing, strict=True):
+            tracks.setdefault(observer, seen)
+    made = []
+    for observer, standing in tracks.items():
+        still = [at_rest(track, stance.start) for track in standing]
+        for name in dict.fromkeys(track.marker[: track.marker.rfind("/")] for track in standing):
+            markers = run.team[name].markers
+            if markers is None or (observer in stayed and name in stayed):
+                continue
+            try:
+                plane = plane_from_mount(run.team[observer].mount, markers, run.team.floor)
+            except DegenerateGeometry:  # a camera below these markers
+                continue
+            sighting = sight(stance, run.team[observer], run.team[name], still, plane)
+            made += [] if sighting is None else [sighting]
+    return made
 
 
 def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: Markers | None) -> Plane:

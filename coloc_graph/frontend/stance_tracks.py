@@ -65,6 +65,7 @@ class StanceTracks:
         self._trackers: dict[str, MarkerTracker] = {}
         self._taken: dict[str, int] = defaultdict(int)
         self._made: dict[str, tuple[float, list[Track]]] = {}
+        self._standing: dict[str, list[Track]] = {}
 
     def of(self, robot: str, end: float | None = None) -> list[Track]:
         """Those of an observer, up to an instant (default: the stance's end), which never goes back.
@@ -77,6 +78,10 @@ class StanceTracks:
             self._made[robot] = made = end, self._of(robot, end)
         return made[1]
 
+    def standing(self, robot: str) -> list[Track]:
+        """Those of the markers of robots that stand, once `of` has been asked for; only names tell which they are."""
+        return self._standing.get(robot, [])
+
     def _of(self, robot: str, end: float) -> list[Track]:
         run, stance, camera = self._run, self._stance, self._run.team[robot].camera
         tracker = self._trackers.get(robot)
@@ -87,7 +92,11 @@ class StanceTracks:
         if run.has_detections(robot):
             seen = list(run.detections(robot, stance.start, end))
             if all(marker for one in seen for marker in one.markers):
-                return named_tracks(robot, seen)
+                tracks = named_tracks(robot, seen)
+                stand = {f"{name}/" for name in stance.observers}
+                standing = [track for track in tracks if track.marker[: track.marker.rfind("/") + 1] in stand]
+                self._standing[robot] = standing
+                return [track for track in tracks if track not in standing]
             for one in seen[self._taken[robot] :]:
                 tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
             self._taken[robot] = len(seen)

@@ -2,7 +2,7 @@
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -33,11 +33,12 @@ class ChannelInfo(NamedTuple):
 
 
 class Message(NamedTuple):
-    """One message as it is in the file, `ns` UTC nanoseconds."""
+    """One message as it is in the file, `ns` UTC nanoseconds; `place` is where it is among the others of its chunk."""
 
     channel: int
     ns: int
     data: memoryview
+    place: int
 
 
 @dataclass(slots=True)
@@ -126,12 +127,10 @@ def _decompress(name: bytes, data: bytes, size: int) -> bytes:
     return data
 
 
-def messages(
-    path: Path, file: BinaryIO, chunk: ChunkInfo, channels: Collection[int] | None = None
-) -> Iterator[Message]:
-    """The messages of some channels (None: of all) in a chunk, in the order of writing; all are checked."""
+def messages(path: Path, file: BinaryIO, chunk: ChunkInfo) -> Iterator[Message]:
+    """The messages in a chunk, in the order of writing; all are checked."""
     start, end = chunk.start, chunk.end
-    for opcode, body in records(path, decompressed(path, file, chunk), chunk.offset):
+    for place, (opcode, body) in enumerate(records(path, decompressed(path, file, chunk), chunk.offset)):
         if opcode != Opcode.MESSAGE:
             continue
         if len(body) < _MESSAGE.size:
@@ -139,8 +138,7 @@ def messages(
         channel, _, ns, _ = _MESSAGE.unpack_from(body)
         if not start <= ns <= end:
             raise damaged(path, chunk.offset, "a message outside of its chunk's time")
-        if channels is None or channel in channels:
-            yield Message(channel, ns, body[_MESSAGE.size :])
+        yield Message(channel, ns, body[_MESSAGE.size :], place)
 
 
 def learn(path: Path, file: BinaryIO, chunk: ChunkInfo, known: Definitions) -> None:

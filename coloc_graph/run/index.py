@@ -6,7 +6,7 @@ over the record headers (https://mcap.dev/spec), the same way for a whole file a
 
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,6 +21,7 @@ from coloc_graph.run.chunks import (
     ChannelInfo,
     ChunkInfo,
     Definitions,
+    Message,
     damaged,
     learn,
     messages,
@@ -35,13 +36,17 @@ FOOTER_SIZE = len(FOOTER_HEAD) + 20
 
 @dataclass(frozen=True)
 class Index:
-    """Chunks in the order of the file; `lost` bytes at its end could not be read, None where it is whole."""
+    """Chunks in the order of the file; `lost` bytes at its end could not be read, None where it is whole.
+
+    `newest` are the messages by channel of the chunks that were read last, by their offset.
+    """
 
     path: Path
     profile: str
     chunks: tuple[ChunkInfo, ...]
     channels: dict[int, ChannelInfo]
     lost: int | None
+    newest: dict[int, dict[int, list[Message]]] = field(default_factory=dict, repr=False, compare=False)
 
 
 def is_mcap(path: Path) -> bool:

@@ -11,6 +11,9 @@ from coloc_graph.run.index import Index
 
 T = TypeVar("T")
 
+#: So many chunks of a run are kept once they are read.
+KEPT = 24
+
 
 class Item(NamedTuple):
     """A message's time [ns], its schema and its bytes."""
@@ -43,18 +46,32 @@ def read_topic(index: Index, topic: str, first: int = 0, last: int | None = None
 
 
 def _messages(index: Index, topic: str, channels: Collection[int], chunks: Iterable[ChunkInfo]) -> Iterator[Message]:
-    """The messages of some channels in some chunks; the file is open only while this runs."""
+    """The messages of some channels in some chunks, in the order of writing; the file is open only while this runs."""
     try:
         with index.path.open("rb") as file:
             for chunk in chunks:
-                count = 0
-                for message in messages(index.path, file, chunk, channels):
-                    count += 1
-                    yield message
-                if count != sum(chunk.counts.get(channel, 0) for channel in channels):
+                by_channel = index.newest.get(chunk.offset)
+                if by_channel is None:
+                    by_channel = _keep(index, chunk, messages(index.path, file, chunk))
+                found = [one for channel in channels for one in by_channel.get(channel, ())]
+                if len(found) != sum(chunk.counts.get(channel, 0) for channel in channels):
                     raise damaged(index.path, chunk.offset, f"not as many messages of {topic} as its index says")
+                if len(channels) > 1:
+                    found.sort(key=lambda one: one.place)
+                yield from found
     except OSError as error:
         raise RunError(f"{index.path}: cannot be read ({error.strerror}); check the disk") from error
+
+
+def _keep(index: Index, chunk: ChunkInfo, read: Iterable[Message]) -> dict[int, list[Message]]:
+    """The messages of a chunk by channel, kept as one of the newest: of a stance each robot's topics are asked for."""
+    by_channel: dict[int, list[Message]] = {}
+    for one in read:
+        by_channel.setdefault(one.channel, []).append(one)
+    while len(index.newest) >= KEPT:
+        index.newest.pop(next(iter(index.newest)), None)
+    index.newest[chunk.offset] = by_channel
+    return by_channel
 
 
 def decoded(index: Index, items: tuple[str, Iterator[Item]], decoder: Callable[[Item], T]) -> Iterator[T]:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.common_view import View
 from coloc_graph.run.messages import Detections, Flag
@@ -37,26 +37,27 @@ class Seen:
     lights: list[NDArray[np.int64]]
 
 
-def wander(movers: int, seconds: float, area: tuple[float, float, float, float], rng: np.random.Generator) -> Array:
-    """Poses (n, movers, 3) of x, y [m], yaw [rad], every `STEP`, of robots that drive from place to place in an area
-    (x from and to, y from and to), and make way for each other."""
-    low, high = np.array(area[::2]), np.array(area[1::2])
+def wander(movers: int, seconds: float, area: ArrayLike, rng: np.random.Generator) -> Array:
+    """Poses (n, movers, 3) of x, y [m], yaw [rad], every `STEP`, of robots that drive from place to place, and make way
+    for each other, in an area (4,) of all, or (movers, 4) of each: x from and to, y from and to [m]."""
+    areas = np.broadcast_to(np.asarray(area, float), (movers, 4))
+    low, high = areas[:, ::2], areas[:, 1::2]
     poses = np.empty((movers, 3))
     for robot in range(movers):
         for _ in range(1000):
-            poses[robot] = *rng.uniform(low, high), rng.uniform(-np.pi, np.pi)
+            poses[robot] = *rng.uniform(low[robot], high[robot]), rng.uniform(-np.pi, np.pi)
             if all(np.hypot(*(poses[robot] - other)[:2]) > ROOM for other in poses[:robot]):
                 break
         else:
             raise ValueError(f"{movers} robots do not fit into the area")
-    goals = rng.uniform(low, high, (movers, 2))
+    goals = rng.uniform(low, high)
     out = np.empty((round(seconds / STEP), movers, 3))
     for k in range(len(out)):
         for robot, (x, y, yaw) in enumerate(poses):
             way = goals[robot] - (x, y)
             turn = float(wrap(np.arctan2(way[1], way[0]) - yaw))
             if np.hypot(*way) < 0.02:
-                goals[robot] = rng.uniform(low, high)
+                goals[robot] = rng.uniform(low[robot], high[robot])
             elif abs(turn) > 0.02:
                 poses[robot, 2] += np.clip(turn, -TURN_RATE * STEP, TURN_RATE * STEP)
             else:
@@ -64,7 +65,7 @@ def wander(movers: int, seconds: float, area: tuple[float, float, float, float],
                 others = np.delete(poses[:, :2], robot, axis=0)
                 near, now = np.hypot(*(others - there).T), np.hypot(*(others - poses[robot, :2]).T)
                 if ((near < ROOM) & (near < now)).any():
-                    goals[robot] = rng.uniform(low, high)
+                    goals[robot] = rng.uniform(low[robot], high[robot])
                 else:
                     poses[robot, :2] = there
         out[k] = poses

@@ -12,8 +12,9 @@ from coloc_graph.run import whole_run
 from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Stance
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.rig import Imperfections
-from coloc_graph.simulation.scenarios import scenario
+from coloc_graph.simulation.scenarios import TeamScenario, scenario
 from coloc_graph.simulation.scenery import Scenery, frames, make_scenery
+from coloc_graph.simulation.teams import build_team_world
 from coloc_graph.simulation.tracks import observe
 from coloc_graph.simulation.wheels import Odometry, move_times, odometry
 from coloc_graph.simulation.world import EPOCH, Depth, World, build_world, stream
@@ -47,16 +48,18 @@ def simulate(
     imperfections: Imperfections | None = None,
     l: float | None = None,  # noqa: E741 (the paper's name)
     theta_deg: float | None = None,
+    robots: int | None = None,
+    at_once: int | None = None,
     fps: float = 10.0,
     image_format: ImageFormat = "jpeg",
     progress: Callable[[int, int], None] | None = None,
 ) -> World:
-    """Simulate a scenario (`single-step`, `six-step`, `hallway`) and write it as a run to `out`.
+    """Simulate a scenario (`single-step`, `six-step`, `hallway`, `team`) and write it as a run to `out`.
 
     `points` correspondences a stance (250 for single-step and for images, else 100), two from each frame at
-    depth images. `l` [m] and `theta_deg` are single-step's. `progress` is called with the stances done and their
-    number. The same arguments give the same bytes. Returns what was true. Raises `InputError`, and leaves no
-    file, where an argument is wrong or the pair has no common view.
+    depth images. `l` [m] and `theta_deg` are single-step's; `robots`, and how many move `at_once`, team's. `progress`
+    is called with the stances done and their number. The same arguments give the same bytes. Returns what was true.
+    Raises `InputError`, and leaves no file, where an argument is wrong or the pair has no common view.
     """
     if depth not in get_args(Depth):
         raise InputError(f"`depth` is {depth!r}; use tracks or images")
@@ -64,10 +67,18 @@ def simulate(
         raise InputError(f"`image_format` is {image_format!r}; use jpeg, png or raw")
     if seed < 0:
         raise InputError(f"`seed` is {seed}; give a whole number that is not negative")
-    what = scenario(scenario_name, stances=stances, l=l, theta_deg=theta_deg, rng=stream(seed, "formation"))
+    what = scenario(
+        scenario_name, stances=stances, l=l, theta_deg=theta_deg, robots=robots, at_once=at_once,
+        rng=stream(seed, "formation"),
+    )  # fmt: skip
     if points is None:
         points = 250 if depth == "images" or scenario_name == "single-step" else 100
-    world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps)
+    if isinstance(what, TeamScenario):
+        if depth == "images":
+            raise InputError("the scenario team has tracks and no images: leave out `depth`")
+        world = build_team_world(what, seed=seed, points=points, imperfections=imperfections)
+    else:
+        world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps)
 
     with whole_run(out, world.team, image_format=image_format) as writer:
         record(world, writer, depth, progress)

@@ -48,8 +48,10 @@ class Imperfections:
         return self.clock_offset != 0 or self.time_jitter > 0
 
 
-def reference_team(distortion: tuple[float, ...] = (), bias_px: float = 0.0) -> Team:
-    """Three robots A (the reference), B and C as in the design: PS3 Eye, 0.40 m up, tilted 20 deg, two LEDs.
+def reference_team(
+    distortion: tuple[float, ...] = (), bias_px: float = 0.0, names: tuple[str, ...] = ("A", "B", "C")
+) -> Team:
+    """Three robots A (the reference), B and C, or more, as in the design: PS3 Eye, 0.40 m up, tilted 20 deg, two LEDs.
 
     `distortion` is OpenCV's, none by default; images are rendered through `MILD_LENS`. `bias_px` is what their
     detected centres share as an error.
@@ -59,8 +61,8 @@ def reference_team(distortion: tuple[float, ...] = (), bias_px: float = 0.0) -> 
     )
     mount = Mount(height=0.40, tilt_deg=20.0)
     markers = Markers(height=0.15, positions=((0.0, 0.125), (0.0, -0.125)))
-    robots = tuple(Robot(name=name, camera=camera, mount=mount, markers=markers) for name in "ABC")
-    return Team(reference="A", robots=robots, floor=Floor())
+    robots = tuple(Robot(name=name, camera=camera, mount=mount, markers=markers) for name in names)
+    return Team(reference=names[0], robots=robots, floor=Floor())
 
 
 def stated_team(team: Team, imperfections: Imperfections) -> Team:

@@ -11,6 +11,9 @@ from coloc_graph.errors import InputError
 #: x [m], y [m], yaw [rad] of a body on the floor.
 Pose = tuple[float, float, float]
 
+#: A team's robots stand in lanes so far apart, one behind the other so far [m].
+LANE, ROW = 0.8, 0.45
+
 #: Half the angle between the pair's cameras in the multi-step experiments.
 HALF_ANGLE = math.radians(17.0)
 
@@ -50,7 +53,7 @@ class Scenario:
         """The robot that stands at `poses[k]`."""
         return self.pair[k % 2]
 
-    def observers(self, k: int) -> tuple[str, str]:
+    def observers(self, k: int) -> tuple[str, ...]:
         """The robots of stance k: the one at `poses[k]`, the anchor, then the one at `poses[k+1]`."""
         return self.stander(k), self.stander(k + 1)
 
@@ -66,6 +69,42 @@ class Scenario:
         """The middle of the pair in stance k [m]."""
         (xi, yi, _), (xj, yj, _) = self.poses[k], self.poses[k + 1]
         return (xi + xj) / 2, (yi + yj) / 2
+
+
+@dataclass(frozen=True)
+class TeamScenario(Scenario):
+    """`names` in lanes, of which the hindmost `at_once` drive about before all others in each stance, and then stand in
+    front: at `poses[s]` stands robot s modulo their number; in stance k, poses k * at_once and on are taken."""
+
+    names: tuple[str, ...] = ()
+    at_once: int = 1
+
+    @property
+    def stances(self) -> int:
+        """The number of stances."""
+        return (len(self.poses) - len(self.names)) // self.at_once + 1
+
+    def stander(self, k: int) -> str:
+        """The robot that stands at `poses[k]`."""
+        return self.names[k % len(self.names)]
+
+    def observers(self, k: int) -> tuple[str, ...]:
+        """The robots that stand in stance k, the hindmost first."""
+        return tuple(self.standing(k))
+
+    def anchors(self, k: int) -> tuple[str, ...]:
+        """The robots that have stayed put since stance k-1."""
+        return tuple(name for name in self.standing(k) if name in self.standing(k - 1)) if k else ()
+
+    def standing(self, k: int) -> dict[str, int]:
+        """Robot -> number of its standing pose, in stance k."""
+        first = k * self.at_once
+        return {self.stander(n): n for n in range(first, first + len(self.names) - self.at_once)}
+
+    def driving(self, k: int) -> dict[str, int]:
+        """Robot -> number of the standing pose that it takes after stance k."""
+        first = k * self.at_once + len(self.names) - self.at_once
+        return {self.stander(n): n for n in range(first, first + self.at_once)}
 
 
 def single_step(l: float = 0.8, theta_deg: float = 35.0) -> Scenario:  # noqa: E741 (the paper's name)
@@ -104,17 +143,46 @@ def hallway(stances: int = 40, rng: np.random.Generator | None = None) -> Scenar
     return Scenario("hallway", tuple((float(x), float(y), float(w)) for x, y, w in poses), Box((0.3, 2.5), (-1.0, 1.0)))
 
 
+def team_of(
+    robots: int = 10, at_once: int | None = None, stances: int = 30, rng: np.random.Generator | None = None
+) -> TeamScenario:
+    """`robots` in lanes, of which `at_once` (a quarter of them by default) move at a time; each stop is off by some
+    centimetres and degrees."""
+    at_once = max(robots // 4, 1) if at_once is None else at_once
+    if not 3 <= robots <= 255:
+        raise InputError(f"a team has 3 to 255 robots, not {robots}")
+    if not 1 <= at_once <= robots - 2:
+        raise InputError(f"of {robots} robots 1 to {robots - 2} may move at once, not {at_once}: two must watch")
+    if stances < 1:
+        raise InputError(f"the team has {stances} stances; give at least 1")
+    rng = np.random.default_rng(0) if rng is None else rng
+    n = np.arange((stances - 1) * at_once + robots)
+    lanes = max(2, round(1.2 * math.sqrt(robots)))
+    lane, row = n % lanes, n // lanes
+    y = (lane - (lanes - 1) / 2) * LANE
+    yaw = -np.sign(y) * HALF_ANGLE * (lanes == 2)  # two lanes look to each other, more look ahead
+    off = rng.standard_normal((len(n), 3)) * (0.02, 0.02, np.deg2rad(2.0))
+    poses = np.stack([ROW * row + ROW / 2 * (lane % 2), y, yaw], axis=1) + off
+    names = tuple(chr(ord("A") + k) if robots <= 26 else f"R{k:02}" for k in range(robots))
+    places = tuple((float(x), float(y), float(w)) for x, y, w in poses)
+    return TeamScenario("team", places, Box((0.7, 2.1), (-0.7, 0.7)), names=names, at_once=at_once)
+
+
 def scenario(
     name: str,
     *,
     stances: int | None = None,
     l: float | None = None,  # noqa: E741
     theta_deg: float | None = None,
+    robots: int | None = None,
+    at_once: int | None = None,
     rng: np.random.Generator | None = None,
 ) -> Scenario:
     """The scenario of a name; `InputError` where there is none, or an argument is not one of its own."""
     if name != "single-step" and (l is not None or theta_deg is not None):
         raise InputError(f"`l` and `theta_deg` belong to single-step, not to {name}; leave them out")
+    if name != "team" and (robots is not None or at_once is not None):
+        raise InputError(f"`robots` and `at_once` belong to team, not to {name}; leave them out")
     if name == "single-step":
         if stances not in (None, 1):
             raise InputError(f"single-step has one stance, not {stances}; leave `stances` out, or use the hallway")
@@ -123,6 +191,8 @@ def scenario(
         return six_step(6 if stances is None else stances)
     if name == "hallway":
         return hallway(40 if stances is None else stances, rng)
+    if name == "team":
+        return team_of(10 if robots is None else robots, at_once, 30 if stances is None else stances, rng)
     raise InputError(f"there is no scenario `{name}`; choose one of {', '.join(SCENARIOS)}")
 
 
@@ -131,4 +201,5 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
     "single-step": single_step,
     "six-step": six_step,
     "hallway": hallway,
+    "team": team_of,
 }

@@ -13,13 +13,13 @@ from coloc_graph.simulation.world import World, stream
 
 @dataclass(frozen=True, eq=False)
 class StanceTracks:
-    """What one observer detected in one stance: `uv` (n, m, 2) [px] of m markers at `stamps` (n,) [s].
+    """What one observer detected in one stance: `uv` (n, m, 2) [px] of m `markers` at `stamps` (n,) [s].
 
     `seen` (n, m) tells which of them were detected; the others' uv mean nothing. `sigma` [px] is per axis.
     """
 
     robot: str
-    mover: str
+    markers: tuple[str, ...]
     stamps: Array
     uv: Array
     seen: NDArray[np.bool_]
@@ -27,7 +27,7 @@ class StanceTracks:
 
     def records(self) -> list[Detections]:
         """One record a capture."""
-        names = np.array([f"{self.mover}/{m}" for m in range(self.uv.shape[1])])
+        names = np.array(self.markers)
         covariance = np.broadcast_to(self.sigma**2 * np.eye(2), (len(names), 2, 2))
         none = np.zeros(len(names))  # no image, so neither peak nor area was measured
         flags = np.zeros(len(names), np.uint8)
@@ -40,14 +40,16 @@ class StanceTracks:
 
 
 def observe(world: World, k: int) -> tuple[StanceTracks, ...]:
-    """What the observers of stance k detect of the mover, in the order of `Stance.observers`."""
-    mover, rng = world.scenario.mover, stream(world.seed, "detection", k)
-    out = []
+    """What the observers of stance k detect of markers, in the order of `Stance.observers`."""
+    rng, out = stream(world.seed, "detection", k), []
     for capture in world.captures[k]:
-        uv, inside = capture.view.project(world.markers_world(mover, capture.times))
+        places, names = [], []
+        for robot in (*world.stances[k].movers, *capture.standing):
+            places.append(world.markers_world(robot, capture.times))
+            names += [f"{robot}/{m}" for m in range(places[-1].shape[1])]
+        uv, inside = capture.view.project(np.concatenate(places, axis=1))
         noisy = uv + world.imperfections.noise_px * rng.standard_normal(uv.shape)
         seen = capture.recorded & inside
-        out.append(
-            StanceTracks(capture.robot, mover, capture.stamps, noisy, seen, detection_sigma(world.imperfections))
-        )
+        sigma = detection_sigma(world.imperfections)
+        out.append(StanceTracks(capture.robot, tuple(names), capture.stamps, noisy, seen, sigma))
     return tuple(out)

@@ -53,7 +53,8 @@ def stream(seed: int, purpose: str, index: int = 0) -> np.random.Generator:
 class Capture:
     """The captures of one stance by one observer: at true `times` (n,) [s], by its clock at `stamps` (n,).
 
-    `recorded` (n, m) says which of the mover's markers its detections hold (tracks depth).
+    `recorded` (n, m) says which of the movers' markers, and then of those of robots that are `standing` in view, its
+    detections hold (tracks depth).
     """
 
     robot: str
@@ -61,6 +62,7 @@ class Capture:
     times: Array
     stamps: Array
     recorded: NDArray[np.bool_]
+    standing: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ class World:
 
     def clock(self, robot: str, times: ArrayLike) -> Array:
         """What a robot's clock says at true times [s]."""
-        return _stamp(robot, self.team, self.imperfections, times)
+        return stamp(robot, self.team, self.imperfections, times)
 
     def markers_world(self, robot: str, times: ArrayLike) -> Array:
         """True places (n, m, 3) [m] of a robot's markers at true times (n,); m may be 0."""
@@ -241,12 +243,13 @@ class _Builder:
             jitter = self.imperfections.time_jitter * rng.standard_normal(len(tour.instants))
             order = np.argsort(tour.instants + jitter)
             times = (tour.instants + jitter)[order]
-            stamps = _stamp(robot, stated, self.imperfections, times)
+            stamps = stamp(robot, stated, self.imperfections, times)
             out.append(Capture(robot, view, times, stamps, tour.recorded[order]))
         return tuple(out)
 
 
-def _stamp(robot: str, team: Team, imperfections: Imperfections, times: ArrayLike) -> Array:
+def stamp(robot: str, team: Team, imperfections: Imperfections, times: ArrayLike) -> Array:
+    """What a robot's clock says at true times [s]."""
     late = 0.0 if robot == team.reference else imperfections.clock_offset
     return np.asarray(times, float) + late
 
