@@ -1,0 +1,168 @@
+"""Teams of many robots, several of which move at once: honesty, what loops are worth, time and memory.
+
+    python benchmarks/team.py [--seeds 24] [--json]     6 robots, 10 stances: NEES; against the best single chain
+    python benchmarks/team.py --table [--large]         time and memory against the number of robots; 50 of 100 stances
+
+Mounts are wrong by 0.5 deg and 3 mm, the floor by 0.1 deg (one sigma each), 0.3 px, about 100 points a pair. The best
+single chain is what the surest way from the reference to each pose makes of the same measurements, one for each pose.
+"""
+
+import argparse
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `coloc` does, before numpy is there
+
+import numpy as np
+from monte_carlo import MemoryRun, anees_interval, over_seeds, truth_of
+
+from coloc_graph.backend import Estimate, joint
+from coloc_graph.backend.chain import spanning_tree
+from coloc_graph.evaluation import align, nees_of
+from coloc_graph.pipeline import SolveOptions, solve
+from coloc_graph.simulation import Imperfections
+from coloc_graph.simulation.scenarios import team_of
+from coloc_graph.simulation.teams import build_team_world
+from coloc_graph.simulation.world import World, stream
+
+WRONG = Imperfections(mount_sigma_deg=0.5, height_sigma=0.003, floor_sigma_deg=0.1)
+
+
+def world_of(robots: int, stances: int, seed: int, at_once: int | None = None) -> World:
+    """What `coloc simulate team` makes of a seed."""
+    what = team_of(robots, at_once, stances, stream(seed, "formation"))
+    return build_team_world(what, seed=seed, imperfections=WRONG)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of a run: NEES per degree of freedom of one pose, of all on average; RMS errors of the team and of the single
+    chain, and what their covariances promise [m]; chi2 and dof."""
+
+    last: float
+    anees: float
+    ate: float
+    ate_chain: float
+    promised: float
+    promised_chain: float
+    chi2: float
+    dof: int
+
+
+def of_seed(seed: int, robots: int, stances: int) -> Figures:
+    """One run, solved whole and as a tree."""
+    world = world_of(robots, stances, seed)
+    solution = solve(MemoryRun(world), SolveOptions())  # type: ignore[arg-type]
+    graph = solution.estimate.graph
+    tied = {id(step.link) for step in spanning_tree(graph, graph.links)}
+    alone = joint(replace(graph, measurements=tuple(m for m in graph.measurements if id(m) in tied)), refuse=False)
+    whole, chained = (_errors(one, world) for one in (solution.estimate, alone))
+    # of one robot's last pose at rest, far from the reference
+    robot = world.scenario.observers(stances - 1)[-1]
+    true = align(solution.estimate.trajectories, truth_of(world), world.team.reference, on_floor=True)
+    last = nees_of(solution.estimate.trajectories[robot], true[robot], [2, 3, 4])[-1]
+    return Figures(
+        float(last), whole[2], whole[0], chained[0], whole[1], chained[1], solution.estimate.chi2, solution.estimate.dof
+    )
+
+
+def _errors(estimate: Estimate, world: World) -> tuple[float, float, float]:
+    """RMS position error of all robots that stand, what the covariances say it is [m], and the average NEES."""
+    true = align(estimate.trajectories, truth_of(world), world.team.reference, on_floor=True)
+    squared, variances, nees = [], [], []
+    for robot, trajectory in estimate.trajectories.items():
+        assert trajectory.stances is not None
+        assert trajectory.covariances is not None
+        stood = np.array([robot in world.stances[k].observers for k in trajectory.stances])
+        off = trajectory.positions - true[robot][:, :3, 3]
+        squared.append((off[stood, :2] ** 2).sum(axis=1))
+        variances.append(np.trace(trajectory.covariances[stood, 3:5, 3:5], axis1=1, axis2=2))
+        nees.append(nees_of(trajectory, true[robot], [2, 3, 4]))
+    rms = (float(np.sqrt(np.concatenate(parts).mean())) for parts in (squared, variances))
+    return *rms, float(np.concatenate(nees).mean())
+
+
+def honesty(seeds: int, robots: int = 6, stances: int = 10) -> dict[str, object]:
+    """Over seeds."""
+    rows = over_seeds(partial(of_seed, robots=robots, stances=stances), range(seeds))
+    low, high = anees_interval(seeds, 3)
+    ate, chain = (np.sqrt(np.mean(np.square([getattr(r, n) for r in rows]))) for n in ("ate", "ate_chain"))
+    promised, promised_chain = (
+        np.sqrt(np.mean(np.square([getattr(r, n) for r in rows]))) for n in ("promised", "promised_chain")
+    )
+    return {
+        "robots": robots,
+        "stances": stances,
+        "seeds": seeds,
+        "nees_of_one_pose": float(np.mean([r.last for r in rows])),
+        "interval_95": [low, high],
+        "anees_of_all": float(np.mean([r.anees for r in rows])),
+        "chi2_per_dof": sum(r.chi2 for r in rows) / sum(r.dof for r in rows),
+        "rms_error_cm": 100 * float(ate),
+        "promised_cm": 100 * float(promised),
+        "rms_error_of_chain_cm": 100 * float(chain),
+        "promised_of_chain_cm": 100 * float(promised_chain),
+        "better_than_chain": float(chain / ate),
+        "promised_better": float(promised_chain / promised),
+    }
+
+
+def sized(robots: int, stances: int) -> dict[str, float]:
+    """Time and memory of one run, from detections in memory, in a process of its own."""
+    world = world_of(robots, stances, 0)
+    run = MemoryRun(world)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    began = time.process_time()
+    solution = solve(run, SolveOptions())  # type: ignore[arg-type]
+    taken = time.process_time() - began
+    accuracy = _errors(solution.estimate, world)
+    return {
+        "robots": robots,
+        "stances": stances,
+        "poses": len(solution.estimate.graph.nodes),
+        "homographies": solution.used,
+        "seconds": taken,
+        "front_end_s": solution.seconds_frontend,
+        "graph_s": solution.seconds_backend,
+        "mib_before": before / 1024,
+        "mib_at_most": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "ate_cm": 100 * accuracy[0],
+        "anees": accuracy[2],
+        "chi2_per_dof": solution.estimate.chi2 / solution.estimate.dof,
+    }
+
+
+def table(sizes: Sequence[tuple[int, int]]) -> list[dict[str, float]]:
+    """Rows of `sized`, one process each."""
+    rows = []
+    for robots, stances in sizes:
+        with get_context("spawn").Pool(1) as pool:
+            rows.append(pool.apply(sized, (robots, stances)))
+        print("  ".join(f"{name} {value:.4g}" for name, value in rows[-1].items()), file=sys.stderr, flush=True)
+    return rows
+
+
+def main() -> None:
+    """Run it, print it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=24)
+    parser.add_argument("--table", action="store_true")
+    parser.add_argument("--large", action="store_true", help="50 robots, 100 stances, too")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    if options.table:
+        found: object = table([(n, 30) for n in (3, 5, 10, 20)] + [(50, 30), (50, 100)][: 1 + options.large])
+    else:
+        found = honesty(options.seeds)
+    print(json.dumps(found, indent=None if options.json else 2))
+
+
+if __name__ == "__main__":
+    main()
