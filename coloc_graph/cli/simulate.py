@@ -28,6 +28,9 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--at-once", type=int, help="team: how many of them move at once; default a quarter")
     command.add_argument("--fps", type=float, help="images a second (images; default 10)")
     command.add_argument("--image-format", choices=("jpeg", "png", "raw"), help="images; default jpeg")
+    command.add_argument(
+        "--messy", action="store_true", help="images: glare, mirrors, flicker, and a person in the way"
+    )
     command.set_defaults(run=run)
 
 
@@ -65,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
             at_once=args.at_once,
             fps=10.0 if args.fps is None else args.fps,
             image_format=args.image_format or "jpeg",
+            messy=args.messy,
             progress=report,
         )
     print(args.out)

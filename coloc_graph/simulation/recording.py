@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from coloc_graph.errors import InputError
 from coloc_graph.run import whole_run
 from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Stance
+from coloc_graph.simulation.mess import messy_frames
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.rig import Imperfections
 from coloc_graph.simulation.scenarios import TeamScenario, scenario
@@ -17,7 +18,7 @@ from coloc_graph.simulation.scenery import Scenery, frames, make_scenery
 from coloc_graph.simulation.teams import build_team_world
 from coloc_graph.simulation.tracks import observe
 from coloc_graph.simulation.wheels import Odometry, move_times, odometry
-from coloc_graph.simulation.world import EPOCH, Depth, World, build_world, stream
+from coloc_graph.simulation.world import EPOCH, Capture, Depth, World, build_world, stream
 from coloc_graph.team import Team
 
 ImageFormat = Literal["jpeg", "raw", "png"]
@@ -52,17 +53,21 @@ def simulate(
     at_once: int | None = None,
     fps: float = 10.0,
     image_format: ImageFormat = "jpeg",
+    messy: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> World:
     """Simulate a scenario (`single-step`, `six-step`, `hallway`, `team`) and write it as a run to `out`.
 
     `points` correspondences a stance (250 for single-step and for images, else 100), two from each frame at
-    depth images. `l` [m] and `theta_deg` are single-step's; `robots`, and how many move `at_once`, team's. `progress`
-    is called with the stances done and their number. The same arguments give the same bytes. Returns what was true.
-    Raises `InputError`, and leaves no file, where an argument is wrong or the pair has no common view.
+    depth images, which `messy` makes of a world of glare, mirrors, flicker and a person in the way. `l` [m] and
+    `theta_deg` are single-step's; `robots`, and how many move `at_once`, team's. `progress` is called with the stances
+    done and their number. The same arguments give the same bytes. Returns what was true. Raises `InputError`, and
+    leaves no file, where an argument is wrong or the pair has no common view.
     """
     if depth not in get_args(Depth):
         raise InputError(f"`depth` is {depth!r}; use tracks or images")
+    if messy and depth != "images":
+        raise InputError("`messy` is of images: use it with depth images")
     if image_format not in get_args(ImageFormat):
         raise InputError(f"`image_format` is {image_format!r}; use jpeg, png or raw")
     if seed < 0:
@@ -81,11 +86,18 @@ def simulate(
         world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps)
 
     with whole_run(out, world.team, image_format=image_format) as writer:
-        record(world, writer, depth, progress)
+        record(world, writer, depth, progress, messy=messy)
     return world
 
 
-def record(world: World, recorder: Recorder, depth: Depth, progress: Callable[[int, int], None] | None = None) -> None:
+def record(
+    world: World,
+    recorder: Recorder,
+    depth: Depth,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    messy: bool = False,
+) -> None:
     """Write all that happens in a world to a recorder, each topic in the order of time."""
     recorder.write_true_team(world.true_team)
     wheels = {
@@ -101,7 +113,7 @@ def record(world: World, recorder: Recorder, depth: Depth, progress: Callable[[i
     for k, stance in enumerate(world.stances):
         events = _truth(world, begin, stance)
         events += _moves(world, begin, stance, wheels)
-        events += _seen(world, k, scenery)
+        events += _seen(world, k, scenery, messy_frames if messy else frames)
         # stable, so that what happens at one instant is written in the order above
         for _, happen in sorted(events, key=lambda event: event[0]):
             happen(recorder)
@@ -111,6 +123,8 @@ def record(world: World, recorder: Recorder, depth: Depth, progress: Callable[[i
 
 
 Event = tuple[float, Callable[[Recorder], None]]
+#: What makes the images of a capture in a stance.
+Rendering = Callable[[World, int, Capture, Scenery], Iterator[Image]]
 
 
 def _write(record: Record, time: float) -> Event:
@@ -144,13 +158,13 @@ def _moves(world: World, begin: float, stance: Stance, wheels: dict[str, Odometr
     return events
 
 
-def _seen(world: World, k: int, scenery: Scenery | None) -> list[Event]:
+def _seen(world: World, k: int, scenery: Scenery | None, rendered: Rendering) -> list[Event]:
     """What the observers of stance k took: images where there is scenery, otherwise detections."""
     if scenery is None:
         return [_write(found, found.time) for tracks in observe(world, k) for found in tracks.records()]
     events = []
     for capture in world.captures[k]:
-        images = frames(world, k, capture, scenery)
+        images = rendered(world, k, capture, scenery)
         events += [(stamp, _write_next(images)) for stamp in capture.stamps.tolist()]
     return events
 

@@ -76,9 +76,18 @@ def scenery_along(first: float, last: float, rng: np.random.Generator) -> Scener
 
 def backdrop(camera: Camera, T_world_camera: Array, scenery: Scenery, rng: np.random.Generator) -> Field:
     """The field (height, width) of a camera with no robot before it: dark, and bright things."""
+    return bright(dark(camera, rng), camera, T_world_camera, scenery)
+
+
+def dark(camera: Camera, rng: np.random.Generator) -> Field:
+    """The field (height, width) of a camera in the dark."""
     x, y = np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height)[:, None]
     a, b, c = rng.uniform(-1, 1, 3)
-    field = (19 - (5 + b) * y + 2.5 * a * x - (2 + c) * x**2).astype(np.float32)
+    return np.asarray(19 - (5 + b) * y + 2.5 * a * x - (2 + c) * x**2, np.float32)
+
+
+def bright(field: Field, camera: Camera, T_world_camera: Array, scenery: Scenery) -> Field:
+    """The same with bright things in it."""
     w = len(scenery.windows)
     uv, depth, ok = _image_of(camera, T_world_camera, np.concatenate([scenery.windows.reshape(-1, 3), scenery.places]))
     corners, whole = uv[: 4 * w].reshape(w, 4, 2), ok[: 4 * w].reshape(w, 4).all(axis=1)
@@ -107,37 +116,49 @@ def frames(world: World, k: int, capture: Capture, scenery: Scenery, sensor: Sen
     sensor = sensor or Sensor()
     index = world.team.names.index(capture.robot)
     rng = stream(world.seed, "sensor", k * len(world.team.names) + index)
-    camera, T_world_camera = capture.view.camera, capture.view.T_world_camera
-    field = backdrop(camera, T_world_camera, scenery, rng)
-    half = sensor.exposure / 2
+    field = backdrop(capture.view.camera, capture.view.T_world_camera, scenery, rng)
+    others = others_in_view(world, capture, sensor)
+    for i, stamp in enumerate(capture.stamps.tolist()):
+        noise = rng.standard_normal(field.shape, dtype=np.float32)
+        yield Image(capture.robot, stamp, draw(field, others, i, sensor, noise))
+
+
+def others_in_view(
+    world: World, capture: Capture, sensor: Sensor, mirrored: float = MIRROR_LEVEL
+) -> list["RobotInView"]:
+    """All other robots as an observer sees them."""
+    half, camera, T_world_camera = sensor.exposure / 2, capture.view.camera, capture.view.T_world_camera
     others = []
     for name in world.team.names:
         if name != capture.robot:
             T_world_body = [world.paths[name].pose_at(capture.times + shift) for shift in (0.0, -half, half)]
             markers = world.true_team[name].markers
             p_body = np.zeros((0, 3)) if markers is None else markers.p_body
-            others.append(RobotInView(camera, [T_world_camera] * 3, T_world_body, p_body, sensor))
-    for i, stamp in enumerate(capture.stamps.tolist()):
-        noise = rng.standard_normal(field.shape, dtype=np.float32)
-        yield Image(capture.robot, stamp, draw(field, others, i, sensor, noise))
+            others.append(RobotInView(camera, [T_world_camera] * 3, T_world_body, p_body, sensor, mirrored))
+    return others
 
 
 def draw(field: Field, others: Sequence["RobotInView"], i: int, sensor: Sensor, noise: Field | None) -> Pixels:
     """The image (height, width) of capture i: a backdrop with other robots before it, and noise of variance 1."""
+    return expose(with_robots(field, others, i), sensor, noise)
+
+
+def with_robots(field: Field, others: Sequence["RobotInView"], i: int) -> Field:
+    """A backdrop with other robots before it, at capture i."""
     image = field.copy()
     for other in others:
         other.add_mirrored(image, i)
     # the far ones first: a near body hides what is behind it
     for other in sorted(others, key=lambda other: -float(other.distance[i])):
         other.paint(image, i)
-    return expose(image, sensor, noise)
+    return image
 
 
 class RobotInView:
     """One robot as another's camera sees it, over n captures.
 
     `T_world_camera`, each (4, 4) or (n, 4, 4), and `T_world_body`, each (n, 4, 4), are in the middle, at the beginning
-    and at the end of the exposures. `p_body` (m, 3) [m] are its LEDs.
+    and at the end of the exposures. `p_body` (m, 3) [m] are its LEDs, of whose light the floor mirrors a part.
     """
 
     def __init__(
@@ -147,6 +168,7 @@ class RobotInView:
         T_world_body: Sequence[Array],
         p_body: Array,
         sensor: Sensor,
+        mirrored: float = MIRROR_LEVEL,
     ) -> None:
         middle = T_world_body[0]
         #: How far it is from the camera (n,) [m].
@@ -169,7 +191,7 @@ class RobotInView:
             ]
 
         self._leds = seen(slice(m), 1.0, sensor.led_level, 1.0)
-        self._mirrored = seen(slice(m, 2 * m), MIRROR_RADIUS, MIRROR_LEVEL * sensor.led_level, MIRROR_BLUR)
+        self._mirrored = seen(slice(m, 2 * m), MIRROR_RADIUS, mirrored * sensor.led_level, MIRROR_BLUR)
 
     def add_mirrored(self, field: Field, i: int) -> None:
         """Add what the floor mirrors of its LEDs."""

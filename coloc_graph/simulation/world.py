@@ -41,6 +41,7 @@ _STREAMS = (
     "wheels",
     "scenery",
     "sensor",
+    "person",
 )
 
 
