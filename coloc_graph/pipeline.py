@@ -24,7 +24,7 @@ LEAST_CHANCE = 1e-4
 #: So many kinds of reasons are named where every measurement is refused.
 REASONS_NAMED = 3
 
-#: Called with how many measurements are done, and of how many.
+#: Called with how many stances are measured, and of how many.
 Progress = Callable[[int, int], None]
 
 
@@ -100,7 +100,7 @@ def solve(
             *run.warnings,
             *solved.clock_warnings,
             *_implausible(run, options, measured),
-            *_warnings(run, estimate, diagnose(estimate.graph), measured),
+            *_warnings(estimate, diagnose(estimate.graph), measured),
         ),
         seconds_frontend=solved.seconds_frontend,
         seconds_backend=time.perf_counter() - started - solved.seconds_frontend,
@@ -147,19 +147,17 @@ def _incrementally(
 
 
 class _Counted:
-    """Measures stances, and says how many pairs are done."""
+    """Measures stances, and says how many are done."""
 
     def __init__(self, run: Run, options: SolveOptions, progress: Progress | None) -> None:
         self._run, self._options, self._progress = run, options, progress
-        self._pairs = sum(math.comb(len(stance.observers), 2) for stance in run.stances)
         self._done = 0
 
     def __call__(self, stance: Stance) -> Iterator[PairMeasurement]:
-        for one in measure_stance(self._run, stance, self._options):
-            self._done += 1
-            if self._progress is not None:
-                self._progress(self._done, self._pairs)
-            yield one
+        yield from measure_stance(self._run, stance, self._options)
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, len(self._run.stances))
 
 
 def _require_poses(run: Run, options: SolveOptions, measured: Sequence[PairMeasurement]) -> None:
@@ -238,10 +236,8 @@ def _why_untied(loose: tuple[Loose, ...], measurements: Iterable[PairMeasurement
     return str(loose[0])
 
 
-def _warnings(
-    run: Run, estimate: Estimate, loose: Sequence[Loose], measurements: Sequence[PairMeasurement]
-) -> list[str]:
-    stances = {stance.index: stance for stance in run.stances}
+def _warnings(estimate: Estimate, loose: Sequence[Loose], measurements: Sequence[PairMeasurement]) -> list[str]:
+    stances = estimate.graph.by_index
     warnings = [
         f"stance {m.homography.stance}: {m.homography.robot_i} and {m.homography.robot_j} not used: "
         f"{m.homography.unusable}"

@@ -1,6 +1,5 @@
 """One stance after the other: measured when it is over, and entered; on a logged run as on a team in the field."""
 
-import itertools
 import time
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,6 +16,7 @@ from coloc_graph.frontend import (
     StanceTracks,
     WheelTrack,
     measure_pair,
+    measured_pairs,
     share_clock_offsets,
     sight_movers,
     sight_standing,
@@ -82,8 +82,9 @@ def measure_stance(
     # a joint estimate takes the scale from the spans by itself, and the heights for a start
     scale: Scale = "heights" if options.method == "joint" else frontend.scale
     tracks = tracks or StanceTracks(run, stance, frontend.tracker)
-    for pair in itertools.combinations(stance.observers, 2):
-        yield measure_pair(run, stance, *pair, replace(frontend, scale=scale), tracks, alone=False)
+    pairs = measured_pairs(tracks)
+    for pair in pairs:
+        yield measure_pair(run, stance, *pair, replace(frontend, scale=scale), tracks, pairs, alone=False)
 
 
 class Motions:

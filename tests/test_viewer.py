@@ -547,16 +547,14 @@ def test_ctrl_c_ends_it_without_a_word(command, result, short, tmp_path):
         _, err = process.communicate(timeout=30)
     finally:
         process.kill()
-    assert (
-        solved and process.returncode == 0 and not [one for one in err.splitlines() if "measurements made" not in one]
-    )
+    assert solved and process.returncode == 0 and not [one for one in err.splitlines() if "stances measured" not in one]
 
 
 def test_ctrl_c_while_it_is_solved_says_that_there_is_no_result(hallway, tmp_path):
     arguments = [COLOC, "solve", hallway, "--out", tmp_path / "out", "--incremental", "--view", "--no-browser"]
     process = started([*arguments, "--port", "0"])
     try:
-        assert any("measurements made" in line for line in process.stderr)  # some are, and not all
+        assert any("stances measured" in line for line in process.stderr)  # some are, and not all
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=30)
     finally:

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
         with suppress(OSError):  # it goes again where nothing came to be in it
             out.rmdir()
         raise
-    with progress("measurements made from the images") as report:
+    with progress("stances measured from the images") as report:
         solution = solve(open_run(run_path), progress=report)
     accuracy = write_result(solution, out / "result")
     picture = out / "hallway.png"

@@ -120,7 +120,7 @@ def _solved(
     from coloc_graph.results import summarise, write_result
 
     with _earlier_result_named(args.out):
-        with progress("measurements made") as report:
+        with progress("stances measured") as report:
             solution = solve(run, options, report, entered)
         accuracy = write_result(solution, args.out)
     warn(solution.warnings)

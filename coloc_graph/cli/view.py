@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     if args.png:
         require_browser()
     if is_run(args.path):
-        with progress("measurements made") as report:
+        with progress("stances measured") as report:
             scene = scene_of_run(open_run(args.path), report)
     else:
         scene = scene_of_result(args.path, args.run_path)

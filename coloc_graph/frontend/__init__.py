@@ -20,6 +20,7 @@ from coloc_graph.frontend.stance import (
     Scale,
     little_in_common,
     measure_pair,
+    measured_pairs,
     sight_movers,
     sight_standing,
 )
@@ -56,6 +57,7 @@ __all__ = [
     "least_squares",
     "little_in_common",
     "measure_pair",
+    "measured_pairs",
     "metric_scale",
     "most_likely_pose",
     "on_plane",

@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 #: A floor, or a mount, that is called exact is taken as exact to this much [rad, m].
 LEAST_SIGMA = 1e-5
 MAX_ITERATIONS = 20
+#: A search has converged where a step is shorter than this in sigmas; what is left is about the square of it.
+CONVERGED = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,7 @@ def most_likely_pose(
         if not np.abs(step).max() < 1.0:
             break
         unknowns[free] += step
-        if np.linalg.norm(A @ step) < 1e-4:
+        if np.linalg.norm(A @ step) < CONVERGED:
             return _result(measurement, start, model, unknowns, steps, width, A)
     raise DegenerateGeometry(
         f"the search for the pose between {measurement.robot_i} and {measurement.robot_j} does not converge: "

@@ -1,6 +1,6 @@
 """One stance of a run: from its images or detections to the homography between two observers."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
@@ -25,7 +25,7 @@ from coloc_graph.frontend.paired_tracks import PairedTracks
 from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
 from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.frontend.relative_pose import relative_pose
-from coloc_graph.frontend.shared_pixels import share
+from coloc_graph.frontend.shared_pixels import Pair, pairs_of, share
 from coloc_graph.frontend.sighting import at_rest, sight
 from coloc_graph.frontend.spans import marker_span
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
@@ -94,7 +94,8 @@ class _Seen:
     plane: Plane
     tracks_i: list[Track]
     tracks_j: list[Track]
-    others: list[list[Track]]  # of the stance's other observers
+    pairs: Sequence[Pair]  # all that are measured in the stance
+    tracks: dict[str, list[Track]]  # of all observers of the stance
 
     @property
     def alone(self) -> bool:
@@ -111,6 +112,15 @@ def little_in_common(measured: HomographyMeasurement, stance: Stance) -> bool:
     return len(stance.observers) > 2 and measured.points < LITTLE_IN_COMMON
 
 
+def measured_pairs(tracks: StanceTracks) -> list[Pair]:
+    """The pairs of a stance's observers that are measured: of many, those with most in common."""
+    return pairs_of(tracks.stance.observers, tracks.all(), _window(tracks.run))
+
+
+def _window(run: Recorded) -> float:
+    return PAIRING_WINDOW if run.team.clock_sigma == 0 else LONGEST_GAP / 2
+
+
 def measure_pair(
     run: Recorded,
     stance: Stance,
@@ -118,22 +128,33 @@ def measure_pair(
     robot_j: str,
     options: FrontendOptions,
     tracks: StanceTracks | None = None,
+    pairs: Sequence[Pair] | None = None,
     *,
     alone: bool = True,
 ) -> PairMeasurement:
     """The homography and relative pose between two observers in one stance; degenerate geometry is an answer.
 
-    `tracks` are those of the stance where they are made already. Where the team's clocks are not said to agree
-    (`Team.clock_sigma`), their offset is estimated with it; unless it is measured `alone`, what is measured is left to
-    `PairMeasurement.at_offset`.
+    `tracks` are those of the stance where they are made already, `pairs` all that are measured in it. Where the team's
+    clocks are not said to agree (`Team.clock_sigma`), their offset is estimated with it; unless it is measured `alone`,
+    what is measured is left to `PairMeasurement.at_offset`.
     """
     found: Correspondences | None = None
     tracks = tracks or StanceTracks(run, stance, options.tracker)
     try:
         plane = stance_plane(run, stance, robot_i)
         tracks_i, tracks_j = tracks.of(robot_i, stance.end), tracks.of(robot_j, stance.end)
-        others = [tracks.of(name, stance.end) for name in stance.observers if name not in (robot_i, robot_j)]
-        seen = _Seen(run, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j, others)
+        seen = _Seen(
+            run,
+            stance,
+            robot_i,
+            robot_j,
+            options,
+            plane,
+            tracks_i,
+            tracks_j,
+            pairs or measured_pairs(tracks),
+            tracks.all(),
+        )
         if run.team.clock_sigma > 0:
             made = _measure_with_clocks(seen, alone)
         else:
@@ -189,8 +210,7 @@ def _measured(
     require_agreement(fit, found, f"{seen.robot_i} or {seen.robot_j}", pairing)
     fit = persisting(fit, found.pairs, found.markers, found.times)
     require_determined(fit)
-    window = PAIRING_WINDOW if offset is None else LONGEST_GAP / 2
-    own = share(found, seen.tracks_i, seen.others, window)
+    own = share(found, (seen.robot_i, seen.robot_j), seen.pairs, seen.tracks, _window(seen.run))
     fit = replace(fit, information=own * fit.information)
     measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
     measurement = replace(measurement, share=own)

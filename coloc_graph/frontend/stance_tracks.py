@@ -58,7 +58,7 @@ class StanceTracks:
     """
 
     def __init__(self, run: Recorded, stance: Stance, options: TrackerOptions | None = None) -> None:
-        self._run, self._stance = run, stance
+        self.run, self.stance = run, stance
         self._markers = stance_markers(run, stance)
         count = sum(len(m.positions) for name in stance.movers if (m := run.team[name].markers))
         self._options = replace(options or TrackerOptions(), markers=max(count, 1))
@@ -72,18 +72,30 @@ class StanceTracks:
 
         `DegenerateGeometry` where the movers' markers share no plane that the camera is above.
         """
-        end = self._stance.end if end is None else end
+        end = self.stance.end if end is None else end
         made = self._made.get(robot)
         if made is None or made[0] != end:
             self._made[robot] = made = end, self._of(robot, end)
         return made[1]
+
+    def all(self) -> dict[str, list[Track]]:
+        """Those of all observers, as far as they are; none of one whose camera is not above the markers' plane."""
+        if len(self.stance.observers) == 2:
+            return {robot: [] for robot in self.stance.observers}  # nobody asks
+        found = {}
+        for robot in self.stance.observers:
+            try:
+                found[robot] = self.of(robot, self.stance.end)
+            except DegenerateGeometry:
+                found[robot] = []
+        return found
 
     def standing(self, robot: str) -> list[Track]:
         """Those of the markers of robots that stand, once `of` has been asked for; only names tell which they are."""
         return self._standing.get(robot, [])
 
     def _of(self, robot: str, end: float) -> list[Track]:
-        run, stance, camera = self._run, self._stance, self._run.team[robot].camera
+        run, stance, camera = self.run, self.stance, self.run.team[robot].camera
         tracker = self._trackers.get(robot)
         if tracker is None:
             size = camera.width, camera.height
