@@ -6,16 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from crowd_scene import FACTS, movers, seen_by_both
+from msgspec.structs import replace as msgspec_replace
 
 from coloc_graph import stance_solver
+from coloc_graph.common_view import View
 from coloc_graph.errors import InputError
-from coloc_graph.frontend import FrontendOptions, Track, correspond, little_in_common, measure_pair
+from coloc_graph.frontend import FrontendOptions, StanceTracks, Track, correspond, little_in_common, measure_pair
 from coloc_graph.frontend.shared_pixels import PARTNERS, pairs_of, share
+from coloc_graph.lie import floor_pose
 from coloc_graph.measurements import Sighting
 from coloc_graph.pipeline import SolveOptions, solve
 from coloc_graph.results import assess
-from coloc_graph.run import Detections, RunWriter, open_run
-from coloc_graph.simulation import Imperfections, record, simulate
+from coloc_graph.run import Detections, Image, RunWriter, Stance, open_run
+from coloc_graph.simulation import Imperfections, record, reference_team, simulate
+from coloc_graph.simulation.crowd import STEP, lights_of
 from coloc_graph.simulation.scenarios import team_of
 from coloc_graph.simulation.teams import build_team_world
 from coloc_graph.team import Floor
@@ -202,3 +206,45 @@ def test_a_messy_world_gives_a_right_pose_or_none(tmp_path):
         right += 1
     assert right
     assert run.team.floor == Floor()
+
+
+def coloured(uv, colours):
+    """A BGR image of soft spots at pixels (n, 2)."""
+    u, v = np.meshgrid(np.arange(320), np.arange(240))
+    image = np.full((240, 320, 3), 8.0)
+    for (x, y), colour in zip(uv, colours, strict=True):
+        image += np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * 1.3**2))[..., None] * colour
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def test_colours_tell_two_movers_apart_even_in_lock_step(tmp_path):
+    """Side by side they drive the same way, and only their colours say which is which."""
+    team = reference_team(names=("A", "B", "C", "D"))
+    hues = {"C": 0.0, "D": 120.0}
+    robots = tuple(
+        msgspec_replace(one, markers=msgspec_replace(one.markers, hue_deg=hues.get(one.name))) for one in team.robots
+    )
+    team = msgspec_replace(team, robots=robots)
+    poses = {"A": floor_pose(0, 0.4, -0.3), "B": floor_pose(0, -0.4, 0.3)}
+    s = np.linspace(0, 2 * np.pi, 70)
+    x, y = 1.4 + 0.3 * np.sin(s), 0.25 * np.sin(2 * s)
+    yaw = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
+    way = np.stack([np.stack([x, y + side, yaw], axis=1) for side in (-0.3, 0.3)], axis=1)
+    p_lights = lights_of(way, STEP * np.arange(70), team["C"].markers.p_body)
+    colours = [(0, 0, 230)] * 2 + [(0, 230, 0)] * 2
+    with RunWriter(tmp_path / "run.mcap", team, image_format="raw") as writer:
+        writer.write(Stance(0, 100.0, 110.0, ("A", "B"), ("C", "D")))
+        for robot, T in poses.items():
+            view = View(team[robot].camera, T @ team[robot].mount.T_body_camera)
+            uv, _ = view.project(p_lights.reshape(70, 4, 3))
+            for k in range(70):
+                writer.write(Image(robot, 101.0 + 0.1 * k, coloured(uv[k], colours)))
+    run = open_run(tmp_path / "run.mcap")
+    tracks = StanceTracks(run, run.stances[0])
+    for robot in "AB":
+        assert {track.mover for track in tracks.of(robot)} == {"C", "D"}
+    measured = measure_pair(run, run.stances[0], "A", "B", FrontendOptions(), tracks)
+    assert measured.homography.unusable is None
+    off = measured.relative_pose.T_i_j.matrix() - np.linalg.inv(poses["A"]) @ poses["B"]
+    assert np.abs(off[:3, 3]).max() < 0.02
+    assert {span.mover for span in measured.relative_pose.spans} == {"C", "D"}

@@ -37,6 +37,12 @@ def span_samples(
     return found
 
 
+def couple_of(tracks: Sequence[Track], camera: Camera, plane: Plane, span: float) -> tuple[int, int] | None:
+    """Of one robot's tracks, which may be in pieces, the two of its two markers that share most samples."""
+    bound = span_samples(tracks, camera, plane, span)
+    return max(bound, key=lambda one: len(one[2]))[:2] if bound else None
+
+
 def markers_of_movers(
     tracks: Sequence[Track], camera: Camera, plane: Plane, spans: Sequence[float], movers: int | None = None
 ) -> list[Track]:

@@ -179,6 +179,8 @@ class Candidates:
             for b, track_j in enumerate(self._j):
                 if track_i.marker and track_j.marker and track_i.marker != track_j.marker:
                     continue
+                if track_i.mover and track_j.mover and track_i.mover != track_j.mover:
+                    continue
                 shared = pair_by_time(track_i.times, track_j.times - offset, window)
                 shared = shared[finite_i[a][shared[:, 0]] & finite_j[b][shared[:, 1]]]
                 if len(shared):

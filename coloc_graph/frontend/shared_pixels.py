@@ -11,7 +11,7 @@ from coloc_graph.frontend.correspondence import Correspondences, pair_by_time
 from coloc_graph.frontend.tracking import Track
 
 #: Of many observers each is measured with so many others at least: those with which it has most in common.
-PARTNERS = 6
+PARTNERS = 4
 
 Pair = tuple[str, str]
 

@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.frontend.bodies import couple_of
 from coloc_graph.frontend.correspondence import pair_by_time
 from coloc_graph.frontend.relative_pose import mounted, turned_normal
 from coloc_graph.frontend.tracking import Track
@@ -95,8 +96,14 @@ def _marker_tracks(
     first, second = (named.get(f"{seen.name}/{n}") for n in range(2))
     if first is not None and second is not None:
         return first, second
-    if any(named) or len(tracks) != 2 or wheels is None or not len(wheels):
+    if any(named) or len(tracks) < 2 or wheels is None or not len(wheels):
         return None
+    if len(tracks) > 2:
+        assert seen.markers is not None
+        couple = couple_of(tracks, observer.camera, plane, seen.markers.span or 0.0)
+        if couple is None:
+            return None
+        tracks = [tracks[n] for n in couple]
     ahead = _drives_ahead(seen, tracks[0], tracks[1], observer, plane, wheels)
     if ahead is None:
         return None

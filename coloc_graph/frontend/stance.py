@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend.bodies import span_samples
+from coloc_graph.frontend.bodies import couple_of, span_samples
 from coloc_graph.frontend.clock_offset import (
     ClockOffset,
     find_offset,
@@ -247,9 +247,10 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
         if markers is None or markers.span is None:
             continue
         tracks = tuple(named[marker] for n in range(2) if (marker := f"{mover}/{n}") in named)
-        if not named and len(movers) == 1:
-            bound = span_samples(seen.tracks_i, robot.camera, seen.plane, markers.span)
-            tracks = bound[0][:2] if len(bound) == 1 else ()
+        own = [n for n, track in enumerate(seen.tracks_i) if not named and (len(movers) == 1 or track.mover == mover)]
+        if own:
+            couple = couple_of([seen.tracks_i[n] for n in own], robot.camera, seen.plane, markers.span)
+            tracks = () if couple is None else (own[couple[0]], own[couple[1]])
         if len(tracks) == 2:
             one = marker_span(mover, tracks, found, fit, bias)
             made += [] if one is None else [one]
@@ -262,7 +263,7 @@ def sight_movers(
     """Where the moving robots were in a stance, by the observer that saw each best; nothing without a floor.
 
     `measured` are all pairs of the stance. A robot whose markers cannot be told apart, or are never seen at once, is
-    not in the list; tracks without names are followed where one robot moves alone.
+    not in the list; tracks without names are followed where one robot moves alone, or has a colour of its own.
     """
     if run.team.floor is None or stance.index in run.planes:
         return []
@@ -278,9 +279,9 @@ def sight_movers(
         except DegenerateGeometry:  # a camera below the markers, which the homography's refusal names
             continue
         for mover in stance.movers:
-            if len(stance.movers) > 1 and not any(track.marker for track in seen):
-                continue
-            sighting = sight(stance, run.team[observer], run.team[mover], seen, plane, wheels.get(mover))
+            named = len(stance.movers) == 1 or any(track.marker for track in seen)
+            own = seen if named else [track for track in seen if track.mover == mover]
+            sighting = sight(stance, run.team[observer], run.team[mover], own, plane, wheels.get(mover))
             before = best.get(mover)
             if sighting is not None and (before is None or np.trace(sighting.covariance) < np.trace(before.covariance)):
                 best[mover] = sighting

@@ -1,7 +1,7 @@
 """What the cameras saw in one stance: the plane of the markers, and their tracks."""
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -54,15 +54,22 @@ class StanceTracks:
     """The tracks of the movers' markers in the observers' cameras: from detections where the run has them, else from
     images. Made once a camera; of a stance that goes on they go on too.
 
-    Detections that name their marker are tracks already; the others, and images, go through the tracker.
+    Detections that name their marker are tracks already; the others, and images, go through a tracker: one for each
+    colour of the movers' markers. A colour that one mover alone has tells which that is.
     """
 
     def __init__(self, run: Recorded, stance: Stance, options: TrackerOptions | None = None) -> None:
         self.run, self.stance = run, stance
-        self._markers = stance_markers(run, stance)
-        count = sum(len(m.positions) for name in stance.movers if (m := run.team[name].markers))
-        self._options = replace(options or TrackerOptions(), markers=max(count, 1))
-        self._trackers: dict[str, MarkerTracker] = {}
+        stance_markers(run, stance)  # refuses movers whose markers share no plane
+        self._options = options or TrackerOptions()
+        self._alike: dict[float | None, list[Markers]] = {}  # the movers' markers by their colour
+        self._named: dict[float | None, list[str]] = {}
+        for name in stance.movers:
+            markers = run.team[name].markers
+            if markers is not None:
+                self._alike.setdefault(markers.hue_deg, []).append(markers)
+                self._named.setdefault(markers.hue_deg, []).append(name)
+        self._trackers: dict[str, dict[float | None, MarkerTracker]] = {}
         self._taken: dict[str, int] = defaultdict(int)
         self._made: dict[str, tuple[float, list[Track]]] = {}
         self._standing: dict[str, list[Track]] = {}
@@ -96,11 +103,6 @@ class StanceTracks:
 
     def _of(self, robot: str, end: float) -> list[Track]:
         run, stance, camera = self.run, self.stance, self.run.team[robot].camera
-        tracker = self._trackers.get(robot)
-        if tracker is None:
-            size = camera.width, camera.height
-            tracker = MarkerTracker(robot, detector_for(self._markers, camera), self._options, size)
-            self._trackers[robot] = tracker
         if run.has_detections(robot):
             seen = list(run.detections(robot, stance.start, end))
             if all(marker for one in seen for marker in one.markers):
@@ -109,10 +111,15 @@ class StanceTracks:
                 standing = [track for track in tracks if track.marker[: track.marker.rfind("/") + 1] in stand]
                 self._standing[robot] = standing
                 return [track for track in tracks if track not in standing]
+            # what was detected elsewhere has lost its colour
+            every = [one for alike in self._alike.values() for one in alike]
+            trackers = self._trackers.setdefault(robot, {None: self._tracker(robot, every)})
             for one in seen[self._taken[robot] :]:
-                tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
+                trackers[None].take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
             self._taken[robot] = len(seen)
         else:
+            alike = self._alike or {None: []}
+            trackers = self._trackers.setdefault(robot, {hue: self._tracker(robot, m) for hue, m in alike.items()})
             for number, image in enumerate(run.images(robot, stance.start, end)):
                 if image.pixels.shape[:2] != (camera.height, camera.width):
                     raise InputError(
@@ -121,11 +128,26 @@ class StanceTracks:
                         "team: correct the camera, and its calibration"
                     )
                 if number >= self._taken[robot]:
-                    tracker.step(image)
+                    for tracker in trackers.values():
+                        tracker.step(image)
                     self._taken[robot] = number + 1
-        plane = stance_plane(run, stance, robot)
-        spans = {m.span for name in stance.movers if (m := run.team[name].markers) and m.span}
-        return markers_of_movers(tracker.tracks(), camera, plane, sorted(spans), len(stance.movers))
+        plane, tracks = stance_plane(run, stance, robot), []
+        for hue, tracker in trackers.items():
+            names = self._named.get(hue, []) if len(trackers) > 1 else list(stance.movers)
+            spans = {m.span for name in names if (m := run.team[name].markers) and m.span}
+            own = markers_of_movers(tracker.tracks(), camera, plane, sorted(spans), len(names))
+            bodies = max((track.body for track in tracks), default=-1) + 1
+            mover = names[0] if len(names) == 1 else ""
+            tracks += [replace(t, mover=mover, body=t.body + bodies * (t.body >= 0)) for t in own]
+        return tracks
+
+    def _tracker(self, robot: str, markers: Sequence[Markers]) -> MarkerTracker:
+        """One for some markers of one colour."""
+        camera, count = self.run.team[robot].camera, sum(len(one.positions) for one in markers)
+        options = replace(self._options, markers=max(count, 1))
+        return MarkerTracker(
+            robot, detector_for(markers[0] if markers else None, camera), options, (camera.width, camera.height)
+        )
 
 
 def named_tracks(robot: str, detections: Iterable[Detections]) -> list[Track]:

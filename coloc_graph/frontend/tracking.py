@@ -48,7 +48,7 @@ class Track:
 
     `uv` (n, 2) [px] with `covariance` (n, 2, 2) [px^2] at `times` (n,) [s, the camera's clock]; `peak` (n,)
     grey levels. `marker` is its name where its identity is known ("C/0"), or "". Tracks of one camera with the same
-    `body` are markers of one robot; -1 where that is not known.
+    `body` are markers of one robot; -1 where that is not known. `mover` is that robot's name where its colour tells it.
     """
 
     robot: str
@@ -58,6 +58,7 @@ class Track:
     covariance: Array
     peak: Array
     body: int = -1
+    mover: str = ""
 
     def __len__(self) -> int:
         return len(self.times)
