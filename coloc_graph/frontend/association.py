@@ -32,6 +32,8 @@ SINGLES, COUPLES, TRIED = 200, 300, 16
 HIDDEN, HIDDEN_ALONE, HIDDEN_MARKER = 0.1, 1e-4, 0.003
 #: A robot counts as unseen for as much of the stance as it is, up to this share.
 LONG = 0.25
+#: Of the lights that go on in a camera while one robot moves, that robot's are at least this share.
+LEAST_ALONE = 0.3
 #: A pairing whose chance is less than this is not believed.
 SURE = 0.995
 #: A pairing that is so much less likely than the best is not worth a word (logarithm).
@@ -58,8 +60,10 @@ class Tracks(Protocol):
 
     #: The samples (n, 2) that a pair shares.
     indices: dict[Pair, NDArray[np.int64]]
-    #: How likely a robot that is in a camera's view is not seen by it.
+    #: How likely a robot that is in a camera's view is not seen by it; and which share of a camera's samples a pairing
+    #: has to be of.
     hidden: float
+    least: float
     #: The robot that each track of i, and of j, is a marker of; no two of -1 are one.
     bodies: tuple[list[int], list[int]]
 
@@ -71,6 +75,9 @@ class Tracks(Protocol):
 
     def visible(self, H_j_i: Array) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.bool_]]]:
         """Of each sample of each track of i whether j would have seen it, and of those of j whether i would."""
+
+    def plausible(self, H_j_i: Array, chosen: Sequence[Pair]) -> bool:
+        """Whether a homography, and what it pairs, can be what it would have to be, by all that is known besides."""
 
     def covered(self, chosen: Sequence[Pair]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.bool_]]]:
         """Of each sample of each track of i, and of j, whether it lies between those that a chosen pair shares."""
@@ -91,6 +98,8 @@ def associate(tracks: Tracks) -> Association | None:
     if not found:
         return None
     best = max(found, key=lambda one: one.weight)
+    if _explained(tracks, best.chosen) < tracks.least:
+        return None
     rivals = [one for one in found if one.weight > best.weight - HOPELESS and not some.alike(one, best)]
     shares = np.exp([one.weight - best.weight for one in rivals])
     whole = 1 + float(shares.sum())
@@ -223,7 +232,7 @@ def _refined(tracks: Tracks, some: _Some, starts: Sequence[tuple[Array, set[Pair
                 seen[chosen] = fit.H, float(np.minimum(fit.squared_residuals, INLIER_GATE).mean())
                 break
             chosen = again
-    found = {chosen: one for chosen, one in seen.items() if one is not None}
+    found = {chosen: one for chosen, one in seen.items() if one is not None and tracks.plausible(one[0], chosen)}
     against = {chosen: _unseen(tracks, H, chosen) for chosen, (H, _) in found.items()}
     sizes = {chosen: sum(len(some.pairs[ab]) for ab in chosen) for chosen in found}
     # noise that is larger than stated is so for all: taken from what leaves least unpaired
@@ -253,6 +262,12 @@ def _unseen(tracks: Tracks, H: Array, chosen: Sequence[Pair]) -> float:
             if (lost < there).any():
                 total += math.log(HIDDEN_MARKER) * float(share[lost == there].sum())
     return total
+
+
+def _explained(tracks: Tracks, chosen: Sequence[Pair]) -> float:
+    """The share of the samples that are of paired tracks, in the camera that has the larger one."""
+    sides = tracks.covered(chosen)
+    return max(sum(int(one.sum()) for one in side) / max(sum(map(len, side)), 1) for side in sides)
 
 
 def _without(seen: list[NDArray[np.bool_]], paired: list[NDArray[np.bool_]]) -> list[NDArray[np.bool_]]:

@@ -12,6 +12,8 @@ from coloc_graph.frontend.tracking import Track
 from coloc_graph.measurements import Plane
 from coloc_graph.team import Camera
 
+#: Two markers of a robot are seen together for this share of the shorter track.
+TOGETHER = 0.5
 #: Samples that two tracks must share to be bound where there is a choice.
 LEAST_SHARED = 8
 
@@ -30,7 +32,7 @@ def span_samples(
     for a in range(len(tracks)):
         for b in range(a + 1, len(tracks)):
             shared = pair_by_time(tracks[a].times, tracks[b].times)
-            if len(shared) >= 2:
+            if len(shared) >= max(2, TOGETHER * min(len(tracks[a]), len(tracks[b]))):
                 distance = np.linalg.norm(on_floor[a][shared[:, 0]] - on_floor[b][shared[:, 1]], axis=1)
                 if (np.abs(distance / span - 1) < tolerance).mean() > 0.8:  # NaN, above the horizon, is not close
                     found.append((a, b, shared))

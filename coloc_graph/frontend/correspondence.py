@@ -4,14 +4,14 @@ Samples are paired by time (5 ms, paper section V). Tracks whose marker has a na
 one pair by what they do (`association`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend.association import HIDDEN, HIDDEN_ALONE, SURE, associate
+from coloc_graph.frontend.association import HIDDEN, HIDDEN_ALONE, LEAST_ALONE, SURE, associate
 from coloc_graph.frontend.interpolation import LONGEST_GAP
 from coloc_graph.frontend.refinement import PointPairs
 from coloc_graph.frontend.tracking import Track
@@ -65,14 +65,26 @@ def pair_by_time(times_i: Array, times_j: Array, window: float = PAIRING_WINDOW)
     return np.stack([kept, nearest[kept]], axis=1)
 
 
+#: Whether a homography, and the tracks of camera i that it pairs, can be right, by what else is known.
+Plausible = Callable[[Array, Sequence[Track]], bool]
+
+
 def correspond(
-    tracks_i: Sequence[Track], tracks_j: Sequence[Track], camera_i: Camera, camera_j: Camera, *, alone: bool = False
+    tracks_i: Sequence[Track],
+    tracks_j: Sequence[Track],
+    camera_i: Camera,
+    camera_j: Camera,
+    *,
+    alone: bool = False,
+    plausible: Plausible | None = None,
 ) -> Correspondences:
     """The correspondences between two cameras' tracks; raises `DegenerateGeometry` where there are none.
 
-    Where one robot moves `alone`, what both cameras see at the same time is that.
+    Where one robot moves `alone`, what both cameras see at the same time is that. What is not `plausible` is no pairing
+    of tracks without names.
     """
-    return _chosen(Candidates(tracks_i, tracks_j, camera_i, camera_j, alone=alone), tracks_i, tracks_j)[1]
+    candidates = Candidates(tracks_i, tracks_j, camera_i, camera_j, alone=alone, plausible=plausible)
+    return _chosen(candidates, tracks_i, tracks_j)[1]
 
 
 def correspond_roughly(
@@ -84,13 +96,15 @@ def correspond_roughly(
     sigma: float,
     *,
     alone: bool = False,
+    plausible: Plausible | None = None,
 ) -> tuple[list[tuple[int, int]], Correspondences]:
     """The same for clocks that differ by `offset`, known to `sigma` [s]: which tracks (a, b) are one marker's.
 
     Nearest samples are paired and moved to the same instant; what the sigma makes of a marker's speed is in
     camera j's covariances. Raises `DegenerateGeometry` as `correspond` does.
     """
-    candidates = Candidates(tracks_i, tracks_j, camera_i, camera_j, (offset, sigma), alone=alone)
+    clock = offset, sigma
+    candidates = Candidates(tracks_i, tracks_j, camera_i, camera_j, clock, alone=alone, plausible=plausible)
     return _chosen(candidates, tracks_i, tracks_j)
 
 
@@ -158,11 +172,12 @@ class Candidates:
         clock: tuple[float, float] | None = None,
         *,
         alone: bool = False,
+        plausible: Plausible | None = None,
     ) -> None:
         self._i, self._j = list(tracks_i), list(tracks_j)
         self._cameras = camera_i, camera_j
-        self._alone = alone
-        self.hidden = HIDDEN_ALONE if alone else HIDDEN
+        self._alone, self._plausible = alone, plausible
+        self.hidden, self.least = (HIDDEN_ALONE, LEAST_ALONE) if alone else (HIDDEN, 0.0)
         self.bodies = [track.body for track in tracks_i], [track.body for track in tracks_j]
         self._x_i = [normalised(track, camera_i) for track in self._i]
         self._x_j = [normalised(track, camera_j) for track in self._j]
@@ -199,6 +214,10 @@ class Candidates:
             [_in_view(camera_j, H_j_i, x) for x, _ in self._x_i],
             [_in_view(camera_i, np.asarray(np.linalg.inv(H_j_i), float), x) for x, _ in self._x_j],
         )
+
+    def plausible(self, H_j_i: Array, chosen: Sequence[tuple[int, int]]) -> bool:
+        """Whether a homography, and what it pairs, can be right by what else is known."""
+        return self._plausible is None or self._plausible(H_j_i, [self._i[a] for a, _ in chosen])
 
     def covered(self, chosen: Sequence[tuple[int, int]]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.bool_]]]:
         """Of each sample of each track of i, and of j, whether it lies between those that a chosen pair shares."""

@@ -29,6 +29,7 @@ from coloc_graph.frontend.shared_pixels import Pair, pairs_of, share
 from coloc_graph.frontend.sighting import at_rest, sight
 from coloc_graph.frontend.spans import marker_span
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
+from coloc_graph.frontend.standing import of_some_span, on_one_floor, require_on_floor
 from coloc_graph.frontend.tracking import Track, TrackerOptions
 from coloc_graph.frontend.wheels import WheelTrack
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose, Sighting
@@ -102,6 +103,16 @@ class _Seen:
         """Whether one robot moves, and no other."""
         return len(self.stance.movers) == 1
 
+    def plausible(self, H_j_i: Array, tracks: Sequence[Track]) -> bool:
+        """Whether a homography has both observers on one floor, and pairs tracks that may be a robot's markers."""
+        team, plane = self.run.team, self.plane
+        if not (plane.normal_from_mount and plane.d_from_mount):
+            return True
+        spans = [m.span for name in self.stance.movers if (m := team[name].markers) and m.span]
+        return of_some_span(tracks, team[self.robot_i], plane, spans) and (
+            team.floor is None or on_one_floor(H_j_i, team[self.robot_i], team[self.robot_j], plane)
+        )
+
     @property
     def cameras(self) -> tuple[Camera, Camera]:
         return self.run.team[self.robot_i].camera, self.run.team[self.robot_j].camera
@@ -158,7 +169,7 @@ def measure_pair(
         if run.team.clock_sigma > 0:
             made = _measure_with_clocks(seen, alone)
         else:
-            found = correspond(tracks_i, tracks_j, *seen.cameras, alone=seen.alone)
+            found = correspond(tracks_i, tracks_j, *seen.cameras, alone=seen.alone, plausible=seen.plausible)
             made = _measured(seen, found, fit_homography(found.pairs, options.criterion))
     except DegenerateGeometry as why:
         made = PairMeasurement(_unusable(stance, robot_i, robot_j, found, str(why)), None, found)
@@ -169,7 +180,13 @@ def _measure_with_clocks(seen: _Seen, alone: bool) -> PairMeasurement:
     prior = ClockOffset(0.0, seen.run.team.clock_sigma)
     require_searchable(prior)
     chosen, rough = correspond_roughly(
-        seen.tracks_i, seen.tracks_j, *seen.cameras, prior.value, prior.sigma, alone=seen.alone
+        seen.tracks_i,
+        seen.tracks_j,
+        *seen.cameras,
+        prior.value,
+        prior.sigma,
+        alone=seen.alone,
+        plausible=seen.plausible,
     )
     tracks = PairedTracks(seen.tracks_i, seen.tracks_j, chosen, *seen.cameras)
     again = partial(_measure_at_offset, seen, tracks, rough)
@@ -228,6 +245,8 @@ def _measured(
     # without the floor: the graph knows it, and must not count it twice
     make_pose = relative_pose if seen.options.pose == "eq2" else most_likely_pose
     pose = make_pose(measurement, robot_i.mount, robot_j.mount, plane)
+    if seen.run.team.floor is not None and seen.plane.normal_from_mount:
+        require_on_floor(pose, seen.run.team.floor)
     marked = tuple(name for name in seen.stance.movers if seen.run.team[name].markers is not None)
     pose = replace(pose, homography=measurement, plane=seen.plane, movers=marked, spans=_spans(seen, found, fit))
     return PairMeasurement(measurement, pose, found, tracks=(seen.tracks_i, seen.tracks_j))
