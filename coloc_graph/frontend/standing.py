@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 #: Two robots that stand on one floor are no further above each other than this [m], nor more tilted [rad], with mounts
 #: that are some degrees and centimetres off.
-HIGHER, TILTED = 0.15, np.deg2rad(12.0)
+HIGHER, TILTED = 0.10, np.deg2rad(12.0)
 #: What a measured pose is allowed besides its own covariance and the floor's: roll, pitch [rad], height [m], since
 #: mounts are not always as stated; and how improbable it may be then (chi2, 3 degrees of freedom).
 SLACK, IMPROBABLE = (np.deg2rad(2.0), np.deg2rad(2.0), 0.03), 40.0
@@ -33,7 +33,7 @@ SPAN_TOLERANCE, OFTEN = 0.45, 0.5
 
 
 def on_one_floor(H_j_i: Array, robot_i: Robot, robot_j: Robot, plane: Plane) -> bool:
-    """Whether a homography has both robots stand on one floor, roughly; True where it is none that says so."""
+    """Whether a homography has both robots stand on one floor, roughly."""
     try:
         R_cj_ci, t_cj_ci = decompose_with_normal(metric_scale(H_j_i), plane.N, plane.d)
     except (DegenerateGeometry, np.linalg.LinAlgError):
@@ -53,9 +53,10 @@ def require_on_floor(pose: RelativePose, floor: Floor) -> None:
     allowed = np.square(SLACK) + 2 * np.square([level, level, floor.height_sigma])
     C = pose.covariance[np.ix_(tangent, tangent)] + np.diag(allowed)
     if off @ np.linalg.solve(C, off) > IMPROBABLE:
+        degrees = np.rad2deg(np.arccos(min(tilt[2], 1.0)))
         raise DegenerateGeometry(
             f"the homography would have {pose.robot_j} {abs(off[2]):.2f} m {'above' if off[2] > 0 else 'below'} "
-            f"{pose.robot_i}, and tilted by {np.rad2deg(np.hypot(*off[:2])):.1f} deg against it, and both stand on one "
+            f"{pose.robot_i}, and tilted by {degrees:.1f} deg against it, and both stand on one "
             "floor: it is of reflections or other lights, or heights and mounts are not as stated"
         )
 
