@@ -182,7 +182,7 @@ def test_reading_touches_only_the_chunks_asked_for(tmp_path, monkeypatch):
         for k in range(200):
             writer.write(Image("A" if k < 100 else "B", T0 + k / 100, noise))
     size = (tmp_path / "run.mcap").stat().st_size
-    assert size > 7e6
+    assert size > 1.5e7
     decoded = []
     real = chunks.decompressed
     monkeypatch.setattr(chunks, "decompressed", lambda *a: decoded.append(a[2].offset) or real(*a))
@@ -198,7 +198,7 @@ def test_reading_touches_only_the_chunks_asked_for(tmp_path, monkeypatch):
     assert len(decoded) <= 52  # half of the file
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 3e6
+    assert peak < 5.5e6  # what is kept are the chunks that were read last
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path):
