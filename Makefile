@@ -46,6 +46,11 @@ bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/online.py
 	$(BIN)/python benchmarks/bumps.py
 	$(BIN)/python benchmarks/many_runs.py
+	$(BIN)/python benchmarks/tracking.py
+	$(BIN)/python benchmarks/association.py
+	$(BIN)/python benchmarks/team.py
+	$(BIN)/python benchmarks/team.py --table
+	$(BIN)/python benchmarks/messy.py
 	$(BIN)/python benchmarks/backend.py $(if $(GRAPHS),--data $(GRAPHS))
 ifneq ($(DATA),)
 	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)
