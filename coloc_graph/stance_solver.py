@@ -82,7 +82,7 @@ def measure_stance(
     # a joint estimate takes the scale from the spans by itself, and the heights for a start
     scale: Scale = "heights" if options.method == "joint" else frontend.scale
     tracks = tracks or StanceTracks(run, stance, frontend.tracker)
-    pairs = measured_pairs(tracks)
+    pairs = measured_pairs(tracks, stance.end)
     for pair in pairs:
         yield measure_pair(run, stance, *pair, replace(frontend, scale=scale), tracks, pairs, alone=False)
 

@@ -157,30 +157,31 @@ def test_of_many_observers_each_is_measured_with_those_that_see_most_of_the_same
     assert all(i[0] == j[0] for i, j in pairs)
 
 
+class Nameless:
+    """A writer that takes the names off what moves, and leaves out what stands."""
+
+    def __init__(self, writer, movers):
+        self._writer, self._movers = writer, movers
+
+    def __getattr__(self, name):
+        return getattr(self._writer, name)
+
+    def write(self, one):
+        if isinstance(one, Detections):
+            moves = [n for n, marker in enumerate(one.markers) if marker.split("/")[0] in self._movers]
+            one = replace(
+                one, markers=("",) * len(moves),
+                **{field: getattr(one, field)[moves] for field in ("uv", "covariance", "flags", "peak", "area")},
+            )  # fmt: skip
+        self._writer.write(one)
+
+
 def test_without_names_the_markers_of_several_movers_find_themselves(tmp_path):
     world = build_team_world(team_of(4, 2, 1), seed=2, points=800)
     path = tmp_path / "run.mcap"
 
-    class Nameless:
-        """Takes the names off what moves, and leaves out what stands."""
-
-        def __init__(self, writer):
-            self._writer = writer
-
-        def __getattr__(self, name):
-            return getattr(self._writer, name)
-
-        def write(self, one):
-            if isinstance(one, Detections):
-                moves = [n for n, marker in enumerate(one.markers) if marker.split("/")[0] in world.stances[0].movers]
-                one = replace(
-                    one, markers=("",) * len(moves),
-                    **{field: getattr(one, field)[moves] for field in ("uv", "covariance", "flags", "peak", "area")},
-                )  # fmt: skip
-            self._writer.write(one)
-
     with RunWriter(path, world.team) as writer:
-        record(world, Nameless(writer), "tracks")
+        record(world, Nameless(writer, world.stances[0].movers), "tracks")
     run = open_run(path)
     measured = measure_pair(run, run.stances[0], *run.stances[0].observers, FrontendOptions())
     assert measured.homography.unusable is None
@@ -248,3 +249,22 @@ def test_colours_tell_two_movers_apart_even_in_lock_step(tmp_path):
     off = measured.relative_pose.T_i_j.matrix() - np.linalg.inv(poses["A"]) @ poses["B"]
     assert np.abs(off[:3, 3]).max() < 0.02
     assert {span.mover for span in measured.relative_pose.spans} == {"C", "D"}
+
+
+def test_the_tracks_of_a_stance_that_goes_on_go_on_for_all_of_its_observers(tmp_path):
+    """Judged while it lasts, a stance of three observers is in the end what it is when it is measured once."""
+    world = build_team_world(team_of(4, 1, 1), seed=3, points=800)
+    stance = world.stances[0]
+    with RunWriter(tmp_path / "run.mcap", world.team) as writer:
+        record(world, Nameless(writer, stance.movers), "tracks")
+    run = open_run(tmp_path / "run.mcap")
+    begun = StanceTracks(run, replace(stance, end=stance.start))
+    for end in (stance.start + 6.0, stance.start + 12.0, stance.end):
+        for pair in itertools.combinations(stance.observers, 2):
+            measure_pair(run, replace(stance, end=end), *pair, FrontendOptions(), begun)
+    once = StanceTracks(run, stance)
+    for robot in stance.observers:
+        went_on, whole = begun.of(robot, stance.end), once.of(robot, stance.end)
+        assert [len(track) for track in went_on] == [len(track) for track in whole]
+        assert all((a.times == b.times).all() for a, b in zip(went_on, whole, strict=True))
+        assert all((np.diff(track.times) > 0).all() for track in went_on)

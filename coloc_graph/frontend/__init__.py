@@ -14,6 +14,7 @@ from coloc_graph.frontend.refinement import PointPairs, least_squares, refine
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.shared_clock import share_clock_offsets
 from coloc_graph.frontend.sighting import sight
+from coloc_graph.frontend.sightings import sight_movers, sight_standing
 from coloc_graph.frontend.stance import (
     FrontendOptions,
     PairMeasurement,
@@ -21,8 +22,6 @@ from coloc_graph.frontend.stance import (
     little_in_common,
     measure_pair,
     measured_pairs,
-    sight_movers,
-    sight_standing,
 )
 from coloc_graph.frontend.stance_tracks import StanceTracks
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions

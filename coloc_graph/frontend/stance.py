@@ -1,6 +1,6 @@
 """One stance of a run: from its images or detections to the homography between two observers."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
@@ -22,17 +22,15 @@ from coloc_graph.frontend.homography import HomographyFit, fit_homography, persi
 from coloc_graph.frontend.interpolation import LONGEST_GAP
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.paired_tracks import PairedTracks
-from coloc_graph.frontend.plane import distance_from_span, plane_from_mount
+from coloc_graph.frontend.plane import distance_from_span
 from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.shared_pixels import Pair, pairs_of, share
-from coloc_graph.frontend.sighting import at_rest, sight
 from coloc_graph.frontend.spans import marker_span
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
 from coloc_graph.frontend.standing import of_some_span, on_one_floor, require_on_floor
 from coloc_graph.frontend.tracking import Track, TrackerOptions
-from coloc_graph.frontend.wheels import WheelTrack
-from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose, Sighting
+from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose
 from coloc_graph.run import Recorded, Stance
 from coloc_graph.team import Camera, Markers
 
@@ -123,9 +121,10 @@ def little_in_common(measured: HomographyMeasurement, stance: Stance) -> bool:
     return len(stance.observers) > 2 and measured.points < LITTLE_IN_COMMON
 
 
-def measured_pairs(tracks: StanceTracks) -> list[Pair]:
-    """The pairs of a stance's observers that are measured: of many, those with most in common."""
-    return pairs_of(tracks.stance.observers, tracks.all(), _window(tracks.run))
+def measured_pairs(tracks: StanceTracks, end: float) -> list[Pair]:
+    """The pairs of a stance's observers that are measured, by what they saw up to an instant [UTC s]: of many, those
+    with most in common."""
+    return pairs_of(tracks.stance.observers, tracks.all(end), _window(tracks.run))
 
 
 def _window(run: Recorded) -> float:
@@ -154,18 +153,8 @@ def measure_pair(
     try:
         plane = stance_plane(run, stance, robot_i)
         tracks_i, tracks_j = tracks.of(robot_i, stance.end), tracks.of(robot_j, stance.end)
-        seen = _Seen(
-            run,
-            stance,
-            robot_i,
-            robot_j,
-            options,
-            plane,
-            tracks_i,
-            tracks_j,
-            pairs or measured_pairs(tracks),
-            tracks.all(),
-        )
+        every, pairs = tracks.all(stance.end), pairs or measured_pairs(tracks, stance.end)
+        seen = _Seen(run, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j, pairs, every)
         if run.team.clock_sigma > 0:
             made = _measure_with_clocks(seen, alone)
         else:
@@ -274,68 +263,6 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
             one = marker_span(mover, tracks, found, fit, bias)
             made += [] if one is None else [one]
     return tuple(made)
-
-
-def sight_movers(
-    run: Recorded, stance: Stance, measured: Iterable[PairMeasurement], wheels: Mapping[str, WheelTrack]
-) -> list[Sighting]:
-    """Where the moving robots were in a stance, by the observer that saw each best; nothing without a floor.
-
-    `measured` are all pairs of the stance. A robot whose markers cannot be told apart, or are never seen at once, is
-    not in the list; tracks without names are followed where one robot moves alone, or has a colour of its own.
-    """
-    if run.team.floor is None or stance.index in run.planes:
-        return []
-    tracks: dict[str, list[Track]] = {}
-    for one in measured:
-        if one.tracks is not None:
-            for observer, seen in zip((one.homography.robot_i, one.homography.robot_j), one.tracks, strict=True):
-                tracks.setdefault(observer, seen)
-    best: dict[str, Sighting] = {}
-    for observer, seen in tracks.items():
-        try:
-            plane = stance_plane(run, stance, observer)
-        except DegenerateGeometry:  # a camera below the markers, which the homography's refusal names
-            continue
-        for mover in stance.movers:
-            named = len(stance.movers) == 1 or any(track.marker for track in seen)
-            own = seen if named else [track for track in seen if track.mover == mover]
-            sighting = sight(stance, run.team[observer], run.team[mover], own, plane, wheels.get(mover))
-            before = best.get(mover)
-            if sighting is not None and (before is None or np.trace(sighting.covariance) < np.trace(before.covariance)):
-                best[mover] = sighting
-    return list(best.values())
-
-
-def sight_standing(
-    run: Recorded, stance: Stance, measured: Iterable[PairMeasurement], before: Stance | None
-) -> list[Sighting]:
-    """Where robots that stand saw others that stand, whose markers have names; nothing without a floor.
-
-    A stance is told by what came since the one `before`: two that have stood since then see no more of each other than
-    they did.
-    """
-    if run.team.floor is None or stance.index in run.planes:
-        return []
-    stayed = {name for name in stance.anchors if before is not None and name in before.observers}
-    tracks: dict[str, list[Track]] = {}
-    for one in measured:
-        for observer, seen in zip((one.homography.robot_i, one.homography.robot_j), one.standing, strict=True):
-            tracks.setdefault(observer, seen)
-    made = []
-    for observer, standing in tracks.items():
-        still = [at_rest(track, stance.start) for track in standing]
-        for name in dict.fromkeys(track.marker[: track.marker.rfind("/")] for track in standing):
-            markers = run.team[name].markers
-            if markers is None or (observer in stayed and name in stayed):
-                continue
-            try:
-                plane = plane_from_mount(run.team[observer].mount, markers, run.team.floor)
-            except DegenerateGeometry:  # a camera below these markers
-                continue
-            sighting = sight(stance, run.team[observer], run.team[name], still, plane)
-            made += [] if sighting is None else [sighting]
-    return made
 
 
 def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: Markers | None) -> Plane:

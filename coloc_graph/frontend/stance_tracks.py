@@ -85,14 +85,12 @@ class StanceTracks:
             self._made[robot] = made = end, self._of(robot, end)
         return made[1]
 
-    def all(self) -> dict[str, list[Track]]:
-        """Those of all observers, as far as they are; none of one whose camera is not above the markers' plane."""
-        if len(self.stance.observers) == 2:
-            return {robot: [] for robot in self.stance.observers}  # nobody asks
-        found = {}
+    def all(self, end: float) -> dict[str, list[Track]]:
+        """Those of all observers up to an instant [UTC s]; none of one whose camera is not above the markers' plane."""
+        found: dict[str, list[Track]] = {}
         for robot in self.stance.observers:
             try:
-                found[robot] = self.of(robot, self.stance.end)
+                found[robot] = self.of(robot, end)
             except DegenerateGeometry:
                 found[robot] = []
         return found
