@@ -1,5 +1,7 @@
 """Which tracks of two cameras are the same markers: right, or said to be ambiguous."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from crowd_scene import FACTS, lockstep, movers, right, seen_by_both
@@ -55,6 +57,20 @@ def test_nothing_is_made_of_tracks_that_have_nothing_in_common():
 def test_the_one_robot_that_moves_is_the_one_that_both_see():
     both = seen_by_both(movers(1, 7), 7)
     assert found(both, alone=True).posterior >= found(both).posterior
+
+
+def test_a_moment_that_agrees_among_much_that_does_not_is_no_pairing():
+    right_, other = seen_by_both(movers(1, 7), 7), seen_by_both(movers(1, 11), 11)
+    pieces = []
+    for (tracks, _), (strange, _) in zip(right_, (other[0], seen_by_both(movers(1, 12), 12)[1]), strict=True):
+        when = [slice(0, 16)] * len(tracks)
+        short = [
+            replace(t, times=t.times[w], uv=t.uv[w], covariance=t.covariance[w], peak=t.peak[w])
+            for t, w in zip(tracks[:2], when, strict=False)
+        ]
+        pieces.append((short + [replace(t, body=0) for t in strange], []))
+    assert found(pieces, alone=True) is None
+    assert found([(p[0][:2], []) for p in pieces], alone=True) is not None  # by itself it is one
 
 
 def test_bodies_are_robots():

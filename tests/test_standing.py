@@ -6,10 +6,11 @@ import pytest
 from planar_scene import CAMERA, MARKERS, MOUNT, Scene
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend import Track, correspond, fit_homography, plane_from_mount
+from coloc_graph.frontend import FrontendOptions, Track, correspond, fit_homography, measure_pair, plane_from_mount
 from coloc_graph.frontend.standing import of_some_span, on_one_floor, require_on_floor
 from coloc_graph.lie import floor_pose
 from coloc_graph.measurements import RelativePose
+from coloc_graph.run import Detections, RunWriter, Stance, open_run
 from coloc_graph.simulation import reference_team
 from coloc_graph.team import Floor
 
@@ -55,6 +56,35 @@ def test_of_a_light_and_a_mirror_image_one_robot_would_be_below_the_floor(i, j, 
     if not right:
         with pytest.raises(DegenerateGeometry, match="no pairing of the tracks of A and B"):
             correspond(*both, CAMERA, CAMERA, alone=True, plausible=lambda H, _: on_one_floor(H, ROBOT, ROBOT, PLANE))
+
+
+def mirrored_run(path, names):
+    """A sees the lights of C, and B their mirror images alone."""
+    team = reference_team()
+    with RunWriter(path, team) as writer:
+        writer.write(Stance(0, 99.0, 115.0, ("A", "B"), ("C",)))
+        for both in seen(UP, DOWN):
+            lights = {}
+            for n, track in enumerate(both):
+                for time, uv in zip(track.times.tolist(), track.uv, strict=True):
+                    lights.setdefault(time, []).append((names[n], uv))
+            for time, found in sorted(lights.items()):
+                marks, uv = zip(*found, strict=True)
+                k = len(uv)
+                C, none = np.broadcast_to(0.01 * np.eye(2), (k, 2, 2)), np.full(k, 200.0)
+                writer.write(Detections(both[0].robot, time, np.array(uv), C, marks, np.zeros(k, np.uint8), none, none))
+    return open_run(path)
+
+
+@pytest.mark.parametrize(
+    ("names", "why"),
+    [(("C/0", "C/1"), "and both stand on one floor: it is of reflections"), (("", ""), "no pairing of the tracks")],
+)
+def test_a_stance_of_lights_and_mirror_images_measures_nothing(tmp_path, names, why):
+    run = mirrored_run(tmp_path / "run.mcap", names)
+    measured = measure_pair(run, run.stances[0], "A", "B", FrontendOptions())
+    assert measured.relative_pose is None
+    assert why in measured.homography.unusable
 
 
 def test_mirror_images_are_no_span_apart():

@@ -9,6 +9,7 @@ from crowd_scene import FACTS, movers, seen_by_both
 from msgspec.structs import replace as msgspec_replace
 
 from coloc_graph import stance_solver
+from coloc_graph.backend import Estimator
 from coloc_graph.common_view import View
 from coloc_graph.errors import InputError
 from coloc_graph.frontend import FrontendOptions, StanceTracks, Track, correspond, little_in_common, measure_pair
@@ -102,6 +103,18 @@ def test_incrementally_a_team_comes_out_the_same(ten):
         sigma = np.sqrt(np.trace(trajectory.covariances[:, 3:, 3:], axis1=1, axis2=2)) + 1e-5
         off = np.linalg.norm(step.trajectories[robot].positions - trajectory.positions, axis=1)
         assert (off < 0.5 * sigma).all()
+
+
+def test_what_is_saved_of_a_team_knows_what_its_pairs_share(ten, tmp_path):
+    solver = stance_solver.StanceSolver(ten.team)
+    for stance in ten.stances[:2]:
+        solver.enter(ten, stance)
+    shares = [m.homography.share for m in solver.estimator.graph.relative_poses]
+    assert min(shares) < 0.6
+    solver.estimator.save(tmp_path / "point.json")
+    again = Estimator.resume(tmp_path / "point.json")
+    assert [m.homography.share for m in again.graph.relative_poses] == shares
+    assert again.estimate().dof == solver.estimator.estimate().dof
 
 
 def test_robots_that_share_no_view_of_a_mover_are_tied_by_seeing_each_other_stand(ten, monkeypatch):

@@ -179,3 +179,16 @@ def test_a_marker_that_stands_for_a_second_among_100_images_is_not_taken_for_a_l
         tracker.take(T0 + 0.01 * k, Blobs(one, np.array([0.01 * np.eye(2)]), flags, none, none))
     (track,) = tracker.tracks()
     assert len(track) == 300
+
+
+@pytest.mark.parametrize("speed", [30.0, 60.0])
+def test_a_marker_that_turns_back_at_once_is_followed(speed):
+    tracker = MarkerTracker("A", Detector(), TrackerOptions(markers=1), size=(320, 240))
+    flags, none = np.zeros(1, np.uint8), np.full(1, 200.0)
+    for k in range(200):
+        u = 100.0 + speed * 0.01 * (100 - abs(k - 100))
+        tracker.take(T0 + 0.01 * k, Blobs(np.array([[u, 80.0]]), np.array([0.0025 * np.eye(2)]), flags, none, none))
+        if k == 103:  # and three images on it knows how fast it goes
+            assert tracker._filters.speed[0, 0] == pytest.approx(-speed, abs=0.2 * speed)
+    (track,) = tracker.tracks()
+    assert len(track) == 200
