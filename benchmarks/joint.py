@@ -197,7 +197,7 @@ def far_off(seed: int) -> Figures:
             m, height=m.height + 0.02 * height, tilt_deg=m.tilt_deg + 3 * tilt, roll_deg=m.roll_deg + 3 * roll,
             height_sigma=0.02, tilt_sigma_deg=3.0, roll_sigma_deg=3.0,
         )  # fmt: skip
-        robots.append(with_fields(robot, mount=wrong))
+        robots.append(with_fields(robot, mount_if_any=wrong))
     return figures_of(replace(world, team=with_fields(world.team, robots=tuple(robots))), SolveOptions("joint"))
 
 

@@ -201,7 +201,7 @@ def bring_in(stereo: Stereo, sigma: float, folder: Path, bias: float | None = No
     With a `bias` [px], which the corners of an image share, it is stated, and how well PnP knows each plane with it.
     """
     robots = [
-        Robot(name=name, camera=replace(camera, bias_px=bias or 0.0), mount=Mount(height=0.0))
+        Robot(name=name, camera_if_any=replace(camera, bias_px=bias or 0.0), mount_if_any=Mount(height=0.0))
         for name, camera in zip(CAMERAS, stereo.cameras, strict=True)
     ]
     write_team(Team(reference=CAMERAS[0], robots=tuple(robots)), folder / "TEAM.toml")

@@ -254,7 +254,7 @@ def test_markers_that_are_never_in_both_cameras_at_once(solve_refused, short, co
 
 def test_a_camera_that_is_not_above_the_markers(solve_refused, refused, short, copied, tmp_path, capsys):
     team = open_run(short).team
-    low = (msgspec.structs.replace(r, mount=msgspec.structs.replace(r.mount, height=0.15)) for r in team.robots)
+    low = (msgspec.structs.replace(r, mount_if_any=msgspec.structs.replace(r.mount, height=0.15)) for r in team.robots)
     team = msgspec.structs.replace(team, robots=tuple(low))
     run = copied(short, tmp_path / "run.mcap", team=team)
     sentence = solve_refused(run)

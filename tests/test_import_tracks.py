@@ -28,8 +28,8 @@ def team(*, markers_on=("C",), noise_px=0.25, names=("A", "B", "C")):
     robots = tuple(
         Robot(
             name=name,
-            camera=msgspec.structs.replace(CAMERA, noise_px=noise_px),
-            mount=MOUNT,
+            camera_if_any=msgspec.structs.replace(CAMERA, noise_px=noise_px),
+            mount_if_any=MOUNT,
             markers=markers if name in markers_on else None,
         )
         for name in names

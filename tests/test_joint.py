@@ -115,7 +115,7 @@ def test_from_mounts_three_degrees_and_two_centimetres_wrong_it_comes_to_the_sam
             mount, height=mount.height + 0.02 * height, tilt_deg=mount.tilt_deg + 3 * tilt,
             roll_deg=mount.roll_deg + 3 * roll, height_sigma=0.02, tilt_sigma_deg=3.0, roll_sigma_deg=3.0,
         )  # fmt: skip
-        return msgspec.structs.replace(graph.rigs[robot], mount=wrong)
+        return msgspec.structs.replace(graph.rigs[robot], mount_if_any=wrong)
 
     rigs = {"A": off("A", signs), "B": off("B", signs[::-1]), "C": graph.rigs["C"]}
     estimate = joint(replace(graph, rigs=rigs))
@@ -131,7 +131,7 @@ def test_from_mounts_three_degrees_and_two_centimetres_wrong_it_comes_to_the_sam
 def test_a_mount_that_is_not_as_stated_is_warned_of_by_name(wrong_mounts, copied, tmp_path):
     run = open_run(wrong_mounts)
     a, *others = run.team.robots
-    tilted = msgspec.structs.replace(a, mount=msgspec.structs.replace(a.mount, tilt_deg=a.mount.tilt_deg + 6.0))
+    tilted = msgspec.structs.replace(a, mount_if_any=msgspec.structs.replace(a.mount, tilt_deg=a.mount.tilt_deg + 6.0))
     path = copied(
         wrong_mounts, tmp_path / "tilted.mcap", team=msgspec.structs.replace(run.team, robots=(tilted, *others))
     )
@@ -183,7 +183,7 @@ def test_scale_by_the_span_leaves_heights_open(wrong_mounts, copied, tmp_path):
     run = open_run(wrong_mounts)
     robots = tuple(
         msgspec.structs.replace(
-            r, mount=msgspec.structs.replace(r.mount, height=r.mount.height + 0.06, height_sigma=0.0)
+            r, mount_if_any=msgspec.structs.replace(r.mount, height=r.mount.height + 0.06, height_sigma=0.0)
         )
         for r in run.team.robots
     )

@@ -38,7 +38,7 @@ def team_of(robots=3, fps=30.0):
     return replace(
         team,
         robots=tuple(
-            replace(team.robots[0], name=chr(ord("A") + n), camera=replace(team.robots[0].camera, fps=fps))
+            replace(team.robots[0], name=chr(ord("A") + n), camera_if_any=replace(team.robots[0].camera, fps=fps))
             for n in range(robots)
         ),
     )

@@ -105,7 +105,7 @@ def test_nees_of_sightings_is_inside_its_interval(rng, tolerance):
     mount = msgspec.structs.replace(
         observer.mount, tilt_sigma_deg=tolerance, roll_sigma_deg=tolerance, height_sigma=0.01 * tolerance
     )
-    stated = msgspec.structs.replace(observer, mount=mount)
+    stated = msgspec.structs.replace(observer, mount_if_any=mount)
     plane = plane_from_mount(mount, mover.markers, team.floor)
     nees = []
     for _ in range(200):
@@ -114,7 +114,7 @@ def test_nees_of_sightings_is_inside_its_interval(rng, tolerance):
         true_mount = msgspec.structs.replace(
             mount, tilt_deg=mount.tilt_deg + tilt, roll_deg=mount.roll_deg + roll, height=mount.height + height
         )
-        tracks = seen_from(rng, msgspec.structs.replace(observer, mount=true_mount), mover, truth[None])
+        tracks = seen_from(rng, msgspec.structs.replace(observer, mount_if_any=true_mount), mover, truth[None])
         seen = sight(STANCE, stated, mover, tracks, plane)
         off = planar(se3_inverse(seen.T_observer_seen.matrix()) @ truth)
         nees.append(off @ np.linalg.solve(seen.covariance, off))

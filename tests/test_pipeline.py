@@ -174,7 +174,9 @@ def test_a_healthy_run_agrees_with_itself_as_well_as_its_noise_lets_it(solutions
 def test_mounts_that_are_not_as_stated_are_warned_of(hallway, copied, tmp_path):
     team = open_run(hallway).team
     tilted = tuple(
-        msgspec.structs.replace(robot, mount=msgspec.structs.replace(robot.mount, tilt_deg=robot.mount.tilt_deg + d))
+        msgspec.structs.replace(
+            robot, mount_if_any=msgspec.structs.replace(robot.mount, tilt_deg=robot.mount.tilt_deg + d)
+        )
         for robot, d in zip(team.robots, (2.0, -2.0, 0.0), strict=True)
     )
     run = open_run(copied(hallway, tmp_path / "tilted.mcap", team=msgspec.structs.replace(team, robots=tilted)))
@@ -196,7 +198,8 @@ def test_whether_measurements_disagree_depends_on_the_degrees_of_freedom(solutio
 def with_camera_at(run, copied, to, **mount):
     team = run.team
     robots = tuple(
-        msgspec.structs.replace(robot, mount=msgspec.structs.replace(robot.mount, **mount)) for robot in team.robots
+        msgspec.structs.replace(robot, mount_if_any=msgspec.structs.replace(robot.mount, **mount))
+        for robot in team.robots
     )
     return open_run(copied(run.path, to, team=msgspec.structs.replace(team, robots=robots)))
 

@@ -69,8 +69,8 @@ def test_a_team_reads_back_as_it_was_written(tmp_path, hue, floor):
     markers = Markers(height=0.15, positions=((0.1, 0.2), (-1 / 3, 0.0)), hue_deg=hue, span_sigma=1e-4)
     mount = Mount(height=0.4, tilt_deg=20.1, roll_deg=-0.3, yaw_deg=5.0, x=0.01, y=-0.02, tilt_sigma_deg=0.3)
     robots = (
-        Robot(name="A", camera=camera(LENSES[1], noise_px=0.1 + 0.2), mount=mount),
-        Robot(name="b-2_c", camera=camera(LENSES[3]), mount=mount, markers=markers),
+        Robot(name="A", camera_if_any=camera(LENSES[1], noise_px=0.1 + 0.2), mount_if_any=mount),
+        Robot(name="b-2_c", camera_if_any=camera(LENSES[3]), mount_if_any=mount, markers=markers),
     )
     team = Team(reference="b-2_c", robots=robots, floor=floor)
     write_team(team, tmp_path / "team.toml")

@@ -253,7 +253,7 @@ class Calibration:
             robots.append(
                 with_fields(
                     robot,
-                    mount=robot.mount if mount is None else mount.mount,
+                    mount_if_any=robot.mount if mount is None else mount.mount,
                     markers=robot.markers if markers is None else markers.markers,
                 )
             )
@@ -276,7 +276,7 @@ def loosened(rigs: Mapping[str, Robot], height_sigma: float) -> dict[str, Robot]
     """The same robots with mounts whose heights are known no better than that [m]."""
     return {
         name: with_fields(
-            robot, mount=with_fields(robot.mount, height_sigma=max(robot.mount.height_sigma, height_sigma))
+            robot, mount_if_any=with_fields(robot.mount, height_sigma=max(robot.mount.height_sigma, height_sigma))
         )
         for name, robot in rigs.items()
     }

@@ -188,7 +188,7 @@ def exact(team: Team) -> Team:
     for robot in team.robots:
         mount = new(robot.mount, height_sigma=0.0, tilt_sigma_deg=0.0, roll_sigma_deg=0.0)
         markers = robot.markers and new(robot.markers, span_sigma=0.0, height_sigma=0.0)
-        robots.append(new(robot, mount=mount, markers=markers))
+        robots.append(new(robot, mount_if_any=mount, markers=markers))
     floor = team.floor and new(team.floor, tilt_sigma_deg=0.0, height_sigma=0.0)
     return new(team, robots=tuple(robots), floor=floor)
 

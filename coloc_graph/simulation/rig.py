@@ -61,7 +61,7 @@ def reference_team(
     )
     mount = Mount(height=0.40, tilt_deg=20.0)
     markers = Markers(height=0.15, positions=((0.0, 0.125), (0.0, -0.125)))
-    robots = tuple(Robot(name=name, camera=camera, mount=mount, markers=markers) for name in names)
+    robots = tuple(Robot(name=name, camera_if_any=camera, mount_if_any=mount, markers=markers) for name in names)
     return Team(reference=names[0], robots=robots, floor=Floor())
 
 
@@ -78,7 +78,7 @@ def stated_team(team: Team, imperfections: Imperfections) -> Team:
             roll_sigma_deg=imperfections.mount_sigma_deg,
         )
         markers = robot.markers and replace(robot.markers, span_sigma=imperfections.span_sigma)
-        return replace(robot, camera=camera, mount=mount, markers=markers)
+        return replace(robot, camera_if_any=camera, mount_if_any=mount, markers=markers)
 
     floor = Floor(tilt_sigma_deg=imperfections.floor_sigma_deg)
     robots = tuple(map(stated, team.robots))
@@ -105,7 +105,7 @@ def true_team(stated: Team, rng: np.random.Generator) -> Team:
             scale = 1 + span * markers.span_sigma / markers.span
             positions = tuple((x * scale, y * scale) for x, y in markers.positions)
             markers = replace(markers, positions=positions, span_sigma=0.0)
-        return replace(robot, mount=mount, markers=markers)
+        return replace(robot, mount_if_any=mount, markers=markers)
 
     return replace(stated, robots=tuple(map(drawn, stated.robots)), clock_sigma=0.0)
 

@@ -29,7 +29,9 @@ def field_team(imperfections: Imperfections = FIELD, fps: float = FPS) -> Team:
     team = stated_team(reference_team(MILD_LENS, IMAGE_BIAS), imperfections)
     new = msgspec.structs.replace
     return new(
-        team, clock_sigma=CLOCKS, robots=tuple(new(robot, camera=new(robot.camera, fps=fps)) for robot in team.robots)
+        team,
+        clock_sigma=CLOCKS,
+        robots=tuple(new(robot, camera_if_any=new(robot.camera, fps=fps)) for robot in team.robots),
     )
 
 

@@ -30,7 +30,7 @@ def team(tilt_deg: float = 20.0) -> Team:
     camera = Camera(width=32, height=24, fx=30.0, fy=30.0, cx=15.5, cy=11.5)
     mount = Mount(height=0.4, tilt_deg=tilt_deg)
     markers = Markers(height=0.15, positions=((0.0, 0.125), (0.0, -0.125)))
-    robots = tuple(Robot(name=name, camera=camera, mount=mount, markers=markers) for name in "ABC")
+    robots = tuple(Robot(name=name, camera_if_any=camera, mount_if_any=mount, markers=markers) for name in "ABC")
     return Team(reference="A", robots=robots)
 
 

@@ -1,0 +1,32 @@
+"""Who the robots are: `Team` of `Robot`s and `Landmark`s on a `Floor`, and the file team.toml.
+
+Fields carry the unit a person writes (`tilt_deg`); metres where a name says nothing. Tolerances (`*_sigma*`)
+are one standard deviation: what a simulated truth is drawn from and what the estimators take as a prior.
+"""
+
+from coloc_graph.team.body import LEAST_SLIP, R_BODY_OPTICAL, Devices, Markers, Mount, Slip
+from coloc_graph.team.camera import Camera
+from coloc_graph.team.file import read_team, without_none, write_team
+from coloc_graph.team.landmark import Landmark, Tag
+from coloc_graph.team.sensors import Ranging, Wheels
+from coloc_graph.team.team import Floor, Robot, Team
+
+__all__ = [
+    "LEAST_SLIP",
+    "R_BODY_OPTICAL",
+    "Camera",
+    "Devices",
+    "Floor",
+    "Landmark",
+    "Markers",
+    "Mount",
+    "Ranging",
+    "Robot",
+    "Slip",
+    "Tag",
+    "Team",
+    "Wheels",
+    "read_team",
+    "without_none",
+    "write_team",
+]

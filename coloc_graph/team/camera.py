@@ -1,0 +1,132 @@
+"""`Camera`: a pinhole and its lens."""
+
+import math
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coloc_graph.team.checks import require_finite, require_not_negative
+
+Array = NDArray[np.float64]
+
+
+class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Pinhole camera with OpenCV's distortion; pixels, (0, 0) is the centre of the top-left pixel.
+
+    `distortion` is OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for none. `noise_px` is the standard
+    deviation of a detected marker centre per axis where a detection does not bring its own. `shot_gain` is the
+    variance [grey levels^2] that one grey level of light adds to a pixel; it decides how sure a centre is.
+    `bias_px` is the standard deviation per axis of an error that all centres of one marker share during a stance,
+    and that no number of them averages away: what calibration leaves of the lens, a background that pulls.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    fps: float = 100.0
+    noise_px: float = 0.3
+    shot_gain: float = 0.1
+    bias_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        for name in ("width", "height", "fx", "fy", "fps", "noise_px"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
+        require_not_negative(self, ("shot_gain", "bias_px"))
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise ValueError(
+                f"`distortion` has {len(self.distortion)} numbers; give none, or OpenCV's 4, 5 or 8 coefficients"
+            )
+        if not all(map(math.isfinite, self.distortion)):
+            raise ValueError("`distortion` holds a number that is not finite")
+
+    @property
+    def K(self) -> Array:
+        """Intrinsic matrix, (3, 3), pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points_camera: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+        """Pixels (..., 2) of points in the camera frame (..., 3) [m], and which of them the image contains.
+
+        Points behind the camera come back as NaN. Source: OpenCV, "Camera Calibration and 3D Reconstruction".
+        """
+        points = np.asarray(points_camera, float)
+        ahead = points[..., 2] > 1e-9
+        x, y = np.moveaxis(points[..., :2] / np.where(ahead, points[..., 2], np.nan)[..., None], -1, 0)
+        ahead &= self._unfolded(x, y)
+        x, y = self._distort(x, y)
+        uv = np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
+        with np.errstate(invalid="ignore"):
+            inside = (uv >= -0.5).all(-1) & (uv[..., 0] < self.width - 0.5) & (uv[..., 1] < self.height - 0.5)
+        return uv, inside & ahead
+
+    def _unfolded(self, x: Array, y: Array) -> NDArray[np.bool_]:
+        """Where the distorted radius still grows: beyond, a lens model folds far points back into the image."""
+        k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *([0.0] * (8 - len(self.distortion))))
+        r2 = x * x + y * y
+        with np.errstate(invalid="ignore"):
+            above, below = (1 + r2 * (a + r2 * (b + r2 * c)) for a, b, c in ((k1, k2, k3), (k4, k5, k6)))
+            above_grows, below_grows = (
+                2 * r2 * (a + r2 * (2 * b + r2 * 3 * c)) for a, b, c in ((k1, k2, k3), (k4, k5, k6))
+            )
+            # the sign of d(r above / below)/dr
+            return np.asarray((above + above_grows) * below - above * below_grows > 0)
+
+    def _lens(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Radial factor and tangential shift of the lens at undistorted normalised coordinates."""
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *([0.0] * (8 - len(self.distortion))))
+        r2 = x * x + y * y
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return (
+            radial,
+            2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        )
+
+    def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
+        if not self.distortion:
+            return x, y
+        radial, dx, dy = self._lens(x, y)
+        return x * radial + dx, y * radial + dy
+
+    def normalise(self, uv: ArrayLike) -> Array:
+        """Undistorted normalised coordinates (n, 2) of pixels (n, 2): the ray is (x, y, 1).
+
+        NaN where the lens model cannot be inverted (pixels far outside the image).
+        """
+        seen = (np.asarray(uv, float).reshape(-1, 2) - (self.cx, self.cy)) / (self.fx, self.fy)
+        if not self.distortion:
+            return np.asarray(seen)
+        x, y = seen.T
+        # OpenCV's fixed point, but to rounding: its five steps leave 1e-3 px at the corners of a wide lens
+        with np.errstate(all="ignore"):
+            for _ in range(100):
+                radial, dx, dy = self._lens(x, y)
+                x_before, y_before = x, y
+                x, y = (seen[:, 0] - dx) / radial, (seen[:, 1] - dy) / radial
+                moved = np.maximum(np.abs(x - x_before), np.abs(y - y_before))
+                if not (moved > 1e-13).any():
+                    break
+        return np.where((moved < 1e-9)[:, None], np.stack([x, y], axis=1), np.nan)
+
+    def per_pixel(self, x: ArrayLike) -> Array:
+        """How far one pixel to the right, and one down, go at normalised coordinates x (n, 2): (n, 2, 2)."""
+        at = np.asarray(x, float)
+        seen_by_x = np.broadcast_to(np.eye(2), (len(at), 2, 2))
+        if self.distortion:
+            step = 1e-6
+            sides = [
+                np.stack(self._distort(*(at + off).T), -1) - np.stack(self._distort(*(at - off).T), -1)
+                for off in ((step, 0.0), (0.0, step))
+            ]
+            seen_by_x = np.stack(sides, axis=-1) / (2 * step)
+        (a, b), (c, d) = np.moveaxis(seen_by_x, 0, -1)
+        with np.errstate(all="ignore"):
+            inverse = np.array([[d / self.fx, -b / self.fy], [-c / self.fx, a / self.fy]]) / (a * d - b * c)
+        return np.moveaxis(inverse, -1, 0)

@@ -1,0 +1,59 @@
+"""What a robot measures by besides its camera's images: `Ranging`, and `Wheels` that are not as they say."""
+
+import msgspec
+
+from coloc_graph.team.checks import require_finite, require_not_negative
+
+
+class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A sensor of range and bearing: what it measures, how noisy, and for how long it errs alike.
+
+    It reads `offset` [m] + `scale` r at range r, and `bearing_offset_deg` more than the bearing. One standard deviation
+    is `range_sigma` + `range_sigma_per_m2` r^2 [m] of a range (as where the range is made of the size of an image), and
+    the hypotenuse of `bearing_sigma_deg` and of `across_sigma` [m] / r of a bearing. Errors of the same target's next
+    measurement are alike for `range_memory` and `bearing_memory` [s], their time of correlation (0: independent).
+    `*_sigma` of offset and scale are tolerances: what has one is found along with the poses.
+    """
+
+    range_sigma: float
+    bearing_sigma_deg: float
+    range_sigma_per_m2: float = 0.0
+    across_sigma: float = 0.0
+    range_memory: float = 0.0
+    bearing_memory: float = 0.0
+    offset: float = 0.0
+    scale: float = 1.0
+    bearing_offset_deg: float = 0.0
+    offset_sigma: float = 0.0
+    scale_sigma: float = 0.0
+    bearing_offset_sigma_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        for name in ("range_sigma", "bearing_sigma_deg", "scale"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
+        names = ("range_sigma_per_m2", "across_sigma", "range_memory", "bearing_memory")
+        require_not_negative(self, (*names, "offset_sigma", "scale_sigma", "bearing_offset_sigma_deg"))
+
+
+class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How odometry and the way differ: the way is `scale` and `turn_scale` times what it says, `delay` [s] later.
+
+    A delay is what odometry has that is made of commands. `*_sigma` are tolerances: what has one is found along with
+    the poses. How noisy odometry is the run itself says, sample by sample.
+    """
+
+    scale: float = 1.0
+    turn_scale: float = 1.0
+    delay: float = 0.0
+    scale_sigma: float = 0.0
+    turn_scale_sigma: float = 0.0
+    delay_sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        for name in ("scale", "turn_scale"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
+        require_not_negative(self, ("scale_sigma", "turn_scale_sigma", "delay_sigma"))

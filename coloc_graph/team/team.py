@@ -1,0 +1,107 @@
+"""`Robot`, `Floor`, and the `Team` that they are."""
+
+from collections.abc import Iterable
+
+import msgspec
+
+from coloc_graph.errors import TeamError
+from coloc_graph.team.body import Devices, Markers, Mount, Slip
+from coloc_graph.team.camera import Camera
+from coloc_graph.team.checks import require_finite, require_not_negative
+from coloc_graph.team.landmark import Landmark, require_name
+from coloc_graph.team.sensors import Ranging, Wheels
+
+
+class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A body with a camera, its mount, and markers (none on a robot that is never watched).
+
+    As an anchor it stays put exactly, or, with a `slip`, within that. `devices` are for its own program. A robot
+    without a camera measures by `ranging` and `wheels`.
+    """
+
+    name: str
+    camera_if_any: Camera | None = msgspec.field(default=None, name="camera")
+    mount_if_any: Mount | None = msgspec.field(default=None, name="mount")
+    markers: Markers | None = None
+    slip: Slip | None = None
+    devices: Devices | None = None
+    ranging: Ranging | None = None
+    wheels: Wheels | None = None
+
+    def __post_init__(self) -> None:
+        require_name(self.name)
+        if (self.camera_if_any is None) != (self.mount_if_any is None):
+            there, missing = ("camera", "mount") if self.mount_if_any is None else ("mount", "camera")
+            raise ValueError(f"robot {self.name} has a `{there}` but no `{missing}`; give both, or neither")
+        if self.camera_if_any is None and self.ranging is None:
+            raise ValueError(f"robot {self.name} has no `camera` with its `mount`, and no `ranging`; give it one")
+
+    @property
+    def camera(self) -> Camera:
+        """The camera; `TeamError` where the robot has none."""
+        if self.camera_if_any is None:
+            raise TeamError(f"robot {self.name} has no camera in the team; give it one under [robots.camera]")
+        return self.camera_if_any
+
+    @property
+    def mount(self) -> Mount:
+        """How the camera sits on the body; `TeamError` where the robot has none."""
+        if self.mount_if_any is None:
+            raise TeamError(f"robot {self.name} has no camera in the team; give it one under [robots.camera]")
+        return self.mount_if_any
+
+
+class Floor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The floor the team stands on: how far from level and flat it is (standard deviations)."""
+
+    tilt_sigma_deg: float = 0.0
+    height_sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        require_not_negative(self, ("tilt_sigma_deg", "height_sigma"))
+
+
+class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The robots, the floor (None where they do not stand on a common one), the reference robot, and landmarks.
+
+    The world frame is the body of `reference` at stance 0. `clock_sigma` [s] is how well the clocks of any two
+    robots agree, one standard deviation; where it is 0 they agree, and no offset is estimated.
+    """
+
+    reference: str
+    robots: tuple[Robot, ...]
+    floor: Floor | None = None
+    clock_sigma: float = 0.0
+    landmarks: tuple[Landmark, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_finite(self)
+        require_not_negative(self, ("clock_sigma",))
+        names = [robot.name for robot in self.robots]
+        everything = [*names, *(landmark.name for landmark in self.landmarks)]
+        twice = sorted({name for name in everything if everything.count(name) > 1})
+        if twice:
+            what = "robots" if names.count(twice[0]) > 1 else "robots or landmarks"
+            raise ValueError(f"two {what} are called `{twice[0]}`; give each a name of its own")
+        if len(names) < 2:
+            raise ValueError("a team has at least two robots; add another under [[robots]]")
+        if self.reference not in names:
+            raise ValueError(f"`reference` is `{self.reference}`, which is not one of the robots {', '.join(names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The robots' names, in the team's order."""
+        return tuple(robot.name for robot in self.robots)
+
+    def __getitem__(self, name: str) -> Robot:
+        for robot in self.robots:
+            if robot.name == name:
+                return robot
+        raise TeamError(f"robot `{name}` is not in the team ({', '.join(self.names)}); add it under [[robots]]")
+
+    def marker_height(self, movers: Iterable[str] = ()) -> float | None:
+        """Height of the marker plane of these robots (of all where none is named) [m]; None if they differ."""
+        wanted = tuple(movers) or self.names
+        heights = {robot.markers.height for robot in self.robots if robot.markers and robot.name in wanted}
+        return heights.pop() if len(heights) == 1 else None
