@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import RunError
 from coloc_graph.run import schemas
-from coloc_graph.run.encode import check_planes, check_stance
-from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Stance
+from coloc_graph.run.encode import check_planes, check_ranges, check_stance
+from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Ranges, Stance
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
@@ -65,6 +65,20 @@ def decode_odometry(robot: str, ns: int, data: memoryview) -> OdometrySample:
 def decode_motion(robot: str, ns: int, data: memoryview) -> Motion:
     """The beginning or the end of a movement."""
     return Motion(robot, schemas.to_seconds(ns), _json(data, schemas.MotionWire).moving)
+
+
+def decode_ranges(robot: str, ns: int, data: memoryview) -> Ranges:
+    """What a sensor of range and bearing measured at one instant."""
+    wire = _json(data, schemas.RangesWire)
+    if not len(wire.target) == len(wire.range) == len(wire.bearing):
+        lengths = f"`range` has {len(wire.range)} and `bearing` {len(wire.bearing)}"
+        raise MalformedError(f"{lengths} entries for {len(wire.target)} in `target`")
+    try:
+        check_ranges(wire.range, "`range`")
+    except RunError as error:
+        raise MalformedError(str(error)) from error
+    time = schemas.to_seconds(ns)
+    return Ranges(robot, time, tuple(wire.target), np.array(wire.range, float), np.array(wire.bearing, float))
 
 
 def decode_stance(ns: int, data: memoryview) -> Stance:

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from coloc_graph.errors import RunError
 from coloc_graph.lie import quaternion
 from coloc_graph.run import schemas
-from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Stance
+from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Ranges, Stance
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
 ImageFormat = Literal["jpeg", "png", "raw"]
-Record = Detections | Image | OdometrySample | Motion | Stance | Planes
+Record = Detections | Image | OdometrySample | Motion | Ranges | Stance | Planes
 
 JPEG_QUALITY = 95
 
@@ -54,6 +54,8 @@ def encode_record(record: Record, image_format: ImageFormat) -> tuple[str, str, 
         case Motion():
             moving = schemas.MotionWire(moving=bool(record.moving))
             return _json(_robot(record, "motion"), record.time, moving)
+        case Ranges():
+            return _json(_robot(record, "ranges"), record.time, _ranges(record))
         case Stance():
             return _json(schemas.STANCE_TOPIC, record.start, _stance(record))
         case Planes():
@@ -91,7 +93,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _robot(record: Detections | Image | OdometrySample | Motion, kind: str) -> str:
+def _robot(record: Detections | Image | OdometrySample | Motion | Ranges, kind: str) -> str:
     return schemas.topic_of(record.robot, kind)
 
 
@@ -139,6 +141,32 @@ def _odometry(record: OdometrySample) -> schemas.OdometryWire:
     x, y, yaw = _finite(f"`pose` of {of}", record.time, (3,), record.pose).tolist()
     C = _covariance(f"`covariance` of {of}", record.time, (3, 3), record.covariance)
     return schemas.OdometryWire(x=x, y=y, yaw=yaw, covariance=C.tolist())
+
+
+def _ranges(record: Ranges) -> schemas.RangesWire:
+    n, time = len(record.targets), record.time
+    of = f"`{record.robot}`'s ranges"
+    range_ = _finite(f"`range` of {of}", time, (n,), record.range)
+    bearing = _finite(f"`bearing` of {of}", time, (n,), record.bearing)
+    check_ranges(range_.tolist(), f"`range` of {of} at {time} s")
+    return schemas.RangesWire(target=list(record.targets), range=range_.tolist(), bearing=bearing.tolist())
+
+
+def check_ranges(ranges: Sequence[float], where: str) -> None:
+    """RunError where a range is none."""
+    for one in ranges:
+        if not one > 0:
+            raise RunError(f"{where} is {one}; give metres above 0, and leave out what was not measured")
+
+
+def check_targets(team: Team, ranges: Ranges, where: str) -> None:
+    """RunError where what was measured is no other robot and no landmark of the team."""
+    known = {*team.names, *(landmark.name for landmark in team.landmarks)} - {ranges.robot}
+    for target in ranges.targets:
+        if target not in known:
+            raise RunError(
+                f"{where} name `{target}`, which is no other robot and no landmark of the team; leave it out"
+            )
 
 
 def _stance(record: Stance) -> schemas.StanceWire:

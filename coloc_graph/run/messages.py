@@ -63,6 +63,20 @@ class OdometrySample:
     covariance: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """How far (n,) [m] and in which direction (n,) [rad, left of ahead is positive] a robot measured `targets`.
+
+    Targets are robots and landmarks of the team.
+    """
+
+    robot: str
+    time: float
+    targets: tuple[str, ...]
+    range: Array
+    bearing: Array
+
+
 @dataclass(frozen=True)
 class Motion:
     """A robot begins or ends a movement."""

@@ -9,9 +9,9 @@ import numpy as np
 
 from coloc_graph.errors import RunError
 from coloc_graph.run import decode, schemas
-from coloc_graph.run.encode import check_robots
+from coloc_graph.run.encode import check_robots, check_targets
 from coloc_graph.run.index import Index, build_index
-from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Planes, Stance
+from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Planes, Ranges, Stance
 from coloc_graph.run.topics import Item, decoded, read_topic, time_span
 from coloc_graph.team import Team
 from coloc_graph.trajectory import Trajectory
@@ -66,6 +66,18 @@ class Run:
         """The beginnings and ends of a robot's movements."""
         items = self._items(robot, "motion", start, end)
         return decoded(self._index, items, lambda item: decode.decode_motion(robot, item.ns, item.data))
+
+    def ranges(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Ranges]:
+        """What a robot's sensor of range and bearing measured, one record an instant."""
+        items = self._items(robot, "ranges", start, end)
+        for one in decoded(self._index, items, lambda item: decode.decode_ranges(robot, item.ns, item.data)):
+            check_targets(self.team, one, f"{self.path}: the ranges of {robot} at {one.time} s")
+            yield one
+
+    @property
+    def has_ranges(self) -> bool:
+        """Whether any robot's sensor of range and bearing measured something."""
+        return any(self._count(robot, "ranges") for robot in self.team.names)
 
     def has_images(self, robot: str) -> bool:
         """Whether there is an image of this robot's camera."""

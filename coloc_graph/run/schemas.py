@@ -54,6 +54,14 @@ class OdometryWire(Wire, frozen=True):
     covariance: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
+class RangesWire(Wire, frozen=True):
+    """Columns over what was measured at one instant: who, how far [m], in which direction [rad]."""
+
+    target: list[str]
+    range: list[float]
+    bearing: list[float]
+
+
 class MotionWire(Wire, frozen=True):
     """Whether a movement begins (true) or ends."""
 
@@ -84,6 +92,7 @@ ROBOT_SCHEMAS: Mapping[str, tuple[str, ...]] = {
     "detections": ("coloc_graph.Detections",),
     "odometry": ("coloc_graph.Odometry",),
     "motion": ("coloc_graph.Motion",),
+    "ranges": ("coloc_graph.Ranges",),
     "truth": (POSE_IN_FRAME,),
 }
 TEAM_SCHEMAS: Mapping[str, tuple[str, ...]] = {
@@ -97,6 +106,7 @@ JSON_TYPES: Mapping[str, type[msgspec.Struct]] = {
     "coloc_graph.Detections": DetectionsWire,
     "coloc_graph.Odometry": OdometryWire,
     "coloc_graph.Motion": MotionWire,
+    "coloc_graph.Ranges": RangesWire,
     "coloc_graph.Stance": StanceWire,
     "coloc_graph.Planes": PlanesWire,
 }

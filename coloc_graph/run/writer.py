@@ -13,8 +13,16 @@ from numpy.typing import ArrayLike
 
 from coloc_graph.errors import RunError
 from coloc_graph.run import schemas
-from coloc_graph.run.encode import ImageFormat, Record, check_robots, encode_pose, encode_record, encode_team
-from coloc_graph.run.messages import Planes, Stance
+from coloc_graph.run.encode import (
+    ImageFormat,
+    Record,
+    check_robots,
+    check_targets,
+    encode_pose,
+    encode_record,
+    encode_team,
+)
+from coloc_graph.run.messages import Planes, Ranges, Stance
 from coloc_graph.team import Team
 
 CHUNK_SIZE = 128 * 1024
@@ -97,6 +105,8 @@ class RunWriter:
                 check_robots(self.team, tuple(record.planes), f"the planes of stance {record.stance}")
             case _:
                 check_robots(self.team, (record.robot,), f"the {type(record).__name__}")
+        if isinstance(record, Ranges):
+            check_targets(self.team, record, f"the ranges of {record.robot} at {record.time} s")
         topic, schema, time, data = encode_record(record, self._image_format)
         self._add(topic, schema, time, data)
 

@@ -1,0 +1,59 @@
+"""Tables of numbers in columns of text, with comments after #, that remember their lines."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DatTable:
+    """`values` (n, columns), and the `lines` (n,) of the file they are from, counted from 1."""
+
+    path: Path
+    values: Array
+    lines: NDArray[np.int64]
+
+
+def read_dat(path: Path, columns: int) -> DatTable:
+    """The rows of a file; `InputError`, with its line, for one that is not so many finite numbers, or where none is."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give the folder of a whole dataset") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is no text (byte {error.start}); give the file as it was published") from error
+    rows, lines = [], []
+    for line, content in enumerate(text.split("\n"), start=1):
+        words = content.split("#", 1)[0].split()
+        if not words:
+            continue
+        if len(words) != columns:
+            cut = " (the file was cut off there?)" if line >= text.count("\n") else ""
+            raise InputError(f"{path}, line {line}: has {len(words)} columns and not {columns}{cut}; repair the row")
+        rows.append(words)
+        lines.append(line)
+    if not rows:
+        raise InputError(f"{path}: holds no row; give the file as it was published")
+    try:
+        values = np.array(rows, float)
+    except ValueError:
+        row, word = next((n, word) for n, words in enumerate(rows) for word in words if not _is_number(word))
+        raise InputError(f"{path}, line {lines[row]}: `{word}` is not a number; repair the row") from None
+    bad = ~np.isfinite(values).all(axis=1)
+    if bad.any():
+        raise InputError(f"{path}, line {lines[int(bad.argmax())]}: holds a number that is not finite; repair the row")
+    return DatTable(path, values, np.array(lines))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
