@@ -132,7 +132,9 @@ class Posterior:
 
     def __init__(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         self.values = values
-        self._isam = gtsam.ISAM2(isam_parameters())
+        parameters = gtsam.ISAM2Params()
+        parameters.setFactorization("QR")
+        self._isam = gtsam.ISAM2(parameters)
         self._isam.update(factors, values)
 
     def covariance(self, key: int) -> Array:
@@ -148,7 +150,7 @@ class Posterior:
         return joint_covariance(self._isam, keys)
 
 
-def joint_covariance(isam: gtsam.ISAM2, keys: Sequence[int]) -> Array:
+def joint_covariance(isam: gtsam.ISAM2 | gtsam.Marginals, keys: Sequence[int]) -> Array:
     """Joint covariance of different variables, in the order given: (6 n, 6 n) of n poses."""
     joint = isam.jointMarginalCovariance(list(keys))
     return np.block([[joint.at(a, b) for b in keys] for a in keys])

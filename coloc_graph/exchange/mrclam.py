@@ -34,6 +34,7 @@ RANGING = Ranging(
     offset_sigma=0.1,
     scale_sigma=0.05,
     bearing_offset_sigma_deg=2.0,
+    place_sigma=0.05,
 )
 #: Their odometry is what the wheels were told, which they do a moment later, and not to the full.
 WHEELS = Wheels(delay=0.1, scale_sigma=0.1, turn_scale_sigma=0.1, delay_sigma=0.1)
@@ -235,7 +236,9 @@ def _odometry(table: DatTable) -> _Odometry:
 def _every(times: Array, period: float) -> NDArray[np.bool_]:
     """Which of ascending times are the first of their period, and the last of all."""
     periods = np.floor((times - times[0]) / period)
-    return np.r_[True, np.diff(periods) > 0] | (np.arange(len(times)) == len(times) - 1)
+    first: NDArray[np.bool_] = np.r_[True, np.diff(periods) > 0]
+    first[-1] = True
+    return first
 
 
 def _write(

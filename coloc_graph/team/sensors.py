@@ -12,7 +12,8 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     is `range_sigma` + `range_sigma_per_m2` r^2 [m] of a range (as where the range is made of the size of an image), and
     the hypotenuse of `bearing_sigma_deg` and of `across_sigma` [m] / r of a bearing. Errors of the same target's next
     measurement are alike for `range_memory` and `bearing_memory` [s], their time of correlation (0: independent).
-    `*_sigma` of offset and scale are tolerances: what has one is found along with the poses.
+    It sits at `x`, `y` [m] on the body. `*_sigma` of what is not noise are tolerances (`place_sigma` is that of x and of
+    y): what has one is found along with the poses.
     """
 
     range_sigma: float
@@ -24,9 +25,12 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     offset: float = 0.0
     scale: float = 1.0
     bearing_offset_deg: float = 0.0
+    x: float = 0.0
+    y: float = 0.0
     offset_sigma: float = 0.0
     scale_sigma: float = 0.0
     bearing_offset_sigma_deg: float = 0.0
+    place_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         require_finite(self)
@@ -34,7 +38,7 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             if getattr(self, name) <= 0:
                 raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
         names = ("range_sigma_per_m2", "across_sigma", "range_memory", "bearing_memory")
-        require_not_negative(self, (*names, "offset_sigma", "scale_sigma", "bearing_offset_sigma_deg"))
+        require_not_negative(self, (*names, "offset_sigma", "scale_sigma", "bearing_offset_sigma_deg", "place_sigma"))
 
 
 class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

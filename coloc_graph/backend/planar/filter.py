@@ -1,0 +1,258 @@
+"""A centralised EKF over a drive: where each robot is at the time, and where the search for the best of all starts.
+
+It estimates robots, landmarks and what is off of wheels and sensors, and needs no first poses: a robot is placed once
+its measurements say where it is. Source: Leung, Barfoot, Liu, "Decentralized localization of sparsely-communicating
+robot networks", 2010, for what is centralised there; Smith, Self, Cheeseman, "Estimating uncertain spatial
+relationships in robotics", 1990.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.backend.planar.model import Pose, RangingModel, WheelsModel, between, compose, wrapped
+from coloc_graph.backend.planar.placing import Placing
+from coloc_graph.keyframes import Drive
+from coloc_graph.team import Ranging, Team, Wheels
+
+Array = NDArray[np.float64]
+
+#: A measurement further off than this (chi2 of two numbers, chance 1e-4) is left out.
+GATE = 18.4
+#: A robot that was just placed is known to this [m, m, rad]; a landmark, before it is measured, to this [m].
+PLACED, ANYWHERE = (0.15, 0.15, 0.1), 30.0
+
+
+@dataclass(eq=False)
+class Filtered:
+    """What a filter went through: `poses` (n, 3) of each robot's keyframes at their time, NaN before it was placed, and
+    `covariances` (n, 3, 3) of x, y, heading; `landmarks` (m, 2) at the end, NaN where never seen; errors of wheels
+    (robots, 3) and ranging (robots, 5) at the end; which measurements were `used`."""
+
+    poses: list[Array]
+    covariances: list[Array]
+    landmarks: Array
+    wheels: Array
+    ranging: Array
+    used: NDArray[np.bool_]
+    placed_at: dict[int, int] = field(default_factory=dict)
+
+    def whole(self, drive: Drive, models: "Models") -> list[Array]:
+        """Poses of all keyframes: those before a robot was placed by following its wheels back."""
+        out = []
+        for robot, poses in enumerate(self.poses):
+            poses = poses.copy()
+            first = self.placed_at.get(robot)
+            for k in range((first or 0) - 1, -1, -1):
+                delta, _ = models.wheels[robot].step(k, self.wheels[robot].tolist())
+                back = between(delta, (0.0, 0.0, 0.0))
+                poses[k] = compose(_pose(poses[k + 1]), back)
+            out.append(poses)
+        return out
+
+
+class Models:
+    """The wheels and sensors of a team, with what is known of their errors."""
+
+    def __init__(self, team: Team, drive: Drive) -> None:
+        robots = [team[name] for name in drive.robots]
+        self.wheels = [
+            WheelsModel(steps, robot.wheels or Wheels()) for robot, steps in zip(robots, drive.steps, strict=True)
+        ]
+        self.ranging = [
+            RangingModel(robot.ranging or Ranging(range_sigma=1.0, bearing_sigma_deg=1.0)) for robot in robots
+        ]
+        self.wheels_sigmas = np.array(
+            [(m.wheels.scale_sigma, m.wheels.turn_scale_sigma, m.wheels.delay_sigma) for m in self.wheels]
+        )
+        self.ranging_sigmas = np.array(
+            [
+                (
+                    *(m.ranging.offset_sigma, m.ranging.scale_sigma),
+                    *(math.radians(m.ranging.bearing_offset_sigma_deg), m.ranging.place_sigma, m.ranging.place_sigma),
+                )
+                for m in self.ranging
+            ]
+        )
+        positions = {one.name: one for one in team.landmarks}
+        known = [positions[name] for name in drive.landmarks]
+        self.map = np.array([one.position or (math.nan, math.nan) for one in known], float).reshape(-1, 2)
+        self.map_sigmas = np.array([one.position_sigma for one in known], float)
+
+    @property
+    def map_known(self) -> bool:
+        """Whether any landmark's position is stated, so that the world is the map's."""
+        return bool(np.isfinite(self.map).any())
+
+
+def filter_forward(team: Team, drive: Drive) -> Filtered:
+    """Run the filter over all of a drive."""
+    return Filter(team, drive).run()
+
+
+class Filter:
+    """The filter's state: robots, their errors, landmarks, in one mean and one covariance."""
+
+    def __init__(self, team: Team, drive: Drive) -> None:
+        self.drive, self.models = drive, Models(team, drive)
+        robots, landmarks = len(drive.robots), len(drive.landmarks)
+        self._robots = robots
+        self._wheels, self._ranging, self._marks = 3 * robots, 6 * robots, 11 * robots
+        size = self._marks + 2 * landmarks
+        self.mean, self.P = np.zeros(size), np.zeros((size, size))
+        self.P[self._wheels : self._marks, self._wheels : self._marks] = np.diag(
+            np.concatenate([self.models.wheels_sigmas.ravel(), self.models.ranging_sigmas.ravel()]) ** 2
+        )
+        self._known = np.isfinite(self.models.map[:, 0])
+        for n in np.flatnonzero(self._known):
+            at = slice(self._marks + 2 * n, self._marks + 2 * n + 2)
+            self.mean[at] = self.models.map[n]
+            self.P[at, at] = np.eye(2) * self.models.map_sigmas[n] ** 2
+        self._at = [0] * robots
+        self._placed = [False] * robots
+        self._placing = [Placing() for _ in range(robots)]
+        # where each robot is in a frame of its own, until it is placed
+        self._own: list[Pose] = [(0.0, 0.0, 0.0)] * robots
+        reference = drive.robots.index(team.reference)
+        if not self.models.map_known:
+            self._placed[reference] = True
+        self.out = Filtered(
+            poses=[np.full((len(t), 3), np.nan) for t in drive.times],
+            covariances=[np.full((len(t), 3, 3), np.nan) for t in drive.times],
+            landmarks=np.full((landmarks, 2), np.nan),
+            wheels=np.zeros((robots, 3)),
+            ranging=np.zeros((robots, 5)),
+            used=np.zeros(len(drive.measured), bool),
+        )
+        if not self.models.map_known:
+            self.out.placed_at[reference] = 0
+            self._note(reference)
+
+    def run(self) -> Filtered:
+        """All measurements in the order of time, then to the last keyframes."""
+        m = self.drive.measured
+        columns = (m.robot, m.keyframe, m.target, m.target_keyframe, m.range, m.bearing, m.share)
+        for index, row in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
+            self.out.used[index] = self._measurement(*row)
+        for robot, times in enumerate(self.drive.times):
+            self._go(robot, len(times) - 1)
+        self.out.landmarks[self._known] = self.mean[self._marks :].reshape(-1, 2)[self._known]
+        self.out.wheels = self.mean[self._wheels : self._ranging].reshape(-1, 3).copy()
+        self.out.ranging = self.mean[self._ranging : self._marks].reshape(-1, 5).copy()
+        return self.out
+
+    def _measurement(
+        self, robot: int, k: int, target: int, k_target: int, range_: float, bearing: float, share: list[float]
+    ) -> bool:
+        self._go(robot, k)
+        if target < self._robots:
+            self._go(target, k_target)
+        if not self._ready(robot, target, range_, bearing):
+            return False
+        return self._update(robot, target, range_, bearing, share)
+
+    def _ready(self, robot: int, target: int, range_: float, bearing: float) -> bool:
+        """Whether both ends of a measurement have a place; else it may help to find one."""
+        model = self.models.ranging[robot]
+        seen = model.place(range_, bearing)
+        is_robot = target < self._robots
+        if not self._placed[robot]:
+            if is_robot and self._placed[target]:
+                self._place(robot, compose(self._own[robot], (*seen, 0.0))[:2], self._pose(target)[:2])
+            elif not is_robot and self._known[target - self._robots]:
+                at = self._marks + 2 * (target - self._robots)
+                world = float(self.mean[at]), float(self.mean[at + 1])
+                self._place(robot, compose(self._own[robot], (*seen, 0.0))[:2], world)
+            return False
+        world = compose(self._pose(robot), (*seen, 0.0))[:2]
+        if is_robot and not self._placed[target]:
+            self._place(target, self._own[target][:2], world)
+            return False
+        if not is_robot and not self._known[target - self._robots]:
+            at = self._marks + 2 * (target - self._robots)
+            self.mean[at : at + 2] = world
+            self.P[at : at + 2, at : at + 2] = np.eye(2) * ANYWHERE**2
+            self._known[target - self._robots] = True
+        return True
+
+    def _place(self, robot: int, local: tuple[float, float], world: tuple[float, float]) -> None:
+        self._placing[robot].add(local, world)
+        frame = self._placing[robot].place()
+        if frame is None:
+            return
+        at = slice(3 * robot, 3 * robot + 3)
+        self.mean[at] = compose(frame, self._own[robot])
+        self.P[at, at] = np.diag(np.square(PLACED))
+        self._placed[robot] = True
+        self.out.placed_at[robot] = self._at[robot]
+        self._note(robot)
+
+    def _pose(self, robot: int) -> Pose:
+        return _pose(self.mean[3 * robot : 3 * robot + 3])
+
+    def _note(self, robot: int) -> None:
+        k, at = self._at[robot], slice(3 * robot, 3 * robot + 3)
+        self.out.poses[robot][k], self.out.covariances[robot][k] = self.mean[at], self.P[at, at]
+
+    def _go(self, robot: int, k: int) -> None:
+        """Follow a robot's wheels up to a keyframe."""
+        model = self.models.wheels[robot]
+        of_errors = slice(self._wheels + 3 * robot, self._wheels + 3 * robot + 3)
+        at = slice(3 * robot, 3 * robot + 3)
+        while self._at[robot] < k:
+            step = self._at[robot]
+            self._at[robot] += 1
+            delta, by_errors = model.step(step, self.mean[of_errors].tolist())
+            if not self._placed[robot]:
+                self._own[robot] = compose(self._own[robot], delta)
+                continue
+            _, _, yaw = self._pose(robot)
+            c, s = math.cos(yaw), math.sin(yaw)
+            R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            F = np.eye(3)
+            F[0, 2], F[1, 2] = -s * delta[0] - c * delta[1], c * delta[0] - s * delta[1]
+            self.mean[at] = compose(self._pose(robot), delta)
+            rows = F @ self.P[at] + (R @ np.array(by_errors).T) @ self.P[of_errors]
+            own = rows[:, at] @ F.T + rows[:, of_errors] @ (R @ np.array(by_errors).T).T
+            self.P[at], self.P[:, at] = rows, rows.T
+            self.P[at, at] = own + R @ model.covariances[step] @ R.T
+            self._note(robot)
+
+    def _update(self, robot: int, target: int, range_: float, bearing: float, share: list[float]) -> bool:
+        is_robot = target < self._robots
+        to = 3 * target if is_robot else self._marks + 2 * (target - self._robots)
+        errors = self._ranging + 5 * robot
+        pose, model = self._pose(robot), self.models.ranging[robot]
+        dx, dy = float(self.mean[to]) - pose[0], float(self.mean[to + 1]) - pose[1]
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        x, y = c * dx + s * dy, -s * dx + c * dy
+        expected = model.expected(x, y, self.mean[errors : errors + 5].tolist())
+        rows = []
+        for (bx, by), by_errors in (
+            (expected.range_by_xy, expected.range_by_errors()),
+            (expected.bearing_by_xy, expected.bearing_by_errors()),
+        ):
+            wx, wy = c * bx - s * by, s * bx + c * by
+            rows.append([-wx, -wy, bx * y - by * x, wx, wy, *by_errors])
+        H = np.array(rows)
+        columns = [3 * robot, 3 * robot + 1, 3 * robot + 2, to, to + 1, *range(errors, errors + 5)]
+        PH = self.P[:, columns] @ H.T
+        sigmas = model.sigmas(range_)
+        S = H @ PH[columns] + np.diag(np.square(sigmas) / share)
+        off = np.array([range_ - expected.range, wrapped(bearing - expected.bearing)])
+        gain = np.linalg.solve(S, PH.T).T
+        if off @ np.linalg.solve(S, off) > GATE:
+            return False
+        self.mean += gain @ off
+        self.P -= gain @ PH.T
+        self._note(robot)
+        if is_robot:
+            self._note(target)
+        return True
+
+
+def _pose(values: Array) -> Pose:
+    x, y, yaw = values.tolist()
+    return x, y, yaw
