@@ -25,10 +25,10 @@ Array = NDArray[np.float64]
 #: What is known of the camera of these robots: a range is made of a barcode's height in the image, so that its error
 #: grows with its square, and lasts while the view stays the same.
 RANGING = Ranging(
-    range_sigma=0.03,
-    range_sigma_per_m2=0.008,
-    bearing_sigma_deg=0.3,
-    across_sigma=0.012,
+    range_sigma=0.036,
+    range_sigma_per_m2=0.0096,
+    bearing_sigma_deg=0.36,
+    across_sigma=0.0145,
     range_memory=3.0,
     bearing_memory=0.6,
     offset_sigma=0.1,

@@ -12,8 +12,8 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     is `range_sigma` + `range_sigma_per_m2` r^2 [m] of a range (as where the range is made of the size of an image), and
     the hypotenuse of `bearing_sigma_deg` and of `across_sigma` [m] / r of a bearing. Errors of the same target's next
     measurement are alike for `range_memory` and `bearing_memory` [s], their time of correlation (0: independent).
-    It sits at `x`, `y` [m] on the body. `*_sigma` of what is not noise are tolerances (`place_sigma` is that of x and of
-    y): what has one is found along with the poses.
+    It sits at `x`, `y` [m] on the body. `*_sigma` of what is not noise are tolerances (`place_sigma` is that of x and
+    of y): what has one is found along with the poses.
     """
 
     range_sigma: float

@@ -1,13 +1,11 @@
 """What comes of a drive: where robots and landmarks are, and what is off of wheels and sensors."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.planar.factors import DriveFactors, landmark_key, pose_key, ranging_key, wheels_key
 from coloc_graph.keyframes import Drive
 from coloc_graph.lie import floor_pose
 from coloc_graph.trajectory import Trajectory
@@ -46,7 +44,8 @@ class DriveEstimate:
     """Poses of all robots at their keyframes, landmarks, errors of wheels and sensors by robot.
 
     `noise` (robots, 3) is what the standard deviations of ranges, bearings and steps were multiplied with to be those
-    of the residuals. `doubted` (n,) are the measurements that all others contradict, which weigh next to nothing.
+    of the residuals. `residuals` (n, 2) are of ranges and bearings in their sigmas, NaN where a measurement was not
+    taken in; `doubted` (n,) are those that all others contradict, which weigh next to nothing.
     `chi2` with `dof` degrees of freedom is of everything else, of what of it is new. `unplaced` are robots whose
     measurements do not say where they are. `on_map` says that the world is the landmarks' map.
     """
@@ -63,7 +62,6 @@ class DriveEstimate:
     iterations: int
     on_map: bool
     unplaced: tuple[str, ...] = ()
-    values: gtsam.Values = field(default_factory=gtsam.Values, repr=False)
 
 
 def trajectory(robot: str, times: Array, poses: Array, covariances: Array) -> Trajectory:
@@ -72,36 +70,3 @@ def trajectory(robot: str, times: Array, poses: Array, covariances: Array) -> Tr
     C[:, [0, 1, 5], [0, 1, 5]] = FLAT**2
     C[:, PLACE[:, None], PLACE] = covariances
     return Trajectory(robot=robot, times=times, T_world_body=floor_pose(*poses.T), covariances=C)
-
-
-def poses_of(values: gtsam.Values, robot: int, count: int) -> Array:
-    """The poses (n, 3) of a robot's keyframes."""
-    found = (values.atPose2(pose_key(robot, k)) for k in range(count))
-    return np.array([(pose.x(), pose.y(), pose.theta()) for pose in found]).reshape(-1, 3)
-
-
-def placed_landmarks(
-    factors: DriveFactors, values: gtsam.Values, covariances: Mapping[int, Array]
-) -> tuple[PlacedLandmark, ...]:
-    """The landmarks that were measured, or whose positions are stated."""
-    drive, models = factors.drive, factors.models
-    counts = np.bincount(drive.measured.target, minlength=len(drive.robots) + len(drive.landmarks))
-    placed = []
-    for number, name in enumerate(drive.landmarks):
-        count, key = int(counts[len(drive.robots) + number]), landmark_key(number)
-        stated = bool(np.isfinite(models.map[number, 0]))
-        if values.exists(key):
-            placed.append(PlacedLandmark(name, values.atPoint2(key), covariances[key], stated, count))
-        elif stated:
-            C = np.eye(2) * models.map_sigmas[number] ** 2
-            placed.append(PlacedLandmark(name, models.map[number], C, stated, count))
-    return tuple(placed)
-
-
-def errors_of(drive: Drive, values: gtsam.Values, covariances: Mapping[int, Array]) -> dict[str, Errors]:
-    """What is off of each robot's wheels and sensor."""
-
-    def of(key: int) -> tuple[Array, Array] | None:
-        return (values.atVector(key), covariances[key]) if values.exists(key) else None
-
-    return {name: Errors(of(wheels_key(n)), of(ranging_key(n))) for n, name in enumerate(drive.robots)}

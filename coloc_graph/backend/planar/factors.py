@@ -1,12 +1,13 @@
 """GTSAM's factors of a drive: steps by the wheels, ranges and bearings, and what is known before."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.planar.estimate import Errors
 from coloc_graph.backend.planar.filter import Models
 from coloc_graph.backend.planar.model import NO_ERRORS, NOTHING_OFF
 from coloc_graph.keyframes import Drive
@@ -56,14 +57,18 @@ class DriveFactors:
         self._has_wheels = [bool(row.any()) for row in models.wheels_sigmas]
         self._has_ranging = [bool(row.any()) for row in models.ranging_sigmas]
         self._exact: NDArray[np.bool_] = np.isfinite(models.map[:, 0]) & (models.map_sigmas < EXACT)
-        self._whiten = [
+        self._whiten: list[Array] = [
             # e^T C^-1 e with C = L L^T
-            (np.linalg.inv(np.linalg.cholesky(model.covariances)) / self.noise[robot, 2] if len(model) else [])
+            np.linalg.inv(np.linalg.cholesky(model.covariances)).reshape(-1, 3, 3) / self.noise[robot, 2]
             for robot, model in enumerate(models.wheels)
         ]
         cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY)
         self._three = gtsam.noiseModel.Unit.Create(3)
         self._two = gtsam.noiseModel.Robust.Create(cauchy, gtsam.noiseModel.Unit.Create(2))
+
+    def whiten(self, robot: int) -> Array:
+        """What makes a robot's steps (n, 3, 3) those of unit variance."""
+        return self._whiten[robot]
 
     def is_exact(self, landmark: int) -> bool:
         """Whether a landmark is where it is said to be, and so no variable."""
@@ -74,7 +79,7 @@ class DriveFactors:
         model, W = self.models.wheels[robot], self._whiten[robot][k]
         (w00, _, _), (w10, w11, _), (w20, w21, w22) = W.tolist()
         a_key, b_key = pose_key(robot, k), pose_key(robot, k + 1)
-        errors_key = wheels_key(robot) if self._has_wheels[robot] else None
+        errors_key = self.wheels_variable(robot)
 
         def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
             a, b = values.atPose2(a_key), values.atPose2(b_key)
@@ -120,7 +125,7 @@ class DriveFactors:
             target_key = landmark_key(landmark)
         else:
             there = (float(self.models.map[landmark, 0]), float(self.models.map[landmark, 1]))
-        errors_key = ranging_key(robot) if self._has_ranging[robot] else None
+        errors_key = self.ranging_variable(robot)
 
         def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
             pose = values.atPose2(key)
@@ -167,11 +172,11 @@ class DriveFactors:
         """What is known before of some robots' wheels and sensors, and of some landmarks."""
         factors: list[gtsam.NonlinearFactor] = []
         for robot in robots:
-            for there, key, sigmas in (
-                (self._has_wheels, wheels_key(robot), self.models.wheels_sigmas[robot]),
-                (self._has_ranging, ranging_key(robot), self.models.ranging_sigmas[robot]),
+            for key, sigmas in (
+                (self.wheels_variable(robot), self.models.wheels_sigmas[robot]),
+                (self.ranging_variable(robot), self.models.ranging_sigmas[robot]),
             ):
-                if there[robot]:
+                if key is not None:
                     noise = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, LEAST_SIGMA))
                     factors.append(gtsam.PriorFactorVector(key, np.zeros(len(sigmas)), noise))
         for landmark in landmarks:
@@ -184,13 +189,16 @@ class DriveFactors:
         """What fixes the world's frame where no landmark does."""
         return gtsam.PriorFactorPose2(key, pose, gtsam.noiseModel.Isotropic.Sigma(3, GAUGE_SIGMA))
 
-    def calibration_keys(self, robot: int) -> list[int]:
-        """The keys of what may be off of a robot's wheels and sensor."""
-        return [
-            key
-            for there, key in (
-                (self._has_wheels[robot], wheels_key(robot)),
-                (self._has_ranging[robot], ranging_key(robot)),
-            )
-            if there
-        ]
+    def wheels_variable(self, robot: int) -> int | None:
+        """The key of the errors of a robot's wheels; None where they are exact."""
+        return wheels_key(robot) if self._has_wheels[robot] else None
+
+    def ranging_variable(self, robot: int) -> int | None:
+        """The key of the errors of a robot's sensor; None where it is exact."""
+        return ranging_key(robot) if self._has_ranging[robot] else None
+
+    def errors_in(self, robot: int, variable: Callable[[int], tuple[Array, Array]]) -> Errors:
+        """What is off of a robot's wheels and sensor, given what is found of a variable by its key."""
+        keys = self.wheels_variable(robot), self.ranging_variable(robot)
+        wheels, ranging = (None if key is None else variable(key) for key in keys)
+        return Errors(wheels, ranging)

@@ -132,10 +132,8 @@ class Filter:
 
     def run(self) -> Filtered:
         """All measurements in the order of time, then to the last keyframes."""
-        m = self.drive.measured
-        columns = (m.robot, m.keyframe, m.target, m.target_keyframe, m.range, m.bearing, m.share)
-        for index, row in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-            self.out.used[index] = self._measurement(*row)
+        for index in range(len(self.drive.measured)):
+            self.take(index)
         for robot, times in enumerate(self.drive.times):
             self._go(robot, len(times) - 1)
         self.out.landmarks[self._known] = self.mean[self._marks :].reshape(-1, 2)[self._known]
@@ -143,15 +141,21 @@ class Filter:
         self.out.ranging = self.mean[self._ranging : self._marks].reshape(-1, 5).copy()
         return self.out
 
-    def _measurement(
-        self, robot: int, k: int, target: int, k_target: int, range_: float, bearing: float, share: list[float]
-    ) -> bool:
-        self._go(robot, k)
+    def take(self, index: int) -> None:
+        """Take in the next measurement."""
+        m = self.drive.measured
+        robot, target = int(m.robot[index]), int(m.target[index])
+        range_, bearing = float(m.range[index]), float(m.bearing[index])
+        self._go(robot, int(m.keyframe[index]))
         if target < self._robots:
-            self._go(target, k_target)
-        if not self._ready(robot, target, range_, bearing):
-            return False
-        return self._update(robot, target, range_, bearing, share)
+            self._go(target, int(m.target_keyframe[index]))
+        if self._ready(robot, target, range_, bearing):
+            self.out.used[index] = self._update(robot, target, range_, bearing, m.share[index].tolist())
+
+    def landmark(self, number: int) -> Array | None:
+        """Where a landmark is (2,) [m]; None while it is not known."""
+        at = self._marks + 2 * number
+        return self.mean[at : at + 2] if self._known[number] else None
 
     def _ready(self, robot: int, target: int, range_: float, bearing: float) -> bool:
         """Whether both ends of a measurement have a place; else it may help to find one."""

@@ -1,7 +1,8 @@
 """What wheels and a sensor of range and bearing measure of poses on the floor, with derivatives.
 
 Poses are (x [m], y [m], heading [rad]). Calibration errors are what is off what the team states: of wheels (scale, turn
-scale, delay [s]), of ranging (offset [m], scale, bearing [rad], x, y of the sensor [m]). In plain floats: there are tens of thousands of them.
+scale, delay [s]), of ranging (offset [m], scale, bearing [rad], x, y of the sensor [m]). In plain floats, since there
+are tens of thousands of them.
 """
 
 import math
