@@ -21,11 +21,11 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 #: The layers from the bottom: a part imports itself and what is in the rows above it, never beside or below it.
 LAYERS = [
-    {"_version", "errors", "lie", "trajectory", "measurements"},
+    {"_version", "errors", "keyframes", "lie", "trajectory", "measurements"},
     {"team", "workers"},
     {"run", "common_view"},
     {"frontend", "backend", "robot_io", "evaluation"},
-    {"simulation", "stance_solver"},
+    {"driving", "simulation", "stance_solver"},
     {"exchange", "pipeline", "inspection"},
     {"report", "online"},
     {"results"},

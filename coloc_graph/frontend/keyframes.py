@@ -189,7 +189,7 @@ def _shares(time: Array, robot: NDArray[np.int64], target: NDArray[np.int64], ra
 def _steps(way: _Way, times: Array, wheels: Wheels) -> Steps:
     reach = DELAYS_SIGMAS * wheels.delay_sigma
     count = int(np.ceil(reach / DELAY_STEP))
-    delays: Array = wheels.delay + DELAY_STEP * np.arange(-count, count + 1)
+    delays: Array = wheels.delay + DELAY_STEP * np.arange(-count, count + 1, dtype=np.float64)
     twists: Array = np.stack([_twists(way.at(times - delay)) for delay in delays])
     variances = np.diff(way.until(times - wheels.delay), axis=0)
     return Steps(delays, twists, _covariances(twists[count], variances))

@@ -2,3 +2,18 @@
 
 `filter_forward` is an EKF, `optimise_drive` the most likely of all in batch, `IncrementalDrive` with ISAM2.
 """
+
+from coloc_graph.backend.planar.batch import optimise_drive
+from coloc_graph.backend.planar.estimate import DriveEstimate, PlacedLandmark
+from coloc_graph.backend.planar.filter import Filtered, filter_forward
+from coloc_graph.backend.planar.incremental import IncrementalDrive, Latest
+
+__all__ = [
+    "DriveEstimate",
+    "Filtered",
+    "IncrementalDrive",
+    "Latest",
+    "PlacedLandmark",
+    "filter_forward",
+    "optimise_drive",
+]

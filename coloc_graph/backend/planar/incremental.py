@@ -22,7 +22,9 @@ from coloc_graph.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 #: Poses this far back are still corrected [s], and what came in meanwhile is taken in so often [s].
-LAG, EVERY = 10.0, 0.5
+LAG, EVERY = 20.0, 1.0
+#: Covariances of a robot's keyframes closer than this [s] are those of the first of them: they change slowly.
+ALIKE = 0.5
 #: A variable is linearised anew where it has changed by more than this: poses [m, rad], errors and landmarks.
 MOVED, TURNED, CHANGED = 0.1, 0.05, 0.05
 
@@ -43,7 +45,7 @@ class IncrementalDrive:
         self._filter = Filter(team, drive)
         self._factors = DriveFactors(drive, self._filter.models)
         parameters = gtsam.ISAM2Params()
-        parameters.setFactorization("QR")
+        parameters.setFactorization("CHOLESKY")
         parameters.relinearizeSkip = 1
         parameters.findUnusedFactorSlots = True
         thresholds = gtsam.ISAM2ThresholdMap()
@@ -194,20 +196,25 @@ class IncrementalDrive:
             return False
         pose = self._smoother.calculateEstimatePose2(key)
         poses[robot][k] = pose.x(), pose.y(), pose.theta()
-        covariances[robot][k] = self._smoother.marginalCovariance(key)
+        times, C = self.drive.times[robot], covariances[robot]
+        first = int(np.searchsorted(times, times[k] - ALIKE))
+        if first < k and np.isfinite(C[first, 0, 0]) and np.array_equal(C[first], C[k - 1]):
+            C[k] = C[k - 1]
+        else:
+            C[k] = self._smoother.marginalCovariance(key)
         return True
 
     def _latest(self, time: float, before: list[int]) -> Latest:
         """Where the robots are, and what is to be kept of their new keyframes."""
         latest = {}
         for robot, name in enumerate(self.drive.robots):
-            for k in range(before[robot], self._entered[robot]):
-                self._note(self._online, self._online_C, robot, k)
             k = self._entered[robot] - 1
+            if k >= before[robot]:
+                self._note(self._online, self._online_C, robot, k)
             if k >= 0:
-                pose = self._smoother.calculateEstimatePose2(pose_key(robot, k))
-                self._newest[robot] = pose.x(), pose.y(), pose.theta()
-                latest[name] = (np.array(self._newest[robot]), self._online_C[robot][k])
+                x, y, yaw = self._online[robot][k].tolist()
+                self._newest[robot] = x, y, yaw
+                latest[name] = self._online[robot][k], self._online_C[robot][k]
         return Latest(time, latest)
 
     def _found(self) -> Found:
@@ -234,7 +241,7 @@ class IncrementalDrive:
         for robot, count in enumerate(self._entered):
             for k in range(self._left[robot], count):
                 self._note(self._smoothed, self._smoothed_C, robot, k)
-        estimate = summed_up(self._factors, self._found(), self._taken, 0)
+        estimate = summed_up(self._factors, self._found(), self._taken, 0, together=False)
         online = {}
         for robot, name in enumerate(self.drive.robots):
             there = np.isfinite(self._online[robot][:, 0])

@@ -74,8 +74,13 @@ def measured_off(factors: DriveFactors, found: Found) -> Array:
     return np.asarray(off / factors.noise[m.robot, :2])
 
 
-def summed_up(factors: DriveFactors, found: Found, taken: NDArray[np.bool_], iterations: int) -> DriveEstimate:
-    """The estimate that was found, of the measurements that were taken in."""
+def summed_up(
+    factors: DriveFactors, found: Found, taken: NDArray[np.bool_], iterations: int, *, together: bool = True
+) -> DriveEstimate:
+    """The estimate that was found, of the measurements that were taken in.
+
+    Where poses were not found all `together`, a chi2 of all says nothing, and there is none.
+    """
     drive, models = factors.drive, factors.models
     off = np.where(taken[:, None], measured_off(factors, found), np.nan)
     valid = np.isfinite(off[:, 0])
@@ -109,8 +114,8 @@ def summed_up(factors: DriveFactors, found: Found, taken: NDArray[np.bool_], ite
         noise=factors.noise,
         doubted=doubted,
         residuals=off,
-        chi2=chi2,
-        dof=dof + (0 if models.map_known else 3),
+        chi2=chi2 if together else 0.0,
+        dof=dof + (0 if models.map_known else 3) if together else 0.0,
         iterations=iterations,
         on_map=models.map_known,
         unplaced=tuple(unplaced),
