@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from coloc_graph.calibration.board import Board
 from coloc_graph.calibration.bundle import Bundle, adjust, adjust_pose, rms, start_pose
 from coloc_graph.calibration.corners import View, Views, neighbours
-from coloc_graph.calibration.lens import LENS_NAMES, folds, ray_sigmas
+from coloc_graph.calibration.lens import LENS_NAMES, ray_sigmas
+from coloc_graph.calibration.lens_choice import Trial, choose_lens
 from coloc_graph.calibration.residuals import fitted_directions, noise_and_shared
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.team import Camera
@@ -43,19 +44,6 @@ class ImageFit:
     rms: float
     tilt_deg: float
     refused: str | None = None
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A number of lens coefficients that was tried: RMS of the fit, and of images that were held out of it [px].
-
-    `why_not` says why it was not taken.
-    """
-
-    coefficients: int
-    rms: float
-    held_out_rms: float
-    why_not: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,14 +114,10 @@ def calibrate_camera(
             f"{len(kept)} images show {board} in {count} places only, and at least {LEAST_IMAGES} are needed; "
             "move the board between images"
         )
-    parts = place % MOST_PARTS
     wanted = LENSES if coefficients is None else (coefficients,)
-    fits, trials = _tried(views, bundle, parts, wanted, progress)
-    best, without = fits
-    p, held = len(best.intrinsics), len(without)
-    off = without - without.mean(axis=0)
-    covariance = (held - 1) / held * off.T @ off
-    dof = sum(2 * len(view.uv) - 6 for view in kept) - p
+    fit, trials = choose_lens(views, bundle, place % MOST_PARTS, wanted, progress)
+    best, covariance = fit.bundle, fit.covariance
+    dof = sum(2 * len(view.uv) - 6 for view in kept) - len(best.intrinsics)
     square_sum = sum(float((r**2).sum()) for r in best.residuals)
     independent = np.asarray(square_sum / dof * np.linalg.inv(best.information), float)
     _require_known(best, covariance)
@@ -238,66 +222,6 @@ def _without_outliers(seen: Views, board: Board, bundle: Bundle) -> tuple[list[V
         )
         refused.append(ImageFit(view.name, len(r), rms([r]), tilt_deg(pose), why))
     return kept, bundle, refused
-
-
-def _tried(
-    views: Views,
-    start: Bundle,
-    parts: NDArray[np.int64],
-    wanted: Sequence[int],
-    progress: Callable[[int, int], None] | None,
-) -> tuple[tuple[Bundle, Array], tuple[Trial, ...]]:
-    """The bundle taken, its intrinsics with each part held out (parts, p), and all that was tried."""
-    done, total = 0, len(wanted) * (int(parts.max()) + 1)
-    best: tuple[Bundle, Array] | None = None
-    best_off = np.empty(0)
-    trials: list[Trial] = []
-    for coefficients in wanted:
-        bundle = adjust(views.views, _resized(start.intrinsics, coefficients), start.poses)
-        why_not = folds(bundle.intrinsics, views.width, views.height)
-        if why_not and len(wanted) > 1:
-            trials.append(Trial(coefficients, bundle.rms, math.nan, why_not))
-            continue
-        without, off, ones = [], [], []
-        for part in range(int(parts.max()) + 1):
-            here = parts == part
-            others = [view for view, held in zip(views.views, here, strict=True) if not held]
-            fit = adjust(others, bundle.intrinsics, bundle.poses[~here])
-            without.append(fit.intrinsics)
-            r = [adjust_pose(views.views[i], fit.intrinsics, bundle.poses[i])[1] for i in np.flatnonzero(here)]
-            off.append(rms(r) ** 2)
-            ones.append(sum(map(len, r)))
-            done += 1
-            if progress is not None:
-                progress(done, total)
-        of_parts = np.array(off)
-        held_out = float(np.sqrt(np.average(of_parts, weights=ones)))
-        if best is not None:
-            better = best_off - of_parts
-            error = float(better.std(ddof=1) / math.sqrt(len(better)))
-            if better.mean() <= error:
-                why_not = "predicts images that were held out no better than fewer coefficients do"
-        trials.append(Trial(coefficients, bundle.rms, held_out, why_not if len(wanted) > 1 else None))
-        if best is None or why_not is None:
-            if best is not None:
-                taken = next(i for i, one in enumerate(trials) if one.why_not is None)
-                before = trials[taken]
-                trials[taken] = Trial(
-                    before.coefficients,
-                    before.rms,
-                    before.held_out_rms,
-                    "predicts images that were held out worse than more coefficients do",
-                )
-            best, best_off = (bundle, np.array(without)), of_parts
-    assert best is not None  # no coefficients at all never fold an image
-    return best, tuple(trials)
-
-
-def _resized(intrinsics: Array, coefficients: int) -> Array:
-    out = np.zeros(4 + coefficients)
-    common = min(len(out), len(intrinsics))
-    out[:common] = intrinsics[:common]
-    return out
 
 
 def _require_known(bundle: Bundle, covariance: Array) -> None:

@@ -78,7 +78,7 @@ def find_boards(
 
     Raises `InputError` where an image cannot be read, where sizes differ, and where no image shows the board.
     """
-    images = [(path, _read(path)) for path in paths]
+    images = [(path, read_image(path)) for path in paths]
     height, width = images[0][1].shape
     for path, image in images:
         if image.shape != (height, width):
@@ -145,7 +145,8 @@ def _refined(image: Image, points: Array, uv: NDArray[np.float32], square: float
     return np.asarray(cv2.cornerSubPix(smooth, uv[:, None].copy(), (half, half), (-1, -1), until), float).reshape(-1, 2)
 
 
-def _read(path: Path) -> Image:
+def read_image(path: Path) -> Image:
+    """The grey values of an image file; `InputError` where it is none."""
     # a camera's pixels are where its sensor has them, whatever a file says about how to hold it
     encoded = np.fromfile(path, np.uint8)
     image = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(encoded) else None

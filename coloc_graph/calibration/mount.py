@@ -7,7 +7,7 @@ the robot) are counted apart.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,9 +86,9 @@ def calibrate_mount(
 ) -> MountCalibration:
     """Height, tilt and roll of a camera whose robot stands still, from boards that lie on the floor.
 
-    `square` is the side of the board's squares, `thickness` the board's [m]. `intrinsics_covariance` (p, p) is that of fx, fy, cx, cy and the lens coefficients;
-    where it is None, what is not known of the camera is a shift of its image by `camera.bias_px`. `floor` says how
-    uneven it is. x, y and yaw are those of `mount`.
+    `square` is the side of the board's squares, `thickness` the board's [m]. `intrinsics_covariance` (p, p) is that of
+    fx, fy, cx, cy and the lens coefficients; where it is None, what is not known of the camera is a shift of its image
+    by `camera.bias_px`. `floor` says how uneven it is. x, y and yaw are those of `mount`.
 
     Raises `InputError` where images contradict each other and it is not clear which are right, `DegenerateGeometry`
     where a board is seen from below or on edge.
@@ -112,7 +112,7 @@ def calibrate_mount(
     by_camera = np.array([fit.by_intrinsics for fit in fitted])
     said = Said(
         np.array([fit.value for fit in fitted]),
-        np.array([counted**2 * fit.covariance for fit in fitted]) + np.diag(uneven**2),
+        np.array([counted**2 * fit.covariance + fit.by_floor * uneven**2 @ fit.by_floor.T for fit in fitted]),
         np.einsum("nip,pq,mjq->nimj", by_camera, shared, by_camera),
     )
     kept, others = _refused_by_others(views, said, sound)
@@ -153,12 +153,14 @@ def calibrate_mount(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """One image: (height, tilt, roll), its covariance for corners of 1 px, how it changes with the intrinsics (3, p),
-    the residuals (n, 2) [px], and the directions that the pose took of them (2n, 6)."""
+    """One image: (height, tilt, roll), its covariance for corners of 1 px, how it changes with the intrinsics (3, p)
+    and with the floor under the board (its height, its tilts: (3, 3)), the residuals (n, 2) [px], and the directions
+    that the pose took of them (2n, 6)."""
 
     value: Array
     covariance: Array
     by_intrinsics: Array
+    by_floor: Array
     residuals: Array
     directions: Array
 
@@ -166,27 +168,39 @@ class _Fit:
 def _fit(view: View, intrinsics: Array, thickness: float) -> _Fit:
     try:
         pose, residuals, information = adjust_pose(view, intrinsics, start_pose(view, intrinsics))
-        value = _of_floor(pose, thickness)
+        R, t, middle = so3_exp(pose[:3]), pose[3:], view.points.mean(axis=0)
+        value = _height_tilt_roll(R, t, thickness)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DegenerateGeometry(
             f"{view.name}: the board has no pose that lies before the camera and below it; "
             "lay it flat on the floor, in full view"
         ) from error
-    step = 1e-6
-    by_pose = np.array(
-        [(_of_floor(pose + off, thickness) - _of_floor(pose - off, thickness)) / (2 * step) for off in step * np.eye(6)]
-    ).T
+
+    def where_pose_is_off(off: Array) -> Array:
+        return _height_tilt_roll(so3_exp(pose[:3] + off[:3]), t + off[3:], thickness)
+
+    def where_floor_is_off(off: Array) -> Array:
+        # higher under the board, or tilted about where it lies
+        turned = R @ so3_exp([off[1], off[2], 0.0])
+        return _height_tilt_roll(turned, t + (R - turned) @ middle + off[0] * R[:, 2], thickness)
+
+    by_pose = _derivative(where_pose_is_off, 6)
     _, A, B = project(intrinsics, pose, view.points)
-    # where the intrinsics change, the best pose does, too
-    by_intrinsics = by_pose @ -np.linalg.solve(information, B.T @ A)
-    covariance = by_pose @ np.linalg.solve(information, by_pose.T)
-    return _Fit(value, covariance, by_intrinsics, residuals, np.linalg.qr(B)[0])
+    return _Fit(
+        value,
+        by_pose @ np.linalg.solve(information, by_pose.T),
+        # where the intrinsics change, the best pose does, too
+        by_pose @ -np.linalg.solve(information, B.T @ A),
+        _derivative(where_floor_is_off, 3),
+        residuals,
+        np.linalg.qr(B)[0],
+    )
 
 
-def _of_floor(pose: Array, thickness: float) -> Array:
-    """(height [m], tilt [rad], roll [rad]) of a camera that sees a board on the floor in this pose (6,)."""
-    up = so3_exp(pose[:3])[:, 2]
-    distance = float(up @ -pose[3:])
+def _height_tilt_roll(R: Array, t: Array, thickness: float) -> Array:
+    """(height [m], tilt [rad], roll [rad]) of a camera that sees a board on the floor in the pose R (3, 3), t (3,)."""
+    up = R[:, 2]
+    distance = float(up @ -t)
     if distance < 0:  # a board's z is up or down as its corners are counted; the camera is above it
         up, distance = -up, -distance
     # R_body_camera.T @ z for the order tilt, roll is (-sin t, sin r cos t, cos r cos t) in axes of the body
@@ -194,6 +208,12 @@ def _of_floor(pose: Array, thickness: float) -> Array:
     if z <= 0:
         raise ValueError("upside down")
     return np.array([distance + thickness, math.asin(-x), math.atan2(y, z)])
+
+
+def _derivative(of: Callable[[Array], Array], size: int) -> Array:
+    """Of a function of (size,) at zero."""
+    step = 1e-6
+    return np.array([(of(off) - of(-off)) / (2 * step) for off in step * np.eye(size)]).T
 
 
 def _noise(views: Sequence[View], fitted: Sequence[_Fit], square: float) -> tuple[float, float]:
