@@ -15,8 +15,11 @@ from coloc_graph.calibration.corners import View
 from coloc_graph.errors import EstimationError
 
 Array = NDArray[np.float64]
-#: Steps, and when a step is none: in units of what the parameters' own noise of one pixel is.
-STEPS, STILL = 100, 1e-7
+#: Steps at most; a step that lowers the sum of squares by less than this part of it is the last: the next would move
+#: no parameter by a thousandth of its sigma.
+STEPS, STILL = 60, 1e-11
+#: Damping to begin with: valleys are shallow (a focal length is a part in a million of the curvature), starts are good.
+DAMPING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,17 +73,17 @@ def adjust(views: Sequence[View], intrinsics: Array, poses: Array) -> Bundle:
     Raises `EstimationError` where the images do not determine the intrinsics.
     """
     intrinsics, poses = np.array(intrinsics, float), np.array(poses, float)
-    damping, at = 1e-6, _linearise(views, intrinsics, poses)
+    damping, at = DAMPING, _linearise(views, intrinsics, poses)
     for _ in range(STEPS):
         step = _step(at, damping)
         moved = _linearise(views, intrinsics + step[0], poses + step[1])
         if moved.cost <= at.cost:
-            done = at.cost - moved.cost <= STILL**2 * max(at.cost, 1e-12)
-            intrinsics, poses, at, damping = intrinsics + step[0], poses + step[1], moved, damping / 10
+            done = at.cost - moved.cost <= STILL * max(at.cost, 1e-12)
+            intrinsics, poses, at, damping = intrinsics + step[0], poses + step[1], moved, damping / 100
             if done:
                 break
         else:
-            damping = max(10 * damping, 1e-9)
+            damping = 100 * damping
             if damping > 1e3:
                 break
     S, influence = _reduced(at, 0.0)
@@ -89,7 +92,7 @@ def adjust(views: Sequence[View], intrinsics: Array, poses: Array) -> Bundle:
 
 def adjust_pose(view: View, intrinsics: Array, pose: Array) -> tuple[Array, Array, Array]:
     """The pose (6,) of one board under known intrinsics, its residuals (n, 2) [px] and information (6, 6) at 1 px."""
-    pose, damping = np.array(pose, float), 1e-6
+    pose, damping = np.array(pose, float), DAMPING
     uv, _, B = project(intrinsics, pose, view.points)
     r = view.uv - uv
     for _ in range(STEPS):
@@ -99,11 +102,11 @@ def adjust_pose(view: View, intrinsics: Array, pose: Array) -> tuple[Array, Arra
         moved = view.uv - uv
         gain = float((r**2).sum() - (moved**2).sum())
         if gain >= 0:
-            pose, r, B, damping = pose + step, moved, moved_B, damping / 10
-            if gain <= STILL**2 * max(float((r**2).sum()), 1e-12):
+            pose, r, B, damping = pose + step, moved, moved_B, damping / 100
+            if gain <= STILL * max(float((r**2).sum()), 1e-12):
                 break
         else:
-            damping = max(10 * damping, 1e-9)
+            damping = 100 * damping
             if damping > 1e3:
                 break
     return pose, r, B.T @ B

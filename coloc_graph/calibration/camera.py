@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from coloc_graph.calibration.board import Board
 from coloc_graph.calibration.bundle import Bundle, adjust, adjust_pose, rms, start_pose
 from coloc_graph.calibration.corners import View, Views, neighbours
-from coloc_graph.calibration.lens import LENS_NAMES, ray_sigmas
+from coloc_graph.calibration.lens import LENS_NAMES, folds, ray_sigmas
 from coloc_graph.calibration.lens_choice import Trial, choose_lens
 from coloc_graph.calibration.residuals import fitted_directions, noise_and_shared
 from coloc_graph.errors import DegenerateGeometry, InputError
@@ -104,8 +104,8 @@ def calibrate_camera(
             f"{board} is in {len(seen.views)} of {seen.images} images, and at least {LEAST_IMAGES} are needed; "
             "take more, 20 are good, with the board tilted and in all parts of the image"
         )
-    most = min(n for n in LENSES if n >= 4) if coefficients is None else coefficients
-    kept, bundle, refused = _without_outliers(seen, board, _start(seen, most))
+    start = _start(seen, 4 if coefficients is None else coefficients)
+    kept, bundle, refused = _without_outliers(seen, board, start)
     views = Views(seen.width, seen.height, tuple(kept), seen.missed)
     place = places(kept, board.square)
     count = int(place.max()) + 1
@@ -114,12 +114,16 @@ def calibrate_camera(
             f"{len(kept)} images show {board} in {count} places only, and at least {LEAST_IMAGES} are needed; "
             "move the board between images"
         )
+    _require_known(bundle, _independent(bundle))
     wanted = LENSES if coefficients is None else (coefficients,)
     fit, trials = choose_lens(views, bundle, place % MOST_PARTS, wanted, progress)
     best, covariance = fit.bundle, fit.covariance
-    dof = sum(2 * len(view.uv) - 6 for view in kept) - len(best.intrinsics)
-    square_sum = sum(float((r**2).sum()) for r in best.residuals)
-    independent = np.asarray(square_sum / dof * np.linalg.inv(best.information), float)
+    why_not = folds(best.intrinsics, seen.width, seen.height)
+    if why_not:
+        raise DegenerateGeometry(
+            f"the images do not determine {len(best.intrinsics) - 4} lens coefficients, since with them the lens "
+            f"{why_not}; ask for fewer with --distortion, or hold the board in the corners of the image, too"
+        )
     _require_known(best, covariance)
     noise, shared = noise_and_shared(kept, best.residuals, fitted_directions(kept, best), board.square)
     lens = float(np.sqrt(np.mean(ray_sigmas(best.intrinsics, covariance, np.concatenate([v.uv for v in kept])) ** 2)))
@@ -141,7 +145,9 @@ def calibrate_camera(
     ]
     order = {view.name: index for index, view in enumerate(seen.views)}
     images = tuple(sorted([*fitted, *refused], key=lambda image: order[image.name]))
-    return CameraCalibration(camera, covariance, independent, images, trials, count, shared, lens, board, views, best)
+    return CameraCalibration(
+        camera, covariance, _independent(best), images, trials, count, shared, lens, board, views, best
+    )
 
 
 def tilt_deg(pose: Array) -> float:
@@ -179,7 +185,9 @@ def _start(seen: Views, coefficients: int) -> Bundle:
     flags = {
         0: cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
         4: cv2.CALIB_FIX_K3,
-    }.get(coefficients, cv2.CALIB_FIX_K3)
+        5: 0,
+        8: cv2.CALIB_RATIONAL_MODEL,
+    }[coefficients]
     points: list[Any] = [view.points.astype(np.float32) for view in seen.views]
     corners: list[Any] = [view.uv.astype(np.float32)[:, None] for view in seen.views]
     guess: Any = None
@@ -190,7 +198,6 @@ def _start(seen: Views, coefficients: int) -> Bundle:
     except cv2.error as error:
         raise DegenerateGeometry(_undetermined("OpenCV finds no camera for them")) from error
     intrinsics = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:coefficients]])
-    intrinsics = np.concatenate([intrinsics, np.zeros(max(0, 4 + coefficients - len(intrinsics)))])
     poses = np.hstack([np.array(rotations).reshape(-1, 3), np.array(translations).reshape(-1, 3)])
     if not (np.isfinite(intrinsics).all() and np.isfinite(poses).all()):
         raise DegenerateGeometry(_undetermined("OpenCV finds no camera for them"))
@@ -222,6 +229,16 @@ def _without_outliers(seen: Views, board: Board, bundle: Bundle) -> tuple[list[V
         )
         refused.append(ImageFit(view.name, len(r), rms([r]), tilt_deg(pose), why))
     return kept, bundle, refused
+
+
+def _independent(bundle: Bundle) -> Array:
+    """Covariance (p, p) of the intrinsics if all corners were independent."""
+    dof = sum(2 * len(r) - 6 for r in bundle.residuals) - len(bundle.intrinsics)
+    squares = sum(float((r**2).sum()) for r in bundle.residuals)
+    try:
+        return np.asarray(squares / dof * np.linalg.inv(bundle.information), float)
+    except np.linalg.LinAlgError:
+        return np.full(bundle.information.shape, math.inf)
 
 
 def _require_known(bundle: Bundle, covariance: Array) -> None:

@@ -28,7 +28,7 @@ def pixel_grid(width: int, height: int, columns: int, rows: int) -> Array:
 def folds(intrinsics: Array, width: int, height: int) -> str | None:
     """Why a lens model cannot be used over the whole image, None where it can."""
     if (intrinsics[:2] <= 0).any():
-        return "its focal length is not positive"
+        return "has a focal length that is not positive"
     camera = camera_of(intrinsics, width, height)
     corners = pixel_grid(width, height, 33, 33).reshape(-1, 2)
     x = camera.normalise(corners)

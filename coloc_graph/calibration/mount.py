@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 #: An image contradicts the others where chance would do so in one of so many calibrations.
 CHANCE = 1e-3
+#: A board that is so near to the others [m, deg] is on the floor, as flat as floors are; sigmas make up for it.
+NEAR_HEIGHT, NEAR_DEG = 0.003, 0.3
 #: Where all images together disagree by more than such a chance, their own errors count as larger.
 DISAGREE = 1e-2
 #: Images whose corners are off by so many times what is usual show another board, or one that is not flat.
@@ -243,19 +245,22 @@ def _refused_by_others(views: Sequence[View], said: Said, kept: list[int]) -> tu
     kept = list(kept)
     while len(kept) > 1:
         off = disagreement(said.of(kept))
-        # of boards that are not quite flat, or a floor that is not, all are off by more than noise
-        usual = max(1.0, float(np.median(off)) / float(chi2_distribution.median(3)))
         worst = int(off.argmax())
-        if off[worst] <= usual * chi2_distribution.isf(CHANCE / len(views), 3):
+        others = kept[:worst] + kept[worst + 1 :]
+        rest = fuse(said.of(others))
+        apart = said.values[kept[worst]] - rest.value
+        # of boards that are not quite flat, or a floor that is not, all are off by more than noise: so many times
+        usual = min(float(np.median(off) / chi2_distribution.median(3)), rest.chi2 / rest.dof) if rest.dof else 1.0
+        by_chance = off[worst] <= max(usual, 1.0) * chi2_distribution.isf(CHANCE / len(views), 3)
+        if by_chance or (abs(apart[0]) < NEAR_HEIGHT and np.abs(apart[1:]).max() < math.radians(NEAR_DEG)):
             break
         if len(kept) == 2:
-            (a, b), apart = (views[index].name for index in kept), said.values[kept[0]] - said.values[kept[1]]
+            a, b = (views[index].name for index in kept)
             raise InputError(
                 f"{a} and {b} contradict each other by {_difference(apart)}: one board was not flat on the floor; "
                 "take a third image, or leave one out"
             )
-        index = kept.pop(worst)
-        apart = said.values[index] - fuse(said.of(kept)).value
+        index, kept = kept[worst], others
         refused[index] = (
             f"its board is not in the plane of the others, by {_difference(apart)}: "
             "not flat on the floor, or the robot moved"

@@ -34,16 +34,22 @@ def held_poses(
         z = camera.fx * width / (camera.width * rng.uniform(0.33, 0.75))
         off = reach * rng.uniform(-0.5, 0.5, 2) * (camera.width / camera.fx, camera.height / camera.fy)
         T = se3(R, [*(z * off), z] - R @ middle)
-        _, inside = camera.project(board.points @ R.T + T[:3, 3])
+        _, inside = camera.project(_outline(board) @ R.T + T[:3, 3])
         if inside.all():
             poses.append(T)
     return np.array(poses)
 
 
 def floor_poses(
-    rng: np.random.Generator, camera: Camera, mount: Mount, board: Board, images: int, floor: Floor | None = None
+    rng: np.random.Generator,
+    camera: Camera,
+    mount: Mount,
+    board: Board,
+    images: int,
+    floor: Floor | None = None,
+    farthest: float = 1.2,
 ) -> Array:
-    """Poses T_camera_board (n, 4, 4) of a board that lies before a robot, whole in the image.
+    """Poses T_camera_board (n, 4, 4) of a board that lies 0.3 to `farthest` metres before a robot, whole in the image.
 
     With a `floor` it is uneven under each board, and under the robot.
     """
@@ -53,10 +59,10 @@ def floor_poses(
     while len(poses) < images:
         # about where it lies, not about the robot
         R_floor_board = _uneven(rng, uneven)
-        R_floor_board[:2, 3] = rng.uniform(0.3, 1.2), rng.uniform(-0.3, 0.3)
+        R_floor_board[:2, 3] = rng.uniform(0.3, farthest), rng.uniform(-0.3, 0.3)
         T = T_camera_floor @ R_floor_board @ se3(rotation_z(rng.uniform(-3, 3)), np.zeros(3))
         T[:3, 3] -= T[:3, :3] @ board.points.mean(axis=0)
-        _, inside = camera.project(board.points @ T[:3, :3].T + T[:3, 3])
+        _, inside = camera.project(_outline(board) @ T[:3, :3].T + T[:3, 3])
         if inside.all():
             poses.append(T)
     return np.array(poses)
@@ -119,6 +125,12 @@ def board_picture(board: Board) -> NDArray[np.float32]:
         printed = np.kron((u + v) % 2, np.ones((PER_SQUARE, PER_SQUARE)))
     printed = np.pad(printed, MARGIN * PER_SQUARE, constant_values=1.0)
     return np.asarray(INK + (PAPER - INK) * printed, np.float32)
+
+
+def _outline(board: Board) -> Array:
+    """The corners of the outermost squares (4, 3) [m]."""
+    low, high = board.points.min(axis=0) - board.square, board.points.max(axis=0) + board.square
+    return np.array([(x, y, 0.0) for x in (low[0], high[0]) for y in (low[1], high[1])])
 
 
 def _uneven(rng: np.random.Generator, sigmas: Array) -> Array:
