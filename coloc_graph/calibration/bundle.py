@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 STEPS, STILL = 60, 1e-11
 #: Damping to begin with: valleys are shallow (a focal length is a part in a million of the curvature), starts are good.
 DAMPING = 1e-9
+UNDETERMINED = "the images do not determine the camera; take more, with the board tilted and in all parts of the image"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +76,12 @@ def adjust(views: Sequence[View], intrinsics: Array, poses: Array) -> Bundle:
     intrinsics, poses = np.array(intrinsics, float), np.array(poses, float)
     damping, at = DAMPING, _linearise(views, intrinsics, poses)
     for _ in range(STEPS):
-        step = _step(at, damping)
-        moved = _linearise(views, intrinsics + step[0], poses + step[1])
-        if moved.cost <= at.cost:
+        try:
+            step = _step(at, damping)
+            moved = _linearise(views, intrinsics + step[0], poses + step[1])
+        except np.linalg.LinAlgError:
+            moved = None
+        if moved is not None and moved.cost <= at.cost:
             done = at.cost - moved.cost <= STILL * max(at.cost, 1e-12)
             intrinsics, poses, at, damping = intrinsics + step[0], poses + step[1], moved, damping / 100
             if done:
@@ -86,7 +90,10 @@ def adjust(views: Sequence[View], intrinsics: Array, poses: Array) -> Bundle:
             damping = 100 * damping
             if damping > 1e3:
                 break
-    S, influence = _reduced(at, 0.0)
+    try:
+        S, influence = _reduced(at, 0.0)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(UNDETERMINED) from error
     return Bundle(intrinsics, poses, at.residuals, S, influence)
 
 
@@ -148,12 +155,6 @@ def _reduced(at: _Linear, damping: float) -> tuple[Array, Array]:
 def _step(at: _Linear, damping: float) -> tuple[Array, Array]:
     S, pull = _reduced(at, damping)
     scale = 1 / np.sqrt(np.diag(S).clip(min=1e-300))  # pixels and lens coefficients are worlds apart
-    try:
-        step = scale * np.linalg.solve(scale * S * scale[:, None], scale * pull.sum(axis=0))
-        V = at.V + damping * at.V * np.eye(6)
-        of_poses = np.linalg.solve(V, (at.b - at.W.mT @ step)[..., None])[..., 0]
-    except np.linalg.LinAlgError as error:
-        raise EstimationError(
-            "the images do not determine the camera; take more, with the board tilted and in all parts of the image"
-        ) from error
-    return step, of_poses
+    step = scale * np.linalg.solve(scale * S * scale[:, None], scale * pull.sum(axis=0))
+    V = at.V + damping * at.V * np.eye(6)
+    return step, np.linalg.solve(V, (at.b - at.W.mT @ step)[..., None])[..., 0]

@@ -63,7 +63,7 @@ def choose_lens(
         bundle = adjust(views.views, _resized(start.intrinsics, coefficients), start.poses)
         why_not = folds(bundle.intrinsics, views.width, views.height)
         if why_not and coefficients != wanted[0]:
-            unusable[coefficients] = bundle.rms, why_not
+            unusable[coefficients] = bundle.rms, f"the lens {why_not}"
         else:
             fits[coefficients] = _held_out(views, bundle, parts)
             better = fits[best].held_out - fits[coefficients].held_out

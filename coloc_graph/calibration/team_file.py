@@ -34,7 +34,7 @@ def _write(path: Path, robot: str, part: str, values: Mapping[str, Any], out: Pa
 
     team = read_team(path)
     number = team.names.index(team[robot].name)
-    document: Any = tomlkit.parse(path.read_text(encoding="utf-8"))
+    document: Any = tomlkit.parse(path.read_bytes().decode())
     table = document["robots"][number][part]
     for name, value in values.items():
         if getattr(getattr(team[robot], part), name) != (tuple(value) if isinstance(value, list) else value):
