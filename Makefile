@@ -54,8 +54,9 @@ bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/backend.py $(if $(GRAPHS),--data $(GRAPHS))
 ifneq ($(DATA),)
 	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)
+	$(BIN)/python benchmarks/calibration.py --data $(DATA)
 else
-	@echo "benchmarks/stereo_board.py is left out: give the folder of its images with make bench DATA=DIR"
+	@echo "benchmarks/stereo_board.py and calibration.py are left out: give the folder of their images with make bench DATA=DIR"
 endif
 
 $(VENV)/made:

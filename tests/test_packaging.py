@@ -22,9 +22,9 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 #: The layers from the bottom: a part imports itself and what is in the rows above it, never beside or below it.
 LAYERS = [
     {"_version", "errors", "keyframes", "lie", "trajectory", "measurements"},
-    {"team", "workers"},
+    {"team", "workers", "whole_file"},
     {"run", "common_view"},
-    {"frontend", "backend", "robot_io", "evaluation"},
+    {"frontend", "backend", "robot_io", "evaluation", "calibration"},
     {"driving", "simulation", "stance_solver"},
     {"exchange", "pipeline", "inspection"},
     {"report", "online"},

@@ -12,6 +12,7 @@ from typing import NoReturn
 
 from coloc_graph._version import __version__
 from coloc_graph.cli import (
+    calibrate,
     certificates,
     coordinate,
     demo,
@@ -41,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"coloc {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in (
-        *(demo, simulate, import_, info, solve, evaluate, view, export, experiment),
+        *(demo, calibrate, simulate, import_, info, solve, evaluate, view, export, experiment),
         *(coordinate, robot, certificates),
     ):
         module.add(commands)

@@ -1,0 +1,27 @@
+"""Cameras and mounts from images of a board: intrinsics, height, tilt and roll, each with how far to trust it.
+
+Knows OpenCV, SciPy and the team; no graph. What it finds goes into team.toml.
+"""
+
+from coloc_graph.calibration.board import Board, make_board
+from coloc_graph.calibration.camera import CameraCalibration, calibrate_camera
+from coloc_graph.calibration.corners import View, Views, find_boards, image_paths
+from coloc_graph.calibration.mount import MountCalibration, calibrate_mount
+from coloc_graph.calibration.team_file import write_camera, write_mount
+from coloc_graph.calibration.verdict import verdict
+
+__all__ = [
+    "Board",
+    "CameraCalibration",
+    "MountCalibration",
+    "View",
+    "Views",
+    "calibrate_camera",
+    "calibrate_mount",
+    "find_boards",
+    "image_paths",
+    "make_board",
+    "verdict",
+    "write_camera",
+    "write_mount",
+]

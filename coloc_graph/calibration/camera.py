@@ -1,0 +1,255 @@
+"""A camera from images of a board: intrinsics with sigmas that hold for other images, and what speaks against it."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.calibration.board import Board
+from coloc_graph.calibration.bundle import Bundle, adjust, adjust_pose, rms, start_pose
+from coloc_graph.calibration.corners import View, Views, neighbours
+from coloc_graph.calibration.lens import LENS_NAMES, folds, ray_sigmas
+from coloc_graph.calibration.lens_choice import Trial, choose_lens
+from coloc_graph.calibration.residuals import fitted_directions, noise_and_shared
+from coloc_graph.errors import DegenerateGeometry, InputError
+from coloc_graph.team import Camera
+
+Array = NDArray[np.float64]
+
+#: Numbers of lens coefficients that are tried: none, k1 k2 p1 p2, k3 too, and the rational ones too.
+LENSES = (0, 4, 5, 8)
+#: So many images are the least; and of those of which sigmas are made, so many parts at most.
+LEAST_IMAGES, MOST_PARTS = 6, 40
+#: An image whose corners are off by so many times what is usual shows another board, or one that moved or is bent.
+OUTLIER = 3.0
+#: Of more than this part of the images refused, it is not clear which ones are right.
+MOST_REFUSED = 1 / 3
+#: A focal length is none where it is known no better than by this part.
+LEAST_KNOWN = 0.1
+
+
+@dataclass(frozen=True)
+class ImageFit:
+    """One image: corners, their RMS distance from the fit [px], how far the board is tilted [deg].
+
+    `refused` says why it was left out; its RMS is then that under the camera of the others.
+    """
+
+    name: str
+    corners: int
+    rms: float
+    tilt_deg: float
+    refused: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """A calibrated camera.
+
+    `covariance` (p, p) of fx, fy, cx, cy [px] and the lens coefficients is the jackknife's: of what the intrinsics
+    become where one place of the board is left out, so that errors which the corners of an image share are counted.
+    `independent_covariance` takes all corners for independent, as OpenCV's stdDeviationsIntrinsics do. `shared_px` is
+    what neighbouring corners have in common, `lens_px` how well a ray's pixel is known where corners were [px an axis];
+    `camera.bias_px` is both. `places` counts images that show the board in another place than those before.
+    """
+
+    camera: Camera
+    covariance: Array
+    independent_covariance: Array
+    images: tuple[ImageFit, ...]
+    trials: tuple[Trial, ...]
+    places: int
+    shared_px: float
+    lens_px: float
+    board: Board
+    used: Views
+    bundle: Bundle
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, in the order of the covariances."""
+        return LENS_NAMES[: len(self.covariance)]
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations (p,) by the jackknife."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def refused(self) -> tuple[ImageFit, ...]:
+        """The images that were left out."""
+        return tuple(image for image in self.images if image.refused)
+
+
+def calibrate_camera(
+    seen: Views,
+    board: Board,
+    coefficients: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> CameraCalibration:
+    """The camera that explains a board's corners best (least squares), with the fewest coefficients that will do.
+
+    `coefficients` is their number (0, 4, 5, 8); where it is None, more of them are taken only where they predict images
+    that were held out better than fewer do, by more than the standard error of that.
+
+    Raises `InputError` where there are too few images, or too many that contradict the others; `DegenerateGeometry`
+    where the images do not determine the camera.
+    """
+    if len(seen.views) < LEAST_IMAGES:
+        raise InputError(
+            f"{board} is in {len(seen.views)} of {seen.images} images, and at least {LEAST_IMAGES} are needed; "
+            "take more, 20 are good, with the board tilted and in all parts of the image"
+        )
+    start = _start(seen, 4 if coefficients is None else coefficients)
+    kept, bundle, refused = _without_outliers(seen, board, start)
+    views = Views(seen.width, seen.height, tuple(kept), seen.missed)
+    place = places(kept, board.square)
+    count = int(place.max()) + 1
+    if count < LEAST_IMAGES:
+        raise InputError(
+            f"{len(kept)} images show {board} in {count} places only, and at least {LEAST_IMAGES} are needed; "
+            "move the board between images"
+        )
+    _require_known(bundle, _independent(bundle))
+    wanted = LENSES if coefficients is None else (coefficients,)
+    fit, trials = choose_lens(views, bundle, place % MOST_PARTS, wanted, progress)
+    best, covariance = fit.bundle, fit.covariance
+    why_not = folds(best.intrinsics, seen.width, seen.height)
+    if why_not:
+        raise DegenerateGeometry(
+            f"the images do not determine {len(best.intrinsics) - 4} lens coefficients, since with them the lens "
+            f"{why_not}; ask for fewer with --distortion, or hold the board in the corners of the image, too"
+        )
+    _require_known(best, covariance)
+    noise, shared = noise_and_shared(kept, best.residuals, fitted_directions(kept, best), board.square)
+    lens = float(np.sqrt(np.mean(ray_sigmas(best.intrinsics, covariance, np.concatenate([v.uv for v in kept])) ** 2)))
+    fx, fy, cx, cy = best.intrinsics[:4].tolist()
+    camera = Camera(
+        width=seen.width,
+        height=seen.height,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        distortion=tuple(best.intrinsics[4:].tolist()),
+        noise_px=max(noise, 1e-6),
+        bias_px=math.hypot(shared, lens),
+    )
+    fitted = [
+        ImageFit(view.name, len(r), rms([r]), tilt_deg(pose))
+        for view, pose, r in zip(kept, best.poses, best.residuals, strict=True)
+    ]
+    order = {view.name: index for index, view in enumerate(seen.views)}
+    images = tuple(sorted([*fitted, *refused], key=lambda image: order[image.name]))
+    return CameraCalibration(
+        camera, covariance, _independent(best), images, trials, count, shared, lens, board, views, best
+    )
+
+
+def tilt_deg(pose: Array) -> float:
+    """How far a board's plane is turned out of the image plane, from its pose (6,) [deg]."""
+    R, _ = cv2.Rodrigues(pose[:3])
+    return math.degrees(math.acos(min(1.0, abs(float(R[2, 2])))))
+
+
+def places(views: Sequence[View], square: float) -> NDArray[np.int64]:
+    """Which place of the board each view shows (n,), from 0: views whose corners coincide show the same.
+
+    They share the errors of their corners, and are no independent evidence.
+    """
+    place: list[int] = []
+    firsts: list[tuple[View, float]] = []
+    for view in views:
+        pairs = neighbours(view.points, square)
+        spacing = float(np.median(np.linalg.norm(view.uv[pairs[:, 0]] - view.uv[pairs[:, 1]], axis=1)))
+        for index, (first, of_first) in enumerate(firsts):
+            near = 0.1 * min(spacing, of_first)
+            if np.linalg.norm(view.uv.mean(axis=0) - first.uv.mean(axis=0)) > 2 * near:
+                continue
+            apart = np.linalg.norm(view.uv[:, None] - first.uv[None], axis=-1).min(axis=1)
+            if np.median(apart) < near:
+                place.append(index)
+                break
+        else:
+            place.append(len(firsts))
+            firsts.append((view, spacing))
+    return np.array(place)
+
+
+def _start(seen: Views, coefficients: int) -> Bundle:
+    """OpenCV's calibration of all images, adjusted to the end."""
+    flags = {
+        0: cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
+        4: cv2.CALIB_FIX_K3,
+        5: 0,
+        8: cv2.CALIB_RATIONAL_MODEL,
+    }[coefficients]
+    points: list[Any] = [view.points.astype(np.float32) for view in seen.views]
+    corners: list[Any] = [view.uv.astype(np.float32)[:, None] for view in seen.views]
+    guess: Any = None
+    try:
+        _, K, lens, rotations, translations = cv2.calibrateCamera(
+            points, corners, (seen.width, seen.height), guess, guess, flags=flags
+        )
+    except cv2.error as error:
+        raise DegenerateGeometry(_undetermined("OpenCV finds no camera for them")) from error
+    intrinsics = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:coefficients]])
+    poses = np.hstack([np.array(rotations).reshape(-1, 3), np.array(translations).reshape(-1, 3)])
+    if not (np.isfinite(intrinsics).all() and np.isfinite(poses).all()):
+        raise DegenerateGeometry(_undetermined("OpenCV finds no camera for them"))
+    return adjust(seen.views, intrinsics, poses)
+
+
+def _without_outliers(seen: Views, board: Board, bundle: Bundle) -> tuple[list[View], Bundle, list[ImageFit]]:
+    """The images that agree, and those that do not: the worst goes first, the others are adjusted anew."""
+    kept, out = list(seen.views), []
+    while True:
+        off = np.array([rms([r]) for r in bundle.residuals])
+        worst = int(off.argmax())
+        if off[worst] <= OUTLIER * np.median(off):
+            break
+        out.append(kept.pop(worst))
+        if len(out) > MOST_REFUSED * len(seen.views) or len(kept) < LEAST_IMAGES:
+            raise InputError(
+                f"{len(out)} of {len(seen.views)} images contradict the others ({', '.join(v.name for v in out[:3])}"
+                f"{', ...' if len(out) > 3 else ''}); check that all show the same flat board, {board}, and are sharp"
+            )
+        bundle = adjust(kept, bundle.intrinsics, np.delete(bundle.poses, worst, axis=0))
+    usual = float(np.median(off))
+    refused = []
+    for view in out:
+        pose, r, _ = adjust_pose(view, bundle.intrinsics, start_pose(view, bundle.intrinsics))
+        why = (
+            f"its corners are off by {rms([r]):.2f} px where {usual:.2f} px are usual: "
+            "another board, or one that moved or is not flat"
+        )
+        refused.append(ImageFit(view.name, len(r), rms([r]), tilt_deg(pose), why))
+    return kept, bundle, refused
+
+
+def _independent(bundle: Bundle) -> Array:
+    """Covariance (p, p) of the intrinsics if all corners were independent."""
+    dof = sum(2 * len(r) - 6 for r in bundle.residuals) - len(bundle.intrinsics)
+    squares = sum(float((r**2).sum()) for r in bundle.residuals)
+    try:
+        return np.asarray(squares / dof * np.linalg.inv(bundle.information), float)
+    except np.linalg.LinAlgError:
+        return np.full(bundle.information.shape, math.inf)
+
+
+def _require_known(bundle: Bundle, covariance: Array) -> None:
+    sigma = float(np.sqrt(np.diag(covariance)[:2]).max())
+    focal = float(bundle.intrinsics[:2].min())
+    if not (math.isfinite(sigma) and focal > 0 and sigma < LEAST_KNOWN * focal):
+        raise DegenerateGeometry(_undetermined(f"the focal length comes out as {focal:.0f} +- {sigma:.0f} px"))
+
+
+def _undetermined(what: str) -> str:
+    return (
+        f"the images do not determine the camera, {what}; tilt the board by 20 to 45 deg, this way and that, "
+        "and hold it in all parts of the image"
+    )

@@ -1,0 +1,64 @@
+"""What intrinsics and their covariance mean in the image: where the lens model folds, how well a ray is known."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.calibration.bundle import project
+from coloc_graph.team import Camera
+
+Array = NDArray[np.float64]
+
+LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
+def camera_of(intrinsics: Array, width: int, height: int) -> Camera:
+    """The camera with intrinsics (p,): fx, fy, cx, cy and the lens coefficients."""
+    fx, fy, cx, cy = intrinsics[:4].tolist()
+    lens = tuple(intrinsics[4:].tolist())
+    return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=lens)
+
+
+def pixel_grid(width: int, height: int, columns: int, rows: int) -> Array:
+    """Centres of the cells of an image (rows, columns, 2) [px]."""
+    u = (np.arange(columns) + 0.5) * width / columns - 0.5
+    v = (np.arange(rows) + 0.5) * height / rows - 0.5
+    return np.stack(np.meshgrid(u, v), axis=-1)
+
+
+def folds(intrinsics: Array, width: int, height: int) -> str | None:
+    """Why a lens model cannot be used over the whole image, None where it can."""
+    if (intrinsics[:2] <= 0).any():
+        return "has a focal length that is not positive"
+    camera = camera_of(intrinsics, width, height)
+    corners = pixel_grid(width, height, 33, 33).reshape(-1, 2)
+    x = camera.normalise(corners)
+    if not np.isfinite(x).all():
+        return "folds the image: not every pixel has a ray"
+    back, seen = camera.project(np.column_stack([x, np.ones(len(x))]))
+    if not seen.all() or np.abs(back - corners).max() > 1e-3:
+        return "folds the image: not every pixel has one ray"
+    return None
+
+
+def ray_sigmas(intrinsics: Array, covariance: Array, uv: Array, at: Array | None = None) -> Array:
+    """How well the pixel of a fixed ray is known (m,) [px an axis], for rays of pixels `at` (m, 2), or of `uv` (n, 2).
+
+    A camera that is turned a little sees what one with other intrinsics would: what a rotation makes up for, the best
+    over the pixels `uv`, is left out. Rays that the model does not have come out as infinite.
+    """
+    size = np.concatenate([uv, uv if at is None else at]).max(axis=0) + 2
+    camera = camera_of(intrinsics, int(size[0]), int(size[1]))
+    A, B = _of_rays(camera, intrinsics, uv)
+    turn = np.linalg.lstsq(B, A, rcond=None)[0]
+    if at is not None:
+        A, B = _of_rays(camera, intrinsics, at)
+    A = (A - B @ turn).reshape(-1, 2, len(intrinsics))
+    variance = np.einsum("mip,pq,miq->m", A, covariance, A) / 2
+    return np.where(np.isfinite(variance), np.sqrt(variance.clip(min=0)), np.inf)
+
+
+def _of_rays(camera: Camera, intrinsics: Array, uv: Array) -> tuple[Array, Array]:
+    """How pixels change with intrinsics (2m, p) and with a rotation (2m, 3), at the rays of pixels (m, 2)."""
+    x = camera.normalise(uv)
+    _, A, B = project(intrinsics, np.array([1e-12, 0, 0, 0, 0, 0.0]), np.column_stack([x, np.ones(len(x))]))
+    return A, B[:, :3]

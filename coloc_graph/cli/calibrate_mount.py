@@ -1,0 +1,75 @@
+"""coloc calibrate mount IMAGES."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from coloc_graph.cli.calibration_arguments import robot_of, say_written, seen_in
+
+if TYPE_CHECKING:
+    from coloc_graph.calibration import MountCalibration
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate, write, print."""
+    from coloc_graph.calibration import calibrate_mount, write_mount
+    from coloc_graph.calibration.summary import read_covariance, summarise_mount
+    from coloc_graph.cli.printing import print_json, warn
+    from coloc_graph.errors import InputError
+    from coloc_graph.team import read_team
+    from coloc_graph.whole_file import require_writable
+
+    robot = robot_of(args)
+    if robot is None:
+        raise InputError("give --team TEAM.toml and --robot NAME, whose camera took the images")
+    if args.out_team:
+        require_writable(args.out_team, force=args.force, what="a team.toml")
+    known = read_covariance(args.calibration, robot.camera) if args.calibration else None
+    seen, board = seen_in(args)
+    if (seen.width, seen.height) != (robot.camera.width, robot.camera.height):
+        raise InputError(
+            f"the images have {seen.width}x{seen.height} pixels and robot {robot.name}'s camera in {args.team} "
+            f"{robot.camera.width}x{robot.camera.height}; give images as it takes them, or calibrate the camera first"
+        )
+    if known is None and robot.camera.bias_px == 0:
+        warn(["the camera is taken for exact; give --calibration DIR of `coloc calibrate camera --out DIR`"])
+    calibration = calibrate_mount(
+        seen.views,
+        robot.camera,
+        robot.mount,
+        board.square,
+        thickness=args.thickness,
+        floor=read_team(args.team).floor,
+        intrinsics_covariance=known,
+    )
+    write_mount(args.team, robot.name, calibration.mount, args.out_team)
+    warn([f"{image.name} was left out: {image.refused}" for image in calibration.refused])
+    warn([f"{name}: the board was not found" for name in seen.missed])
+    if args.json:
+        print_json(summarise_mount(calibration, seen.missed))
+    else:
+        _print_mount(calibration)
+    say_written(args)
+    return 0
+
+
+def _print_mount(calibration: "MountCalibration") -> None:
+    """Height, tilt and roll with their sigmas, and what each image says."""
+    from pathlib import Path
+
+    from coloc_graph.cli.printing import print_table
+
+    rows = [
+        [Path(one.name).name, f"{one.height:.4f} m", f"{one.tilt_deg:.3f} deg", f"{one.roll_deg:.3f} deg",
+         f"{one.rms:.3f} px", "left out" if one.refused else ""]
+        for one in calibration.images
+    ]  # fmt: skip
+    print_table(["image", "height", "tilt", "roll", "corners off", ""], rows)
+    mount = calibration.mount
+    print(
+        f"height {mount.height:.4f} +- {mount.height_sigma:.4f} m, tilt {mount.tilt_deg:.3f} +- "
+        f"{mount.tilt_sigma_deg:.3f} deg, roll {mount.roll_deg:.3f} +- {mount.roll_sigma_deg:.3f} deg"
+    )
+    if calibration.dof:
+        agreement = f"the images agree with chi2/dof {calibration.chi2 / calibration.dof:.2f}"
+        more = f"; sigmas of each are {calibration.scale**0.5:.1f} times larger for it" if calibration.scale > 1 else ""
+        print(agreement + more)

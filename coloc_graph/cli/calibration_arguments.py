@@ -1,0 +1,40 @@
+"""What `coloc calibrate camera` and `mount` share: whose camera, the boards in images, what was written."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coloc_graph.calibration import Board, Views
+    from coloc_graph.team import Robot
+
+
+def robot_of(args: argparse.Namespace) -> "Robot | None":
+    """The robot that is named, None where no team is given; wrong names are errors before any work."""
+    from coloc_graph.errors import InputError
+    from coloc_graph.team import read_team
+
+    if bool(args.team) != bool(args.robot):
+        raise InputError("--team and --robot belong together; give both, or neither")
+    if args.out_team and not args.team:
+        raise InputError("--out-team is a copy of a team; give it with --team and --robot")
+    return read_team(args.team)[args.robot] if args.team else None
+
+
+def seen_in(args: argparse.Namespace) -> "tuple[Views, Board]":
+    """The boards in the images that are named, and which board."""
+    from coloc_graph.calibration import find_boards, image_paths, make_board
+    from coloc_graph.cli.printing import progress
+
+    board = make_board(args.board, args.square, args.charuco, args.marker)
+    paths = image_paths(args.images)
+    with progress("images searched") as report:
+        return find_boards(paths, board, report)
+
+
+def say_written(args: argparse.Namespace) -> None:
+    """What was written, to stderr."""
+    import sys
+
+    for path in (getattr(args, "out", None), args.out_team or args.team, getattr(args, "camera_info", None)):
+        if path:
+            print(f"wrote {path}", file=sys.stderr)

@@ -1,0 +1,196 @@
+"""A camera as ROS has it: the YAML of `camera_info`, as calibrators write it and as topics print it.
+
+What of it our `Camera` cannot say is refused, or is a warning; nothing is dropped without a word. Numbers are read back
+to the bit. Source: ROS `sensor_msgs/CameraInfo`, and the files of `camera_calibration_parsers`.
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from msgspec.structs import replace
+
+from coloc_graph.errors import InputError
+from coloc_graph.team import Camera
+from coloc_graph.whole_file import write_whole
+
+#: Distortion models of ROS that are OpenCV's, and how many coefficients they may have here.
+MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}
+#: Names of the fields: those of a calibrator's file, of a message in ROS 2, and in ROS 1.
+NAMES = {
+    "width": ("image_width", "width"),
+    "height": ("image_height", "height"),
+    "model": ("distortion_model",),
+    "K": ("camera_matrix", "k", "K"),
+    "D": ("distortion_coefficients", "d", "D"),
+    "R": ("rectification_matrix", "r", "R"),
+    "P": ("projection_matrix", "p", "P"),
+}
+
+
+def write_camera_info(camera: Camera, name: str, path: Path) -> None:
+    """Write a camera's size, intrinsics and distortion as `camera_info` YAML.
+
+    Nothing is rectified: R is the identity and P is [K 0].
+    """
+    write_whole(path, camera_info_text(camera, name))
+
+
+def camera_info_text(camera: Camera, name: str) -> str:
+    """The YAML of a camera."""
+    K = camera.K
+    fields = {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": name,
+        "camera_matrix": _matrix(K),
+        "distortion_model": "rational_polynomial" if len(camera.distortion) == 8 else "plumb_bob",
+        "distortion_coefficients": _matrix(np.array([camera.distortion])),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(np.hstack([K, np.zeros((3, 1))])),
+    }
+    return yaml.safe_dump(fields, sort_keys=False, default_flow_style=None, width=200)
+
+
+def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Camera, tuple[str, ...]]:
+    """The camera in a `camera_info` YAML, and warnings on what of it was left out.
+
+    What such a file does not say (fps, noise) is as in `base`. Raises `InputError` where it is not one, and where it
+    describes what `Camera` cannot: a fisheye, skewed pixels, binned images, a region of interest.
+    """
+    path = Path(path)
+    fields = _fields(path)
+    width, height = (_whole(path, fields, name) for name in ("width", "height"))
+    K = _numbers(path, fields, "K", (3, 3))
+    D = _numbers(path, fields, "D", None).ravel()
+    model = str(_get(path, fields, "model"))
+    if K[0, 0] == 0:
+        raise InputError(f"{path}: the camera is not calibrated (its matrix is zero); calibrate it first")
+    if model not in MODELS:
+        known = " and ".join(MODELS)
+        raise InputError(
+            f"{path}: `distortion_model` is {model}{', a fisheye' if model == 'equidistant' else ''}, and the lens "
+            f"models here are {known}; calibrate the camera anew with `coloc calibrate camera`"
+        )
+    if len(D) not in MODELS[model]:
+        counts = " or ".join(map(str, MODELS[model]))
+        raise InputError(f"{path}: {model} has {counts} coefficients, and there are {len(D)}; check the file")
+    if K[0, 1] != 0 or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
+        raise InputError(
+            f"{path}: the camera matrix is [fx {K[0, 1]:g} cx; {K[1, 0]:g} fy cy; ...], and a pinhole without skew has "
+            "zeros there and 0 0 1 below; calibrate the camera anew without skew"
+        )
+    _require_whole_image(path, fields, width, height)
+    values: dict[str, Any] = {
+        "width": width,
+        "height": height,
+        "fx": float(K[0, 0]),
+        "fy": float(K[1, 1]),
+        "cx": float(K[0, 2]),
+        "cy": float(K[1, 2]),
+        "distortion": tuple(D.tolist()),
+    }
+    try:
+        camera = Camera(**values) if base is None else replace(base, **values)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: {error}") from error
+    return camera, _left_out(path, fields, K)
+
+
+def _matrix(values: Any) -> dict[str, Any]:
+    rows, columns = values.shape
+    return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}
+
+
+def _fields(path: Path) -> Mapping[str, Any]:
+    try:
+        # a topic that is printed ends each message with ---; the first is as good as any
+        fields = next(iter(yaml.safe_load_all(path.read_text(encoding="utf-8"))), None)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a camera_info YAML") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not text; give the path of a camera_info YAML") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark is not None else ""
+        raise InputError(f"{path}{where}: is not YAML ({getattr(error, 'problem', error)}); check the file") from error
+    if not isinstance(fields, dict):
+        raise InputError(f"{path}: holds no fields; give a camera_info YAML, with camera_matrix and the others")
+    return fields
+
+
+def _get(path: Path, fields: Mapping[str, Any], name: str) -> Any:
+    for one in NAMES[name]:
+        if one in fields:
+            return fields[one]
+    raise InputError(f"{path}: has no `{NAMES[name][0]}`; give a camera_info YAML that is whole")
+
+
+def _whole(path: Path, fields: Mapping[str, Any], name: str) -> int:
+    value = _get(path, fields, name)
+    if not isinstance(value, int) or isinstance(value, bool) or value <= 0:
+        raise InputError(f"{path}: `{NAMES[name][0]}` is {value!r}; give a whole number of pixels")
+    return value
+
+
+def _numbers(path: Path, fields: Mapping[str, Any], name: str, shape: tuple[int, int] | None) -> Any:
+    value, called = _get(path, fields, name), next(one for one in NAMES[name] if one in fields)
+    stated: tuple[Any, ...] | None = None
+    if isinstance(value, dict):
+        stated, value = (value.get("rows"), value.get("cols")), value.get("data")
+    try:
+        # YAML 1.1 takes 1e-05 for text, which C++ writes
+        numbers = np.array([float(one) for one in value])
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: `{called}` is not a list of numbers; check the file") from error
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{path}: `{called}` holds a number that is not finite; calibrate the camera anew")
+    if stated is not None and not all(isinstance(one, int) for one in stated):
+        raise InputError(f"{path}: `{called}` has rows and cols that are not whole numbers; check the file")
+    for size in (shape, stated):
+        if size is not None and math.prod(size) != len(numbers):
+            needed = "x".join(map(str, size))
+            raise InputError(f"{path}: `{called}` has {len(numbers)} numbers where {needed} are needed; check the file")
+    return numbers.reshape(shape) if shape is not None else numbers
+
+
+def _require_whole_image(path: Path, fields: Mapping[str, Any], width: int, height: int) -> None:
+    """Binned images and parts of images have other pixels than those that K is in."""
+    for name in ("binning_x", "binning_y"):
+        if fields.get(name, 0) not in (0, 1):
+            raise InputError(
+                f"{path}: `{name}` is {fields[name]}: the images are binned, and the matrix is that of the whole ones; "
+                "calibrate the camera with images as they are used"
+            )
+    roi = fields.get("roi") or {}
+    if not isinstance(roi, dict):
+        raise InputError(f"{path}: `roi` is {roi!r}; give x_offset, y_offset, width and height, or leave it out")
+    part = tuple(roi.get(name, 0) for name in ("x_offset", "y_offset", "width", "height"))
+    if part not in ((0, 0, 0, 0), (0, 0, width, height)):
+        raise InputError(
+            f"{path}: `roi` is a part of the image, {part[2]}x{part[3]} at ({part[0]}, {part[1]}); "
+            "calibrate the camera with images as they are used"
+        )
+
+
+def _left_out(path: Path, fields: Mapping[str, Any], K: Any) -> tuple[str, ...]:
+    said = []
+    if any(name in fields for name in NAMES["R"]):
+        R = _numbers(path, fields, "R", (3, 3))
+        # the identity, or zeros where nobody filled it in
+        if not np.array_equal(R, np.eye(3)) and R.any():
+            said.append(
+                f"{path}: `rectification_matrix` was left out: it turns the images of a stereo pair, and ours are as "
+                "the camera takes them"
+            )
+    if any(name in fields for name in NAMES["P"]):
+        P = _numbers(path, fields, "P", (3, 4))
+        if P.any() and not np.array_equal(P, np.hstack([K, np.zeros((3, 1))])):
+            said.append(
+                f"{path}: `projection_matrix` was left out: it is of rectified images, and ours are as the camera "
+                "takes them"
+            )
+    return tuple(said)

@@ -1,0 +1,119 @@
+"""camera_info YAML: to the bit there and back; what our camera cannot say is refused, or a warning."""
+
+import numpy as np
+import pytest
+import yaml
+
+from coloc_graph.errors import InputError
+from coloc_graph.exchange.camera_info import camera_info_text, read_camera_info, write_camera_info
+from coloc_graph.team import Camera
+
+FILE = """
+image_width: 640
+image_height: 480
+camera_name: narrow_stereo
+camera_matrix: {rows: 3, cols: 3, data: [430.2, 0.0, 306.7, 0.0, 430.5, 227.2, 0.0, 0.0, 1.0]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.34, 0.11, 7e-05, -6e-04, 0.0]}
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+"""
+#: As a topic prints it; K is `k` in ROS 2 and `K` in ROS 1.
+MESSAGE = """
+header: {stamp: {sec: 12, nanosec: 34}, frame_id: camera}
+height: 480
+width: 640
+distortion_model: plumb_bob
+d: [-0.34, 0.11, 7.0e-05, -0.0006, 0.0]
+k: [430.2, 0.0, 306.7, 0.0, 430.5, 227.2, 0.0, 0.0, 1.0]
+r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+p: [430.2, 0.0, 306.7, 0.0, 0.0, 430.5, 227.2, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+binning_y: 0
+roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
+---
+height: 480
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    def from_text(text, base=None):
+        path = tmp_path / "camera.yaml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_camera_info(path, base)
+
+    return from_text
+
+
+@pytest.mark.parametrize("coefficients", [0, 4, 5, 8])
+def test_a_camera_comes_back_to_the_bit(tmp_path, coefficients):
+    rng = np.random.default_rng(coefficients)
+    for scale in (1.0, 1e-7, 1e-300):
+        lens = tuple((scale * rng.normal(size=coefficients)).tolist())
+        fx, fy, cx, cy = (300 * rng.uniform(0.1, 2, 4)).tolist()
+        camera = Camera(width=321, height=239, fx=fx, fy=fy, cx=cx, cy=cy, distortion=lens, fps=30.0, noise_px=0.17)
+        write_camera_info(camera, "A", tmp_path / "a.yaml")
+        assert read_camera_info(tmp_path / "a.yaml", camera) == (camera, ())
+        assert [path.name for path in tmp_path.iterdir()] == ["a.yaml"]
+    fields = yaml.safe_load(camera_info_text(camera, "A"))
+    assert fields["distortion_model"] == ("rational_polynomial" if coefficients == 8 else "plumb_bob")
+    assert fields["distortion_coefficients"]["cols"] == coefficients and fields["camera_name"] == "A"
+
+
+def test_a_calibrators_file_and_a_printed_topic_are_the_same_camera(read):
+    camera, warnings = read(FILE)
+    assert warnings == () and camera.distortion == (-0.34, 0.11, 7e-05, -6e-04, 0.0)
+    assert (camera.width, camera.height, camera.fx, camera.cy) == (640, 480, 430.2, 227.2)
+    assert read(MESSAGE) == read(MESSAGE.replace("\nk:", "\nK:").replace("\nd:", "\nD:")) == (camera, ())
+
+
+def test_what_is_of_rectified_images_is_left_out_with_a_warning(read):
+    _, (said,) = read(FILE.replace("data: [1, 0, 0, 0, 1, 0", "data: [1, 0, 0.001, 0, 1, 0"))
+    assert "`rectification_matrix` was left out" in said
+    _, (said,) = read(MESSAGE.replace("p: [430.2, 0.0, 306.7, 0.0,", "p: [430.2, 0.0, 306.7, -38.7,"))
+    assert "`projection_matrix` was left out" in said
+    assert read(MESSAGE.replace("p: [430.2, 0.0, 306.7, 0.0, 0.0, 430.5, 227.2, 0.0, 0.0, 0.0, 1.0, 0.0]",
+                                "p: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]"))[1] == ()  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "says"), [
+    ("plumb_bob", "equidistant", "`distortion_model` is equidistant, a fisheye"),
+    ("plumb_bob", "division", "`distortion_model` is division, and the lens models here are plumb_bob and rational"),
+    ("plumb_bob", "rational_polynomial", "rational_polynomial has 8 coefficients, and there are 5"),
+    ("d: [-0.34, ", "d: [-0.34, 0.1, ", "plumb_bob has 0 or 4 or 5 coefficients, and there are 6"),
+    ("binning_x: 0", "binning_x: 2", "`binning_x` is 2: the images are binned"),
+    ("height: 0, width: 0", "height: 100, width: 200", "`roi` is a part of the image, 200x100 at (0, 0)"),
+    ("k: [430.2, 0.0,", "k: [430.2, 1.5,", "without skew"),
+    ("k: [430.2,", "k: [0.0,", "is not calibrated"),
+    ("k: [430.2,", "k: [-430.2,", "`fx` is -430.2"),
+    ("k: [430.2,", "k: [.nan,", "`k` holds a number that is not finite"),
+    ("k: [430.2,", "k: [wide,", "`k` is not a list of numbers"),
+    ("k: [430.2,", "k: [430.2, 0,", "`k` has 10 numbers where 3x3 are needed"),
+    ("width: 640", "width: wide", "`image_width` is 'wide'; give a whole number"),
+    ("\nwidth: 640", "", "has no `image_width`"),
+    ("\nd: [", "\nd: {rows: 1, cols: 4}\ne: [", "`d` is not a list of numbers"),
+    ("\nd: [", "\nd: {rows: 1, cols: 4, data: [1, 2, 3, 4, 5]}\ne: [", "`d` has 5 numbers where 1x4 are needed"),
+    ("roi: {", "roi: [", "line"),
+])  # fmt: skip
+def test_what_our_camera_cannot_say_is_refused(read, old, new, says):
+    assert old in MESSAGE
+    with pytest.raises(InputError) as error:
+        read(MESSAGE.replace(old, new))
+    assert says in str(error.value) and "camera.yaml" in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    (b"\xff\xfe\x00", "is not text"),
+    ("just words", "holds no fields"),
+    ("", "holds no fields"),
+    ("a: [1, 2", "is not YAML"),
+    ("!!python/object/apply:os.system ['true']", "is not YAML"),
+])  # fmt: skip
+def test_files_that_are_none_are_refused(read, text, says):
+    with pytest.raises(InputError, match=says):
+        read(text)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_camera_info(tmp_path / "nowhere.yaml")
