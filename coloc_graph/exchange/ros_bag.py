@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coloc_graph.errors import BagError, ColocError
+from coloc_graph.run import is_mcap
 from coloc_graph.run.schemas import to_seconds
 
 if TYPE_CHECKING:
@@ -135,6 +136,10 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
     ros2 = path.suffix != ".bag" or path.is_dir()
     if ros2 and path.is_file() and path.suffix not in (".mcap", ".db3"):
         raise BagError(f"{path}: is no bag by its name; give a ROS 1 .bag, a ROS 2 folder, or an .mcap")
+    if path.is_file() and is_mcap(path) and not _profile(path).startswith("ros2"):
+        raise BagError(
+            f"{path}: is an MCAP file, and not of ROS 2 (its profile is `{_profile(path)}`); give a bag, a run as it is"
+        )
     with _understood(path):
         reader: Any = rosbag2.Reader(path) if ros2 else rosbag1.Reader(path)
         reader.open()
@@ -152,6 +157,14 @@ def _standard_types(*, ros2: bool) -> "Typestore":
     store = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
     return store
+
+
+def _profile(path: Path) -> str:
+    """The profile that an MCAP file says it has; `ros2` where it was cut off before, which is for rosbags to say."""
+    with path.open("rb") as file:
+        start = file.read(4096)
+    (size,) = struct.unpack_from("<I", start.ljust(21, b"\0"), 17)  # after magic, opcode, and the record's length
+    return start[21 : 21 + size].decode(errors="replace") if len(start) >= 21 + size else "ros2"
 
 
 @contextmanager

@@ -113,7 +113,7 @@ def _stances(
     if found:
         return found
     if len(cameras) < 2:
-        raise BagError(f"{map_path}: {len(cameras)} robots have an `image`; a stance needs two that watch")
+        raise BagError(f"{map_path}: {len(cameras)} of its robots have an `image`; a stance needs two that watch")
     if not marked & {one.robot for one in moves}:
         raise BagError(f"{map_path}: no robot in it carries markers by {the_map.team}; give those of who is watched")
     stood = ", ".join(
