@@ -5,17 +5,17 @@ Profile `ros2`, messages in CDR, schemas as ros2msg: what `ros2 bag` records int
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from coloc_graph.errors import BagError, InputError
 from coloc_graph.exchange.ros_bag import NOT_INSTALLED, POSE, POSE_WITH_COVARIANCE, TF
 from coloc_graph.exchange.ros_poses import ros_covariance
 from coloc_graph.lie import quaternion
-from coloc_graph.run.schemas import LIBRARY, to_ns
+from coloc_graph.run.schemas import to_ns
 from coloc_graph.team import Team
 from coloc_graph.trajectory import Trajectory
 
@@ -25,19 +25,11 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 PATH, TRANSFORM = "nav_msgs/msg/Path", "geometry_msgs/msg/TransformStamped"
-WORLD = "world"
-#: What who comes late gets all the same, as ROS's tf_static: rosbag2's own notation of the quality of service.
-LATCHED = """\
-- history: keep_last
-  depth: 1
-  reliability: reliable
-  durability: transient_local
-  deadline: {sec: 9223372036, nsec: 854775807}
-  lifespan: {sec: 9223372036, nsec: 854775807}
-  liveliness: automatic
-  liveliness_lease_duration: {sec: 9223372036, nsec: 854775807}
-  avoid_ros_namespace_conventions: false
-"""
+WORLD, TF_STATIC = "world", "/tf_static"
+#: The metadata that ROS 2 Humble and all later ones read.
+VERSION: Literal[8] = 8
+#: No limit, as ROS 2 writes it: the nanoseconds of 63 bits.
+FOREVER = divmod(2**63 - 1, 1_000_000_000)
 
 
 def write_ros2(trajectories: Mapping[str, Trajectory], team: Team, path: str | Path) -> int:
@@ -57,14 +49,9 @@ def write_ros2(trajectories: Mapping[str, Trajectory], team: Team, path: str | P
     messages = [new.mounts(trajectories, team)]
     for robot, trajectory in trajectories.items():
         messages += new.of_robot(robot, trajectory)
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            _write(file, new.store, sorted(messages, key=lambda one: one.ns))
-        part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
+        _write(Path(folder) / "bag", new.store, sorted(messages, key=lambda one: one.ns))
+        (Path(folder) / "bag" / "bag.mcap").replace(path)
     return sum(map(len, trajectories.values()))
 
 
@@ -94,7 +81,7 @@ class _Messages:
             self._transform(ns, f"{robot}/base_link", f"{robot}/camera", team[robot].mount.T_body_camera)
             for robot in trajectories
         ]
-        return _Message("/tf_static", ns, TF, self._new(TF, transforms=mounts))
+        return _Message(TF_STATIC, ns, TF, self._new(TF, transforms=mounts))
 
     def of_robot(self, robot: str, trajectory: Trajectory) -> Iterator[_Message]:
         """A robot's path, its poses with covariances, and its tf."""
@@ -139,19 +126,37 @@ class _Messages:
         return self._new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
-def _write(file: IO[bytes], store: "Typestore", messages: Sequence[_Message]) -> None:
-    """An MCAP file of messages, as `ros2 bag` records one."""
-    writer = Writer(file, compression=CompressionType.ZSTD)
-    writer.start(profile="ros2", library=LIBRARY)
-    schemas: dict[str, int] = {}
-    channels: dict[str, int] = {}
-    for one in messages:
-        if one.type not in schemas:
-            definition, _ = store.generate_msgdef(one.type, ros_version=2)
-            schemas[one.type] = writer.register_schema(one.type, "ros2msg", definition.encode())
-        if one.topic not in channels:
-            kept = {"offered_qos_profiles": LATCHED} if one.topic == "/tf_static" or one.type == PATH else {}
-            channels[one.topic] = writer.register_channel(one.topic, "cdr", schemas[one.type], kept)
-        data = bytes(store.serialize_cdr(one.content, one.type))
-        writer.add_message(channels[one.topic], log_time=one.ns, publish_time=one.ns, data=data)
-    writer.finish()  # type: ignore[no-untyped-call]
+def _write(folder: Path, store: "Typestore", messages: Sequence[_Message]) -> None:
+    """The ROS 2 bag `folder` of messages."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    writer = Writer(folder, version=VERSION, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    connections: dict[str, Any] = {}
+    with writer:
+        for one in messages:
+            if one.topic not in connections:
+                # who subscribes late wants mounts and paths all the same, and tf asks for them so
+                kept = [_latched()] if one.type == PATH or one.topic == TF_STATIC else []
+                connections[one.topic] = writer.add_connection(
+                    one.topic, one.type, typestore=store, offered_qos_profiles=kept
+                )
+            writer.write(connections[one.topic], one.ns, store.serialize_cdr(one.content, one.type))
+
+
+def _latched() -> Any:
+    """ROS 2's quality of service of what is told once and holds."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    forever = QosTime(*FOREVER)
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=1,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL,
+        deadline=forever,
+        lifespan=forever,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=forever,
+        avoid_ros_namespace_conventions=False,
+    )
