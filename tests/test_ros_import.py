@@ -4,6 +4,7 @@ import itertools
 import json
 import re
 import shutil
+from pathlib import Path
 
 import cv2
 import msgspec
@@ -19,8 +20,9 @@ from coloc_graph.errors import BagError, ColocError, TeamError
 from coloc_graph.exchange.ros_bag import open_bag
 from coloc_graph.exchange.ros_images import ENCODINGS, camera_of, image_of
 from coloc_graph.exchange.ros_import import import_ros
-from coloc_graph.exchange.ros_map import OdometrySigmas
+from coloc_graph.exchange.ros_map import OdometrySigmas, RobotTopics, RosMap
 from coloc_graph.exchange.ros_poses import stated_increments
+from coloc_graph.exchange.stances import MotionThresholds
 from coloc_graph.frontend.wheels import WheelTrack
 from coloc_graph.inspection import inspect
 from coloc_graph.lie import floor_pose
@@ -704,3 +706,14 @@ def test_an_encoded_image_is_written_as_it_is_and_only_jpeg_and_png_are(tmp_path
         with pytest.raises(RunError, match="names robot `Z`"):
             writer.write(EncodedImage("Z", 2.0, "png", data))
     assert np.array_equal(next(open_run(tmp_path / "run.mcap").images("A")).pixels.ravel(), np.arange(48))
+
+
+def test_the_example_of_the_documentation_is_a_map_with_every_field():
+    text = (Path(__file__).parents[1] / "docs" / "ros.md").read_text(encoding="utf-8")
+    example = re.search(r"```toml\n(.*?)```", text, re.DOTALL)[1]
+    found = msgspec.toml.decode(example, type=RosMap)
+    assert found.motion == MotionThresholds()  # the defaults, as it says
+    for kind in (RosMap, MotionThresholds, RobotTopics, OdometrySigmas):
+        assert all(re.search(rf"\b{field}\b", example) for field in kind.__struct_fields__), kind
+    for encoding in ENCODINGS:
+        assert encoding in text or encoding.startswith(("bayer", "8UC")), encoding

@@ -142,57 +142,48 @@ def derive_stances(
     `marked` are the robots with markers. Who stood from one stance to the next, and observes in both, is its anchor.
     A stance ends where a robot that takes part begins or ends to move, pauses of the movers left aside.
     """
+    at_rest = {one.robot: one.standing() for one in team}
+    settled = {one.robot: one.standing(thresholds.settle) for one in team}
+    moved = {one.robot: one.moved for one in team if one.robot in marked}
+    instants = {time for spans in (*settled.values(), *(one.moved for one in team)) for span in spans for time in span}
     found: list[Stance] = []
-    standing = {one.robot: one.standing(thresholds.settle) for one in team}
-    for begin, end in itertools.pairwise(_instants(team, standing)):
+    for begin, end in itertools.pairwise(sorted(instants)):
         observers = tuple(
-            one.robot
-            for one in team
-            if _within(begin, end, standing[one.robot]) and _saw(cameras, one.robot, begin, end)
+            robot for robot in _throughout(settled, begin, end) if _images(cameras, robot, begin, end) >= LEAST_IMAGES
         )
-        movers = tuple(one.robot for one in team if one.robot in marked and _within(begin, end, one.moved))
+        movers = _throughout(moved, begin, end)
         if len(observers) < 2 or not movers:
             continue
-        stance = Stance(len(found), begin, end, observers, movers)
-        if found and _goes_on(found[-1], stance, team, thresholds.pause):
-            found[-1] = replace(found[-1], end=end)
+        before = found[-1] if found else None
+        if (
+            before is not None
+            and (before.observers, before.movers) == (observers, movers)
+            and begin - before.end <= thresholds.pause
+            and {*observers} <= {*_throughout(at_rest, before.start, end)}
+        ):
+            found[-1] = replace(before, end=end)
         else:
-            found.append(stance)
+            found.append(Stance(len(found), begin, end, observers, movers))
     found = [one for one in found if one.end - one.start >= thresholds.shortest]
-    anchors = [(), *(_anchors(before, after, team) for before, after in itertools.pairwise(found))]
+    anchors = [(), *(_anchors(before, after, at_rest) for before, after in itertools.pairwise(found))]
     return [replace(one, index=k, anchors=anchors[k]) for k, one in enumerate(found)]
 
 
-def _instants(team: Sequence[Movements], standing: Mapping[str, list[Span]]) -> list[float]:
-    """When any robot begins or ends to stand or to move."""
-    spans = [span for one in team for span in (*standing[one.robot], *one.moved)]
-    return sorted({time for span in spans for time in span})
+def _throughout(spans: Mapping[str, Sequence[Span]], begin: float, end: float) -> tuple[str, ...]:
+    """The robots of which one of the stretches, which are in order and apart, holds another stretch."""
+    found = []
+    for robot, every in spans.items():
+        k = bisect.bisect_right(every, (begin, np.inf)) - 1
+        if k >= 0 and every[k][0] <= begin and end <= every[k][1]:
+            found.append(robot)
+    return tuple(found)
 
 
-def _within(begin: float, end: float, spans: Sequence[Span]) -> bool:
-    """Whether one of the stretches, which are in order and apart, holds another."""
-    k = bisect.bisect_right(spans, (begin, np.inf)) - 1
-    return k >= 0 and spans[k][0] <= begin and end <= spans[k][1]
-
-
-def _saw(cameras: Mapping[str, Array], robot: str, begin: float, end: float) -> bool:
+def _images(cameras: Mapping[str, Array], robot: str, begin: float, end: float) -> int:
     first, last = np.searchsorted(cameras.get(robot, np.empty(0)), [begin, end])
-    return bool(last - first >= LEAST_IMAGES)
+    return int(last - first)
 
 
-def _goes_on(before: Stance, after: Stance, team: Sequence[Movements], pause: float) -> bool:
-    """Whether a stance is the one before, after a pause of its movers."""
-    return (
-        (before.observers, before.movers) == (after.observers, after.movers)
-        and after.start - before.end <= pause
-        and set(_stood(before.start, after.end, team)) >= set(after.observers)
-    )
-
-
-def _anchors(before: Stance, after: Stance, team: Sequence[Movements]) -> tuple[str, ...]:
-    stood = _stood(before.start, after.end, team)
+def _anchors(before: Stance, after: Stance, at_rest: Mapping[str, Sequence[Span]]) -> tuple[str, ...]:
+    stood = _throughout(at_rest, before.start, after.end)
     return tuple(robot for robot in after.observers if robot in before.observers and robot in stood)
-
-
-def _stood(begin: float, end: float, team: Sequence[Movements]) -> list[str]:
-    return [one.robot for one in team if _within(begin, end, one.standing())]
