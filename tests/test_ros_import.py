@@ -21,6 +21,7 @@ from coloc_graph.exchange.ros_bag import open_bag
 from coloc_graph.exchange.ros_images import ENCODINGS, camera_of, image_of
 from coloc_graph.exchange.ros_import import import_ros
 from coloc_graph.exchange.ros_map import OdometrySigmas, RobotTopics, RosMap
+from coloc_graph.exchange.ros_order import InOrder, order_of
 from coloc_graph.exchange.ros_poses import stated_increments
 from coloc_graph.exchange.stances import MotionThresholds
 from coloc_graph.frontend.wheels import WheelTrack
@@ -369,7 +370,8 @@ def test_cameras_as_ros_says_them(tmp_path):
 def test_a_calibration_that_changes_in_the_bag_is_refused(bring_in):
     text = TRIPODS.replace('image = "/A/image"', 'image = "/A/image"\ncamera_info = "/A/info"')
     changed = msgspec.structs.replace(CAMERA, fx=10.5)
-    sent = [camera_info("/A/info", T0, CAMERA), camera_info("/A/info", T0 + SECOND, changed), *pictures()]
+    cameras = ((0, CAMERA), (1, changed), (2, CAMERA))
+    sent = [*(camera_info("/A/info", T0 + k * SECOND, one) for k, one in cameras), *pictures()]
     with pytest.raises(BagError, match=r"/A/info received at 1700000001.0 s is of another camera than the first"):
         bring_in(sent, text)
 
@@ -392,6 +394,16 @@ def test_images_are_sorted_by_their_own_time_and_what_is_there_twice_is_dropped_
     late, twice = summary.warnings
     assert "bag.mcap: 4 messages of /A/image came after later ones" in late
     assert "bag.mcap: 2 messages of /A/image have the time of another one" in twice
+
+
+def test_of_messages_of_one_instant_the_first_is_kept_and_the_others_are_not_held():
+    order = order_of([3, 1, 2, 1, 3])
+    assert (order.ns.tolist(), order.kept.tolist(), order.late, order.repeated) == ([1, 2, 3], [1, 2, 0], 3, 2)
+    waiting = InOrder(order.ns)
+    given = [list(waiting.take(ns, f"{number}: {ns}")) for number, ns in enumerate([3, 3, 1, 2, 1])]
+    assert given == [[], [], [(1, "2: 1")], [(2, "3: 2"), (3, "0: 3")], []]
+    all_twice = InOrder(np.arange(1000))
+    assert sum(len(list(all_twice.take(ns, ns))) for ns in (*range(999), *range(999))) == 999
 
 
 def test_images_that_are_hopelessly_out_of_order_are_refused_before_they_fill_the_memory(bring_in):
