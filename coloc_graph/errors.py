@@ -4,7 +4,8 @@
     ├── InputError            a file or an argument is wrong
     │   ├── TeamError         a team description
     │   ├── RunError          a run (MCAP)
-    │   └── TracksError       tracks or planes in a CSV
+    │   ├── TracksError       tracks or planes in a CSV
+    │   └── BagError          a ROS bag, or the map that says what is in it
     ├── DegenerateGeometry    the geometry cannot give what is asked, with the remedy
     ├── EstimationError       the graph cannot be solved, or the solver's answer did not pass its check
     │   └── MeasurementError  a measurement, or a stance, cannot enter the graph
@@ -34,6 +35,10 @@ class RunError(InputError):
 
 class TracksError(InputError):
     """Imported tracks or planes are wrong; the message names file and line."""
+
+
+class BagError(InputError):
+    """A ROS bag, or the map that says what is in it, is wrong; the message names file, topic and time."""
 
 
 class DegenerateGeometry(ColocError):

@@ -31,7 +31,7 @@ from coloc_graph.exchange.g2o import write_g2o
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.pipeline import Solution, SolveOptions
 from coloc_graph.run import read_truth, run_id
-from coloc_graph.team import without_none, write_team
+from coloc_graph.team import Team, read_team, without_none, write_team
 from coloc_graph.trajectory import Trajectory
 
 SUMMARY, CONFIG = "summary.json", "config.toml"
@@ -263,3 +263,19 @@ def read_result(path: str | Path) -> Result:
         raise InputError(f"{path / SUMMARY} is damaged ({error}); solve the run again") from error
     trajectories = {robot: read_tum(path / "trajectories" / f"{robot}.tum") for robot in robots}
     return Result(path, summary, trajectories, Path(os.path.normpath(path / run)), summary.get("run_id"))
+
+
+def team_of(result: Result) -> Team:
+    """The team of a result: as a joint estimate found it, otherwise as it was stated.
+
+    Raises `TeamError` or `InputError` where the result is damaged.
+    """
+    found, config = result.path / "team.toml", result.path / CONFIG
+    if found.exists():
+        return read_team(found)
+    try:
+        return msgspec.convert(msgspec.toml.decode(config.read_bytes())["team"], Team)
+    except OSError as error:
+        raise InputError(f"{config}: cannot be read ({error.strerror}); solve the run again") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, KeyError) as error:
+        raise InputError(f"{config}: is damaged ({error}); solve the run again") from error

@@ -19,7 +19,7 @@ from coloc_graph.run import open_run
 
 COLOC = Path(sys.executable).with_name("coloc")
 COMMANDS = ["", "demo", "simulate", "import", "import tracks", "info", "solve", "evaluate", "experiment", "view"]
-COMMANDS += ["export", "coordinate", "robot", "certificates"]
+COMMANDS += ["import ros", "import mrclam", "export", "coordinate", "robot", "certificates"]
 COMMANDS += ["calibrate", "calibrate camera", "calibrate mount"]
 
 

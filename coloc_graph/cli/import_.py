@@ -1,4 +1,4 @@
-"""coloc import tracks TEAM.toml TRACKS.csv --out RUN, coloc import mrclam DIR --out RUN."""
+"""coloc import tracks TEAM.toml TRACKS.csv, mrclam DIR or ros BAG MAP.toml --out RUN."""
 
 import argparse
 
@@ -15,12 +15,21 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     tracks.add_argument("--planes", metavar="PLANES.csv", help="marker planes: stance,robot,nx,ny,nz,d")
     tracks.add_argument("--moves", metavar="MOVES.csv", help="who moved before which stance: stance,robot")
     add_out(tracks)
-    tracks.set_defaults(run=run)
+    tracks.set_defaults(run=run_tracks)
     mrclam = kinds.add_parser("mrclam", help="a UTIAS MR.CLAM dataset: range and bearing, odometry, truth")
     mrclam.add_argument("folder", metavar="DIR")
     mrclam.add_argument("--map-unknown", action="store_true", help="do not say where the landmarks are")
     add_out(mrclam)
     mrclam.set_defaults(run=run_mrclam)
+    ros = kinds.add_parser("ros", help="images, odometry and truth from a ROS 1 or ROS 2 bag; needs no ROS")
+    ros.add_argument("bag", metavar="BAG", help="a ROS 1 .bag, a ROS 2 folder, or an .mcap")
+    ros.add_argument("map", metavar="MAP.toml", help="which topics are whose, see docs/ros.md")
+    ros.add_argument(
+        "--image-format", choices=("jpeg", "png", "raw"), default="jpeg", help="of images that are neither JPEG nor PNG"
+    )
+    ros.add_argument("--json", action="store_true")
+    add_out(ros)
+    ros.set_defaults(run=run_ros)
 
 
 def run_mrclam(args: argparse.Namespace) -> int:
@@ -40,8 +49,8 @@ def run_mrclam(args: argparse.Namespace) -> int:
     return 0
 
 
-def run(args: argparse.Namespace) -> int:
-    """Import and print."""
+def run_tracks(args: argparse.Namespace) -> int:
+    """Import tracks and print."""
     from coloc_graph.cli.printing import counted, progress, warn
     from coloc_graph.exchange.tracks import import_tracks
 
@@ -53,4 +62,25 @@ def run(args: argparse.Namespace) -> int:
     warn(summary.warnings)
     rows, stances = counted(summary.rows, "row"), counted(summary.stances, "stance")
     print(f"{args.out}: {rows}, {stances}, observers {', '.join(summary.observers)}")
+    return 0
+
+
+def run_ros(args: argparse.Namespace) -> int:
+    """Import a bag and print."""
+    from dataclasses import asdict
+
+    from coloc_graph.cli.printing import counted, print_json, progress, warn
+    from coloc_graph.exchange.ros_import import import_ros
+
+    require_run_place(args.out, force=args.force)
+    with progress("messages read") as report:
+        summary = import_ros(args.bag, args.map, args.out, image_format=args.image_format, progress=report)
+    warn(summary.warnings)
+    if args.json:
+        print_json(asdict(summary))
+        return 0
+    counts = ", ".join(f"{count} {what}" for what, count in summary.counts.items())
+    print(f"{args.out}: {counts}; {counted(summary.stances, 'stance')}, observers {', '.join(summary.observers)}")
+    for robot, (stood, known) in summary.stood.items():
+        print(f"{robot} stood {stood:.1f} of {known:.1f} s")
     return 0

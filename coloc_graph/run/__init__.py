@@ -5,13 +5,24 @@ A run is one MCAP file that Foxglove opens; docs/run-format.md says what is in i
 """
 
 from coloc_graph.run.index import is_mcap
-from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Ranges, Stance
+from coloc_graph.run.messages import (
+    Detections,
+    EncodedImage,
+    Flag,
+    Image,
+    Motion,
+    OdometrySample,
+    Planes,
+    Ranges,
+    Stance,
+)
 from coloc_graph.run.reader import Run, open_run, read_true_team, read_truth, run_id
 from coloc_graph.run.recorded import Recorded
 from coloc_graph.run.writer import RunWriter, whole_run
 
 __all__ = [
     "Detections",
+    "EncodedImage",
     "Flag",
     "Image",
     "Motion",

@@ -11,12 +11,22 @@ from numpy.typing import NDArray
 from coloc_graph.errors import RunError
 from coloc_graph.lie import quaternion
 from coloc_graph.run import schemas
-from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Ranges, Stance
+from coloc_graph.run.messages import (
+    Detections,
+    EncodedImage,
+    Flag,
+    Image,
+    Motion,
+    OdometrySample,
+    Planes,
+    Ranges,
+    Stance,
+)
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
 ImageFormat = Literal["jpeg", "png", "raw"]
-Record = Detections | Image | OdometrySample | Motion | Ranges | Stance | Planes
+Record = Detections | Image | EncodedImage | OdometrySample | Motion | Ranges | Stance | Planes
 
 JPEG_QUALITY = 95
 
@@ -47,6 +57,8 @@ def encode_record(record: Record, image_format: ImageFormat) -> tuple[str, str, 
         case Image():
             schema = schemas.RAW_IMAGE if image_format == "raw" else schemas.COMPRESSED_IMAGE
             return _robot(record, "image"), schema, record.time, _image(record, image_format)
+        case EncodedImage():
+            return _robot(record, "image"), schemas.COMPRESSED_IMAGE, record.time, _encoded(record)
         case Detections():
             return _json(_robot(record, "detections"), record.time, _detections(record))
         case OdometrySample():
@@ -93,7 +105,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _robot(record: Detections | Image | OdometrySample | Motion | Ranges, kind: str) -> str:
+def _robot(record: Detections | Image | EncodedImage | OdometrySample | Motion | Ranges, kind: str) -> str:
     return schemas.topic_of(record.robot, kind)
 
 
@@ -233,10 +245,21 @@ def _image(record: Image, image_format: ImageFormat) -> bytes:
             step=width * (1 if pixels.ndim == 2 else 3),
             data=pixels.tobytes(),
         )
-    else:
-        message = schemas.protobuf_type(schemas.COMPRESSED_IMAGE)(
-            format=image_format, data=_compress(pixels, image_format, of)
-        )
+        return _of_camera(message, record)
+    return _compressed(record, image_format, _compress(pixels, image_format, of))
+
+
+def _encoded(record: EncodedImage) -> bytes:
+    if record.format not in ("jpeg", "png"):
+        raise RunError(f"`{record.robot}`'s image at {record.time} s is `{record.format}`; give jpeg or png")
+    return _compressed(record, record.format, record.data)
+
+
+def _compressed(record: Image | EncodedImage, image_format: str, data: bytes) -> bytes:
+    return _of_camera(schemas.protobuf_type(schemas.COMPRESSED_IMAGE)(format=image_format, data=data), record)
+
+
+def _of_camera(message: Any, record: Image | EncodedImage) -> bytes:
     message.frame_id = f"{record.robot}/camera"
     _stamp(message, record.time)
     return bytes(message.SerializeToString(deterministic=True))

@@ -6,6 +6,7 @@ of the top-left pixel.
 
 from dataclasses import dataclass, field
 from enum import IntFlag
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,19 @@ class Image:
     robot: str
     time: float
     pixels: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedImage:
+    """An image as another camera's file, `data` a whole `format` (jpeg or png), to be written as it is.
+
+    It is read back as an `Image`.
+    """
+
+    robot: str
+    time: float
+    format: Literal["jpeg", "png"]
+    data: bytes
 
 
 @dataclass(frozen=True, eq=False)

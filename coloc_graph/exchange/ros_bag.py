@@ -1,0 +1,188 @@
+"""A ROS bag, without ROS: what topics it has, and their messages. ROS 1 `.bag`; ROS 2 folders, `.mcap`, `.db3`.
+
+The messages that are read are standard ones, whose definitions are the same in every distribution: definitions that a
+bag brings are not needed, and those of messages that nobody asks for do no harm.
+"""
+
+import struct
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coloc_graph.errors import BagError, ColocError
+from coloc_graph.run import is_mcap
+from coloc_graph.run.schemas import to_seconds
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO, ODOMETRY = "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"
+POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+TF, OLD_TF = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
+
+NOT_INSTALLED = "ROS bags need rosbags, which is not installed here: pip install 'coloc-graph[ros]'"
+#: What mends a bag that was cut off, by the ending of its name.
+REMEDIES = {".bag": "`rosbag reindex`", ".mcap": "`mcap recover`"}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag: its types (one, unless it is odd) as `package/msg/Type`, and how many messages."""
+
+    name: str
+    types: tuple[str, ...]
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class BagMessage:
+    """A message as it is in the bag, and when the bag received it [ns]."""
+
+    topic: str
+    type: str
+    received: int
+    data: bytes
+
+
+class Bag:
+    """A bag that is open; `open_bag` gives one."""
+
+    def __init__(self, path: Path, reader: Any, store: "Typestore", *, ros2: bool) -> None:
+        self.path, self.ros2 = path, ros2
+        self._reader, self._store = reader, store
+        by_name: dict[str, list[Any]] = {}
+        for connection in reader.connections:
+            by_name.setdefault(connection.topic, []).append(connection)
+        self.topics: Mapping[str, Topic] = {
+            name: Topic(name, tuple(sorted({one.msgtype for one in every})), sum(one.msgcount for one in every))
+            for name, every in sorted(by_name.items())
+        }
+
+    def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
+        """The messages of some topics, in the order in which the bag received them."""
+        wanted = [one for one in self._reader.connections if one.topic in topics]
+        for one in wanted:
+            self._require_standard(one)
+        if not wanted:
+            return
+        last: BagMessage | None = None
+        messages = self._reader.messages(connections=wanted)
+        while True:
+            with _understood(self.path, _after(last)):
+                found = next(messages, None)
+            if found is None:
+                return
+            connection, received, data = found
+            last = BagMessage(connection.topic, connection.msgtype, received, bytes(data))
+            yield last
+
+    def decode(self, message: BagMessage) -> Any:
+        """The message as an object with the fields of its type, ROS 1 as ROS 2."""
+        kind = TF if message.type == OLD_TF else message.type
+        read = self._store.deserialize_cdr if self.ros2 else self._store.deserialize_ros1
+        try:
+            return read(message.data, kind)
+        except Exception as error:  # of a damaged message rosbags raises whatever it stumbles over
+            raise self.error(message, f"is not a {message.type} ({error}); record the bag again") from error
+
+    def stamp(self, message: BagMessage) -> int:
+        """The header's stamp of a message that begins with one [ns]; 0 where it is not set."""
+        try:
+            if not self.ros2:  # after a sequence number
+                seconds, rest = struct.unpack_from("<II", message.data, 4)
+            else:  # after CDR's header, which says who is first of a number's bytes
+                seconds, rest = struct.unpack_from("<iI" if message.data[1] & 1 else ">iI", message.data, 4)
+        except (struct.error, IndexError) as error:
+            raise self.error(message, f"is too short for a {message.type}; record the bag again") from error
+        return int(seconds) * 1_000_000_000 + int(rest)
+
+    def error(self, message: BagMessage, what: str) -> BagError:
+        """The sentence for a message that is wrong."""
+        return BagError(
+            f"{self.path}: the message of {message.topic} received at {to_seconds(message.received)} s {what}"
+        )
+
+    def _require_standard(self, connection: Any) -> None:
+        """`BagError` where a bag defines a standard message otherwise than everybody else."""
+        kind = connection.msgtype
+        if kind == OLD_TF or not connection.digest or kind not in self._store.fielddefs:
+            return
+        known = self._store.hash_rihs01(kind) if self.ros2 else self._store.generate_msgdef(kind)[1]
+        if connection.digest not in (known, "*"):
+            raise BagError(
+                f"{self.path}: {connection.topic} has messages of a {kind} that is not the standard one "
+                f"({connection.digest}); record the standard message"
+            )
+
+
+@contextmanager
+def open_bag(path: str | Path) -> Iterator[Bag]:
+    """A bag to read from; `BagError` where there is none, or it was cut off, or rosbags is not installed."""
+    path = Path(path)
+    try:
+        from rosbags import rosbag1, rosbag2
+    except ImportError as error:
+        raise BagError(NOT_INSTALLED) from error
+    if not path.exists():
+        raise BagError(f"{path}: there is no such bag; give a ROS 1 .bag, a ROS 2 folder, or an .mcap")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        raise BagError(
+            f"{path}: is a folder without metadata.yaml, so no ROS 2 bag that was closed; give an .mcap within it, "
+            "or mend it with `ros2 bag reindex`"
+        )
+    ros2 = path.suffix != ".bag" or path.is_dir()
+    if ros2 and path.is_file() and path.suffix not in (".mcap", ".db3"):
+        raise BagError(f"{path}: is no bag by its name; give a ROS 1 .bag, a ROS 2 folder, or an .mcap")
+    if path.is_file() and is_mcap(path) and not _profile(path).startswith("ros2"):
+        raise BagError(
+            f"{path}: is an MCAP file, and not of ROS 2 (its profile is `{_profile(path)}`); give a bag, a run as it is"
+        )
+    with _understood(path):
+        reader: Any = rosbag2.Reader(path) if ros2 else rosbag1.Reader(path)
+        reader.open()
+    try:
+        yield Bag(path, reader, _standard_types(ros2=ros2), ros2=ros2)
+    finally:
+        reader.close()
+
+
+def _standard_types(*, ros2: bool) -> "Typestore":
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    if ros2:
+        return get_typestore(Stores.LATEST)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
+    return store
+
+
+def _profile(path: Path) -> str:
+    """The profile that an MCAP file says it has; `ros2` where it was cut off before, which is for rosbags to say."""
+    with path.open("rb") as file:
+        start = file.read(4096)
+    (size,) = struct.unpack_from("<I", start.ljust(21, b"\0"), 17)  # after magic, opcode, and the record's length
+    return start[21 : 21 + size].decode(errors="replace") if len(start) >= 21 + size else "ros2"
+
+
+@contextmanager
+def _understood(path: Path, where: str = "") -> Iterator[None]:
+    """Whatever rosbags stumbles over in a damaged bag is one sentence."""
+    try:
+        yield
+    except ColocError:
+        raise
+    except PermissionError:
+        raise
+    except Exception as error:  # struct, lz4, sqlite, assertions: it raises what it stumbles over
+        remedy = REMEDIES.get(path.suffix, "`ros2 bag reindex`")
+        what = str(error).rstrip(".") or type(error).__name__
+        raise BagError(
+            f"{path}: cannot be read as a ROS bag{where} ({what}); a bag that was cut off is mended by {remedy}"
+        ) from error
+
+
+def _after(last: BagMessage | None) -> str:
+    return "" if last is None else f" after the message of {last.topic} at {to_seconds(last.received)} s"

@@ -1,0 +1,116 @@
+"""MAP.toml: which topics of a ROS bag are whose, and what of it. docs/ros.md shows one."""
+
+import math
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from coloc_graph.errors import BagError
+from coloc_graph.exchange.stances import MotionThresholds
+from coloc_graph.team import Team, read_team
+
+#: From what it is known when a robot moves.
+MotionSource = Literal["odometry", "stands", "moves"]
+
+
+class OdometrySigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How far odometry errs, one standard deviation each, growing with the root of the way.
+
+    `along` and `across` [m] are of the way after one metre, ahead and sideways; `turned` [rad] is of the heading after
+    turning by one radian, `veer` [rad] after driving one metre.
+    """
+
+    along: float
+    turned: float
+    veer: float
+    across: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in msgspec.structs.asdict(self).items():
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"`{name}` is {value}; give a number that is not negative")
+
+
+class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One robot's topics, None where the bag has none.
+
+    `rectified` says that the images are rectified, so that the camera is P of its camera_info, without distortion.
+    `truth_tf` are the two frames of tf whose transform is T_world_body: world, body. `motion` is from what it is known
+    when the robot moves: by its `odometry`, or it always `stands`, or always `moves`.
+    """
+
+    name: str
+    image: str | None = None
+    camera_info: str | None = None
+    rectified: bool = False
+    odometry: str | None = None
+    odometry_sigmas: OdometrySigmas | None = None
+    truth: str | None = None
+    truth_tf: tuple[str, str] | None = None
+    motion: MotionSource = "odometry"
+
+    def __post_init__(self) -> None:
+        if self.truth is not None and self.truth_tf is not None:
+            raise ValueError("`truth` and `truth_tf` are both there; give one of them")
+        if self.motion == "odometry" and self.odometry is None:
+            raise ValueError(
+                f"when `{self.name}` moves is not known: give its `odometry`, or say that it always "
+                '`motion = "stands"` or `motion = "moves"`'
+            )
+        if self.rectified and self.camera_info is None:
+            raise ValueError("`rectified` is true and there is no `camera_info`; give it, or leave `rectified` out")
+        if self.odometry_sigmas is not None and self.odometry is None:
+            raise ValueError("there are `odometry_sigmas` and no `odometry`; give it, or leave them out")
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Its topics by what they are: image, camera_info, odometry, truth."""
+        every = {kind: getattr(self, kind) for kind in ("image", "camera_info", "odometry", "truth")}
+        return {kind: topic for kind, topic in every.items() if topic is not None}
+
+
+class RosMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What of a ROS bag is what. `team` is the path of a team.toml, from where the map lies.
+
+    `time` is where a message's time is from: its header's stamp, or when the bag received it. `motion` is when a robot
+    counts as moving, and what makes a stance.
+    """
+
+    team: str
+    robots: tuple[RobotTopics, ...]
+    time: Literal["header", "bag"] = "header"
+    motion: MotionThresholds = MotionThresholds()
+
+    def __post_init__(self) -> None:
+        names = [robot.name for robot in self.robots]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"robot `{twice[0]}` is there twice; give each robot once, with all of its topics")
+        if not any(robot.topics for robot in self.robots):
+            raise ValueError("no robot has a topic; give at least two robots, under [[robots]], with their topics")
+        used: dict[str, str] = {}
+        for robot in self.robots:
+            for kind, topic in robot.topics.items():
+                if topic in used:
+                    raise ValueError(f"{topic} is there twice, as {used[topic]} and as {kind} of {robot.name}")
+                used[topic] = f"{kind} of {robot.name}"
+
+
+def read_map(path: str | Path) -> tuple[RosMap, Team]:
+    """The map in a TOML file, and its team; `BagError` (`TeamError` for the team) names the file and the path in it."""
+    path = Path(path)
+    try:
+        found = msgspec.toml.decode(path.read_bytes(), type=RosMap)
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read ({error.strerror}); give the path of a map, see docs/ros.md") from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise BagError(f"{path}: {error}; see docs/ros.md for the fields") from error
+    team = read_team(path.parent / found.team)
+    for number, robot in enumerate(found.robots):
+        if robot.name not in team.names:
+            raise BagError(
+                f"{path}: robot `{robot.name}` is not in the team ({', '.join(team.names)}) - at "
+                f"`$.robots[{number}].name`; correct the name, or add the robot to {found.team}"
+            )
+    return found, team

@@ -1,0 +1,160 @@
+"""What a ROS bag says of each robot, as a run has it: camera, odometry, true poses, movements; and what is odd."""
+
+from collections.abc import Mapping
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import BagError
+from coloc_graph.exchange.ros_bag import Bag
+from coloc_graph.exchange.ros_images import camera_of, differences
+from coloc_graph.exchange.ros_map import RobotTopics, RosMap
+from coloc_graph.exchange.ros_poses import grown_increments, stated_increments
+from coloc_graph.exchange.ros_read import Recording
+from coloc_graph.exchange.stances import Movements, movements
+from coloc_graph.run import OdometrySample
+from coloc_graph.run.schemas import to_seconds
+from coloc_graph.team import Team
+
+Array = NDArray[np.float64]
+
+#: A message's bytes up to here are another's, if only their times differ.
+STAMPED = 12
+#: Odometry on a floor is not tilted by more than this [deg].
+LEVEL = 5.0
+#: Images that are taken so long before or after all odometry are told of [s].
+UNKNOWN = 1.0
+
+
+def with_cameras(bag: Bag, the_map: RosMap, recording: Recording, team: Team) -> tuple[Team, list[str]]:
+    """The team with the cameras that the bag knows, and where these are others than were stated."""
+    cameras, warnings = {}, []
+    for robot in the_map.robots:
+        if robot.camera_info is None:
+            continue
+        stated = team[robot.name].camera
+        messages = recording.values[robot.camera_info]
+        found = camera_of(bag, messages[0], stated, rectified=robot.rectified)
+        for message in {one.data[STAMPED:]: one for one in messages}.values():
+            if differences(camera_of(bag, message, stated, rectified=robot.rectified), found):
+                raise bag.error(message, "is of another camera than the first one; import one calibration at a time")
+        cameras[robot.name] = found
+        if other := differences(found, stated):
+            warnings.append(
+                f"{bag.path}: {robot.name}'s camera is that of {robot.camera_info}, and the team states another: "
+                + ", ".join(other)
+            )
+    robots = tuple(msgspec.structs.replace(one, camera=cameras.get(one.name, one.camera)) for one in team.robots)
+    return msgspec.structs.replace(team, robots=robots), warnings
+
+
+def seconds(ns: NDArray[np.int64]) -> Array:
+    """UTC seconds (n,) of nanoseconds."""
+    return np.array([to_seconds(one) for one in ns.tolist()])
+
+
+def odometry_of(bag: Bag, robot: RobotTopics, recording: Recording) -> list[OdometrySample]:
+    """A robot's odometry; the covariances of its increments are as the map states them, or as those of its poses grow.
+
+    Raises `BagError` where neither says anything.
+    """
+    assert robot.odometry is not None
+    values = recording.values[robot.odometry]
+    poses = np.array([one.pose for one in values])
+    if robot.odometry_sigmas is not None:
+        increments = stated_increments(poses, robot.odometry_sigmas)
+    else:
+        where = f"{bag.path}: {robot.odometry} (`odometry` of {robot.name})"
+        increments = grown_increments(poses, [one.covariance for one in values], where)
+    times = seconds(recording.orders[robot.odometry].ns).tolist()
+    return [OdometrySample(robot.name, *one) for one in zip(times, poses, increments, strict=True)]
+
+
+def truth_of(bag: Bag, robot: RobotTopics, recording: Recording) -> list[tuple[float, Array]]:
+    """The true poses of a robot's body, with their times [UTC s]."""
+    if robot.truth is not None:
+        times = seconds(recording.orders[robot.truth].ns).tolist()
+        return [(time, one.T_world_body) for time, one in zip(times, recording.values[robot.truth], strict=True)]
+    if robot.truth_tf is None:
+        return []
+    world, body = (frame.lstrip("/") for frame in robot.truth_tf)
+    for frame in (world, body):
+        if frame not in recording.frames:
+            raise BagError(
+                f"{bag.path}: tf has no frame `{frame}`, which `truth_tf` of {robot.name} names; it has: "
+                + ", ".join(recording.frames.names)
+            )
+    found = recording.frames.poses(world, body)
+    if found is None or not len(found[0]):
+        what = "never moves" if found else "is not known"
+        raise BagError(
+            f"{bag.path}: by tf the pose of `{body}` in `{world}`, `truth_tf` of {robot.name}, {what}; give two frames "
+            "with the robot's movement between them, or leave it out"
+        )
+    return list(zip(seconds(found[0]).tolist(), found[1], strict=True))
+
+
+def movements_of(
+    the_map: RosMap, recording: Recording, odometry: Mapping[str, list[OdometrySample]]
+) -> list[Movements]:
+    """When each robot moved: by its odometry, or as the map says for all of the time."""
+    begin, end = _extent(recording)
+    found = []
+    for robot in the_map.robots:
+        if robot.motion == "odometry":
+            samples = odometry[robot.name]
+            times, poses = [one.time for one in samples], [one.pose for one in samples]
+            found.append(movements(robot.name, times, poses, the_map.motion))
+        else:
+            found.append(Movements(robot.name, begin, end, ((begin, end),) if robot.motion == "moves" else ()))
+    return found
+
+
+def _extent(recording: Recording) -> tuple[float, float]:
+    every = [order.ns for order in recording.orders.values()]
+    return to_seconds(int(min(ns[0] for ns in every))), to_seconds(int(max(ns[-1] for ns in every)))
+
+
+def of_motion(bag: Bag, the_map: RosMap, recording: Recording, moves: list[Movements]) -> list[str]:
+    """What is odd about how robots moved."""
+    said = []
+    for robot, one in zip(the_map.robots, moves, strict=True):
+        if one.crept:
+            first = one.crept[0]
+            said.append(
+                f"{bag.path}: {robot.name} got somewhere without ever being as fast as [motion] says, "
+                f"{len(one.crept)} times (the first from {first[0]:.3f} to {first[1]:.3f} s): it counts as moving then"
+            )
+        if robot.odometry is not None:
+            tilt = float(np.rad2deg(max(moment.tilt for moment in recording.values[robot.odometry])))
+            if tilt > LEVEL:
+                said.append(
+                    f"{bag.path}: {robot.odometry} is tilted by up to {tilt:.0f} deg, and only x, y and yaw are taken: "
+                    "is it of the body, x forward, z up?"
+                )
+        if robot.image is not None and robot.motion == "odometry":
+            ns = recording.orders[robot.image].ns
+            out = max(one.start - to_seconds(int(ns[0])), to_seconds(int(ns[-1])) - one.end)
+            if out > UNKNOWN:
+                said.append(
+                    f"{bag.path}: images of {robot.name} are up to {out:.1f} s before or after its odometry, and "
+                    "whether it stands then is not known: no stance is made of them"
+                )
+    return said
+
+
+def of_team(bag: Bag, the_map: RosMap, team: Team, recording: Recording) -> list[str]:
+    """Who is left out, and truths that are not of one world."""
+    said = []
+    absent = [name for name in team.names if name not in {robot.name for robot in the_map.robots}]
+    if absent:
+        said.append(
+            f"{bag.path}: nothing is imported for {', '.join(absent)} of the team, since the map has no such robot"
+        )
+    worlds = {robot.name: recording.values[robot.truth][0].frame for robot in the_map.robots if robot.truth}
+    worlds |= {robot.name: robot.truth_tf[0].lstrip("/") for robot in the_map.robots if robot.truth_tf}
+    if len(set(worlds.values())) > 1:
+        frames = ", ".join(f"{name} in `{frame}`" for name, frame in worlds.items())
+        said.append(f"{bag.path}: the true poses are not all in one frame ({frames}): they cannot be compared")
+    return said
