@@ -1,6 +1,7 @@
 """Our ATE and RPE against evo's, run as a program on the same TUM files.
 
     python benchmarks/evo_agreement.py --evo DIR [--poses 20000] [--json]
+    python benchmarks/evo_agreement.py --evo DIR --write tests/evo       a small pair and evo's answers, for the tests
 
 DIR holds `evo_ape` and `evo_rpe` (evo is GPL: it is neither imported nor a dependency; install it elsewhere). Three
 trajectories: one that is free in space, one on a floor that stands at times, one far from its origin; and the first two
@@ -9,8 +10,10 @@ greatest error, and of single errors.
 """
 
 import argparse
+import itertools
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -88,12 +91,12 @@ def trajectories(n: int) -> dict[str, tuple[Trajectory, Trajectory]]:
     return out | {"team": (team[0], team[1])}
 
 
-def evo(program: str, evo_dir: Path, folder: Path, name: str, *options: str) -> tuple[Spread, Array]:
-    """What evo says: its statistics and all errors."""
+def evo(program: str, evo_dir: Path, folder: Path, files: tuple[str, str], *options: str) -> tuple[Spread, Array]:
+    """What evo says of two files in a folder, truth first: its statistics and all errors."""
     zipped = folder / "result.zip"
     zipped.unlink(missing_ok=True)
     subprocess.run(
-        [evo_dir / program, "tum", f"{name}.true", f"{name}.est", *options, "--no_warnings", "--save_results", zipped],
+        [evo_dir / program, "tum", *files, *options, "--no_warnings", "--save_results", zipped],
         cwd=folder, env=os.environ | {"HOME": str(folder)}, check=True, capture_output=True, timeout=600,
     )  # fmt: skip
     with zipfile.ZipFile(zipped) as results:
@@ -115,7 +118,7 @@ def rows_of(evo_dir: Path, n: int, folder: Path) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
 
     def add(name: str, figure: str, options: list[str], ours: Array, program: str) -> None:
-        off = difference(ours, evo(program, evo_dir, folder, name, *options))
+        off = difference(ours, evo(program, evo_dir, folder, (f"{name}.true", f"{name}.est"), *options))
         rows.append({"case": name, "figure": figure, "count": len(ours), "rmse": spread(ours).rmse, "difference": off})
         print("  ".join(f"{value:.3g}" if isinstance(value, float) else f"{value}" for value in rows[-1].values()),
               file=sys.stderr, flush=True)  # fmt: skip
@@ -145,13 +148,43 @@ def rows_of(evo_dir: Path, n: int, folder: Path) -> list[dict[str, object]]:
     return rows
 
 
+def write_reference(evo_dir: Path, folder: Path) -> None:
+    """A small pair of files with short numbers, and what evo says of it."""
+    rng = np.random.default_rng(5)
+    true = on_floor(160, rng)[::2] @ se3_exp(0.05 * rng.normal(size=(80, 6)))
+    times = 1_700_000_000 + np.arange(80) / 4
+    folder.mkdir(exist_ok=True)
+    for name, T in (("true", true), ("est", drifting(true, rng, 0.02, planar=False))):
+        write_tum(Trajectory(name, times, T), folder / f"{name}.tum")
+        numbers = np.loadtxt(folder / f"{name}.tum")
+        np.savetxt(folder / f"{name}.tum", numbers, fmt=["%.2f", *["%.5f"] * 3, *["%.7f"] * 4])
+    answers = {}
+    for alignment, options in ALIGNED.items():
+        for unit, relation in (("m", "trans_part"), ("deg", "angle_deg")):
+            stats, _ = evo("evo_ape", evo_dir, folder, ("true.tum", "est.tum"), "-r", relation, *options)
+            answers[f"ATE {alignment} {unit}"] = asdict(stats)
+    for length, source in itertools.product((0.5, 1.0, 2.0), ("estimate", "truth")):
+        pairs = ["--pairs_from_reference"] if source == "truth" else []
+        for unit, relation in (("m", "trans_part"), ("deg", "angle_deg")):
+            delta = ["-r", relation, "-d", str(length), "-u", "m", "--all_pairs", *pairs]
+            stats, errors = evo("evo_rpe", evo_dir, folder, ("true.tum", "est.tum"), *delta)
+            answers[f"RPE {length} {source} {unit}"] = asdict(stats) | {"pairs": len(errors)}
+    (folder / "result.zip").unlink()
+    shutil.rmtree(folder / ".evo", ignore_errors=True)
+    (folder / "evo.json").write_text(json.dumps(answers, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     """Run it, print it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--evo", type=Path, required=True, metavar="DIR", help="the folder of evo's programs")
     parser.add_argument("--poses", type=int, default=20000)
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--write", type=Path, metavar="DIR")
     options = parser.parse_args()
+    if options.write:
+        write_reference(options.evo.resolve(), options.write.resolve())
+        return
     with tempfile.TemporaryDirectory() as folder:
         rows = rows_of(options.evo.resolve(), options.poses, Path(folder))
     worst = {case: max(row["difference"] for row in rows if row["case"] == case) for case in {r["case"] for r in rows}}  # type: ignore[type-var]

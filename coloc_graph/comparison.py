@@ -18,6 +18,7 @@ from coloc_graph.evaluation import (
     PairsFrom,
     align,
     evaluate,
+    usual_alignment,
 )
 from coloc_graph.exchange.tum import read_tum
 from coloc_graph.results import CONFIG, holds_result, read_result
@@ -74,8 +75,8 @@ def of_result(
 ) -> Comparison:
     """A result against the truth in its run (where `run_path` says, if it was moved), or against another truth.
 
-    Aligned by the reference unless said otherwise, or by the team where its poses belong to no stances. Raises
-    `InputError` where the run is another or has no truth.
+    Aligned as is usual (`usual_alignment`) unless said otherwise. Raises `InputError` where the run is another or has
+    no truth.
     """
     result = read_result(path)
     estimated = _with_poses(result.trajectories, f"{path}")
@@ -90,10 +91,8 @@ def of_result(
             raise InputError(
                 f"{run}: the run holds no truth to compare with; record it on /<robot>/truth, or give it with --truth"
             )
-    stood = all(one.stances is not None for one in estimated.values())
-    return Comparison(
-        estimated, true, alignment or ("reference" if stood else "team"), team.reference, team.floor is not None
-    )
+    alignment = alignment or usual_alignment(estimated)
+    return Comparison(estimated, true, alignment, team.reference, team.floor is not None)
 
 
 def of_files(

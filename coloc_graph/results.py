@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from coloc_graph._version import __version__
 from coloc_graph.errors import InputError
-from coloc_graph.evaluation import Accuracy, accuracy_json, align, evaluate
+from coloc_graph.evaluation import Accuracy, accuracy_json, align, evaluate, usual_alignment
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import write_g2o
 from coloc_graph.exchange.tum import read_tum, write_tum
@@ -61,8 +61,9 @@ def assess(
         return None
     on_floor = solution.run.team.floor is not None
     trajectories = solution.estimate.trajectories
-    true = align(trajectories, truth, solution.run.team.reference, on_floor=on_floor)
-    return evaluate(trajectories, true, on_floor=on_floor), true
+    how = usual_alignment(trajectories)
+    true = align(trajectories, truth, solution.run.team.reference, on_floor=on_floor, alignment=how)
+    return evaluate(trajectories, true, on_floor=on_floor, alignment=how), true
 
 
 def holds_result(out: str | Path) -> bool:

@@ -4,7 +4,7 @@
 """
 
 from coloc_graph.evaluation.accuracy import Accuracy, DistanceAccuracy, RobotAccuracy, accuracy_json, evaluate
-from coloc_graph.evaluation.alignment import ALIGNMENTS, Alignment, align
+from coloc_graph.evaluation.alignment import ALIGNMENTS, Alignment, align, usual_alignment
 from coloc_graph.evaluation.nees import FREE, PLANAR, Nees, effective_poses, nees, nees_of, whitened
 from coloc_graph.evaluation.pose_errors import (
     RPE_DISTANCES,
@@ -40,6 +40,7 @@ __all__ = [
     "nees_of",
     "relative_errors",
     "true_poses",
+    "usual_alignment",
     "whitened",
     "with_truth",
 ]

@@ -24,6 +24,11 @@ ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 _THIN = 1e-9
 
 
+def usual_alignment(estimated: Mapping[str, Trajectory]) -> Alignment:
+    """By the reference, in whose world poses at stances are; by the team where poses belong to no stances."""
+    return "reference" if all(one.stances is not None for one in estimated.values()) else "team"
+
+
 def align(
     estimated: Mapping[str, Trajectory],
     truth: Mapping[str, Trajectory],

@@ -21,8 +21,8 @@ DEFINED = 1e-5
 class Nees:
     """Mean normalised estimation error squared per degree of freedom over `poses`, 1 where covariances are honest.
 
-    If they are, it is between `low` and `high` in 95 % of runs: chi-square with as many degrees of freedom as
-    `effective` poses have that know nothing of each other.
+    `low` and `high` hold 95 % of a chi-square variable of as many degrees of freedom as `effective` poses have that
+    know nothing of each other. That number is estimated, too: of honest runs 84 to 96 % were in (docs/evaluation.md).
     """
 
     mean: float

@@ -21,6 +21,8 @@ from coloc_graph.report.drawing import COLOURS, GREY, INK, MARKERS, Array, Truth
 from coloc_graph.trajectory import Trajectory
 
 _WIDTH = 9.0  # [in]
+#: The figures; there is no last one where nobody went far enough.
+NAMES = ("trajectories", "errors", "rpe")
 #: Pictures that can be written.
 SUFFIXES = (".png", ".svg", ".pdf")
 _ALIGNED: dict[Alignment, str] = {
@@ -64,7 +66,7 @@ def require_plot_place(out: str | Path, *, force: bool) -> None:
         raise InputError(f"{out} is a folder; give the name of a picture, or a folder that is not called like one")
     if not out.absolute().parent.is_dir():
         raise InputError(f"{out} cannot be written, since there is no such folder; make it, or give another place")
-    there = [path for path in _paths(out, ("trajectories", "errors", "rpe")) if path.exists()]
+    there = [path for path in _paths(out, NAMES) if path.exists()]
     if there and not force:
         raise InputError(f"{there[0]} exists; replace it with --force, or give another name")
 
@@ -96,6 +98,8 @@ def write_plots(out: str | Path, drawings: Mapping[str, tuple[float, Drawing]], 
             figure.savefig(Path(work) / path.name, dpi=130, metadata=_WITHOUT_DATE[path.suffix.lower()])
         for path in paths:
             (Path(work) / path.name).replace(path)
+    for path in set(_paths(out, NAMES)) - set(paths):
+        path.unlink(missing_ok=True)  # of an earlier comparison
     return paths
 
 
