@@ -149,7 +149,7 @@ def test_pictures_are_drawn_and_not_over_others(call, refused, result, tmp_path)
     assert png.read_text() == "another picture"
     code, out, _ = call(result, "--plot", png, "--force")
     assert code == 0 and out.splitlines()[-1] == f"written: {png}" and png.read_bytes().startswith(b"\x89PNG")
-    code, out, _ = call(result, "--plot", folder, "--json", "--robots", "A", "--rpe", "0.3")
+    code, out, _ = call(result, "--plot", folder, "--json", "--robots", "A", "--rpe", "0.3,0.35,0.4,0.7")
     assert code == 0 and json.loads(out)["ate_m"] > 0
     assert sorted(path.name for path in folder.iterdir()) == ["errors.png", "rpe.png", "trajectories.png"]
     # what is not drawn this time does not stay behind from the last

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from coloc_graph._version import __version__
-from coloc_graph.evaluation import Accuracy, RobotAccuracy
+from coloc_graph.evaluation import Accuracy, RelativeError, RobotAccuracy
 from coloc_graph.frontend import PairMeasurement
 from coloc_graph.pipeline import Solution
 from coloc_graph.report.drawing import Truth, position_sigmas, trajectories_of
@@ -196,16 +196,16 @@ def _relative_table(accuracy: Accuracy) -> str:
     if not which:
         return ""
     head = ["Relative (RPE)", *(f"{accuracy.relative[k].distance:g} m" for k in which)]
-    rows = [
-        [escape(name)]
-        + [
-            f"{_number(relative[k].translation_percent, 2)}&nbsp;%, {_number(relative[k].rotation_deg, 2)}°"
-            for k in which
-        ]
-        for name, relative in [*((row.robot, row.relative) for row in accuracy.robots), ("Team", accuracy.relative)]
-    ]
+    whose = [*((row.robot, row.relative) for row in accuracy.robots), ("Team", accuracy.relative)]
+    rows = [[escape(name), *(_relative_cell(relative[k]) for k in which)] for name, relative in whose]
     note = "RMS error of translation, in % of the distance travelled, and of rotation between two poses so far apart."
     return f'{_table(head, rows[:-1], [0], rows[-1])}\n<p class="soft">{note}</p>'
+
+
+def _relative_cell(one: RelativeError) -> str:
+    if not one.pairs:
+        return DASH
+    return f"{_number(one.translation_percent, 2)}&nbsp;%, {_number(one.rotation_deg, 2)}°"
 
 
 def _calibration_section(solution: Solution) -> str:
