@@ -51,6 +51,7 @@ bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/team.py
 	$(BIN)/python benchmarks/team.py --table
 	$(BIN)/python benchmarks/messy.py
+	$(BIN)/python benchmarks/nees_interval.py
 	$(BIN)/python benchmarks/backend.py $(if $(GRAPHS),--data $(GRAPHS))
 ifneq ($(DATA),)
 	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)

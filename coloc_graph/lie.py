@@ -293,3 +293,16 @@ def se3_exp(xi: ArrayLike) -> Array:
     b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
     V = np.eye(3) + a * W + b * (W @ W)
     return se3(so3_exp(w), (V @ v[..., None])[..., 0])
+
+
+def se3_log(T: ArrayLike) -> Array:
+    """Tangents (..., 6), rotation first, of poses (..., 4, 4)."""
+    T = np.asarray(T, float)
+    w = so3_log(T[..., :3, :3])
+    W = hat(w)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = angle < 1e-3
+    half = np.where(small, 1.0, angle) / 2
+    c = np.where(small, 1 / 12 + angle**2 / 720, (1 - half / np.tan(half)) / (4 * half**2))
+    V_inverse = np.eye(3) - W / 2 + c * (W @ W)
+    return np.concatenate([w, (V_inverse @ T[..., :3, 3:])[..., 0]], axis=-1)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from coloc_graph._version import __version__
 from coloc_graph.errors import InputError
-from coloc_graph.evaluation import Accuracy, align, evaluate
+from coloc_graph.evaluation import Accuracy, accuracy_json, align, evaluate, usual_alignment
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import write_g2o
 from coloc_graph.exchange.tum import read_tum, write_tum
@@ -54,14 +54,16 @@ MEASUREMENT_COLUMNS = (
 def assess(
     solution: Solution, truth_path: str | Path | None = None
 ) -> tuple[Accuracy, dict[str, NDArray[np.float64]]] | None:
-    """A solution against its run's truth, or that of another, with the true poses in its world; None without truth."""
+    """A solution against its run's truth, or that of another, with the true poses in its world (NaN where there are
+    none); None without truth."""
     truth = read_truth(solution.run.path if truth_path is None else truth_path)
     if not truth:
         return None
     on_floor = solution.run.team.floor is not None
     trajectories = solution.estimate.trajectories
-    true = align(trajectories, truth, solution.run.team.reference, on_floor=on_floor)
-    return evaluate(trajectories, true, on_floor=on_floor), true
+    how = usual_alignment(trajectories)
+    true = align(trajectories, truth, solution.run.team.reference, on_floor=on_floor, alignment=how)
+    return evaluate(trajectories, true, on_floor=on_floor, alignment=how), true
 
 
 def holds_result(out: str | Path) -> bool:
@@ -150,32 +152,6 @@ def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
     if accuracy is not None:
         summary["accuracy"] = accuracy_json(accuracy)
     return summary
-
-
-def accuracy_json(accuracy: Accuracy) -> dict[str, Any]:
-    """An accuracy as in summary.json."""
-    return {
-        "length_error_percent": {row.robot: row.length_error_percent for row in accuracy.robots},
-        "ate_m": accuracy.ate,
-        "end_position_error_m": accuracy.end_position_error,
-        "heading_error_deg": accuracy.heading_error_deg,
-        "anees": accuracy.anees,
-        "robots": {
-            row.robot: {
-                "true_length_m": row.true_length,
-                "estimated_length_m": row.estimated_length,
-                "length_error_m": row.length_error,
-                "ate_m": row.ate,
-                "end_position_error_m": row.end_position_error,
-                "heading_error_deg": row.heading_error_deg,
-            }
-            for row in accuracy.robots
-        },
-        "distances": [
-            {"robots": [row.robot_i, row.robot_j], "true_m": row.true, "estimated_m": row.estimated}
-            for row in accuracy.distances
-        ],
-    }
 
 
 def _measurements(solution: Solution) -> str:

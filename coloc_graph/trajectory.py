@@ -25,6 +25,12 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.times)
 
+    def where(self, kept: NDArray[np.bool_]) -> "Trajectory":
+        """The poses where `kept` (n,) is true."""
+        stances = None if self.stances is None else self.stances[kept]
+        covariances = None if self.covariances is None else self.covariances[kept]
+        return Trajectory(self.robot, self.times[kept], self.T_world_body[kept], stances, covariances)
+
     @property
     def positions(self) -> Array:
         """Positions in the world, (n, 3) [m]."""

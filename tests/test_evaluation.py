@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import chi2
 
 from coloc_graph.errors import InputError
-from coloc_graph.evaluation import PLANAR, RobotAccuracy, align, evaluate, nees_of, true_poses
+from coloc_graph.evaluation import PLANAR, RobotAccuracy, Spread, align, evaluate, nees_of, true_poses
 from coloc_graph.lie import floor_pose, rotation_x, se3, so3_exp
 from coloc_graph.trajectory import Trajectory
 
@@ -91,9 +91,9 @@ def test_a_stretched_path_is_that_many_percent_long(team):
 
 
 def test_a_robot_that_stood_has_no_percentage():
-    assert RobotAccuracy("A", 0.0, 0.01, 0, 0, 0).length_error_percent is None
-    assert RobotAccuracy("A", 0.04, 0.05, 0, 0, 0).length_error_percent is None
-    assert RobotAccuracy("A", 1.0, 0.99, 0, 0, 0).length_error_percent == pytest.approx(1)
+    nothing = Spread(0, 0, 0, 0)
+    for true, estimated, percent in ((0.0, 0.01, None), (0.04, 0.05, None), (1.0, 0.99, pytest.approx(1))):
+        assert RobotAccuracy("A", true, estimated, 0, 0, nothing, nothing).length_error_percent == percent
 
 
 def test_truth_is_the_latest_at_or_before_each_pose(team):
@@ -148,8 +148,9 @@ def test_nees_counts_a_held_pose_once_and_the_worlds_own_never():
             "the truth does not hold robot B",
         ),
         (
-            lambda team: team | {"B": trajectory("B", times=TIMES[2:])},
-            "the truth of robot B begins after stance 0; record it from the first stance on",
+            lambda team: team | {"B": trajectory("B", times=TIMES + 100)},
+            "the truth of robot B is at none of its times: the estimate reaches from 1700000000.000 to "
+            "1700000040.000 s, the truth from 1700000100.000",
         ),
     ],
 )
@@ -162,7 +163,7 @@ def test_truth_that_does_not_cover_the_estimate_is_refused_in_words(team, truth,
 def test_truth_that_begins_late_names_the_stance_and_not_its_place():
     late = trajectory("A", times=TIMES[2:])
     estimate = {"A": Trajectory("A", TIMES[1:], floor_pose(np.arange(4), 0, 0), np.array([5, 6, 7, 8]))}
-    with pytest.raises(InputError, match="begins after stance 5"):
+    with pytest.raises(InputError, match="reference robot A begins after stance 5"):
         align(estimate, {"A": late}, "A", on_floor=True)
 
 
@@ -192,8 +193,34 @@ def test_the_truth_of_a_robot_that_drives_is_followed_between_its_samples():
     times = np.array([0.0, 1.0, 1.1, 1.2, 9.0])
     poses = floor_pose([0, 0, 0.02, 0.06, 0.5], [0, 0, 0, 0.02, 0.5], [0, 0, 0.1, 0.3, 0])
     truth = {"A": Trajectory("A", times, poses)}
-    asked = Trajectory("A", np.array([0.5, 1.05, 1.15, 1.2, 5.0, 99.0]), np.tile(np.eye(4), (6, 1, 1)))
-    found = true_poses(truth, asked)
+    when = np.array([0.5, 1.05, 1.15, 1.2, 5.0, 9.0])
+    asked = Trajectory("A", when, np.tile(np.eye(4), (6, 1, 1)), np.arange(6))
     # between samples that are near: half way, by the shortest turn; between others it stood at the earlier one
     expected = floor_pose([0, 0.01, 0.04, 0.06, 0.06, 0.5], [0, 0, 0.01, 0.02, 0.02, 0.5], [0, 0.05, 0.2, 0.3, 0.3, 0])
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(true_poses(truth, asked), expected, atol=1e-12)
+    # without stances nobody says that it stood: there is no truth between samples that are far apart
+    found = true_poses(truth, dataclasses.replace(asked, stances=None))
+    np.testing.assert_allclose(found[[1, 2, 3, 5]], expected[[1, 2, 3, 5]], atol=1e-12)
+    assert np.isnan(found[[0, 4]]).all()
+    # unless it is said that it drove evenly
+    found = true_poses(truth, dataclasses.replace(asked, stances=None), longest_gap=8.0)
+    share = 3.8 / 7.8
+    np.testing.assert_allclose(found[4, :3, 3], [0.06 + 0.44 * share, 0.02 + 0.48 * share, 0], atol=1e-12)
+
+
+def test_poses_outside_of_the_truth_are_left_out_and_counted(team):
+    truth = team | {"B": team["B"].where(np.array([0, 1, 1, 1, 0], bool))}
+    off = team["B"].T_world_body.copy()
+    off[1:4, 0, 3] += 0.01
+    off[[0, 4], 0, 3] += 99.0
+    estimate = {"A": team["A"], "B": Trajectory("B", TIMES, off, np.arange(5))}
+    true = align(estimate, truth, "A", on_floor=True)
+    accuracy = evaluate(estimate, true, on_floor=True)
+    assert true["B"].shape == (5, 4, 4) and np.isnan(true["B"][[0, 4]]).all()
+    assert accuracy.warnings == (
+        "robot B: 2 of 5 poses are left out, since there is no truth at their times "
+        "(1 before it begins, 1 after it ends, 0 in its gaps)",
+    )
+    # what is wrong where there is no truth counts nowhere
+    assert accuracy.robots[1].translation == Spread(*[pytest.approx(0.01)] * 4)
+    assert accuracy.end_position_error == pytest.approx(0.01) and accuracy.robots[0].ate == 0

@@ -1,5 +1,6 @@
 """TUM and g2o: to the bit and back, as others read them, and files that are wrong."""
 
+import dataclasses
 import re
 
 import gtsam
@@ -30,6 +31,13 @@ def test_tum_reads_back_to_the_bit(rng, tmp_path):
         assert np.array_equal(getattr(read, name), getattr(written, name)), name
     # a rotation goes through a quaternion, which costs a last bit or two
     np.testing.assert_allclose(read.T_world_body, written.T_world_body, rtol=0, atol=2e-15)
+
+
+def test_tum_of_poses_that_belong_to_no_stances_keeps_their_covariances(rng, tmp_path):
+    written = dataclasses.replace(wild(rng), stances=None)
+    write_tum(written, tmp_path / "B.tum")
+    read = read_tum(tmp_path / "B.tum")
+    assert read.stances is None and np.array_equal(read.covariances, written.covariances)
 
 
 def test_tum_of_an_estimate_reads_back(solutions, tmp_path):
@@ -75,6 +83,12 @@ def test_tum_of_other_tools_is_read(tmp_path):
         ("inf 0 0 0 0 0 0 1\n", "x.tum, line 1: 8 finite"),
         ("1 0 0 0 0 0 0 0\n", "x.tum, line 1: the quaternion is not of unit length"),
         ("1 0 0 0 1 1 1 1\n", "x.tum, line 1: the quaternion is not of unit length"),
+        (
+            "1 0 0 0 0 0 0 1\n3 0 0 0 0 0 0 1\n\n2 0 0 0 0 0 0 1\n",
+            "x.tum, line 4: the time 2.0 does not come after 3.0",
+        ),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "x.tum, line 2: the time 1.0 does not come after 1.0; sort the poses"),
+        ("1,0,0,0,0,0,0,1\n", "x.tum, line 1: 8 finite"),
     ],
 )
 def test_a_bad_tum_file_is_one_sentence_with_its_line(tmp_path, text, words):

@@ -1,5 +1,6 @@
 """Laws of the groups, and their maps against scipy's."""
 
+import gtsam
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -15,7 +16,9 @@ from coloc_graph.lie import (
     rotation_y,
     rotation_z,
     se3,
+    se3_exp,
     se3_inverse,
+    se3_log,
     sl3_exp,
     sl3_hat,
     sl3_normalise,
@@ -113,6 +116,18 @@ def test_poses_are_a_group(rng):
     assert T_a_b @ se3_inverse(T_a_b) == pytest.approx(one, abs=1e-13)
     assert se3_inverse(T_a_b @ T_b_c) == pytest.approx(se3_inverse(T_b_c) @ se3_inverse(T_a_b), abs=1e-13)
     assert se3_inverse(T_a_b) == pytest.approx(np.linalg.inv(T_a_b), abs=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 9e-4, 1.1e-3, 1.0, 3.1, np.pi - 1e-9])
+def test_se3_log_undoes_exp_and_is_gtsams(rng, angle):
+    w = rng.normal(size=(20, 3))
+    xi = np.hstack([angle * w / np.linalg.norm(w, axis=1, keepdims=True), rng.normal(size=(20, 3))])
+    T = se3_exp(xi)
+    found = se3_log(T)
+    assert found == pytest.approx(xi, abs=1e-8 if angle > 3.13 else 1e-12)
+    if angle < 3:
+        theirs = np.array([gtsam.Pose3.Logmap(gtsam.Pose3(one)) for one in T])
+        assert found == pytest.approx(theirs, abs=1e-9)
 
 
 def test_floor_pose_spreads_its_arguments_and_yaw_reads_it_back(rng):

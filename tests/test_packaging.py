@@ -29,13 +29,13 @@ LAYERS = [
     {"exchange", "pipeline", "inspection"},
     {"report", "online"},
     {"results"},
-    {"experiments", "viewer", "many_runs"},
+    {"experiments", "viewer", "many_runs", "comparison"},
     {"cli"},
 ]
 RANK = {part: rank for rank, parts in enumerate(LAYERS) for part in parts}
 #: Only what compares with truth, or shows it, reads it.
 TRUTH = {"read_truth", "read_true_team"}
-READS_TRUTH = {"run", "evaluation", "results", "viewer", "cli"}
+READS_TRUTH = {"run", "evaluation", "results", "comparison", "viewer", "cli"}
 
 
 def part_of(path):

@@ -313,6 +313,30 @@ def test_report_says_lengths_counts_options_and_reasons() -> None:
     assert "details" in page.tags
 
 
+def test_report_says_errors_over_all_poses_and_over_stretches_of_the_way() -> None:
+    estimate, truth = leapfrog(20)
+    accuracy = accuracy_of(estimate, truth)
+    text = Page(render_report(solution_of(estimate), accuracy, truth)).text
+    row = accuracy.robots[0]
+    assert row.nees is not None
+    over = next(one for one in accuracy.relative if one.pairs)
+    for said in (
+        f"{100 * row.translation.max:.2f}",
+        f"{row.rotation_deg.median:.2f}",
+        f"{row.nees.low:.2f}\xa0to\xa0{row.nees.high:.2f}",
+        f"{over.distance:g} m",
+        f"{over.translation_percent:.2f}\xa0%, {over.rotation_deg:.2f}°",
+    ):
+        assert said in text, said
+
+
+def test_report_of_a_run_whose_truth_ends_early_says_so_and_draws_the_rest() -> None:
+    estimate, truth = leapfrog(6)
+    truth["A"][3:] = np.nan
+    text = Page(render_report(solution_of(estimate), accuracy_of(estimate, truth), truth)).text
+    assert "robot A: 3 of 6 poses are left out" in text and "nan" not in text.lower()
+
+
 def test_report_escapes_what_others_wrote() -> None:
     estimate, truth = leapfrog(3)
     nasty = "<script>alert('x')</script> & \"quotes\" <img src=http://bad>"

@@ -5,11 +5,19 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from coloc_graph.cli.printing import counted, print_table
-from coloc_graph.evaluation import Accuracy
+from coloc_graph.evaluation import Accuracy, Alignment, RobotAccuracy
 
 if TYPE_CHECKING:
     from coloc_graph.backend import Calibration
     from coloc_graph.trajectory import Trajectory
+
+#: What was made to agree, in words.
+ALIGNED: dict[Alignment, str] = {
+    "reference": "aligned by the reference robot's first pose",
+    "team": "aligned by all poses of the team",
+    "robot": "aligned by the poses of each robot on its own",
+    "none": "not aligned",
+}
 
 
 def print_accuracy(accuracy: Accuracy) -> None:
@@ -48,6 +56,54 @@ def print_accuracy(accuracy: Accuracy) -> None:
                 for row in accuracy.distances
             ],
         )
+
+
+def print_errors(accuracy: Accuracy) -> None:
+    """Per robot and for the team: errors over all poses (ATE) with the NEES, and over stretches of the way (RPE)."""
+    whose: list[tuple[str, Accuracy | RobotAccuracy]] = [(row.robot, row) for row in accuracy.robots]
+    if len(whose) > 1:
+        whose.append(("team", accuracy))
+    rows = []
+    for name, of in whose:
+        t, r = of.translation, of.rotation_deg
+        translation = [f"{100 * value:.2f}" for value in (t.rmse, t.mean, t.median, t.max)]
+        rotation = [f"{value:.2f}" for value in (r.rmse, r.mean, r.median, r.max)]
+        rows.append([name, *translation, *rotation, *_nees_cells(of)])
+    head = ["all poses", "RMSE [cm]", "mean", "median", "max", "RMSE [deg]", "mean", "median", "max"]
+    print(f"\n{ALIGNED[accuracy.alignment]}:")
+    print_table([*head, "NEES", "95 % if honest"], rows)
+    rows = [
+        [
+            name,
+            f"{one.distance:g} m",
+            str(one.pairs),
+            _or_dash(one.translation, "m"),
+            _or_dash(one.translation_percent, "%"),
+            _or_dash(one.rotation_deg, "deg"),
+        ]
+        for name, of in whose
+        for one in of.relative
+        if one.pairs
+    ]
+    if rows:
+        print()
+        print_table(["relative (RPE)", "over", "pairs", "translation", "of it", "rotation"], rows)
+    missing = [f"{one.distance:g} m" for one in accuracy.relative if not one.pairs]
+    if missing:
+        print(f"no two poses of a robot are {' or '.join(missing)} apart along its path")
+
+
+def _nees_cells(of: Accuracy | RobotAccuracy) -> list[str]:
+    if isinstance(of, Accuracy):  # robots share errors, by how much is not known: their average has no interval
+        return ["-" if of.anees is None else f"{of.anees:.2f}", ""]
+    if of.nees is None:
+        return ["-", ""]
+    effective = f"{of.nees.effective:.0f} of {of.nees.poses}"
+    return [f"{of.nees.mean:.2f}", f"{of.nees.low:.2f} to {of.nees.high:.2f} ({effective} independent)"]
+
+
+def _or_dash(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{value:.3g} {unit}"
 
 
 def print_calibration(calibration: "Calibration") -> None:

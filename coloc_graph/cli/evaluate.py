@@ -1,39 +1,121 @@
-"""coloc evaluate DIR."""
+"""coloc evaluate DIR, or --estimate ROBOT=FILE ... --truth ROBOT=FILE ...: an estimate against truth."""
 
 import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coloc_graph.comparison import Comparison
+
+#: As in coloc_graph.evaluation, which is too heavy for --help.
+ALIGNMENTS = ("reference", "team", "robot", "none")
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """The command's arguments."""
-    command = commands.add_parser("evaluate", help="compare a result with the truth in its run")
-    command.add_argument("dir", metavar="DIR", help="a result of `coloc solve`")
+    command = commands.add_parser(
+        "evaluate",
+        help="compare a result, or TUM files, with truth",
+        description="Compare a result with the truth in its run, or trajectories of any program (TUM) with others: "
+        "lengths, ATE, RPE, NEES, per robot and for the team. See docs/evaluation.md.",
+    )
+    command.add_argument("dir", metavar="DIR", nargs="?", help="a result of `coloc solve`, or a folder of <robot>.tum")
+    command.add_argument(
+        "--estimate", nargs="+", default=[], metavar="ROBOT=FILE", help="instead of DIR: TUM files, or a folder of them"
+    )
+    command.add_argument(
+        "--truth", nargs="+", default=[], metavar="RUN|DIR|ROBOT=FILE", help="a run with truth, or TUM (the run's own)"
+    )
     command.add_argument("--run", dest="run_path", metavar="RUN", help="the run, if it is no longer where it was")
+    command.add_argument(
+        "--align",
+        choices=ALIGNMENTS,
+        help="by the reference's first pose (results with stances), by all poses of the team (others), each robot on "
+        "its own, or not at all",
+    )
+    command.add_argument(
+        "--reference", metavar="ROBOT", help="of TUM files: whose first pose `--align reference` takes"
+    )
+    command.add_argument("--planar", action="store_true", help="of TUM files: the robots stand on the plane z = 0")
+    command.add_argument("--robots", metavar="A,B", help="these alone")
+    command.add_argument("--rpe", metavar="M,M", type=_distances, help="distances of the RPE [m] (1,2,5,10)")
+    command.add_argument(
+        "--pairs-from-truth", action="store_true", help="distances of the RPE are those of the true path"
+    )
+    command.add_argument(
+        "--longest-gap", type=_seconds, metavar="S", help="truth is interpolated over no longer a gap (0.25)"
+    )
+    command.add_argument("--plot", metavar="FILE|DIR", help="pictures: one (.png, .svg, .pdf), or a folder of three")
+    command.add_argument("--force", action="store_true", help="replace pictures that are already there")
     command.add_argument("--json", action="store_true")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate and print."""
-    from coloc_graph.cli.accuracy import print_accuracy, print_promised
-    from coloc_graph.cli.printing import print_json
-    from coloc_graph.errors import InputError
-    from coloc_graph.evaluation import align, evaluate
-    from coloc_graph.results import accuracy_json, read_result
-    from coloc_graph.run import open_run, read_truth
+    """Compare, draw, print."""
+    from dataclasses import replace
 
-    result = read_result(args.dir)
-    run_path = args.run_path or result.run_path
-    result.require_run(run_path)
-    team = open_run(run_path).team
-    truth = read_truth(run_path)
-    if not truth:
-        raise InputError(f"{run_path}: the run holds no truth to compare with; record it on /<robot>/truth")
-    on_floor = team.floor is not None
-    true = align(result.trajectories, truth, team.reference, on_floor=on_floor)
-    accuracy = evaluate(result.trajectories, true, on_floor=on_floor)
+    from coloc_graph.cli.accuracy import print_accuracy, print_errors, print_promised
+    from coloc_graph.cli.printing import print_json, warn
+    from coloc_graph.evaluation import RPE_DISTANCES, accuracy_json
+
+    if args.plot:
+        from coloc_graph.report.comparison import comparison_drawings, require_plot_place, write_plots
+
+        require_plot_place(args.plot, force=args.force)  # before the work, not after it
+    comparison = _comparison(args)
+    if args.robots:
+        comparison = comparison.only([robot for robot in args.robots.split(",") if robot])
+    if args.longest_gap is not None:
+        comparison = replace(comparison, longest_gap=args.longest_gap)
+    accuracy, true = comparison.compare(args.rpe or RPE_DISTANCES, "truth" if args.pairs_from_truth else "estimate")
+    warn(accuracy.warnings)
+    written = []
+    if args.plot:
+        drawings = comparison_drawings(comparison.estimated, true, accuracy, on_floor=comparison.on_floor)
+        written = write_plots(args.plot, drawings, force=args.force)
     if args.json:
         print_json(accuracy_json(accuracy))
-    else:
-        print_accuracy(accuracy)
-        print_promised(result.trajectories)
+        return 0
+    print_accuracy(accuracy)
+    print_errors(accuracy)
+    print_promised(comparison.estimated)
+    if written:
+        print("written: " + ", ".join(str(path) for path in written))
     return 0
+
+
+def _comparison(args: argparse.Namespace) -> "Comparison":
+    """What the arguments say is compared with what."""
+    from coloc_graph import comparison
+    from coloc_graph.errors import InputError
+
+    if bool(args.dir) == bool(args.estimate):
+        raise InputError("what is compared is not said; give the folder of a result, or --estimate with TUM files")
+    if args.dir and comparison.is_result(args.dir):
+        if args.reference or args.planar:
+            raise InputError("--reference and --planar are for TUM files; of a result its team says so")
+        return comparison.of_result(args.dir, args.run_path, args.truth, args.align)
+    if args.run_path or not args.truth:
+        raise InputError("TUM files are compared with --truth; give a run with truth, or TUM files")
+    given = [args.dir] if args.dir else args.estimate
+    return comparison.of_files(given, args.truth, args.align, reference=args.reference, on_floor=args.planar)
+
+
+def _distances(text: str) -> tuple[float, ...]:
+    """`1,2,5` as metres."""
+    distances = sorted({_positive(part, "distances in metres, as 1,2,5") for part in text.split(",")})
+    return tuple(distances)
+
+
+def _seconds(text: str) -> float:
+    return _positive(text, "a time in seconds, as 0.25")
+
+
+def _positive(text: str, what: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"`{text}` is not positive; give {what}")
+    return value

@@ -55,6 +55,7 @@ def report(folder: Path, truth_path: Path | None = None) -> None:
     if assessed is None:
         print_last_poses(solution.estimate.trajectories)
     else:
+        warn(assessed[0].warnings)
         print_accuracy(assessed[0])
         print_promised(solution.estimate.trajectories)
     print_calibration(solution.estimate.calibration)

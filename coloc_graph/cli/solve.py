@@ -123,7 +123,7 @@ def _solved(
         with progress("stances measured") as report:
             solution = solve(run, options, report, entered)
         accuracy = write_result(solution, args.out)
-    warn(solution.warnings)
+    warn([*solution.warnings, *(accuracy.warnings if accuracy else ())])
     if args.json:
         print_json(summarise(solution, accuracy))
     else:

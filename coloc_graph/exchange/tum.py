@@ -24,7 +24,7 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
     """Write poses as `path` (.tum), and covariances with stance numbers as `path` with .cov.csv.
 
     Covariances are the upper triangle in GTSAM's tangent: rotation [rad] first, then translation [m], in the
-    body frame. Numbers are written so that they read back to the bit.
+    body frame; the stance is empty where poses belong to none. Numbers are written so that they read back to the bit.
     """
     lines = []
     for time, T in zip(trajectory.times, trajectory.T_world_body, strict=True):
@@ -32,20 +32,22 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
         numbers = [time, *T[:3, 3], x, y, z, w]
         lines.append(" ".join(repr(float(number)) for number in numbers))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    if trajectory.covariances is None or trajectory.stances is None:
+    if trajectory.covariances is None:
         return
     rows = [COVARIANCE_HEADER]
-    for stance, time, covariance in zip(trajectory.stances, trajectory.times, trajectory.covariances, strict=True):
-        rows.append(",".join([str(int(stance)), *(repr(float(x)) for x in (time, *(covariance[ij] for ij in _UPPER)))]))
+    stances = [""] * len(trajectory) if trajectory.stances is None else [str(int(one)) for one in trajectory.stances]
+    for stance, time, covariance in zip(stances, trajectory.times, trajectory.covariances, strict=True):
+        rows.append(",".join([stance, *(repr(float(x)) for x in (time, *(covariance[ij] for ij in _UPPER)))]))
     path.with_suffix(".cov.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
 def read_tum(path: Path) -> Trajectory:
     """The trajectory in a .tum file, with covariances where the .cov.csv lies beside it; the robot is its name.
 
-    Raises `InputError` naming file and line.
+    Raises `InputError` naming file and line, also where times do not increase.
     """
-    poses, times = [], []
+    poses: list[Array] = []
+    times: list[float] = []
     for number, line in enumerate(_lines(path), start=1):
         if not line.strip() or line.startswith("#"):
             continue
@@ -54,19 +56,25 @@ def read_tum(path: Path) -> Trajectory:
         if abs(length - 1) > 1e-3:
             raise InputError(f"{path}, line {number}: the quaternion is not of unit length; write qx qy qz qw")
         x, y, z, w = (value / length for value in values[4:])  # GTSAM does not normalise
+        if times and not values[0] > times[-1]:
+            raise InputError(
+                f"{path}, line {number}: the time {values[0]!r} does not come after {times[-1]!r}; "
+                "sort the poses by time, one an instant"
+            )
         times.append(values[0])
         poses.append(gtsam.Pose3(gtsam.Rot3(w, x, y, z), np.array(values[1:4])).matrix())
     stances, covariances = None, None
     beside = path.with_suffix(".cov.csv")
     if beside.exists():
+        cells = [line.split(",") for line in _lines(beside)[1:]]
+        of_stances = any(one[0] for one in cells)
         rows = [
-            _numbers(beside, number, line.split(","), 23)
-            for number, line in enumerate(_lines(beside), start=1)
-            if number > 1
+            _numbers(beside, number, one if of_stances else ["0", *one[1:]], 23)
+            for number, one in enumerate(cells, start=2)
         ]
         if len(rows) != len(poses):
             raise InputError(f"{beside} has {len(rows)} rows and {path.name} {len(poses)} poses; write both anew")
-        stances = np.array([int(row[0]) for row in rows])
+        stances = np.array([int(row[0]) for row in rows]) if of_stances else None
         covariances = np.zeros((len(rows), 6, 6))
         for row, covariance in zip(rows, covariances, strict=True):
             for (i, j), value in zip(_UPPER, row[2:], strict=True):

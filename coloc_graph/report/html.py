@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from coloc_graph._version import __version__
-from coloc_graph.evaluation import Accuracy, RobotAccuracy
+from coloc_graph.evaluation import Accuracy, RelativeError, RobotAccuracy
 from coloc_graph.frontend import PairMeasurement
 from coloc_graph.pipeline import Solution
 from coloc_graph.report.drawing import Truth, position_sigmas, trajectories_of
@@ -61,7 +61,7 @@ def render_report(solution: Solution, accuracy: Accuracy | None, truth: Truth | 
         f'<p class="soft">{_headline(solution)}</p>',
         _verdict(solution, accuracy),
         _accuracy_section(accuracy) if accuracy is not None else "",
-        _warnings_section(solution.warnings),
+        _warnings_section([*solution.warnings, *(accuracy.warnings if accuracy is not None else ())]),
         _calibration_section(solution),
         _figures_section(solution, truth),
         _used_section(solution),
@@ -165,7 +165,47 @@ def _accuracy_section(accuracy: Accuracy) -> str:
             f" The squared error is {_number(accuracy.anees, 2)} times what the covariances predict "
             f"(NEES per degree of freedom, {_many(accuracy.nees_poses, 'pose')}; 1 is honest)."
         )
-    return f'<h2>Accuracy</h2>\n{_table(head, rows, [0], foot)}\n<p class="soft">{note}</p>'
+    first = f'<h2>Accuracy</h2>\n{_table(head, rows, [0], foot)}\n<p class="soft">{note}</p>'
+    return f"{first}\n{_errors_table(accuracy)}\n{_relative_table(accuracy)}"
+
+
+def _errors_table(accuracy: Accuracy) -> str:
+    """Errors over all poses, and whether each robot's NEES is one that honest covariances give."""
+    head = ["All poses", *("RMSE [cm]", "Mean", "Median", "Max"), *("RMSE [°]", "Mean", "Median", "Max"), "NEES",
+            "95 % if honest"]  # fmt: skip
+    rows = []
+    for row in accuracy.robots:
+        spreads = [_number(100 * value, 2) for value in dataclasses.astuple(row.translation)]
+        spreads += [_number(value, 2) for value in dataclasses.astuple(row.rotation_deg)]
+        nees = [DASH, DASH]
+        if row.nees is not None:
+            interval = f"{_number(row.nees.low, 2)}&nbsp;to&nbsp;{_number(row.nees.high, 2)}"
+            value = _number(row.nees.mean, 2)
+            nees = [value if row.nees.consistent else f'<span class="bad">{value}</span>', interval]
+        rows.append([escape(row.robot), *spreads, *nees])
+    note = (
+        "Position and rotation over all poses. The NEES of a robot whose covariances are honest is seldom outside of "
+        "the interval, which is wide since neighbouring poses share errors: few of them are independent."
+    )
+    return f'{_table(head, rows, [0])}\n<p class="soft">{note}</p>'
+
+
+def _relative_table(accuracy: Accuracy) -> str:
+    """Errors over stretches of the way, of the distances that some robot went."""
+    which = [k for k, one in enumerate(accuracy.relative) if one.pairs]
+    if not which:
+        return ""
+    head = ["Relative (RPE)", *(f"{accuracy.relative[k].distance:g} m" for k in which)]
+    whose = [*((row.robot, row.relative) for row in accuracy.robots), ("Team", accuracy.relative)]
+    rows = [[escape(name), *(_relative_cell(relative[k]) for k in which)] for name, relative in whose]
+    note = "RMS error of translation, in % of the distance travelled, and of rotation between two poses so far apart."
+    return f'{_table(head, rows[:-1], [0], rows[-1])}\n<p class="soft">{note}</p>'
+
+
+def _relative_cell(one: RelativeError) -> str:
+    if not one.pairs:
+        return DASH
+    return f"{_number(one.translation_percent, 2)}&nbsp;%, {_number(one.rotation_deg, 2)}°"
 
 
 def _calibration_section(solution: Solution) -> str:

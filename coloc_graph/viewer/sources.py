@@ -14,7 +14,7 @@ import numpy as np
 from coloc_graph.backend import Estimate, Method, chain, smooth
 from coloc_graph.backend.graph import Places
 from coloc_graph.errors import EstimationError, InputError
-from coloc_graph.evaluation import align
+from coloc_graph.evaluation import align, left_out, with_truth
 from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions, WheelTrack
 from coloc_graph.measurements import RelativePose
 from coloc_graph.pipeline import Progress, Solution, SolveOptions, solve
@@ -172,8 +172,11 @@ def _true(
         true = align(estimated, truth, run.team.reference, on_floor=run.team.floor is not None)
     except InputError as error:
         return (), (f"the truth in the run is not shown: {error}",)
-    trajectories = {robot: replace(one, T_world_body=true[robot], covariances=None) for robot, one in estimated.items()}
-    return (layer_of(TRUE, robots, stances, trajectories),), ()
+    trajectories = {
+        robot: replace(one, T_world_body=true[robot], covariances=None).where(with_truth(true[robot]))
+        for robot, one in estimated.items()
+    }
+    return (layer_of(TRUE, robots, stances, trajectories),), left_out(estimated, true)
 
 
 def _wheels(run: Run | None) -> dict[str, WheelTrack]:

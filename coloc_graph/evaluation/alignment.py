@@ -1,0 +1,113 @@
+"""Truth taken into the estimate's world: by the reference's first pose, by a fit, or as it is."""
+
+from collections.abc import Mapping
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import InputError
+from coloc_graph.evaluation.truth import LONGEST_TRUTH_GAP, true_poses, with_truth
+from coloc_graph.lie import closest_rotation, floor_pose, se3, se3_inverse, yaw
+from coloc_graph.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+#: What of the estimate and the truth is made to agree before they are compared.
+#: `reference`: the reference robot's first pose; `team`: all poses of all robots, by one rigid motion;
+#: `robot`: each robot's own poses, by its own; `none`: nothing, since both are in the same world.
+Alignment = Literal["reference", "team", "robot", "none"]
+ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
+
+#: Positions that reach no further across their line, or about their point, than this part of their length have no
+#: rotation of their own (variances, so that this is 0.03 mm a metre).
+_THIN = 1e-9
+
+
+def usual_alignment(estimated: Mapping[str, Trajectory]) -> Alignment:
+    """By the reference, in whose world poses at stances are; by the team where poses belong to no stances."""
+    return "reference" if all(one.stances is not None for one in estimated.values()) else "team"
+
+
+def align(
+    estimated: Mapping[str, Trajectory],
+    truth: Mapping[str, Trajectory],
+    reference: str | None = None,
+    *,
+    on_floor: bool,
+    alignment: Alignment = "reference",
+    longest_gap: float = LONGEST_TRUTH_GAP,
+) -> dict[str, Array]:
+    """The true poses T_world_body (n, 4, 4) at each robot's estimated poses, in the estimate's world; NaN without.
+
+    They are found by time (`true_poses`). On a floor the truth is turned and moved on it only. `reference` is the
+    robot that defines the world, where that is what is aligned. Raises `InputError` where the truth lacks a robot or
+    is at none of its times, and where what is to be aligned says too little.
+    """
+    at = {robot: true_poses(truth, one, longest_gap) for robot, one in estimated.items()}
+    if alignment == "none":
+        return at
+    if alignment == "reference":
+        T_world_truth = _of_reference(estimated, at, reference, on_floor=on_floor)
+        return {robot: T_world_truth @ poses for robot, poses in at.items()}
+    if alignment == "team":
+        T_world_truth = _fitted(estimated, at, on_floor=on_floor)
+        return {robot: T_world_truth @ poses for robot, poses in at.items()}
+    return {
+        robot: _fitted({robot: estimated[robot]}, {robot: poses}, on_floor=on_floor) @ poses
+        for robot, poses in at.items()
+    }
+
+
+def _of_reference(
+    estimated: Mapping[str, Trajectory], at: Mapping[str, Array], reference: str | None, *, on_floor: bool
+) -> Array:
+    """T_world_truth (4, 4) that puts the reference's first pose where it truly was."""
+    if reference is None or reference not in at:
+        raise InputError(f"the estimate does not hold the reference robot {reference}; nothing can be compared")
+    first = estimated[reference]
+    if not with_truth(at[reference])[0]:
+        begins = f"stance {first.stances[0]}" if first.stances is not None else f"{first.times[0]:.3f} s"
+        raise InputError(
+            f"the truth of the reference robot {reference} begins after {begins}, where the estimate does; "
+            "record it from there on, or align the team"
+        )
+    T_truth_body, T_world_body = at[reference][0], first.T_world_body[0]
+    if on_floor:
+        T_truth_body, T_world_body = (floor_pose(T[0, 3], T[1, 3], yaw(T)) for T in (T_truth_body, T_world_body))
+    return np.asarray(T_world_body @ se3_inverse(T_truth_body))
+
+
+def _fitted(estimated: Mapping[str, Trajectory], at: Mapping[str, Array], *, on_floor: bool) -> Array:
+    """T_world_truth (4, 4) that brings all true positions nearest to the estimated ones.
+
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, without scale.
+    """
+    known = {robot: with_truth(poses) for robot, poses in at.items()}
+    to = np.concatenate([one.positions[known[robot]] for robot, one in estimated.items()])
+    of = np.concatenate([poses[known[robot], :3, 3] for robot, poses in at.items()])
+    size = 2 if on_floor else 3
+    a, b = (to - to.mean(0))[:, :size], (of - of.mean(0))[:, :size]
+    spreads = np.array([np.linalg.eigvalsh(x.T @ x / len(x))[::-1] for x in (a, b)])
+    if (spreads[:, 0] < 1e-12).any() or (not on_floor and (spreads[:, 1] < _THIN * spreads[:, 0]).any()):
+        whose = ", ".join(estimated)
+        shape, remedy = "in one place", "reference"
+        if spreads.shape[1] == 3 and not (spreads[:, 0] < 1e-12).any():
+            shape, remedy = "on one line", "reference, or planar if they are on a floor"
+        raise InputError(
+            f"all poses of {whose} are {shape}, so that no rotation can be fitted; align by another way ({remedy})"
+        )
+    R = np.eye(3)
+    R[:size, :size] = _rotation(a.T @ b)
+    t = to.mean(0) - R @ of.mean(0)
+    if on_floor:
+        t[2] = 0.0  # heights are those above the floor, in the estimate and in truth
+    return se3(R, t)
+
+
+def _rotation(M: Array) -> Array:
+    """The rotation nearest to a matrix of two or three dimensions."""
+    if len(M) == 3:
+        return closest_rotation(M)
+    angle = np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])
+    return floor_pose(0, 0, angle)[:2, :2]

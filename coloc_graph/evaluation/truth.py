@@ -1,0 +1,80 @@
+"""True poses at the times of an estimate, and what is left out where there is no truth."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import InputError
+from coloc_graph.lie import so3_exp, so3_log
+from coloc_graph.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+#: True poses further apart in time than this are not joined [s].
+LONGEST_TRUTH_GAP = 0.25
+#: Instants no further apart than this are the same [s]: times of floats and of nanoseconds differ in the last digits.
+SAME_TIME = 1e-6
+
+
+def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, longest_gap: float = LONGEST_TRUTH_GAP) -> Array:
+    """The true poses (n, 4, 4) at an estimate's times, interpolated between two that are near; NaN without truth.
+
+    Near is at most `longest_gap` [s] apart. In a longer gap a robot of an estimate with stances stood where it was
+    before, since robots stand while they observe and truth may be sparse then; of one without, nothing is known.
+    Raises `InputError` where the truth lacks the robot, or is at none of its times.
+    """
+    true = truth.get(estimated.robot)
+    if true is None or not len(true):
+        raise InputError(
+            f"the truth does not hold robot {estimated.robot}, which the estimate does; "
+            "give its truth, or leave the robot out"
+        )
+    times = estimated.times
+    index = np.searchsorted(true.times, times + SAME_TIME, side="right") - 1
+    known = (index >= 0) & (times <= true.times[-1] + SAME_TIME)
+    index = index.clip(min=0)
+    after = np.minimum(index + 1, len(true) - 1)
+    gap = true.times[after] - true.times[index]
+    near = (gap > 0) & (gap <= longest_gap)
+    if estimated.stances is None:
+        known &= near | (times <= true.times[index] + SAME_TIME)
+    if not known.any():
+        raise InputError(
+            f"the truth of robot {estimated.robot} is at none of its times: the estimate reaches from "
+            f"{_span(times)}, the truth from {_span(true.times)}, with gaps; check the clocks, or record truth "
+            "more often"
+        )
+    share = np.where(near, ((times - true.times[index]) / np.where(near, gap, 1.0)).clip(0, 1), 0.0)[:, None]
+    T_world_body, ahead = true.T_world_body[index].copy(), true.T_world_body[after]
+    moved = share[:, 0] > 0
+    turn = so3_log(T_world_body[moved, :3, :3].mT @ ahead[moved, :3, :3])
+    T_world_body[moved, :3, :3] = T_world_body[moved, :3, :3] @ so3_exp(share[moved] * turn)
+    T_world_body[:, :3, 3] += share * (ahead[:, :3, 3] - T_world_body[:, :3, 3])
+    T_world_body[~known] = np.nan
+    return T_world_body
+
+
+def with_truth(true: Array) -> NDArray[np.bool_]:
+    """At which of its poses (n, 4, 4) an estimate has a true one, (n,)."""
+    return np.asarray(np.isfinite(true).all(axis=(1, 2)))
+
+
+def left_out(estimated: Mapping[str, Trajectory], true: Mapping[str, Array]) -> tuple[str, ...]:
+    """A sentence a robot on the poses that have no true one, and are left out."""
+    sentences = []
+    for robot in estimated:
+        known = np.flatnonzero(with_truth(true[robot]))
+        n, lost = len(true[robot]), len(true[robot]) - len(known)
+        if not lost:
+            continue
+        before, after = int(known[0]), n - 1 - int(known[-1])
+        sentences.append(
+            f"robot {robot}: {lost} of {n} poses are left out, since there is no truth at their times "
+            f"({before} before it begins, {after} after it ends, {lost - before - after} in its gaps)"
+        )
+    return tuple(sentences)
+
+
+def _span(times: Array) -> str:
+    return f"{times[0]:.3f} to {times[-1]:.3f} s"
