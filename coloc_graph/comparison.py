@@ -91,7 +91,8 @@ def of_result(
             raise InputError(
                 f"{run}: the run holds no truth to compare with; record it on /<robot>/truth, or give it with --truth"
             )
-    alignment = alignment or usual_alignment(estimated)
+    on_map = result.summary.get("world") == "map"
+    alignment = alignment or ("none" if on_map else usual_alignment(estimated))
     return Comparison(estimated, true, alignment, team.reference, team.floor is not None)
 
 

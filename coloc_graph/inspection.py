@@ -27,6 +27,8 @@ class Finding:
 def inspect(run: Run) -> list[Finding]:
     """Everything that is wrong with a run, without looking into its images."""
     findings = [Finding("file", warning) for warning in run.warnings]
+    if run.has_ranges and not run.stances:
+        return [*findings, *_drive_findings(run)]
     if not run.stances:
         findings.append(Finding("run", "it holds no stance, so that there is nothing to solve: record one"))
     elif run.team.reference not in run.stances[0].observers:
@@ -35,6 +37,21 @@ def inspect(run: Run) -> list[Finding]:
         )
     for before, stance in zip((None, *run.stances), run.stances, strict=False):
         findings += _stance_findings(run, before, stance)
+    return findings
+
+
+def _drive_findings(run: Run) -> list[Finding]:
+    """What is wrong with a run of robots that drive all the time."""
+    findings = []
+    for robot in run.team.names:
+        if run.topics.get(f"/{robot}/ranges") and not run.topics.get(f"/{robot}/odometry"):
+            findings.append(Finding(robot, "it measured ranges and has no odometry: record it too"))
+        elif run.topics.get(f"/{robot}/ranges") and run.team[robot].ranging is None:
+            findings.append(Finding(robot, "the team does not say how well it measures: give it [robots.ranging]"))
+    if not any(landmark.position is not None for landmark in run.team.landmarks):
+        findings.append(
+            Finding("team", "no landmark's position is stated: the world is where the reference robot begins")
+        )
     return findings
 
 

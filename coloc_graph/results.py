@@ -13,7 +13,8 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,18 +91,9 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
     """
     from coloc_graph.report import render_report  # matplotlib is heavy, and of no use to who only reads results
 
-    out = Path(out)
-    require_place(out)
     assessed = assess(solution)
     accuracy, true = assessed if assessed is not None else (None, None)
-
-    place = out.resolve()  # "." has no name, and a link's target is what is replaced
-    place.parent.mkdir(parents=True, exist_ok=True)
-    # a folder of our own beside it, whose name nobody else has
-    work = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
-    part, old = work / "new", work / "old"
-    (part / "trajectories").mkdir(parents=True)
-    try:
+    with whole_result(out) as part:
         for robot, trajectory in solution.estimate.trajectories.items():
             write_tum(trajectory, part / "trajectories" / f"{robot}.tum")
         write_g2o(solution.estimate, part / "graph.g2o")
@@ -111,9 +103,25 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
             write_team(solution.estimate.calibration.of_team(solution.run.team), part / "team.toml")
         (part / CONFIG).write_text(tomli_w.dumps(_config(solution)), encoding="utf-8")
         (part / "report.html").write_text(render_report(solution, accuracy, true), encoding="utf-8")
-        run_path = os.path.relpath(solution.run.path.absolute(), out.absolute())
-        summary = summarise(solution, accuracy) | {"run": run_path, "run_id": run_id(solution.run.path)}
-        (part / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        write_summary(summarise(solution, accuracy), solution.run.path, out, part)
+    return accuracy
+
+
+@contextmanager
+def whole_result(out: str | Path) -> Iterator[Path]:
+    """A folder to write a result to, with trajectories/ in it, which is at `out` once it is whole.
+
+    An earlier result there is replaced then, and stays as it was after an exception.
+    """
+    require_place(out)
+    place = Path(out).resolve()  # "." has no name, and a link's target is what is replaced
+    place.parent.mkdir(parents=True, exist_ok=True)
+    # a folder of our own beside it, whose name nobody else has
+    work = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
+    part, old = work / "new", work / "old"
+    (part / "trajectories").mkdir(parents=True)
+    try:
+        yield part
         if place.exists():
             place.rename(old)
         part.rename(place)
@@ -123,7 +131,12 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
         raise
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    return accuracy
+
+
+def write_summary(summary: dict[str, Any], run: Path, out: str | Path, part: Path) -> None:
+    """Write summary.json into `part` of the result `out`, with which run it is of."""
+    named = summary | {"run": os.path.relpath(run.absolute(), Path(out).absolute()), "run_id": run_id(run)}
+    (part / SUMMARY).write_text(json.dumps(named, indent=2) + "\n", encoding="utf-8")
 
 
 def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:

@@ -29,7 +29,7 @@ LAYERS = [
     {"exchange", "pipeline", "inspection"},
     {"report", "online"},
     {"results"},
-    {"experiments", "viewer", "many_runs", "comparison"},
+    {"drive_results", "experiments", "viewer", "many_runs", "comparison"},
     {"cli"},
 ]
 RANK = {part: rank for rank, parts in enumerate(LAYERS) for part in parts}

@@ -39,6 +39,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--port", type=int, default=8080, help="of --view (8080)")
     command.add_argument("--no-browser", action="store_true", help="with --view, do not open a browser")
     command.add_argument("--without-odometry", action="store_true", help="leave out what the wheels say")
+    command.add_argument("--without-robots", action="store_true", help="leave out what robots measured of each other")
     command.add_argument("--processes", type=int, metavar="N", help="of a folder, so many at a time (one a core)")
     command.add_argument("--cluster", metavar="ADDRESS", help="of a folder, by the Dask scheduler at tcp://HOST:PORT")
     command.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -72,6 +73,17 @@ def run(args: argparse.Namespace) -> int:
         require_free("127.0.0.1", args.port)
     with _earlier_result_named(args.out):
         logged = open_run(args.run_path)
+    if logged.has_ranges and not logged.stances:
+        from coloc_graph.cli.solve_drive import solve_one_drive
+
+        if args.view or args.method != "joint":
+            raise InputError(
+                f"{args.run_path} holds ranges of robots that drive, and no stances: --method and --view are not for it"
+            )
+        with _earlier_result_named(args.out):
+            return solve_one_drive(args, logged)
+    if args.without_robots:
+        raise InputError(f"{args.run_path} holds no ranges; --without-robots is for runs that do")
     if not args.view:
         _solved(args, logged, options)
         return 0

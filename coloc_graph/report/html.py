@@ -2,50 +2,20 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from html import escape
 from typing import Any
 
 import numpy as np
 
 from coloc_graph._version import __version__
-from coloc_graph.evaluation import Accuracy, RelativeError, RobotAccuracy
+from coloc_graph.evaluation import Accuracy, RobotAccuracy
 from coloc_graph.frontend import PairMeasurement
 from coloc_graph.pipeline import Solution
+from coloc_graph.report.accuracy import accuracy_section
 from coloc_graph.report.drawing import Truth, position_sigmas, trajectories_of
-from coloc_graph.report.plots import error_figure, figure_svg, residual_figure, trajectories_figure
-
-DASH = "–"
-
-_CSS = """
-:root { color-scheme: light dark; --ink: #24292f; --soft: #59636e; --line: #d8dee4; --page: #ffffff;
-  --wash: #f6f8fa; --bad: #a63a00; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e6edf3; --soft: #9aa4af; --line: #30363d; --page: #0d1117;
-  --wash: #161b22; --bad: #ff9d66; } }
-body { margin: 0 auto; padding: 2.5rem 1.5rem 4rem; max-width: 60rem; background: var(--page); color: var(--ink);
-  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
-h1 { font-size: 1.75rem; line-height: 1.25; margin: 0; overflow-wrap: anywhere; }
-h2 { font-size: 1.15rem; margin: 2.5rem 0 .75rem; }
-p { margin: .5rem 0; }
-.soft, figcaption, footer { color: var(--soft); font-size: .9rem; }
-.verdict { margin: 1.5rem 0; padding: .75rem 1.1rem; background: var(--wash); border-left: 4px solid #0072b2;
-  border-radius: 4px; font-size: 1.1rem; font-variant-numeric: tabular-nums; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: .9rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .35rem .65rem; text-align: right; border-bottom: 1px solid var(--line); vertical-align: top; }
-th { color: var(--soft); font-weight: 600; }
-th.text, td.text { text-align: left; overflow-wrap: break-word; }
-tfoot td { font-weight: 600; border-bottom: 0; }
-.bad { color: var(--bad); }
-figure { margin: 0 0 1.75rem; }
-.card { background: #ffffff; border: 1px solid var(--line); border-radius: 6px; padding: .75rem; }
-.card svg { display: block; width: 100%; height: auto; }
-figcaption { margin-top: .4rem; }
-summary { cursor: pointer; }
-ul { padding-left: 1.2rem; }
-li { margin: .3rem 0; overflow-wrap: anywhere; }
-footer { margin-top: 3rem; border-top: 1px solid var(--line); padding-top: .75rem; }
-"""
+from coloc_graph.report.page import DASH, document, figure_card, many, number, table, warnings_section
+from coloc_graph.report.plots import error_figure, residual_figure, trajectories_figure
 
 
 def render_report(solution: Solution, accuracy: Accuracy | None, truth: Truth | None) -> str:
@@ -60,8 +30,8 @@ def render_report(solution: Solution, accuracy: Accuracy | None, truth: Truth | 
         f"<h1>{escape(name)}</h1>",
         f'<p class="soft">{_headline(solution)}</p>',
         _verdict(solution, accuracy),
-        _accuracy_section(accuracy) if accuracy is not None else "",
-        _warnings_section([*solution.warnings, *(accuracy.warnings if accuracy is not None else ())]),
+        accuracy_section(accuracy) if accuracy is not None else "",
+        warnings_section([*solution.warnings, *(accuracy.warnings if accuracy is not None else ())]),
         _calibration_section(solution),
         _figures_section(solution, truth),
         _used_section(solution),
@@ -69,14 +39,7 @@ def render_report(solution: Solution, accuracy: Accuracy | None, truth: Truth | 
         f"<footer>coloc-graph {escape(__version__)}. Metres, degrees and pixels; the world is the reference robot's "
         "body at its first stance.</footer>",
     ]
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\n"
-        f"<title>{escape(name)}: {escape(solution.estimate.method)}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
-        + "\n".join(section for section in sections if section)
-        + "\n</body>\n</html>\n"
-    )
+    return document(f"{name}: {solution.estimate.method}", sections)
 
 
 def _headline(solution: Solution) -> str:
@@ -84,22 +47,13 @@ def _headline(solution: Solution) -> str:
     robots = ", ".join(one.robot for one in trajectories_of(solution.estimate))
     return (
         f"Method <b>{escape(solution.estimate.method)}</b>; robots {escape(robots) or DASH}; "
-        f"{_many(len(solution.run.stances), 'stance')}; {_many(used, 'measurement')} used, {refused} refused"
+        f"{many(len(solution.run.stances), 'stance')}; {many(used, 'measurement')} used, {refused} refused"
     )
 
 
 def _counts(solution: Solution) -> tuple[int, int]:
     refused = len(solution.measurements) - solution.used
     return len(solution.measurements) - refused, refused
-
-
-def _many(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
-
-
-def _number(value: float | None, digits: int) -> str:
-    """A number, or a dash where there is none."""
-    return f"{value:.{digits}f}" if value is not None and math.isfinite(value) else DASH
 
 
 def _verdict(solution: Solution, accuracy: Accuracy | None) -> str:
@@ -109,103 +63,19 @@ def _verdict(solution: Solution, accuracy: Accuracy | None) -> str:
     else:
         for one in trajectories_of(solution.estimate):
             length = 100 * float(np.linalg.norm(one.positions[-1] - one.positions[0]))
-            sigma = _number(200 * float(position_sigmas(one)[-1]), 1)
-            lines.append(f"{escape(one.robot)}: {_number(length, 1)} cm estimated, end ± {sigma} cm (predicted 2σ)")
+            sigma = number(200 * float(position_sigmas(one)[-1]), 1)
+            lines.append(f"{escape(one.robot)}: {number(length, 1)} cm estimated, end ± {sigma} cm (predicted 2σ)")
     return f'<div class="verdict">{"<br>".join(lines)}</div>' if lines else ""
 
 
 def _robot_verdict(row: RobotAccuracy) -> str:
     name = escape(row.robot)
     if row.length_error_percent is None:
-        return f"{name}: stayed where it was, {_number(100 * row.end_position_error, 2)} cm off"
+        return f"{name}: stayed where it was, {number(100 * row.end_position_error, 2)} cm off"
     return (
-        f"{name}: {_number(100 * row.true_length, 1)} cm true, {_number(100 * row.estimated_length, 1)} cm estimated, "
-        f"<b>{_number(row.length_error_percent, 2)} %</b>"
+        f"{name}: {number(100 * row.true_length, 1)} cm true, {number(100 * row.estimated_length, 1)} cm estimated, "
+        f"<b>{number(row.length_error_percent, 2)} %</b>"
     )
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], text: Sequence[int], foot: Sequence[str] = ()) -> str:
-    """A table of cells that are HTML already; the columns of `text` are set to the left."""
-
-    def cells(tag: str, row: Sequence[str]) -> str:
-        return "".join(
-            f'<{tag} class="text">{cell}</{tag}>' if column in text else f"<{tag}>{cell}</{tag}>"
-            for column, cell in enumerate(row)
-        )
-
-    body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    last = f"<tfoot><tr>{cells('td', foot)}</tr></tfoot>" if foot else ""
-    head_row = f"<thead><tr>{cells('th', head)}</tr></thead>"
-    return f'<div class="wide"><table>{head_row}\n<tbody>\n{body}\n</tbody>{last}</table></div>'
-
-
-def _accuracy_section(accuracy: Accuracy) -> str:
-    head = ["Robot", "True [cm]", "Est. [cm]", "Error [cm]", "Error [%]", "ATE [cm]", "End [cm]", "Heading [°]"]
-    rows = [
-        [
-            escape(row.robot),
-            _number(100 * row.true_length, 1),
-            _number(100 * row.estimated_length, 1),
-            _number(100 * abs(row.length_error), 2),
-            _number(row.length_error_percent, 2),
-            _number(100 * row.ate, 2),
-            _number(100 * row.end_position_error, 2),
-            _number(row.heading_error_deg, 2),
-        ]
-        for row in accuracy.robots
-    ]
-    team = [_number(100 * accuracy.ate, 2), _number(100 * accuracy.end_position_error, 2)]
-    foot = ["Team", *[""] * 4, *team, _number(accuracy.heading_error_deg, 2)]
-    note = (
-        "Lengths are straight from the first to the last pose, as in the paper's Table II. ATE is the RMS position "
-        "error over all poses; end and heading are those of the last pose, the team's its worst."
-    )
-    if accuracy.anees is not None:
-        note += (
-            f" The squared error is {_number(accuracy.anees, 2)} times what the covariances predict "
-            f"(NEES per degree of freedom, {_many(accuracy.nees_poses, 'pose')}; 1 is honest)."
-        )
-    first = f'<h2>Accuracy</h2>\n{_table(head, rows, [0], foot)}\n<p class="soft">{note}</p>'
-    return f"{first}\n{_errors_table(accuracy)}\n{_relative_table(accuracy)}"
-
-
-def _errors_table(accuracy: Accuracy) -> str:
-    """Errors over all poses, and whether each robot's NEES is one that honest covariances give."""
-    head = ["All poses", *("RMSE [cm]", "Mean", "Median", "Max"), *("RMSE [°]", "Mean", "Median", "Max"), "NEES",
-            "95 % if honest"]  # fmt: skip
-    rows = []
-    for row in accuracy.robots:
-        spreads = [_number(100 * value, 2) for value in dataclasses.astuple(row.translation)]
-        spreads += [_number(value, 2) for value in dataclasses.astuple(row.rotation_deg)]
-        nees = [DASH, DASH]
-        if row.nees is not None:
-            interval = f"{_number(row.nees.low, 2)}&nbsp;to&nbsp;{_number(row.nees.high, 2)}"
-            value = _number(row.nees.mean, 2)
-            nees = [value if row.nees.consistent else f'<span class="bad">{value}</span>', interval]
-        rows.append([escape(row.robot), *spreads, *nees])
-    note = (
-        "Position and rotation over all poses. The NEES of a robot whose covariances are honest is seldom outside of "
-        "the interval, which is wide since neighbouring poses share errors: few of them are independent."
-    )
-    return f'{_table(head, rows, [0])}\n<p class="soft">{note}</p>'
-
-
-def _relative_table(accuracy: Accuracy) -> str:
-    """Errors over stretches of the way, of the distances that some robot went."""
-    which = [k for k, one in enumerate(accuracy.relative) if one.pairs]
-    if not which:
-        return ""
-    head = ["Relative (RPE)", *(f"{accuracy.relative[k].distance:g} m" for k in which)]
-    whose = [*((row.robot, row.relative) for row in accuracy.robots), ("Team", accuracy.relative)]
-    rows = [[escape(name), *(_relative_cell(relative[k]) for k in which)] for name, relative in whose]
-    note = "RMS error of translation, in % of the distance travelled, and of rotation between two poses so far apart."
-    return f'{_table(head, rows[:-1], [0], rows[-1])}\n<p class="soft">{note}</p>'
-
-
-def _relative_cell(one: RelativeError) -> str:
-    if not one.pairs:
-        return DASH
-    return f"{_number(one.translation_percent, 2)}&nbsp;%, {_number(one.rotation_deg, 2)}°"
 
 
 def _calibration_section(solution: Solution) -> str:
@@ -230,14 +100,7 @@ def _calibration_section(solution: Solution) -> str:
         ]
         for row in rows
     ]  # fmt: skip
-    return f"<h2>Calibration</h2>\n{_table(head, cells, [0, 1])}"
-
-
-def _warnings_section(warnings: Sequence[str]) -> str:
-    if not warnings:
-        return ""
-    items = "\n".join(f"<li>{escape(warning)}</li>" for warning in warnings)
-    return f'<h2 class="bad">Warnings</h2>\n<ul>\n{items}\n</ul>'
+    return f"<h2>Calibration</h2>\n{table(head, cells, [0, 1])}"
 
 
 def _figures_section(solution: Solution, truth: Truth | None) -> str:
@@ -254,11 +117,7 @@ def _figures_section(solution: Solution, truth: Truth | None) -> str:
             "How well one homography explains each stance: 1 is what the stated pixel noise gives.",
         ),
     ]
-    parts = [
-        f'<figure>\n<div class="card" role="img" aria-label="{escape(caption)}">{figure_svg(figure, name)}</div>\n'
-        f"<figcaption>{escape(caption)}</figcaption>\n</figure>"
-        for name, figure, caption in figures
-    ]
+    parts = [figure_card(name, figure, caption) for name, figure, caption in figures]
     return "<h2>Figures</h2>\n" + "\n".join(parts)
 
 
@@ -275,7 +134,7 @@ def _used_section(solution: Solution) -> str:
         *_flat("", dataclasses.asdict(solution.options)),
     ]
     rows = [[escape(key), escape(value)] for key, value in facts]
-    return f"<h2>What was used</h2>\n{_table(['What', 'Value'], rows, [0, 1])}"
+    return f"<h2>What was used</h2>\n{table(['What', 'Value'], rows, [0, 1])}"
 
 
 def _flat(prefix: str, options: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -290,10 +149,10 @@ def _flat(prefix: str, options: dict[str, Any]) -> Iterator[tuple[str, str]]:
 def _measurements_section(solution: Solution) -> str:
     measurements = solution.measurements
     head = ["Stance", "Pair", "Points", "Inliers", "Residual", "Overlap [px]", "Normal error [°]", "Usable, or why not"]
-    table = _table(head, (_measurement_row(one, solution.why_not(one)) for one in measurements), [1, 7])
+    rows = table(head, (_measurement_row(one, solution.why_not(one)) for one in measurements), [1, 7])
     return (
-        f"<h2>Measurements</h2>\n<details>\n<summary>{_many(len(measurements), 'measured pair')}</summary>\n"
-        f"{table}\n</details>"
+        f"<h2>Measurements</h2>\n<details>\n<summary>{many(len(measurements), 'measured pair')}</summary>\n"
+        f"{rows}\n</details>"
     )
 
 
@@ -304,8 +163,8 @@ def _measurement_row(measured: PairMeasurement, why_not: str | None) -> list[str
         f"{escape(h.robot_i)}&nbsp;–&nbsp;{escape(h.robot_j)}",
         str(h.points),
         str(h.inliers),
-        _number(h.residual, 2),
-        _number(h.overlap_px, 0),
-        _number(math.degrees(pose.normal_error) if pose else None, 2),
+        number(h.residual, 2),
+        number(h.overlap_px, 0),
+        number(math.degrees(pose.normal_error) if pose else None, 2),
         "yes" if why_not is None else f'<span class="bad">{escape(why_not)}</span>',
     ]
