@@ -20,7 +20,7 @@ from coloc_graph.team import Team
 Array = NDArray[np.float64]
 
 #: Of so many measurements and steps of each robot it is looked how much of their residual the fit has taken away.
-SAMPLED = 150
+SAMPLED = 30
 #: Noise is not taken for less, or more, than so many times what is stated.
 NOISE_RANGE = (0.2, 5.0)
 

@@ -39,7 +39,7 @@ class Errors:
     ranging: tuple[Array, Array] | None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DriveEstimate:
     """Poses of all robots at their keyframes, landmarks, errors of wheels and sensors by robot.
 
@@ -62,6 +62,13 @@ class DriveEstimate:
     iterations: int
     on_map: bool
     unplaced: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        agreement = f", chi2/dof {self.chi2 / self.dof:.2f}" if self.dof > 0 else ""
+        return (
+            f"DriveEstimate({self.drive!r}, {len(self.trajectories)} robots and {len(self.landmarks)} landmarks placed, "
+            f"{int(self.doubted.sum())} measurements doubted{agreement})"
+        )
 
 
 def trajectory(robot: str, times: Array, poses: Array, covariances: Array) -> Trajectory:

@@ -1,0 +1,127 @@
+"""MR.CLAM datasets: batch and incremental against a centralised EKF, with and without the map and the other robots.
+
+    python benchmarks/mrclam.py --data DIR      DIR holds Barcodes.dat, Robot1_Odometry.dat, ...
+
+The EKF is that of `coloc_graph.backend.planar` (robots, landmarks, what is off of wheels and sensors, in one state),
+and the same without calibration, as filters on these data usually are. What is thought at the time is compared at the same
+instants: where the incremental estimate has just taken in what was measured.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import replace as with_new
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+
+from coloc_graph.backend.planar import filter_forward
+from coloc_graph.backend.planar.estimate import trajectory
+from coloc_graph.driving import DriveOptions, solve_drive
+from coloc_graph.evaluation import align, evaluate
+from coloc_graph.exchange.mrclam import import_mrclam
+from coloc_graph.frontend.keyframes import keyframes_of
+from coloc_graph.run import Run, open_run, read_truth
+from coloc_graph.trajectory import Trajectory
+
+
+def uncalibrated(run: Run) -> Run:
+    """The run of a team that takes wheels and sensors for exact."""
+    robots = tuple(
+        replace(
+            robot,
+            ranging=replace(
+                robot.ranging, offset_sigma=0.0, scale_sigma=0.0, bearing_offset_sigma_deg=0.0, place_sigma=0.0
+            ),
+            wheels=replace(robot.wheels, delay=0.0, scale_sigma=0.0, turn_scale_sigma=0.0, delay_sigma=0.0),
+        )
+        for robot in run.team.robots
+    )
+    return with_new(run, team=replace(run.team, robots=robots))
+
+
+def filtered(run: Run, between_robots: bool, at: Mapping[str, Trajectory]) -> tuple[dict[str, Trajectory], float]:
+    """What the EKF thinks at its time, at the instants of other trajectories; and the seconds it takes."""
+    drive = keyframes_of(run, between_robots=between_robots)
+    started = time.perf_counter()
+    found = filter_forward(run.team, drive)
+    seconds = time.perf_counter() - started
+    out = {}
+    for n, name in enumerate(drive.robots):
+        wanted = np.isin(drive.times[n], at[name].times) & np.isfinite(found.poses[n][:, 0])
+        poses, C = found.poses[n][wanted], found.covariances[n][wanted].copy()
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        R = np.zeros((len(poses), 3, 3))
+        R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = c, s, -s, c, 1.0
+        out[name] = trajectory(name, drive.times[n][wanted], poses, R @ C @ R.mT)
+    return out, seconds
+
+
+def report(label: str, trajectories: Mapping[str, Trajectory], run: Run, on_map: bool, seconds: float) -> np.ndarray:
+    """Print a row; RMS position errors by robot [m]."""
+    how = "none" if on_map else "team"
+    true = align(trajectories, read_truth(run.path), run.team.reference, on_floor=True, alignment=how)
+    accuracy = evaluate(trajectories, true, on_floor=True, alignment=how)
+    errors = np.array([row.translation.rmse for row in accuracy.robots])
+    nees = "-" if accuracy.anees is None else f"{accuracy.anees:.1f}"
+    heading = np.sqrt(np.mean([row.rotation_deg.rmse**2 for row in accuracy.robots]))
+    per_robot = " ".join(f"{100 * one:5.1f}" for one in errors)
+    print(f"{label:38s} {per_robot}   {heading:4.1f} deg   NEES {nees:>4s}   {seconds:5.1f} s", flush=True)
+    return errors
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", required=True, metavar="DIR")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        for map_known in (True, False):
+            path = Path(folder) / f"{map_known}.mcap"
+            summary = import_mrclam(args.data, path, map_known=map_known)
+            run = open_run(path)
+            for between_robots in (True, False):
+                print(
+                    f"\nmap {'known' if map_known else 'unknown'}, {'with' if between_robots else 'without'} robots "
+                    f"measuring each other; RMS position by robot [cm], {summary.seconds:.0f} s of data"
+                )
+                if not map_known and not between_robots:
+                    continue  # one team is several worlds then
+                batch = solve_drive(run, DriveOptions(between_robots=between_robots))
+                seconds = batch.seconds_backend + batch.seconds_frontend
+                of_batch = report("batch", batch.estimate.trajectories, run, map_known, seconds)
+                one = solve_drive(run, DriveOptions(incremental=True, between_robots=between_robots))
+                of_one = report("incremental", one.estimate.trajectories, run, map_known, one.seconds_backend)
+                report("incremental, at its time", one.online, run, map_known, one.seconds_backend)
+                ekf, seconds = filtered(run, between_robots, one.online)
+                report("EKF, calibrating", ekf, run, map_known, seconds)
+                ekf, seconds = filtered(uncalibrated(run), between_robots, one.online)
+                report("EKF", ekf, run, map_known, seconds)
+                ratios = of_one / of_batch
+                print(
+                    f"incremental / batch {ratios.min():.2f}-{ratios.max():.2f}; incremental is "
+                    f"{summary.seconds / one.seconds_backend:.1f} times real time; chi2/dof of the batch "
+                    f"{batch.estimate.chi2 / batch.estimate.dof:.2f}"
+                )
+                if not map_known:
+                    _report_map(batch.estimate.landmarks, args.data)
+
+
+def _report_map(landmarks: tuple, data: str) -> None:
+    """How well the landmarks are found, after one rigid alignment."""
+    truth = {f"L{int(row[0])}": row[1:3] for row in np.loadtxt(Path(data) / "Landmark_Groundtruth.dat")}
+    p = np.array([one.position for one in landmarks])
+    q = np.array([truth[one.name] for one in landmarks])
+    p0, q0 = p - p.mean(axis=0), q - q.mean(axis=0)
+    angle = np.arctan2((p0[:, 0] * q0[:, 1] - p0[:, 1] * q0[:, 0]).sum(), (p0 * q0).sum())
+    c, s = np.cos(angle), np.sin(angle)
+    off = np.hypot(*(p0 @ np.array([[c, s], [-s, c]]) - q0).T)
+    print(
+        f"landmarks, after one alignment: RMS {100 * np.sqrt((off**2).mean()):.1f} cm, at most {100 * off.max():.1f} cm"
+    )
+
+
+if __name__ == "__main__":
+    main()
