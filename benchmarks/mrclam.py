@@ -3,8 +3,8 @@
     python benchmarks/mrclam.py --data DIR      DIR holds Barcodes.dat, Robot1_Odometry.dat, ...
 
 The EKF is that of `coloc_graph.backend.planar` (robots, landmarks, what is off of wheels and sensors, in one state),
-and the same without calibration, as filters on these data usually are. What is thought at the time is compared at the same
-instants: where the incremental estimate has just taken in what was measured.
+and the same without calibration, as filters on these data usually are. What is thought at the time is compared at the
+same instants: where the incremental estimate has just taken in what was measured.
 """
 
 import argparse

@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 #: Of so many measurements and steps of each robot it is looked how much of their residual the fit has taken away.
 SAMPLED = 30
+#: Where the fit has left less than this of residuals, they say nothing of noise.
+LEAST_LEFT = 0.3
 #: Noise is not taken for less, or more, than so many times what is stated.
 NOISE_RANGE = (0.2, 5.0)
 
@@ -60,17 +62,19 @@ def _optimised(team: Team, drive: Drive, calibrate_noise: bool) -> DriveEstimate
     values = _start(filtered, factors, robots)
     graph = _graph(factors, values, robots)
     values, iterations = gauss_newton(graph.factors, values)
+    absorbed = None
     if calibrate_noise:
         found = _found(factors, values)
         marginals = gtsam.Marginals(graph.factors, values)
-        factors = DriveFactors(drive, models, _noise(factors, graph, found, values, marginals))
+        noise, absorbed = _noise(factors, graph, found, values, marginals)
+        factors = DriveFactors(drive, models, noise)
         graph = _graph(factors, values, robots)
         values, more = gauss_newton(graph.factors, values)
         iterations += more
     found = _found(factors, values, gtsam.Marginals(graph.factors, values))
     taken = np.zeros(len(drive.measured), bool)
     taken[graph.measured] = True
-    return summed_up(factors, found, taken, iterations)
+    return summed_up(factors, found, taken, iterations, absorbed)
 
 
 def _start(filtered: Filtered, factors: DriveFactors, robots: Sequence[int]) -> gtsam.Values:
@@ -150,11 +154,14 @@ def _found(factors: DriveFactors, values: gtsam.Values, marginals: gtsam.Margina
 
 def _noise(
     factors: DriveFactors, graph: _Graph, found: Found, values: gtsam.Values, marginals: gtsam.Marginals
-) -> Array:
+) -> tuple[Array, float]:
     """What standard deviations are to be multiplied with, (robots, 3): of ranges, bearings, steps.
 
-    Of a sum of squared residuals the fit has taken away a part: that of the sampled ones.
+    Of a sum of squared residuals the fit has taken away a part: that of the sampled ones. And how many degrees of
+    freedom the fit has left more than shares say: of a measurement with a share s, of which it has taken h, it has left
+    s (1 - h), and not s - h, since errors that last are not fitted as new ones would be.
     """
+    absorbed = 0.0
     drive, m = factors.drive, factors.drive.measured
     off = measured_off(factors, found)[graph.measured]
     good = np.abs(off).max(axis=1, initial=0.0) < DOUBTED
@@ -165,17 +172,18 @@ def _noise(
         if len(own):
             share = m.share[graph.measured[own]]
             some = rng.choice(own, min(SAMPLED, len(own)), replace=False)
-            taken = sum(_taken(graph.of_measured(int(n)), values, marginals) for n in some)
-            left = 1 - taken / m.share[graph.measured[some]].sum(axis=0)
+            taken = np.mean([_taken(graph.of_measured(int(n)), values, marginals) for n in some], axis=0)
             mean = (share * off[own] ** 2).sum(axis=0) / share.sum(axis=0)
-            noise[robot, :2] *= np.sqrt(mean / np.maximum(left, 0.1))
+            noise[robot, :2] *= np.sqrt(mean / np.maximum(1 - taken, LEAST_LEFT))
+            absorbed += float(((1 - share) * taken).sum())
         steps = len(drive.times[robot]) - 1
         if steps > 0:
             some = rng.choice(steps, min(SAMPLED, steps), replace=False)
             of_steps = [_taken(graph.factors.at(first + int(k)), values, marginals) for k in some]
             left = 1 - float(np.mean(of_steps))
-            noise[robot, 2] *= float(np.sqrt((steps_off(factors, found, robot) ** 2).mean() / max(left, 0.1)))
-    return np.clip(noise, *NOISE_RANGE)
+            if left > LEAST_LEFT:
+                noise[robot, 2] *= float(np.sqrt((steps_off(factors, found, robot) ** 2).mean() / left))
+    return np.clip(noise, *NOISE_RANGE), absorbed
 
 
 def _taken(factor: gtsam.NonlinearFactor, values: gtsam.Values, marginals: gtsam.Marginals) -> Array:

@@ -66,8 +66,8 @@ class DriveEstimate:
     def __repr__(self) -> str:
         agreement = f", chi2/dof {self.chi2 / self.dof:.2f}" if self.dof > 0 else ""
         return (
-            f"DriveEstimate({self.drive!r}, {len(self.trajectories)} robots and {len(self.landmarks)} landmarks placed, "
-            f"{int(self.doubted.sum())} measurements doubted{agreement})"
+            f"DriveEstimate({self.drive!r}, {len(self.trajectories)} robots and {len(self.landmarks)} landmarks "
+            f"placed, {int(self.doubted.sum())} measurements doubted{agreement})"
         )
 
 

@@ -241,7 +241,7 @@ class IncrementalDrive:
         for robot, count in enumerate(self._entered):
             for k in range(self._left[robot], count):
                 self._note(self._smoothed, self._smoothed_C, robot, k)
-        estimate = summed_up(self._factors, self._found(), self._taken, 0, together=False)
+        estimate = summed_up(self._factors, self._found(), self._taken, 0)
         online = {}
         for robot, name in enumerate(self.drive.robots):
             there = np.isfinite(self._online[robot][:, 0])

@@ -75,11 +75,12 @@ def measured_off(factors: DriveFactors, found: Found) -> Array:
 
 
 def summed_up(
-    factors: DriveFactors, found: Found, taken: NDArray[np.bool_], iterations: int, *, together: bool = True
+    factors: DriveFactors, found: Found, taken: NDArray[np.bool_], iterations: int, absorbed: float | None = None
 ) -> DriveEstimate:
     """The estimate that was found, of the measurements that were taken in.
 
-    Where poses were not found all `together`, a chi2 of all says nothing, and there is none.
+    `absorbed` are the degrees of freedom that a fit of all of it together leaves beyond what shares say; without it
+    there is no chi2.
     """
     drive, models = factors.drive, factors.models
     off = np.where(taken[:, None], measured_off(factors, found), np.nan)
@@ -114,8 +115,8 @@ def summed_up(
         noise=factors.noise,
         doubted=doubted,
         residuals=off,
-        chi2=chi2 if together else 0.0,
-        dof=dof + (0 if models.map_known else 3) if together else 0.0,
+        chi2=0.0 if absorbed is None else chi2,
+        dof=0.0 if absorbed is None else float(dof) + absorbed + (0 if models.map_known else 3),
         iterations=iterations,
         on_map=models.map_known,
         unplaced=tuple(unplaced),

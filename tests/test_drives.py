@@ -1,0 +1,297 @@
+import json
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from mrclam_folder import DELAY, LANDMARKS, SCALE, make
+from msgspec.structs import replace as with_fields
+
+from coloc_graph.backend.planar import optimise_drive
+from coloc_graph.backend.planar.factors import DriveFactors, landmark_key, pose_key, ranging_key, wheels_key
+from coloc_graph.backend.planar.filter import Models, filter_forward
+from coloc_graph.backend.planar.placing import Placing
+from coloc_graph.cli import main
+from coloc_graph.drive_results import assess_drive
+from coloc_graph.driving import DriveOptions, calibrated, solve_drive
+from coloc_graph.errors import InputError, RunError
+from coloc_graph.exchange.mrclam import import_mrclam
+from coloc_graph.frontend.keyframes import keyframes_of
+from coloc_graph.run import OdometrySample, Ranges, open_run, whole_run
+from coloc_graph.team import Landmark, Ranging, Robot, Team
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("drives")
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    made = make(folder / "data", seed=1, seconds=40.0)
+    import_mrclam(made.path, folder / "run.mcap")
+    return open_run(folder / "run.mcap")
+
+
+@pytest.fixture(scope="module")
+def unmapped(folder, run):
+    import_mrclam(folder / "data", folder / "unmapped.mcap", map_known=False)
+    return open_run(folder / "unmapped.mcap")
+
+
+@pytest.fixture(scope="module")
+def batch(run):
+    return solve_drive(run)
+
+
+@pytest.fixture(scope="module")
+def incremental(run):
+    return solve_drive(run, DriveOptions(incremental=True))
+
+
+def rms(accuracy):
+    return max(row.translation.rmse for row in accuracy.robots)
+
+
+def test_robots_are_where_they_are_and_the_covariances_say_how_well(batch):
+    accuracy = assess_drive(batch).accuracy
+    assert rms(accuracy) < 0.05
+    assert 0.4 < accuracy.anees < 1.5
+    estimate = batch.estimate
+    assert 0.6 < estimate.chi2 / estimate.dof < 1.3
+    assert np.all((estimate.noise > 0.6) & (estimate.noise < 1.5))
+    assert not batch.warnings
+
+
+def test_wheels_that_are_not_as_they_say_are_found_out(run, batch):
+    for robot in run.team.names:
+        errors, C = batch.estimate.errors[robot].wheels
+        wheels = run.team[robot].wheels
+        true = np.array([SCALE - wheels.scale, errors[1], DELAY - wheels.delay])
+        assert np.all(np.abs(errors - true) < 4 * np.sqrt(np.diagonal(C)))
+        assert np.sqrt(C[2, 2]) < wheels.delay_sigma / 3
+    found = calibrated(run.team, batch.estimate)
+    assert found["R1"].wheels.scale == pytest.approx(SCALE, abs=0.1)
+    assert found["R1"].wheels.delay_sigma < run.team["R1"].wheels.delay_sigma
+
+
+def test_each_robot_helps_the_others(run, batch):
+    alone = solve_drive(run, DriveOptions(between_robots=False))
+    assert len(alone.estimate.drive.measured) < len(batch.estimate.drive.measured)
+
+    def sigma(solution):
+        return np.mean([np.sqrt(t.covariances[:, 3, 3]).mean() for t in solution.estimate.trajectories.values()])
+
+    assert sigma(batch) < sigma(alone)
+
+
+def test_as_it_happens_it_is_nearly_as_good(batch, incremental):
+    of_batch, of_one = assess_drive(batch), assess_drive(incremental)
+    assert rms(of_one.accuracy) < 1.6 * rms(of_batch.accuracy)
+    assert rms(of_one.online) < 0.12
+    # nothing that comes later is in what was thought at the time
+    assert rms(of_one.online) > rms(of_one.accuracy)
+    assert set(incremental.online) == set(incremental.estimate.trajectories)
+    for robot, online in incremental.online.items():
+        assert np.isfinite(online.covariances).all()
+        smoothed = incremental.estimate.trajectories[robot]
+        assert len(smoothed) == len(batch.estimate.trajectories[robot])
+
+
+def test_without_a_map_robots_and_landmarks_are_found_up_to_where_the_map_lies(unmapped):
+    solution = solve_drive(unmapped)
+    assert not solution.estimate.on_map
+    start = solution.estimate.trajectories["R1"]
+    assert np.allclose(start.T_world_body[0], np.eye(4), atol=1e-3)
+    assert rms(assess_drive(solution).accuracy) < 0.06
+    found = np.array([one.position for one in solution.estimate.landmarks])
+    true = np.array([LANDMARKS[int(one.name[1:])] for one in solution.estimate.landmarks])
+    p, q = found - found.mean(axis=0), true - true.mean(axis=0)
+    angle = np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum())
+    c, s = np.cos(angle), np.sin(angle)
+    off = p @ np.array([[c, s], [-s, c]]) - q
+    sigmas = np.array([np.sqrt(np.trace(one.covariance)) for one in solution.estimate.landmarks])
+    assert np.all(np.hypot(*off.T) < 3 * sigmas)
+    assert np.median(np.hypot(*off.T)) < 0.06
+    known = calibrated(unmapped.team, solution.estimate).landmarks[0]
+    assert known.position == pytest.approx(tuple(solution.estimate.landmarks[0].position))
+
+
+def test_a_map_that_lies_elsewhere_moves_the_estimate_with_it_and_nothing_else(folder, batch):
+    made = make(folder / "moved", seed=1, seconds=40.0, turned=1.0, shifted=(5.0, -2.0))
+    import_mrclam(made.path, folder / "moved.mcap")
+    moved = solve_drive(open_run(folder / "moved.mcap"))
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]]
+    T[:2, 3] = 5.0, -2.0
+    for robot, trajectory in batch.estimate.trajectories.items():
+        off = moved.estimate.trajectories[robot].T_world_body - T @ trajectory.T_world_body
+        assert np.abs(off).max() < 0.01
+    assert moved.estimate.chi2 == pytest.approx(batch.estimate.chi2, rel=0.02)
+
+
+def test_what_was_read_wrong_is_doubted_and_moves_nothing(run, batch):
+    drive = batch.estimate.drive
+    target, robots = drive.measured.target.copy(), len(drive.robots)
+    landmarks = np.flatnonzero((target >= robots) & (drive.measured.share[:, 0] > 0.3))
+    wrong = landmarks[10::8]
+    target[wrong] = robots + (target[wrong] - robots + 3) % len(drive.landmarks)
+    estimate = optimise_drive(run.team, replace(drive, measured=replace(drive.measured, target=target)))
+    assert set(wrong) == set(np.flatnonzero(estimate.doubted))
+    for robot, trajectory in batch.estimate.trajectories.items():
+        off = estimate.trajectories[robot].positions - trajectory.positions
+        assert np.sqrt((off**2).sum(axis=1).mean()) < 0.02
+
+
+def test_the_filter_needs_no_first_poses(run):
+    drive = keyframes_of(run)
+    filtered = filter_forward(run.team, drive)
+    assert set(filtered.placed_at) == {0, 1, 2}
+    assert max(filtered.placed_at.values()) < 20
+    assert filtered.used.mean() > 0.9
+
+
+def test_derivatives_are_those_of_the_residuals(unmapped):
+    drive, team = keyframes_of(unmapped), unmapped.team
+    models = Models(team, drive)
+    factors = DriveFactors(drive, models)
+    rng = np.random.default_rng(0)
+    values = gtsam.Values()
+    for robot, times in enumerate(drive.times):
+        values.insert(wheels_key(robot), rng.normal(size=3) * 0.01)
+        values.insert(ranging_key(robot), rng.normal(size=5) * 0.05)
+        for k in range(len(times)):
+            values.insert(pose_key(robot, k), gtsam.Pose2(*rng.normal(size=3)))
+    for n in range(len(drive.landmarks)):
+        values.insert(landmark_key(n), 3 + rng.normal(size=2))
+    of_robots = np.flatnonzero(drive.measured.target < 3)[:3]
+    of_landmarks = np.flatnonzero(drive.measured.target >= 3)[:3]
+    made = [factors.step(0, 3), factors.step(1, 7), *(factors.measured(int(n)) for n in (*of_robots, *of_landmarks))]
+    for factor in made:
+        A = np.empty((factor.dim(), 0))
+        for key in factor.keys():  # noqa: SIM118  GTSAM's own
+            size = {ord("x"): 3, ord("w"): 3, ord("r"): 5, ord("l"): 2}[gtsam.mrsymbolChr(key)]
+            for column in range(size):
+                ends = []
+                for sign in (1, -1):
+                    step = gtsam.VectorValues()
+                    step.insert(key, sign * 1e-6 * np.eye(size)[column])
+                    ends.append(factor.unwhitenedError(values.retract(step)))
+                A = np.column_stack([A, (ends[0] - ends[1]) / 2e-6])
+        exact, _ = factor.linearize(values).jacobian()
+        # robust factors are scaled as a whole
+        scale = np.linalg.norm(exact) / np.linalg.norm(A)
+        assert np.abs(scale * A - exact).max() < 1e-5 * np.abs(exact).max()
+
+
+def test_errors_that_last_count_by_how_long_they_do(run):
+    drive = keyframes_of(run)
+    m, memory = drive.measured, run.team["R1"].ranging.range_memory
+    pair = np.flatnonzero((m.robot == 0) & (m.target == m.target[m.robot == 0][0]))
+    assert m.share[pair[0]].tolist() == [1.0, 1.0]
+    gaps = np.diff(m.time[pair])
+    assert np.allclose(m.share[pair[1:], 0], np.tanh(gaps / (2 * memory)))
+
+
+def test_a_robot_is_placed_by_points_that_agree_and_not_by_those_that_do_not():
+    rng = np.random.default_rng(3)
+    local = rng.uniform(-2, 2, (8, 2))
+    c, s = np.cos(0.7), np.sin(0.7)
+    world = local @ np.array([[c, s], [-s, c]]) + (1.0, -2.0)
+    placing = Placing()
+    for n in range(3):
+        placing.add(tuple(local[n]), tuple(world[n]))
+    assert placing.place() is None  # too few to be sure
+    placing.add(tuple(local[3]), tuple(world[3] + 3.0))  # read wrong
+    for n in range(4, 8):
+        placing.add(tuple(local[n]), tuple(world[n]))
+    assert placing.place() == pytest.approx((1.0, -2.0, 0.7))
+
+
+def write(path, *, odometry=True, target="L", ranging=True, away=False):
+    sensor = Ranging(range_sigma=0.05, bearing_sigma_deg=0.5) if ranging else None
+    robots = tuple(Robot(name=name, ranging=sensor or Ranging(range_sigma=1, bearing_sigma_deg=1)) for name in "AB")
+    team = Team(reference="A", robots=robots, landmarks=(Landmark(name="L", position=(1.0, 0.0)),))
+    with whole_run(path, team) as writer:
+        for k in range(20):
+            if odometry:
+                writer.write(OdometrySample("A", 100.0 + k, np.array([0.1 * k, 0.0, 0.0]), np.eye(3) * 1e-4))
+            time = 100.0 + k + (1000.0 if away else 0.0)
+            writer.write(Ranges("A", time, (target,), np.array([1.0]), np.array([0.0])))
+    return path
+
+
+def test_a_run_without_odometry_says_so(tmp_path):
+    run = open_run(write(tmp_path / "run.mcap", odometry=False))
+    with pytest.raises(InputError, match="robot A measured ranges, and has no odometry"):
+        keyframes_of(run)
+
+
+def test_ranges_of_who_is_not_in_the_team_cannot_be_written(tmp_path):
+    with pytest.raises(RunError, match="name `X`, which is no other robot and no landmark"):
+        write(tmp_path / "run.mcap", target="X")
+    with pytest.raises(RunError, match="name `A`, which is no other"):
+        write(tmp_path / "run.mcap", target="A")
+    assert not list(tmp_path.iterdir())
+
+
+def test_ranges_where_there_is_no_odometry_are_left_out_and_counted(tmp_path):
+    run = open_run(write(tmp_path / "run.mcap", away=True))
+    with pytest.raises(InputError, match="no range was measured while there is odometry"):
+        keyframes_of(run)
+
+
+def test_one_landmark_alone_places_nobody(tmp_path, capsys):
+    path = write(tmp_path / "run.mcap")
+    assert main(["solve", str(path), "--out", str(tmp_path / "result")]) == 2
+    assert "no robot's measurements say where it is" in capsys.readouterr().err
+    assert not (tmp_path / "result").exists()
+
+
+def test_a_robot_needs_a_camera_or_a_sensor_of_ranges():
+    with pytest.raises(ValueError, match="no `camera` with its `mount`, and no `ranging`"):
+        Robot(name="A")
+    with pytest.raises(ValueError, match="`range_sigma` is 0"):
+        Ranging(range_sigma=0.0, bearing_sigma_deg=1.0)
+
+
+def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
+    out = tmp_path / "result"
+    assert main(["solve", str(run.path), "--out", str(out), "--incremental"]) == 0
+    printed = capsys.readouterr().out
+    assert "RMS position" in printed and "3 robots" not in printed
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["method"] == "incremental" and summary["world"] == "map"
+    assert summary["online_accuracy"]["ate_m"] > summary["accuracy"]["ate_m"] > 0
+    rows = (out / "measurements.csv").read_text().splitlines()
+    assert len(rows) == 1 + summary["measurements"]["used"] + summary["measurements"]["rejected"]
+    assert {one.name for one in out.iterdir()} == {
+        *("summary.json", "config.toml", "team.toml", "report.html", "landmarks.csv", "measurements.csv"),
+        *("trajectories", "online"),
+    }
+    report = (out / "report.html").read_text()
+    assert "the landmarks&#x27; map" in report or "the landmarks' map" in report
+    assert report.count("<svg") >= 2
+    assert main(["evaluate", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ate_m"] == pytest.approx(summary["accuracy"]["ate_m"])
+    assert main(["solve", str(run.path), "--out", str(out), "--method", "chain"]) == 2
+    assert main(["info", str(run.path)]) == 0
+
+
+def test_exact_wheels_and_sensors_are_no_variables(run):
+    exact = with_fields(
+        run.team,
+        robots=tuple(
+            with_fields(
+                robot,
+                wheels=with_fields(
+                    robot.wheels, scale=SCALE, delay=DELAY, scale_sigma=0.0, turn_scale_sigma=0.0, delay_sigma=0.0
+                ),
+                ranging=Ranging(range_sigma=0.05, bearing_sigma_deg=0.5),
+            )
+            for robot in run.team.robots
+        ),
+    )
+    estimate = optimise_drive(exact, keyframes_of(replace(run, team=exact)), calibrate_noise=False)
+    assert all(one.wheels is None and one.ranging is None for one in estimate.errors.values())
+    assert set(estimate.trajectories) == set(run.team.names)
