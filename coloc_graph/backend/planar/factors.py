@@ -89,14 +89,24 @@ class DriveFactors:
             dx, dy = b.x() - a.x(), b.y() - a.y()
             x, y = c * dx + s * dy, -s * dx + c * dy
             delta, by_errors = model.step(k, errors)
-            e0, e1, e2 = x - delta[0], y - delta[1], math.remainder(b.theta() - yaw - delta[2], math.tau)
+            # in units of what the wheels say: with the noise fixed in metres, a smaller world would have less of it
+            p, q = model.units(errors)
+            e0, e1 = p * (x - delta[0]), p * (y - delta[1])
+            e2 = q * math.remainder(b.theta() - yaw - delta[2], math.tau)
             if jacobians is not None:
                 turn = b.theta() - yaw
-                ct, st = math.cos(turn), math.sin(turn)
-                jacobians[0] = W @ np.array([[-1.0, 0.0, y], [0.0, -1.0, -x], [0.0, 0.0, -1.0]])
-                jacobians[1] = W @ np.array([[ct, -st, 0.0], [st, ct, 0.0], [0.0, 0.0, 1.0]])
+                ct, st = p * math.cos(turn), p * math.sin(turn)
+                jacobians[0] = W @ np.array([[-p, 0.0, p * y], [0.0, -p, -p * x], [0.0, 0.0, -q]])
+                jacobians[1] = W @ np.array([[ct, -st, 0.0], [st, ct, 0.0], [0.0, 0.0, q]])
                 if errors_key is not None:
-                    jacobians[2] = W @ -np.array(by_errors).T
+                    (x0, y0, w0), (x1, y1, w1), (x2, y2, w2) = by_errors
+                    jacobians[2] = W @ np.array(
+                        [
+                            [-p * (x0 + e0), -p * x1, -p * x2],
+                            [-p * (y0 + e1), -p * y1, -p * y2],
+                            [-q * w0, -q * (w1 + e2), -q * w2],
+                        ]
+                    )
             return np.array([w00 * e0, w10 * e0 + w11 * e1, w20 * e0 + w21 * e1 + w22 * e2])
 
         keys = [a_key, b_key] if errors_key is None else [a_key, b_key, errors_key]

@@ -71,6 +71,10 @@ class WheelsModel:
         by_delay = (a * dx - b * dy + by_w[0] * dw, b * dx + a * dy + by_w[1] * dw, dw)
         return (a * x - b * y, b * x + a * y, w), (by_scale, by_turn, by_delay)
 
+    def units(self, errors: Sequence[float] | Array) -> tuple[float, float]:
+        """What a metre of the way, and a radian of a turn, are as the wheels say them."""
+        return 1 / (self.wheels.scale + errors[0]), 1 / (self.wheels.turn_scale + errors[1])
+
     def _twist(self, k: int, delay: float) -> tuple[Sequence[float], Sequence[float]]:
         """The twist that odometry says at a delay, and by how much it changes with it."""
         delays, twists = self._delays, self._twists[k]

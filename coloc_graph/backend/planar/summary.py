@@ -48,6 +48,8 @@ def steps_off(factors: DriveFactors, found: Found, robot: int) -> Array:
         delta, _ = model.step(k, errors)
         off[k] = x - delta[0], y - delta[1], yaw - delta[2]
     off[:, 2] = (off[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    p, q = model.units(errors)
+    off *= (p, p, q)
     whitened: Array = np.einsum("nij,nj->ni", factors.whiten(robot), off)
     return whitened
 
