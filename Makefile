@@ -1,7 +1,7 @@
 # make demo   a virtual environment, the package, and the main job: render, solve, show
 # make test   the same environment: lint, format, types, tests
 # make bench  the benchmarks behind the figures in the README; DATA=DIR for that on the stereo pairs of a chessboard,
-#             GRAPHS=DIR for those on the pose graphs sphere2500 and M3500
+#             GRAPHS=DIR for those on the pose graphs sphere2500 and M3500, MRCLAM=DIR for that on an MR.CLAM dataset
 
 PYTHON ?= python3
 VENV := .venv
@@ -9,6 +9,7 @@ BIN := $(VENV)/bin
 ARGS ?=
 DATA ?=
 GRAPHS ?=
+MRCLAM ?=
 
 .PHONY: demo test lint types unit bench clean
 
@@ -53,6 +54,9 @@ bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/messy.py
 	$(BIN)/python benchmarks/nees_interval.py
 	$(BIN)/python benchmarks/backend.py $(if $(GRAPHS),--data $(GRAPHS))
+ifneq ($(MRCLAM),)
+	$(BIN)/python benchmarks/mrclam.py --data $(MRCLAM)
+endif
 ifneq ($(DATA),)
 	$(BIN)/python benchmarks/stereo_board.py --data $(DATA)
 	$(BIN)/python benchmarks/calibration.py --data $(DATA)
