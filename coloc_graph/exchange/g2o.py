@@ -2,8 +2,9 @@
 
 VERTEX_SE3:QUAT and EDGE_SE3:QUAT with the information's upper triangle, translation first; read are also VERTEX_SE2
 and EDGE_SE2. Ids are plain integers; numbers read back to the bit. g2o has no word for a stay-put constraint:
-stances that share a pose share a vertex, and a comment says so, which `read_g2o` understands. Nor has it one for a
-floor: its priors are left out. What a planar measurement does not know has the information `UNKNOWN`.
+stances that share a pose share a vertex, and a comment says so, which `read_g2o` understands. Landmarks, and the map,
+are vertices like any other, named in comments. Nor has g2o a word for a floor: its priors are left out. What a planar
+measurement does not know has the information `UNKNOWN`.
 
 Source: g2o's file format, https://github.com/RainerKuemmerle/g2o/wiki/File-Format
 """
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend import Estimate, StayPut
 from coloc_graph.backend.factors import GAUGE_SIGMA, link_covariance
+from coloc_graph.backend.landmarks import MAP
 from coloc_graph.errors import InputError
 from coloc_graph.lie import quaternion
 from coloc_graph.measurements import Node
@@ -43,6 +45,10 @@ def write_g2o(estimate: Estimate, path: Path) -> None:
             key = graph.key(robot, stance)
             poses.setdefault(key, gtsam.Pose3(T))
             names.setdefault(key, []).append(f"{robot}@{stance}")
+    still = estimate.landmarks if estimate.map is None else {**estimate.landmarks, MAP: estimate.map}
+    for name, placed in still.items():
+        key = graph.places.still()[name]
+        poses[key], names[key] = placed.T_world_body, ["the map" if name == MAP else f"landmark {name}"]
     ids = {key: number for number, key in enumerate(poses)}
 
     lines = []

@@ -169,8 +169,8 @@ class StanceTracks:
             if _name(track) not in known:
                 raise InputError(
                     f"{self.run.path}: stance {self.stance.index}: the detections of {robot} name `{track.marker}`, "
-                    f"and there is no robot or landmark `{_name(track)}` in the team; correct the name, or add it under "
-                    "[[landmarks]]"
+                    f"and there is no robot or landmark `{_name(track)}` in the team; correct the name, or add it "
+                    "under [[landmarks]]"
                 )
 
     def _tracker(self, robot: str, markers: Sequence[Markers]) -> MarkerTracker:
