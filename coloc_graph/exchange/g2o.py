@@ -11,7 +11,7 @@ Source: g2o's file format, https://github.com/RainerKuemmerle/g2o/wiki/File-Form
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import gtsam
@@ -88,7 +88,7 @@ class G2oGraph:
 
     The `fixed` vertices (the lowest id where the file fixes none) hold the world by a prior, the first factors.
     `names` are the robots and stances that our own files give to vertices, and `stay_puts` their constraints: all of
-    `names[id]` are one place.
+    `names[id]` are one place. `landmarks` are the names of the vertices that are landmarks.
     """
 
     factors: gtsam.NonlinearFactorGraph
@@ -96,6 +96,7 @@ class G2oGraph:
     fixed: tuple[int, ...]
     names: dict[int, tuple[Node, ...]]
     stay_puts: tuple[StayPut, ...]
+    landmarks: dict[int, str] = field(default_factory=dict)
 
 
 def read_g2o(path: str | Path) -> G2oGraph:
@@ -114,6 +115,7 @@ class _Reader:
         self.fixed: list[tuple[int, int]] = []
         self.names: dict[int, tuple[Node, ...]] = {}
         self.stay_puts: list[StayPut] = []
+        self.landmarks: dict[int, str] = {}
         self.tags: dict[str, tuple[int | None, Callable[[list[float]], None]]] = {
             "VERTEX_SE2": (4, self._vertex2),
             "VERTEX_SE3:QUAT": (8, self._vertex3),
@@ -152,6 +154,8 @@ class _Reader:
 
     def _comment(self, line: str) -> None:
         if found := _IS.fullmatch(line.strip()):
+            if found[2].startswith("landmark "):
+                self.landmarks[int(found[1])] = found[2].removeprefix("landmark ")
             named = [name.rpartition("@") for name in found[2].split(" = ")]
             if all(robot and stance.isdecimal() for robot, _, stance in named):
                 self.names[int(found[1])] = tuple((robot, int(stance)) for robot, _, stance in named)
@@ -229,4 +233,4 @@ class _Reader:
                 noise = gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA)
                 factors.add(gtsam.PriorFactorPose3(key, self.values.atPose3(key), noise))
         factors.push_back(self.edges)
-        return G2oGraph(factors, self.values, fixed, self.names, tuple(self.stay_puts))
+        return G2oGraph(factors, self.values, fixed, self.names, tuple(self.stay_puts), self.landmarks)
