@@ -15,8 +15,8 @@ Pose = tuple[float, float, float]
 #: A team's robots stand in lanes so far apart, one behind the other so far [m].
 LANE, ROW = 0.8, 0.45
 
-#: Round a course the pair comes so much further with each leap, its corners are as wide, and so far to its sides are
-#: walls [m].
+#: Round a course the pair comes so much further with each leap, its corners are as wide, and so far aside is its
+#: outer wall [m].
 LEAP, CORNER, WALL = 0.25, 1.2, 0.95
 
 #: Half the angle between the pair's cameras in the multi-step experiments.
@@ -193,8 +193,8 @@ def team_of(
 def course(
     length: float = 100.0, landmark_every: float = 10.0, laps: int = 4, rng: np.random.Generator | None = None
 ) -> CourseScenario:
-    """A leap-frog of `length` [m] in all, `laps` times round a square with round corners, landmarks on the walls every
-    so many metres, on this side and on that; each stop is off by a centimetre and a degree."""
+    """A leap-frog of `length` [m] in all, `laps` times round a square with round corners, landmarks on its outer wall
+    every so many metres; each stop is off by a centimetre and a degree."""
     if laps < 1:
         raise InputError(f"`laps` is {laps}; give at least 1")
     for name, value in (("length", length), ("landmark_every", landmark_every)):
@@ -213,10 +213,10 @@ def course(
     at = np.stack([x - 0.36 * side * np.sin(yaw), y + 0.36 * side * np.cos(yaw), yaw - HALF_ANGLE * side], axis=1)
     poses = at + rng.standard_normal(at.shape) * (0.01, 0.01, np.deg2rad(1.0))
     count = max(round(lap / landmark_every), 1)
-    wall = np.where(np.arange(count) % 2, -WALL, WALL)
-    x, y, yaw = _along((np.arange(count) + 0.5) * lap / count, lap).T
-    x, y = x - wall * np.sin(yaw), y + wall * np.cos(yaw)
-    faced = _along((np.arange(count) + 0.5) * lap / count - 2.0, lap)
+    way = np.arange(count) * lap / count + 0.75 * (lap / 4 - CORNER * math.pi / 2)  # the first towards a straight's end
+    x, y, yaw = _along(way, lap).T
+    x, y = x + WALL * np.sin(yaw), y - WALL * np.cos(yaw)
+    faced = _along(way - 2.0, lap)
     landmarks = np.stack([x, y, np.arctan2(faced[:, 1] - y, faced[:, 0] - x)], axis=1)
     return CourseScenario(
         "landmarks",
