@@ -15,7 +15,7 @@ from coloc_graph.inspection import inspect, landmarks_seen
 from coloc_graph.lie import floor_pose, se3_inverse
 from coloc_graph.pipeline import SolveOptions, solve
 from coloc_graph.results import LANDMARKS, read_result, write_result
-from coloc_graph.run import Image, Stance, open_run, read_true_team
+from coloc_graph.run import Image, Motion, OdometrySample, Stance, open_run, read_true_team
 from coloc_graph.simulation import Sensor, reference_team, simulate
 from coloc_graph.simulation.rendering import expose
 from coloc_graph.simulation.rig import MILD_LENS
@@ -83,20 +83,17 @@ def test_the_edges_of_a_rendered_tag_are_found_where_they_are_projected(lens, di
 def test_the_middles_are_those_of_the_edges_in_space_and_not_in_the_image():
     """A tag seen from aside: the middle of an edge is not half way between its corners in the image."""
     team = team_with(lens=())
-    camera, big = team["A"].camera, Tag(id=3, size=0.6, height=0.15)
-    T = floor_pose(1.5, 0.0, np.pi + 0.9)
+    camera, big = team["A"].camera, Tag(id=3, size=0.4, height=0.15)
+    T = floor_pose(1.2, 0.0, np.pi + 0.9)
     near = seen_by(team, T, tag=big)
     half = big.size / 2
     p = np.array([[0.0, y, big.height + z] for y, z in ((-half, half), (half, half), (half, -half), (-half, -half))])
     T_camera = se3_inverse(team["A"].mount.T_body_camera) @ T
     corners = camera.project(p @ T_camera[:3, :3].T + T_camera[:3, 3])[0]
-    try:
-        uv, _ = measure_tag(near, camera, corners, 8)
-    except DegenerateGeometry:
-        pytest.fail("the tag is not measured")
+    uv, _ = measure_tag(near, camera, corners, 8)
     naive = np.stack([corners[1] + corners[2], corners[0] + corners[3]]) / 2
     true = edges_of(team, T, big)
-    assert np.abs(naive - true).max() > 1.0 and np.abs(uv - true).max() < 0.2
+    assert np.abs(naive - true).max() > 0.5 and np.abs(uv - true).max() < 0.2
 
 
 def test_a_tag_is_sighted_where_it_stands_as_surely_as_it_says():
@@ -253,6 +250,14 @@ def test_a_result_tells_where_landmarks_are_and_the_viewer_shows_them(lap, solve
         scene_of_result(tmp_path / "result")
 
 
+def test_landmarks_come_in_stance_by_stance_as_they_do_at_once(lap, solved):
+    """With pixels and mounts, too: what is far off when it comes is led in by poses."""
+    by_stance = solve(open_run(lap), SolveOptions(incremental=True))
+    for name, placed in solved.estimate.landmarks.items():
+        assert placed.T_world_body.equals(by_stance.estimate.landmarks[name].T_world_body, 1e-5)
+    assert not by_stance.estimate.refused
+
+
 def test_info_counts_where_landmarks_are_seen(lap, capsys):
     run = open_run(lap)
     seen = landmarks_seen(run)
@@ -263,8 +268,12 @@ def test_info_counts_where_landmarks_are_seen(lap, capsys):
 
 def test_detections_of_a_landmark_that_the_team_does_not_have_say_so(lap, tmp_path, copied):
     run = open_run(lap)
+    there = landmarks_seen(run)[1].stances
     team = replace(run.team, landmarks=run.team.landmarks[:1])
-    copy = copied(lap, tmp_path / "run.mcap", team=team)
+    copy = copied(
+        lap, tmp_path / "run.mcap", team=team, stances=[s for s in run.stances if s.index in there],
+        change=lambda record: None if isinstance(record, OdometrySample | Motion) else record,
+    )  # fmt: skip
     words = "name `L2/0`, and there is no robot or landmark `L2` in the team"
     with pytest.raises(InputError, match=words):
         solve(open_run(copy), SolveOptions())
