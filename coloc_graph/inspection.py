@@ -4,16 +4,19 @@ Detections that name their markers are measured as a solve does; images are not 
 """
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend.correspondence import PAIRING_WINDOW, correspond_roughly, pair_by_time
+from coloc_graph.frontend.landmarks import in_words, sight_landmarks
 from coloc_graph.frontend.plausibility import implausible
 from coloc_graph.frontend.stance import FrontendOptions, little_in_common, measure_pair
-from coloc_graph.frontend.stance_tracks import StanceTracks, named_tracks, stance_plane
+from coloc_graph.frontend.stance_tracks import StanceTracks, stance_plane
 from coloc_graph.run import Detections, Run, Stance
+from coloc_graph.team import Landmark
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,38 @@ class Finding:
 
     where: str
     what: str
+
+
+@dataclass(frozen=True)
+class LandmarkSeen:
+    """A landmark of the team, and by whom it was seen, and in which stances, in detections that name it."""
+
+    landmark: Landmark
+    stances: tuple[int, ...]
+    observers: tuple[str, ...]
+
+    @property
+    def what(self) -> str:
+        """What is seen of it, in words."""
+        if self.landmark.tag is not None:
+            return f"tag {self.landmark.tag.family} {self.landmark.tag.id}"
+        return "no camera sees it" if self.landmark.markers is None else "two lights"
+
+
+def landmarks_seen(run: Run) -> list[LandmarkSeen]:
+    """Where the landmarks of a team are seen; images are not looked into."""
+    stances: dict[str, dict[int, None]] = {landmark.name: {} for landmark in run.team.landmarks}
+    observers: dict[str, dict[str, None]] = {landmark.name: {} for landmark in run.team.landmarks}
+    watches = [(stance, robot) for stance in run.stances for robot in stance.observers] if stances else []
+    for stance, robot in watches:
+        for name in {name for one in run.detections(robot, stance.start, stance.end) for name in _bodies(one)}:
+            if name in stances:
+                stances[name][stance.index] = observers[name][robot] = None
+    return [LandmarkSeen(one, tuple(stances[one.name]), tuple(observers[one.name])) for one in run.team.landmarks]
+
+
+def _bodies(one: Detections) -> Iterable[str]:
+    return {marker.rpartition("/")[0] for marker in one.markers}
 
 
 def inspect(run: Run) -> list[Finding]:
@@ -91,6 +126,12 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
     if not measurable:
         return findings
     tracks = StanceTracks(run, stance)
+    try:
+        landmarks = [(robot, tracks.landmarks(robot)) for robot in named]
+    except InputError as why:  # of a marker that nobody in the team has
+        return [*findings, Finding(where, str(why).removeprefix(f"{run.path}: {where}: "))]
+    for doubt in in_words(sight_landmarks(run, stance, landmarks)[1]):
+        findings.append(Finding(where, doubt.removeprefix(f"{where}: ")))
     for i, j in itertools.combinations(stance.observers, 2):
         if run.team.clock_sigma == 0 and not len(pair_by_time(times[i], times[j])):
             nearest = np.abs(times[i][:, None] - times[j][None]).min()
@@ -102,17 +143,15 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
                 )
             )
         elif i in named and j in named:
-            findings += [Finding(where, what) for what in _of_detections(run, stance, i, j, named, tracks)]
+            findings += [Finding(where, what) for what in _of_detections(run, stance, i, j, tracks)]
     return list(dict.fromkeys(findings))  # two pairs may find the same
 
 
-def _of_detections(
-    run: Run, stance: Stance, i: str, j: str, named: dict[str, list[Detections]], tracks: StanceTracks
-) -> list[str]:
+def _of_detections(run: Run, stance: Stance, i: str, j: str, tracks: StanceTracks) -> list[str]:
     """What is wrong with what two observers detected by name."""
     sigma = run.team.clock_sigma
     if sigma > 0:  # the search for the clocks' offset is for a solve
-        tracks_i, tracks_j = (named_tracks(robot, named[robot]) for robot in (i, j))
+        tracks_i, tracks_j = (tracks.of(robot) for robot in (i, j))
         camera_i, camera_j = (run.team[robot].camera for robot in (i, j))
         try:
             found = correspond_roughly(tracks_i, tracks_j, camera_i, camera_j, 0.0, sigma)[1]

@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 
 from coloc_graph.backend import Estimate, Loose, PoseGraph, chain, diagnose, joint, smooth
 from coloc_graph.errors import EstimationError, InputError
-from coloc_graph.frontend import PairMeasurement, little_in_common, share_clock_offsets
+from coloc_graph.frontend import Doubt, PairMeasurement, in_words, little_in_common, share_clock_offsets
 from coloc_graph.frontend.plausibility import implausible
 from coloc_graph.run import Run, Stance
 from coloc_graph.stance_solver import METHODS, EnteredStance, Motions, SolveOptions, StanceSolver, measure_stance
@@ -71,6 +71,7 @@ class _Solved:
     clock_warnings: list[str]
     seconds_frontend: float
     seconds_updates: tuple[float, ...] = ()
+    doubts: Sequence[Doubt] = ()
 
 
 def solve(
@@ -99,6 +100,7 @@ def solve(
         warnings=(
             *run.warnings,
             *solved.clock_warnings,
+            *in_words(solved.doubts),
             *_implausible(run, options, measured),
             *_warnings(estimate, diagnose(estimate.graph), measured),
         ),
@@ -115,17 +117,16 @@ def _at_once(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
     poses = [m.relative_pose for m in measured if m.relative_pose is not None]
     _require_poses(run, options, measured)
     made = time.perf_counter()
-    motions = []
+    motions, sources = [], Motions(run.team, odometry=options.odometry)
     if options.method != "chain" and run.team.floor is not None:
         # the paper's chain takes neither, and wheels know the floor alone
-        of_stance = Motions(run.team, odometry=options.odometry).of_stance
         for stance in run.stances:
             pairs = [m for m in measured if m.homography.stance == stance.index]
-            motions += of_stance(run, stance, pairs)
+            motions += sources.of_stance(run, stance, pairs)
     graph = PoseGraph.of(run.team, run.stances, [*poses, *motions])
     graph = replace(graph, rigs=options.rigs(run.team) or graph.rigs)
     _require_ties(run, graph, measured)
-    return _Solved(BATCH[options.method](graph), measured, clock_warnings, made - started)
+    return _Solved(BATCH[options.method](graph), measured, clock_warnings, made - started, doubts=sources.doubts)
 
 
 def _incrementally(
@@ -143,7 +144,7 @@ def _incrementally(
     # what was refused, was it that an anchor was pushed? An estimator looks at one stance at a time
     estimate = replace(estimate, bumped=solver.estimator.bumps())
     frontend, updates = zip(*solver.seconds, strict=True)
-    return _Solved(estimate, solver.measured, solver.warnings, sum(frontend), updates)
+    return _Solved(estimate, solver.measured, solver.warnings, sum(frontend), updates, solver.doubts)
 
 
 class _Counted:

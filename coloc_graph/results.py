@@ -1,8 +1,9 @@
 """A result on disk: written whole or not at all, and read back.
 
 DIR holds summary.json, trajectories/<robot>.tum (and .cov.csv), graph.g2o, graph.dot, measurements.csv, config.toml,
-report.html, and, of a joint estimate, team.toml: the team with its mounts and markers as they turned out. The same run,
-options and version give the same bytes, except for `seconds` in summary.json.
+report.html; where landmarks were sighted, landmarks.csv; and, of a joint estimate, team.toml: the team with its mounts
+and markers as they turned out. The same run, options and version give the same bytes, except for `seconds` in
+summary.json.
 """
 
 import csv
@@ -29,13 +30,14 @@ from coloc_graph.errors import InputError
 from coloc_graph.evaluation import Accuracy, accuracy_json, align, evaluate, usual_alignment
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import write_g2o
+from coloc_graph.exchange.landmarks import landmark_rows, landmarks_csv, map_row
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.pipeline import Solution, SolveOptions
 from coloc_graph.run import read_truth, run_id
 from coloc_graph.team import Team, read_team, without_none, write_team
 from coloc_graph.trajectory import Trajectory
 
-SUMMARY, CONFIG = "summary.json", "config.toml"
+SUMMARY, CONFIG, LANDMARKS = "summary.json", "config.toml", "landmarks.csv"
 MEASUREMENT_COLUMNS = (
     *(
         "stance",
@@ -99,6 +101,9 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
         write_g2o(solution.estimate, part / "graph.g2o")
         (part / "graph.dot").write_text(to_dot(solution.estimate.graph), encoding="utf-8")
         (part / "measurements.csv").write_text(_measurements(solution), encoding="utf-8")
+        if solution.estimate.landmarks:
+            rows = landmarks_csv(landmark_rows(solution.estimate))
+            (part / LANDMARKS).write_text(rows, encoding="utf-8")
         if solution.estimate.calibration.rows:
             write_team(solution.estimate.calibration.of_team(solution.run.team), part / "team.toml")
         (part / CONFIG).write_text(tomli_w.dumps(_config(solution)), encoding="utf-8")
@@ -154,6 +159,8 @@ def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
         "untied": [list(one) for one in estimate.untied],
         "bumped": [[one.stay_put.robot, one.stay_put.before, one.stay_put.after] for one in estimate.bumped],
         "calibration": [dataclasses.asdict(row) for row in estimate.calibration.rows],
+        "landmarks": [dataclasses.asdict(row) for row in landmark_rows(estimate)],
+        "map": None if (row := map_row(estimate)) is None else dataclasses.asdict(row),
         "warnings": list(solution.warnings),
         "seconds": {
             "frontend": round(solution.seconds_frontend, 3),

@@ -8,8 +8,10 @@ from typing import get_args
 
 from coloc_graph.backend import Estimator, Method, StanceEstimate, loosened
 from coloc_graph.backend.graph import Places, slips_of
+from coloc_graph.backend.landmarks import landmarks_of
 from coloc_graph.errors import ColocError, InputError
 from coloc_graph.frontend import (
+    Doubt,
     FrontendOptions,
     PairMeasurement,
     Scale,
@@ -18,6 +20,7 @@ from coloc_graph.frontend import (
     measure_pair,
     measured_pairs,
     share_clock_offsets,
+    sight_landmarks,
     sight_movers,
     sight_standing,
 )
@@ -96,17 +99,22 @@ class Motions:
     def __init__(self, team: Team, *, odometry: bool = True) -> None:
         self.team, self._odometry = team, odometry
         self._places = Places(team.names, slips_of(team))
+        self._sighted: set[tuple[str, str]] = set()  # landmarks, by who has stayed where it saw them
+        #: Landmarks that were seen and are not used.
+        self.doubts: list[Doubt] = []
         self._before: Stance | None = None
         self._there: set[str] = set()
         self._last: dict[str, tuple[int, float]] = {}  # each robot's last pose: its stance, its time
         self._samples: dict[str, list[OdometrySample]] = {robot: [] for robot in team.names}  # from there on
-        self._earlier: tuple[Stance | None, set[str], dict[str, tuple[int, float]]] | None = None
+        self._earlier: (
+            tuple[Stance | None, set[str], dict[str, tuple[int, float]], set[tuple[str, str]], list[Doubt]] | None
+        ) = None
 
     def withdraw(self) -> None:
         """Forget the last stance; once, until another has come."""
         assert self._before is not None and self._earlier is not None
         self._places.forget(self._earlier[0], self._before)
-        self._before, self._there, self._last = self._earlier
+        self._before, self._there, self._last, self._sighted, self.doubts = self._earlier
         self._samples = {robot: [] for robot in self.team.names}  # they are read again
         self._earlier = None
 
@@ -115,7 +123,26 @@ class Motions:
         wheels = {robot: self._wheels(run, robot, stance) for robot in self.team.names}
         sightings = sight_movers(run, stance, measured, wheels)
         sightings += sight_standing(run, stance, measured, self._before)
+        earlier = self._before, self._there, dict(self._last), self._sighted, list(self.doubts)
+        sightings += self._of_landmarks(run, stance, measured)
+        self._earlier = earlier
         return [*sightings, *self._ways(stance, measured, sightings, wheels)]
+
+    def _of_landmarks(self, run: Recorded, stance: Stance, measured: Sequence[PairMeasurement]) -> list[Sighting]:
+        """The landmarks that observers saw: who has stayed sees no more of one than when it came."""
+        before = self._before
+        here = {r for r in stance.observers if before is not None and r not in self._places.slips
+                and Places.stays(r, before, stance)}  # fmt: skip
+        self._sighted = {one for one in self._sighted if one[0] in here}
+        seen = (
+            (robot, what)
+            for one in measured
+            for robot, what in zip((one.homography.robot_i, one.homography.robot_j), one.landmarks, strict=True)
+        )
+        made, doubts = sight_landmarks(run, stance, seen, self._sighted)
+        self._sighted |= {(one.observer, one.seen) for one in made}
+        self.doubts += doubts
+        return made
 
     def _wheels(self, run: Recorded, robot: str, stance: Stance) -> WheelTrack:
         samples = self._samples[robot]
@@ -134,11 +161,11 @@ class Motions:
         wheels: Mapping[str, WheelTrack],
     ) -> list[Odometry]:
         before = self._before
-        self._earlier = before, self._there, dict(self._last)
         self._places.accept(self._places.after(before, stance))
         held = [r for r in stance.anchors if before and r in self._there and Places.stays(r, before, stance)]
-        posed = (robot for m in measured if m.relative_pose for robot, _ in m.relative_pose.ends)
-        self._there = {*stance.observers, *posed, *held, *(robot for s in sightings for robot, _ in s.ends)}
+        posed = [robot for m in measured if m.relative_pose for robot, _ in m.relative_pose.ends]
+        posed += [robot for s in sightings for robot, _ in s.ends if robot in self._samples]  # landmarks have no wheels
+        self._there = {*stance.observers, *posed, *held}
         self._before = stance
         times = {s.seen: s.time for s in sightings if s.seen in stance.movers}
         ways: list[Odometry] = []
@@ -172,9 +199,8 @@ class StanceSolver:
     def __init__(self, team: Team, options: SolveOptions | None = None) -> None:
         self.options = (options or SolveOptions()).resolved()
         self.team = team
-        self.estimator = Estimator(
-            team.reference, team.names, team.floor, slips_of(team), self.options.rigs(team) or None
-        )
+        rigs = self.options.rigs(team) or None
+        self.estimator = Estimator(team.reference, team.names, team.floor, slips_of(team), rigs, landmarks_of(team))
         #: All pairs of all stances; those that are unusable too.
         self.measured: tuple[PairMeasurement, ...] = ()
         #: What is to be said of clocks.
@@ -219,6 +245,11 @@ class StanceSolver:
         self.seconds.append((self._measuring + entering - started, time.perf_counter() - entering))
         self.measured += shared
         return EnteredStance(here, said, made, shared)
+
+    @property
+    def doubts(self) -> list[Doubt]:
+        """Landmarks that were seen and are not used."""
+        return self._motions.doubts
 
     def withdraw(self) -> None:
         """Take the last stance out again, as if it had never come; `EstimationError` where it is the first."""

@@ -35,7 +35,7 @@ LAYERS = [
 RANK = {part: rank for rank, parts in enumerate(LAYERS) for part in parts}
 #: Only what compares with truth, or shows it, reads it.
 TRUTH = {"read_truth", "read_true_team"}
-READS_TRUTH = {"run", "evaluation", "results", "comparison", "viewer", "cli"}
+READS_TRUTH = {"run", "drive_results", "evaluation", "results", "comparison", "viewer", "cli"}
 
 
 def part_of(path):

@@ -15,6 +15,7 @@ from coloc_graph.backend.estimate import Bump, Estimate, Refusal, make_estimate
 from coloc_graph.backend.factors import Method, require_rigs
 from coloc_graph.backend.fit import Fit, fit_graph
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
+from coloc_graph.backend.landmarks import OnMap
 from coloc_graph.backend.solver import Posterior, lm_parameters, with_stack
 from coloc_graph.measurements import RelativePose, Sighting
 from coloc_graph.team import Slip
@@ -24,6 +25,8 @@ LEAST_CHANCE_OF_ALL = 1e-4
 #: A stay-put constraint is loosened by so much to see whether the others contradict it.
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)
 MOST_BUMPS = 3
+#: What may be wrong, and is tested against all the rest.
+TESTED = (RelativePose, Sighting, OnMap)
 #: Rounds of refusing the worst and taking back what then agrees.
 ROUNDS = 20
 
@@ -83,7 +86,7 @@ def _is_suspicious(fit: Fit, posterior: Posterior) -> bool:
         return False
     if fit.chance < LEAST_CHANCE_OF_ALL:
         return True
-    tested = fit.agreements(posterior, (RelativePose, Sighting, StayPut))
+    tested = fit.agreements(posterior, (*TESTED, StayPut))
     return any(one.chance() < LEAST_CHANCE for one in tested.values())
 
 
@@ -104,7 +107,7 @@ def _find_wrong(method: Method, graph: PoseGraph) -> tuple[Refusal, ...]:
     for _ in range(ROUNDS):
         fit = fit_graph(method, graph.without(doubted.values()))
         posterior = Posterior(fit.factors, fit.values)
-        tested = fit.agreements(posterior, (RelativePose, Sighting))
+        tested = fit.agreements(posterior, TESTED)
         scale = _scale(tested.values())
         worst = min(tested, key=lambda index: tested[index].chance(scale), default=None)
         again = {key for key, link in doubted.items() if _agrees(fit, posterior, link, scale)}
@@ -117,19 +120,25 @@ def _find_wrong(method: Method, graph: PoseGraph) -> tuple[Refusal, ...]:
             doubted[id(fit.links[worst])] = fit.links[worst]
     return tuple(
         Refusal(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
-        for link in graph.measurements
+        for link in (*graph.measurements, *graph.on_map)
         if id(link) in doubted
         for off in [_innovation(fit, posterior, link).sigmas]
     )
 
 
 def _outliers(fit: Fit) -> dict[int, Link]:
-    """The relative poses that graduated non-convexity leaves out, by identity; everything else is taken for true.
+    """The relative poses, and sightings of landmarks, that graduated non-convexity leaves out, by identity; everything
+    else is taken for true.
 
     Source: Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", 2020.
     """
     first = fit.factors.size() - len(fit.links)
-    suspects = [index for index, link in enumerate(fit.links) if isinstance(link, RelativePose)]
+    landmarks = fit.graph.landmarks
+    suspects = [
+        index
+        for index, link in enumerate(fit.links)
+        if isinstance(link, RelativePose) or (isinstance(link, Sighting) and link.seen in landmarks)
+    ]
     parameters = gtsam.GncLMParams(lm_parameters(fit.values.size()))
     parameters.setKnownInliers(sorted(set(range(fit.factors.size())) - {first + index for index in suspects}))
     optimiser = gtsam.GncLMOptimizer(fit.factors, fit.values, parameters)
@@ -168,7 +177,7 @@ def _bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
     bumps: list[Bump] = []
     for _ in range(MOST_BUMPS):
         fit = fit_graph(method, loose)
-        tested = fit.agreements(Posterior(fit.factors, fit.values), (StayPut, RelativePose, Sighting))
+        tested = fit.agreements(Posterior(fit.factors, fit.values), (StayPut, *TESTED))
         stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
         if not stays:
             break
@@ -180,7 +189,7 @@ def _bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
         freed = _moved(loose, stay)
         moved = fit_graph(method, freed)
         # by what is left once it may have moved: a bump bends everything else
-        rest = moved.agreements(Posterior(moved.factors, moved.values), (RelativePose, Sighting))
+        rest = moved.agreements(Posterior(moved.factors, moved.values), TESTED)
         scale = _scale(rest.values())
         if stays[plainest].chance(scale) > LEAST_CHANCE:
             break

@@ -10,7 +10,7 @@ from msgspec.structs import replace as with_fields
 from numpy.typing import NDArray
 
 from coloc_graph.measurements import RelativePose
-from coloc_graph.team import Markers, Mount, Robot, Team
+from coloc_graph.team import Landmark, Markers, Mount, Robot, Team
 
 Array = NDArray[np.float64]
 
@@ -33,10 +33,14 @@ class Variables:
     Each is an error (n,), of what is stated. What is stated without a tolerance is exact, and no variable.
     """
 
-    def __init__(self, robots: tuple[str, ...], rigs: Mapping[str, Robot]) -> None:
+    def __init__(
+        self, robots: tuple[str, ...], rigs: Mapping[str, Robot], landmarks: Mapping[str, Landmark] | None = None
+    ) -> None:
         self.rigs = rigs
         self._numbers = {robot: number for number, robot in enumerate(robots, start=1)}
         self._names = {number: robot for robot, number in self._numbers.items()}
+        self._landmarks = dict(landmarks or {})
+        self._order = list(self._landmarks)  # their keys have the number 0, and are told by their place here
         self.sigmas: dict[int, Array] = {}
         self.anchors: dict[int, Array] = {}
 
@@ -62,12 +66,18 @@ class Variables:
             if self.is_mount(key)
         )
 
-    def markers(self, robot: str) -> int | None:
-        """The key of a robot's markers."""
-        markers = self.rigs[robot].markers
+    def markers_of(self, name: str) -> Markers:
+        """What is seen of a robot, or of a landmark."""
+        markers = self._landmarks[name].seen_as if name in self._landmarks else self.rigs[name].markers
         assert markers is not None
+        return markers
+
+    def markers(self, name: str) -> int | None:
+        """The key of a robot's markers, or of a landmark's."""
+        markers = self.markers_of(name)
         relative = markers.span_sigma / markers.span if markers.span else 0.0
-        return self._key(MARKERS, robot, 0, [relative, markers.height_sigma])
+        index = self._order.index(name) if name in self._landmarks else 0
+        return self._key(MARKERS, name, index, [relative, markers.height_sigma])
 
     def clocks(self, robot_i: str, robot_j: str, sigma: float) -> tuple[int | None, float]:
         """The key of what is left of the offset of two clocks, and its sign for this order of them."""
@@ -78,10 +88,10 @@ class Variables:
         """The key of a plane that was stated for a stance."""
         return self._key(PLANE, robot, stance, sigmas.tolist())
 
-    def _key(self, kind: int, robot: str, index: int, sigmas: list[float]) -> int | None:
+    def _key(self, kind: int, name: str, index: int, sigmas: list[float]) -> int | None:
         if not any(sigmas):
             return None
-        key = int(gtsam.mrsymbol(kind, self._numbers[robot], index))
+        key = int(gtsam.mrsymbol(kind, self._numbers.get(name, 0), index))
         self.sigmas[key] = np.maximum(sigmas, LEAST_SIGMA)
         return key
 
@@ -98,9 +108,10 @@ class Variables:
         """Whether a key is a mount's."""
         return bool(gtsam.mrsymbolChr(key) == MOUNT)
 
-    def robot(self, key: int) -> str:
+    def owner(self, key: int) -> str:
         """Whose mount or markers a key is."""
-        return self._names[gtsam.mrsymbolLabel(key)]
+        number = int(gtsam.mrsymbolLabel(key))
+        return self._names[number] if number else self._order[gtsam.mrsymbolIndex(key)]
 
 
 def is_calibration(key: int) -> bool:
@@ -219,24 +230,22 @@ class Calibration:
     def mounts(self) -> dict[str, CalibratedMount]:
         """By robot, those that were stated with a tolerance."""
         return {
-            robot: CalibratedMount(key, robot, rig.mount, self.values[key], self.covariances[key])
-            for key, robot, rig in self._of(MOUNT)
+            name: CalibratedMount(key, name, variables.rigs[name].mount, self.values[key], self.covariances[key])
+            for key, name, variables in self._of(MOUNT)
         }
 
     @cached_property
     def markers(self) -> dict[str, CalibratedMarkers]:
-        """By robot, those that were stated with a tolerance."""
+        """By robot or landmark, those that were stated with a tolerance."""
         return {
-            robot: CalibratedMarkers(key, robot, rig.markers, self.values[key], self.covariances[key])
-            for key, robot, rig in self._of(MARKERS)
-            if rig.markers is not None
+            name: CalibratedMarkers(key, name, variables.markers_of(name), self.values[key], self.covariances[key])
+            for key, name, variables in self._of(MARKERS)
         }
 
-    def _of(self, kind: int) -> Iterable[tuple[int, str, Robot]]:
+    def _of(self, kind: int) -> Iterable[tuple[int, str, Variables]]:
         for key in sorted(self.values):
             if self.variables is not None and gtsam.mrsymbolChr(key) == kind:
-                robot = self.variables.robot(key)
-                yield key, robot, self.variables.rigs[robot]
+                yield key, self.variables.owner(key), self.variables
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -257,7 +266,13 @@ class Calibration:
                     markers=robot.markers if markers is None else markers.markers,
                 )
             )
-        return with_fields(team, robots=tuple(robots))
+        landmarks = [
+            landmark if landmark.name not in self.markers else with_fields(
+                landmark, markers=self.markers[landmark.name].markers
+            )
+            for landmark in team.landmarks
+        ]  # fmt: skip
+        return with_fields(team, robots=tuple(robots), landmarks=tuple(landmarks))
 
     @property
     def far(self) -> tuple[Row, ...]:

@@ -22,7 +22,7 @@ from coloc_graph.measurements import (
     Sighting,
 )
 from coloc_graph.run import Stance
-from coloc_graph.team import Floor, Robot, Slip
+from coloc_graph.team import Floor, Landmark, Robot, Slip
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -52,6 +52,7 @@ class Checkpoint:
     measurements: tuple[Measurement, ...]
     refused: dict[int, str]
     early: tuple[Early, ...]
+    landmarks: dict[str, Landmark]
 
 
 class _Array(msgspec.Struct, forbid_unknown_fields=True):
@@ -135,6 +136,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     measurements: list[_Measured]
     refused: dict[int, str]
     early: list[_Early]
+    landmarks: dict[str, Landmark] = {}
 
 
 def write(saved: Checkpoint, path: Path) -> None:
@@ -150,6 +152,7 @@ def write(saved: Checkpoint, path: Path) -> None:
         measurements=[_of(one) for one in saved.measurements],
         refused=saved.refused,
         early=[_Early(one.stance, [_of(m) for m in one.measurements], one.after) for one in saved.early],
+        landmarks=saved.landmarks,
     )
     part = path.with_name(path.name + ".part")
     try:
@@ -178,6 +181,7 @@ def read(path: Path) -> Checkpoint:
             measurements=tuple(_to(one) for one in file.measurements),
             refused=file.refused,
             early=tuple(Early(one.stance, tuple(map(_to, one.measurements)), one.after) for one in file.early),
+            landmarks=file.landmarks,
         )
         for taken in (saved.measurements, *(one.measurements for one in saved.early)):
             require_valid(taken, saved.floor)

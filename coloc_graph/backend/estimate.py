@@ -12,6 +12,7 @@ from coloc_graph.backend.calibration import Calibration, Variables
 from coloc_graph.backend.consistency import UNCHECKED, Agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.graph import PoseGraph, StayPut
+from coloc_graph.backend.landmarks import MAP, OnMap, Placed
 from coloc_graph.backend.solver import Posterior
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Measurement, Node
@@ -22,9 +23,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Refusal:
-    """A measurement that was left out, and why, in words."""
+    """A measurement, or a place on the map, that was left out, and why, in words."""
 
-    measurement: Measurement
+    measurement: Measurement | OnMap
     reason: str
 
 
@@ -61,6 +62,7 @@ class Estimate:
     well the measurements agree (dof 0: nothing could contradict). `untied` are the (robot, stance) that no
     measurement ties to the reference; they have no pose. `refused` are the measurements that all others contradict,
     and `bumped` the anchors that did. `calibration` is what a joint estimate found of mounts, markers and clocks.
+    `landmarks` are those that were sighted, by name, and `map` is where the map of those that are on one is.
     """
 
     method: Method
@@ -73,6 +75,8 @@ class Estimate:
     refused: tuple[Refusal, ...] = ()
     bumped: tuple[Bump, ...] = ()
     calibration: Calibration = field(default_factory=Calibration)
+    landmarks: Mapping[str, Placed] = field(default_factory=dict)
+    map: Placed | None = None
 
     def pose(self, robot: str, stance: int) -> gtsam.Pose3:
         """T_world_body of a robot at a stance; `EstimationError` where it has none."""
@@ -121,6 +125,8 @@ class Estimate:
                 key = self.graph.key(robot, stance)
                 if not values.exists(key):
                     values.insert(key, gtsam.Pose3(T))
+        for name, placed in {**self.landmarks, **({} if self.map is None else {MAP: self.map})}.items():
+            values.insert(self.graph.places.still()[name], placed.T_world_body)
         for key, errors in self.calibration.values.items():
             values.insert(key, errors)
         return values
@@ -197,4 +203,8 @@ def make_estimate(
             )
     untied = graph.untied(poses)
     calibration = Calibration(variables, errors, {key: covariances[key] for key in errors})
-    return Estimate(method, graph, trajectories, untied, chi2, dof, iterations, refused, bumped, calibration)
+    still = {name: Placed(poses[key], covariances[key]) for name, key in graph.places.still().items() if key in poses}
+    here = still.pop(MAP, None)
+    return Estimate(
+        method, graph, trajectories, untied, chi2, dof, iterations, refused, bumped, calibration, still, here
+    )

@@ -26,12 +26,13 @@ from coloc_graph.backend.graph import (
     require_robots,
     slips_of,
 )
+from coloc_graph.backend.landmarks import Placed, landmarks_of, map_of, of_seen
 from coloc_graph.backend.live_graph import LiveGraph, rebuilt
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError, MeasurementError
 from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
 from coloc_graph.run import Stance
-from coloc_graph.team import Floor, Robot, Slip, Team
+from coloc_graph.team import Floor, Landmark, Robot, Slip, Team
 
 Array = NDArray[np.float64]
 
@@ -57,14 +58,16 @@ class Estimator:
         floor: Floor | None = None,
         slips: Mapping[str, Slip] | None = None,
         rigs: Mapping[str, Robot] | None = None,
+        landmarks: Mapping[str, Landmark] | None = None,
     ) -> None:
         self.reference, self.robots, self.floor, self.slips = reference, tuple(robots), floor, dict(slips or {})
-        self.rigs = dict(rigs or {})
+        self.rigs, self.landmarks = dict(rigs or {}), dict(landmarks or {})
+        self._on_map = map_of(self.landmarks)
         if reference not in self.robots:
             raise EstimationError(f"the reference robot {reference} is not one of {', '.join(self.robots)}")
         if self.rigs:
             require_rigs(self.robots, self.rigs)
-        self._places = Places(self.robots, self.slips)
+        self._places = Places(self.robots, self.slips, self.landmarks)
         self._stances: dict[int, Stance] = {}
         self._log: list[Measurement] = []  # everything that ever came, the refused too
         self._refused: dict[int, Refusal] = {}  # by the measurement's identity
@@ -78,7 +81,7 @@ class Estimator:
     def of(cls, team: Team, method: Method = "joint") -> "Estimator":
         """The estimator of a team: with its mounts to be calibrated, or of poses alone (`smooth`)."""
         rigs = {robot.name: robot for robot in team.robots} if method == "joint" else None
-        return cls(team.reference, team.names, team.floor, slips_of(team), rigs)
+        return cls(team.reference, team.names, team.floor, slips_of(team), rigs, landmarks_of(team))
 
     @property
     def method(self) -> Method:
@@ -86,7 +89,7 @@ class Estimator:
         return "joint" if self.rigs else "smooth"
 
     def _new_factors(self) -> Factors:
-        return Factors(self.floor, Variables(self.robots, self.rigs) if self.rigs else None)
+        return Factors(self.floor, Variables(self.robots, self.rigs, self.landmarks) if self.rigs else None)
 
     @property
     def stances(self) -> tuple[Stance, ...]:
@@ -112,8 +115,9 @@ class Estimator:
     def graph(self) -> PoseGraph:
         """Everything that is in, as a graph; `EstimationError` while there is no stance."""
         return PoseGraph(
-            self.reference, self.robots, self.stances, self.measurements, self.floor, self.slips, self.rigs
-        )
+            self.reference, self.robots, self.stances, self.measurements, self.floor, self.slips, self.rigs,
+            self.landmarks, self._on_map,
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         return (
@@ -128,6 +132,14 @@ class Estimator:
     def covariance(self, robot: str, stance: int | None = None) -> Array:
         """Covariance (6, 6) of that pose: GTSAM's tangent, rotation [rad] first, then translation [m], body frame."""
         return self._live.covariance(self._tied_key(robot, stance))
+
+    def placed(self) -> dict[str, Placed]:
+        """Where the landmarks are that were sighted, and the map (`landmarks.MAP`), by name."""
+        return {
+            name: Placed(self._live.pose(key), self._live.covariance(key))
+            for name, key in self._places.still().items()
+            if key in self._live.tied
+        }
 
     def residual(self, measurement: Measurement) -> float:
         """How far a measurement is from where all stand now, RMS in units of its noise; NaN where an end of it has no
@@ -260,6 +272,7 @@ class Estimator:
                 measurements=self.measurements,
                 refused={numbers[key]: one.reason for key, one in self._refused.items()},
                 early=tuple(self._early.values()),
+                landmarks=self.landmarks,
             ),
             Path(path),
         )
@@ -268,7 +281,7 @@ class Estimator:
     def resume(cls, path: str | Path) -> "Estimator":
         """The estimator of a checkpoint, as it was; `InputError` where the file is none."""
         saved = checkpoint.read(Path(path))
-        estimator = cls(saved.reference, saved.robots, saved.floor, saved.slips, saved.rigs)
+        estimator = cls(saved.reference, saved.robots, saved.floor, saved.slips, saved.rigs, saved.landmarks)
         before = None
         for stance in saved.stances:
             estimator._places.accept(estimator._places.after(before, stance))
@@ -287,7 +300,7 @@ class Estimator:
 
     def _enter(self, stance: Stance | None, taken: tuple[Measurement, ...]) -> StanceEstimate:
         before = next(reversed(self._stances.values()), None)
-        links: list[Link] = [*self._loose, *taken]
+        links: list[Link] = [*self._loose, *taken, *self._newly_on_map(taken)]
         if stance is not None:
             if before is not None:
                 self._require_anchor(stance, taken)
@@ -310,6 +323,15 @@ class Estimator:
         self._loose = entering.loose
         said = self._at(next(reversed(self._stances.values())), refused, agreement)
         return replace(said, residuals=tuple(map(self.residual, taken)))
+
+    def _newly_on_map(self, taken: Iterable[Measurement]) -> tuple[Link, ...]:
+        """What the map says of the landmarks that are seen for the first time."""
+        waiting = set(map(id, self._loose))
+        return tuple(
+            one
+            for one in of_seen(self._on_map, (m.seen for m in taken if isinstance(m, Sighting)))
+            if id(one) not in waiting and self._places.key(one.ends[1]) not in self._live.tied
+        )
 
     def _require_anchor(self, stance: Stance, taken: tuple[Measurement, ...]) -> None:
         if not stance.anchors and not any(isinstance(one, Odometry) and one.after == stance.index for one in taken):

@@ -34,7 +34,7 @@ def factors_for(method: Method, graph: PoseGraph, known: gtsam.Values | None = N
     """What makes the factors of a graph for a method; mounts may be `known` to be elsewhere than stated."""
     if method != "joint":
         return Factors(graph.floor)
-    variables = Variables(graph.robots, graph.rigs)
+    variables = Variables(graph.robots, graph.rigs, graph.landmarks)
     if known is not None:
         variables.anchors |= calibrations_in(known)
     return Factors(graph.floor, variables)
@@ -129,7 +129,12 @@ class Factors:
                 return markers_factor(link, i, j, self.variables)
             assert isinstance(link, RelativePose)
             return homography_factor(link, i, j, self.variables, self.floor is not None)
-        return gtsam.BetweenFactorPose3(i, j, link.T_i_j, _noise(link))
+        return self.between(link, i, j, link.T_i_j)
+
+    @staticmethod
+    def between(link: Link, i: int, j: int, T_i_j: gtsam.Pose3) -> gtsam.NonlinearFactor:
+        """A link as what it says of the two poses alone, with the covariance that it has as such."""
+        return gtsam.BetweenFactorPose3(i, j, T_i_j, _noise(link))
 
     def expected(self, link: Link, i: int, j: int, errors: Callable[[int], Array]) -> gtsam.Pose3:
         """The pose of a link's second end in its first, with calibration variables at `errors` of their keys.

@@ -7,11 +7,12 @@ from functools import cached_property
 
 import gtsam
 
+from coloc_graph.backend.landmarks import ALWAYS, MAP, OnMap, landmarks_of, map_of, of_seen
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, MeasurementError
 from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
 from coloc_graph.run import Stance
-from coloc_graph.team import Floor, Robot, Slip, Team
+from coloc_graph.team import Floor, Landmark, Robot, Slip, Team
 
 #: GTSAM's keys number the robots of a team in one byte.
 MOST_ROBOTS = 255
@@ -45,18 +46,23 @@ class StayPut:
 
 
 #: What the graph holds between two nodes.
-Link = Measurement | StayPut
+Link = Measurement | StayPut | OnMap
 
 
 class Places:
-    """Which variable each robot's pose at each stance is: stance after stance, by counting its moves."""
+    """Which variable each robot's pose at each stance is: stance after stance, by counting its moves.
 
-    def __init__(self, robots: tuple[str, ...], slips: Mapping[str, Slip]) -> None:
+    `landmarks`, and the map, never move: each is one variable, at every stance.
+    """
+
+    def __init__(self, robots: tuple[str, ...], slips: Mapping[str, Slip], landmarks: Iterable[str] = ()) -> None:
         if len(robots) > MOST_ROBOTS:
             raise EstimationError(f"a team of {len(robots)} robots is too large: a graph holds {MOST_ROBOTS} at most")
         self.slips = slips
         self._numbers = {robot: number for number, robot in enumerate(robots, start=1)}
         self._moves = dict.fromkeys(robots, 0)
+        # robots are numbered from 1; what never moves has the number 0, and is told by its count
+        self._still = {name: int(gtsam.mrsymbol(ord("x"), 0, n)) for n, name in enumerate((MAP, *landmarks))}
         self._keys: dict[Node, int] = {}
 
     def after(self, before: Stance | None, stance: Stance) -> dict[Node, int]:
@@ -94,10 +100,22 @@ class Places:
 
     def key(self, node: Node) -> int:
         """GTSAM's key of a node; `KeyError` where there is no such robot or stance."""
-        return self._keys[node]
+        still = self._still.get(node[0])
+        return self._keys[node] if still is None else still
 
     def __contains__(self, node: Node) -> bool:
-        return node in self._keys
+        return node in self._keys or (node[0] in self._still and (node[1] == ALWAYS or self._is_stance(node[1])))
+
+    def _is_stance(self, index: int) -> bool:
+        return any((robot, index) in self._keys for robot in self._numbers)
+
+    def is_still(self, name: str) -> bool:
+        """Whether it is a landmark, or the map."""
+        return name in self._still
+
+    def still(self) -> dict[str, int]:
+        """The keys of the landmarks and of the map."""
+        return dict(self._still)
 
 
 @dataclass(frozen=True, repr=False)
@@ -109,6 +127,7 @@ class PoseGraph:
     where the reference robot stands at the first stance: its body, or, where there is a `floor`, the floor beneath
     it (the same on a level floor), x along its heading. `slips` are of the robots that stay put within a tolerance.
     `rigs` are the robots as the team describes them, with mounts and markers: what the joint estimate calibrates.
+    `landmarks` that were sighted are one variable each, and `on_map` is what is known of where these stand.
 
     Raises `EstimationError` where there is nothing to solve, and `MeasurementError` where a measurement is not one.
     """
@@ -120,12 +139,25 @@ class PoseGraph:
     floor: Floor | None = None
     slips: Mapping[str, Slip] = field(default_factory=dict)
     rigs: Mapping[str, Robot] = field(default_factory=dict)
+    landmarks: Mapping[str, Landmark] = field(default_factory=dict)
+    on_map: tuple[OnMap, ...] = ()
 
     @classmethod
     def of(cls, team: Team, stances: Iterable[Stance], measurements: Iterable[Measurement]) -> "PoseGraph":
         """The graph of a team."""
         rigs = {robot.name: robot for robot in team.robots}
-        return cls(team.reference, team.names, tuple(stances), tuple(measurements), team.floor, slips_of(team), rigs)
+        landmarks = landmarks_of(team)
+        return cls(
+            team.reference,
+            team.names,
+            tuple(stances),
+            tuple(measurements),
+            team.floor,
+            slips_of(team),
+            rigs,
+            landmarks,
+            map_of(landmarks),
+        )
 
     def __post_init__(self) -> None:
         if not self.stances:
@@ -146,7 +178,7 @@ class PoseGraph:
     @cached_property
     def places(self) -> Places:
         """Which variable each node is."""
-        places = Places(self.robots, self.slips)
+        places = Places(self.robots, self.slips, self.landmarks)
         for before, stance in zip((None, *self.stances), self.stances, strict=False):
             places.accept(places.after(before, stance))
         return places
@@ -158,11 +190,12 @@ class PoseGraph:
 
     @cached_property
     def nodes(self) -> tuple[Node, ...]:
-        """All nodes, in the order of the stances."""
+        """All nodes, in the order of the stances; landmarks are none of them."""
         named: dict[int, dict[str, None]] = defaultdict(dict)
         for measured in self.measurements:
             for robot, index in measured.ends:
-                named[index][robot] = None
+                if robot not in self.landmarks:
+                    named[index][robot] = None
         nodes: list[Node] = []
         there: set[str] = set()
         for before, stance in zip((None, *self.stances), self.stances, strict=False):
@@ -171,6 +204,15 @@ class PoseGraph:
             there = set(at)
             nodes += [(robot, stance.index) for robot in at]
         return tuple(nodes)
+
+    @cached_property
+    def sighted(self) -> dict[str, tuple[Sighting, ...]]:
+        """The sightings of each landmark that was seen."""
+        found: dict[str, list[Sighting]] = defaultdict(list)
+        for one in self.measurements:
+            if isinstance(one, Sighting) and one.seen in self.landmarks:
+                found[one.seen].append(one)
+        return {name: tuple(found[name]) for name in self.landmarks if name in found}
 
     @property
     def relative_poses(self) -> tuple[RelativePose, ...]:
@@ -199,8 +241,10 @@ class PoseGraph:
 
     @property
     def links(self) -> tuple[Link, ...]:
-        """All that holds two variables together: measurements, and stay-put constraints with a slip."""
-        return (*self.measurements, *(stay for stay in self.stay_puts if stay.slip is not None))
+        """All that holds two variables together: measurements, stay-put constraints with a slip, and what the map says
+        of landmarks that were seen."""
+        slipping = (stay for stay in self.stay_puts if stay.slip is not None)
+        return (*self.measurements, *slipping, *of_seen(self.on_map, self.sighted))
 
     def key(self, robot: str, stance: int) -> int:
         """GTSAM's key of a robot's pose at a stance."""
@@ -223,8 +267,8 @@ class PoseGraph:
         out = {id(one) for one in refused}
         if not out:
             return self
-        graph = PoseGraph(self.reference, self.robots, self.stances, tuple(m for m in self.measurements
-                          if id(m) not in out), self.floor, self.slips, self.rigs)  # fmt: skip
+        kept = tuple(m for m in self.measurements if id(m) not in out)
+        graph = replace(self, measurements=kept, on_map=tuple(one for one in self.on_map if id(one) not in out))
         vars(graph).update(nodes=self.nodes, times=self.times)  # a node stays one, and untied, if all it had is refused
         return graph
 
@@ -240,6 +284,8 @@ class PoseGraph:
         exact = len(self.stay_puts) - slipping
         shown = ", ".join(f"{s.robot}@{s.before}={s.robot}@{s.after}" for s in self.stay_puts[:4])
         more = ", ..." if len(self.stay_puts) > 4 else ""
+        if self.sighted:
+            counts.append(f"{len(self.sighted)} landmarks")
         return (
             f"PoseGraph({len(self.robots)} robots, {len(self.stances)} stances, {', '.join(counts)}, "
             f"{exact} stay-put exact and {slipping} with a slip{': ' if shown else ''}{shown}{more})"
@@ -277,6 +323,8 @@ def require_ends(measured: Measurement, places: Places, stances: Mapping[int, St
             raise MeasurementError(f"the {measured} names {what} there: correct it, or add that first")
     (robot_i, before), (robot_j, after) = measured.ends
     if isinstance(measured, Odometry):
+        if places.is_still(robot_i):
+            raise MeasurementError(f"the {measured} names a landmark, which does not move")
         if before >= after:
             raise MeasurementError(f"the {measured} does not lead from a stance to a later one")
         return

@@ -123,8 +123,8 @@ def sighted(link: Sighting, variables: Variables, errors: Callable[[int], Array]
 
 
 def _markers_model(link: Sighting, variables: Variables) -> MarkersModel:
-    markers = variables.rigs[link.seen].markers
-    assert link.x_markers is not None and link.x_covariance is not None and markers is not None
+    assert link.x_markers is not None and link.x_covariance is not None
+    markers = variables.markers_of(link.seen)
     return MarkersModel(link.x_markers, link.x_covariance, variables.rigs[link.observer].mount, markers)
 
 

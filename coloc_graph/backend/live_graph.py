@@ -1,5 +1,6 @@
 """The graph inside an estimator: ISAM2 with QR, what enters it, and what all others contradict taken out again."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import gtsam
@@ -16,6 +17,7 @@ from coloc_graph.backend.fit import fit_graph
 from coloc_graph.backend.graph import Link, PoseGraph
 from coloc_graph.backend.solver import CALIBRATED, isam_parameters, joint_covariance, with_stack
 from coloc_graph.errors import EstimationError
+from coloc_graph.measurements import Sighting
 
 Array = NDArray[np.float64]
 
@@ -23,6 +25,8 @@ Array = NDArray[np.float64]
 CLEAR = float(chdtri(1, LEAST_CHANCE))
 #: So many steps at most lead to the optimum when something enters: a first stance with mounts a degree off takes 4.
 MOST_STEPS = 10
+#: Poses that a step moves by less than this are there [m, entries of a rotation].
+THERE = 1e-4
 #: A step that leaves more than this share of the worst chi2 has not brought it nearer.
 NEARER = 0.9
 
@@ -89,6 +93,7 @@ class LiveGraph:
                 factors.add(factor)
         made = [self.factors_of.of_link(*tie) for tie in (*entering.ties, *entering.near)]
         far = {id(tie): self.factors_of.of_link(*tie) for tie in entering.far}
+        gates = {id(tie): self._gate(tie) for tie in entering.far}
         self._new_variables([*made, *far.values()], factors, values)
         first = factors.size() + len(entering.ties)
         for factor in made:
@@ -98,7 +103,7 @@ class LiveGraph:
         indices = self._into_isam(factors, values) if factors.size() else []
         inside = {index: Entered(tie[0], self.isam.getFactorsUnsafe().at(index))
                   for index, tie in zip(indices[first:], entering.near, strict=True)}  # fmt: skip
-        refused = self._enter_far([Entered(tie[0], far[id(tie)]) for tie in entering.far], inside)
+        refused = self._enter_far([(Entered(tie[0], far[id(tie)]), gates[id(tie)]) for tie in entering.far], inside)
         if entering.far or not clear:
             refused += self._take_out(inside)
         together = self._agreement([self.isam.getFactorsUnsafe().at(index) for index in (*indices[:first], *inside)])
@@ -129,13 +134,15 @@ class LiveGraph:
             values.insert(key, self._calibrated[key])
             factors.add(self.factors_of.calibration_prior(key))
 
-    def _into_isam(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> list[int]:
-        """Put factors in and optimise; their indices.
+    def _into_isam(
+        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, instead_of: Sequence[int] = ()
+    ) -> list[int]:
+        """Put factors in, `instead_of` others, and optimise; their indices.
 
         Where mounts turn out otherwise than thought, everything is linearised anew until they stay: poses shift with
         them, and that far one step does not lead to the optimum.
         """
-        indices = list(self.isam.update(factors, values).getNewFactorsIndices())
+        indices = list(self.isam.update(factors, values, list(instead_of)).getNewFactorsIndices())
         for _ in range(MOST_STEPS):
             now = {key: self.errors(key) for key in self._calibrated}
             if all(np.abs(now[key] - before).max() < CALIBRATED for key, before in self._calibrated.items()):
@@ -161,21 +168,53 @@ class LiveGraph:
                 values.insert(key, self._known(key))
         return values
 
-    def _enter_far(self, far: list[Entered], inside: dict[int, Entered]) -> list[tuple[Link, Agreement]]:
+    def _gate(self, tie: Tie) -> gtsam.NonlinearFactor | None:
+        """By what a sighting that is far off is tested, and led in: what it says of two poses. None of all else, which
+        is tested as it is.
+
+        A landmark that drift has put elsewhere is far off in the image, or behind the camera: there pixels tell
+        neither how far, nor the way there.
+        """
+        link, i, j = tie
+        if not isinstance(link, Sighting) or self.factors_of.variables is None:
+            return None
+        return self.factors_of.between(link, i, j, self.factors_of.expected(link, i, j, self.errors))
+
+    def _enter_far(
+        self, far: list[tuple[Entered, gtsam.NonlinearFactor | None]], inside: dict[int, Entered]
+    ) -> list[tuple[Link, Agreement]]:
         """Put in what does not contradict what is known, and note it as `inside`; what does is refused."""
         refused: list[tuple[Link, Agreement]] = []
         passed: list[Entered] = []
-        factors = gtsam.NonlinearFactorGraph()
-        for one in far:
-            off = self._agreement([one.factor], inside=False)
+        factors, leading = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+        for one, gate in far:
+            off = self._agreement([one.factor if gate is None else gate], inside=False)
             if off.chance() < LEAST_CHANCE:
                 refused.append((one.link, off))
             else:
                 passed.append(one)
                 factors.add(one.factor)
+                if gate is not None:
+                    leading.add(gate)
         if passed:
-            inside |= zip(self._into_isam(factors, gtsam.Values()), passed, strict=True)
+            led = self._led_in(leading)
+            inside |= zip(self._into_isam(factors, gtsam.Values(), led), passed, strict=True)
         return refused
+
+    def _led_in(self, leading: gtsam.NonlinearFactorGraph) -> list[int]:
+        """Put in factors that are to lead the poses to where others make sense, and go there; their indices."""
+        if not leading.size():
+            return []
+        indices = list(self.isam.update(leading, gtsam.Values()).getNewFactorsIndices())
+        keys = keys_of([leading.at(n) for n in range(leading.size())])
+        before = [self.isam.calculateEstimatePose3(key) for key in keys]
+        for _ in range(MOST_STEPS):
+            self._linearise()
+            now = [self.isam.calculateEstimatePose3(key) for key in keys]
+            if all(a.equals(b, THERE) for a, b in zip(before, now, strict=True)):
+                break
+            before = now
+        return indices
 
     def _take_out(self, inside: dict[int, Entered]) -> list[tuple[Link, Agreement]]:
         """Take out what all others contradict, the worst first."""

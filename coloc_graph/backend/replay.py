@@ -26,9 +26,8 @@ def replay(
     by_stance: dict[int, list[Measurement]] = defaultdict(list)
     for measured in graph.measurements:
         by_stance[max(stance for _, stance in measured.ends)].append(measured)
-    estimator = Estimator(
-        graph.reference, graph.robots, graph.floor, graph.slips, graph.rigs if method == "joint" else None
-    )
+    rigs = graph.rigs if method == "joint" else None
+    estimator = Estimator(graph.reference, graph.robots, graph.floor, graph.slips, rigs, graph.landmarks)
     seconds = []
     before = None
     for stance in graph.stances:

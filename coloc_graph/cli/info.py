@@ -19,12 +19,12 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 def run(args: argparse.Namespace) -> int:
     """Look and print."""
     from coloc_graph.cli.printing import counted, print_json, print_table
-    from coloc_graph.inspection import inspect
+    from coloc_graph.inspection import inspect, landmarks_seen
     from coloc_graph.run import open_run, read_truth
     from coloc_graph.run.schemas import topic_of
 
     opened = open_run(args.run_path)
-    findings = inspect(opened)
+    findings, landmarks = inspect(opened), landmarks_seen(opened)
     truth = {robot: len(poses) for robot, poses in sorted(read_truth(args.run_path).items())}
     topics = opened.topics | {topic_of(robot, "truth"): count for robot, count in truth.items()}
     seconds = (opened.end - opened.start) if opened.start is not None and opened.end is not None else 0.0
@@ -37,6 +37,16 @@ def run(args: argparse.Namespace) -> int:
                 "seconds": seconds,
                 "topics": topics,
                 "truth": list(truth),
+                "landmarks": [
+                    {
+                        "name": one.landmark.name,
+                        "what": one.what,
+                        "on_map": one.landmark.on_map,
+                        "stances": list(one.stances),
+                        "observers": list(one.observers),
+                    }
+                    for one in landmarks
+                ],
                 "problems": [{"where": finding.where, "what": finding.what} for finding in findings],
             }
         )
@@ -45,6 +55,23 @@ def run(args: argparse.Namespace) -> int:
     print(f"team: {', '.join(opened.team.names)}; reference {opened.team.reference}")
     print(f"truth: {', '.join(truth) if truth else 'none'}")
     print_table(["topic", "messages"], [[topic, str(count)] for topic, count in sorted(topics.items())])
+    if landmarks:
+        in_images = any(opened.has_images(robot) and not opened.has_detections(robot) for robot in opened.team.names)
+        print_table(
+            ["landmark", "seen as", "on the map", "stances", "seen by"],
+            [
+                [
+                    one.landmark.name,
+                    one.what,
+                    "yes" if one.landmark.on_map else "no",
+                    "?" if in_images and not one.stances else str(len(one.stances)),
+                    ", ".join(one.observers),
+                ]
+                for one in landmarks
+            ],
+        )
+        if in_images:
+            print("images are not looked into: which landmarks are in them is found when the run is solved")
     if not findings:
         print("nothing wrong was found")
     for finding in findings:

@@ -9,7 +9,7 @@ from coloc_graph.cli.printing import progress
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """The command's arguments."""
     command = commands.add_parser("simulate", help="write a run of a simulated team, with truth in it")
-    command.add_argument("scenario", help="single-step, six-step, hallway or team")
+    command.add_argument("scenario", help="single-step, six-step, hallway, team or landmarks")
     add_out(command)
     command.add_argument("--depth", choices=("tracks", "images"), default="tracks", help="marker centres, or images")
     command.add_argument("--seed", type=int, default=0)
@@ -26,6 +26,10 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--theta", type=float, help="single-step: angle between the observers, deg")
     command.add_argument("--robots", type=int, help="team: how many robots; default 10")
     command.add_argument("--at-once", type=int, help="team: how many of them move at once; default a quarter")
+    command.add_argument("--length", type=float, help="landmarks: how far the team goes in all, m; default 100")
+    command.add_argument("--laps", type=int, help="landmarks: in how many laps of a square course; default 4")
+    command.add_argument("--landmark-every", type=float, help="landmarks: so far apart along the course, m; default 10")
+    command.add_argument("--known", action="store_true", help="landmarks: the team is told where they are")
     command.add_argument("--fps", type=float, help="images a second (images; default 10)")
     command.add_argument("--image-format", choices=("jpeg", "png", "raw"), help="images; default jpeg")
     command.add_argument(
@@ -66,6 +70,10 @@ def run(args: argparse.Namespace) -> int:
             theta_deg=args.theta,
             robots=args.robots,
             at_once=args.at_once,
+            length=args.length,
+            landmark_every=args.landmark_every,
+            laps=args.laps,
+            known=args.known,
             fps=10.0 if args.fps is None else args.fps,
             image_format=args.image_format or "jpeg",
             messy=args.messy,

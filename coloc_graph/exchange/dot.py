@@ -3,6 +3,7 @@
 from collections import defaultdict
 
 from coloc_graph.backend import PoseGraph, StayPut
+from coloc_graph.backend.landmarks import OnMap
 from coloc_graph.measurements import Node, Odometry, RelativePose
 
 #: Colours that colour-blind readers tell apart (Okabe and Ito).
@@ -13,12 +14,16 @@ def to_dot(graph: PoseGraph) -> str:
     """The graph in the dot language; draw it with `dot -Tsvg`, or `neato` for large ones.
 
     A box is one variable, named by all stances at which it holds; a double border is a robot that stayed put
-    exactly. Dashed edges are stay-put constraints with a slip, dotted ones odometry, thin ones sightings.
+    exactly. Dashed edges are stay-put constraints with a slip, dotted ones odometry, thin ones sightings. Landmarks are
+    hexagons, and so is the map, with dashed edges to those that are on it.
     """
     places: dict[int, list[Node]] = defaultdict(list)
     for node in graph.nodes:
         places[graph.places.key(node)].append(node)
-    ids = {key: f"n{number}" for number, key in enumerate(places)}
+    linked = [[graph.places.key(node) for node in link.ends] for link in graph.links]
+    ends = {key for keys in linked for key in keys}
+    still = {key: name for name, key in graph.places.still().items() if key in ends}
+    ids = {key: f"n{number}" for number, key in enumerate([*places, *still])}
     lines = ["graph poses {", "  node [shape=box, style=rounded, fontname=Helvetica];", "  edge [fontname=Helvetica];"]
     for key, nodes in places.items():
         label = " = ".join(f"{robot}@{stance}" for robot, stance in nodes)
@@ -26,12 +31,16 @@ def to_dot(graph: PoseGraph) -> str:
         borders = 2 if len(nodes) > 1 else 1
         world = ", penwidth=3" if key == graph.reference_key else ""
         lines.append(f'  {ids[key]} [label="{label}", color="{colour}", peripheries={borders}{world}];')
-    for link in graph.links:
-        i, j = (ids[graph.places.key(node)] for node in link.ends)
+    for key, name in still.items():
+        lines.append(f'  {ids[key]} [label="{name.removeprefix("/")}", shape=hexagon, style=solid, color="#555555"];')
+    for link, keys in zip(graph.links, linked, strict=True):
+        i, j = (ids[key] for key in keys)
         if isinstance(link, RelativePose):
             style = f'label="H {link.stance}"'
         elif isinstance(link, StayPut):
             style = 'label="stay put", style=dashed'
+        elif isinstance(link, OnMap):
+            style = "style=dashed"
         else:
             style = "style=dotted" if isinstance(link, Odometry) else "penwidth=0.5"
         lines.append(f"  {i} -- {j} [{style}];")

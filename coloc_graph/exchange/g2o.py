@@ -2,15 +2,16 @@
 
 VERTEX_SE3:QUAT and EDGE_SE3:QUAT with the information's upper triangle, translation first; read are also VERTEX_SE2
 and EDGE_SE2. Ids are plain integers; numbers read back to the bit. g2o has no word for a stay-put constraint:
-stances that share a pose share a vertex, and a comment says so, which `read_g2o` understands. Nor has it one for a
-floor: its priors are left out. What a planar measurement does not know has the information `UNKNOWN`.
+stances that share a pose share a vertex, and a comment says so, which `read_g2o` understands. Landmarks, and the map,
+are vertices like any other, named in comments. Nor has g2o a word for a floor: its priors are left out. What a planar
+measurement does not know has the information `UNKNOWN`.
 
 Source: g2o's file format, https://github.com/RainerKuemmerle/g2o/wiki/File-Format
 """
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import gtsam
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend import Estimate, StayPut
 from coloc_graph.backend.factors import GAUGE_SIGMA, link_covariance
+from coloc_graph.backend.landmarks import MAP
 from coloc_graph.errors import InputError
 from coloc_graph.lie import quaternion
 from coloc_graph.measurements import Node
@@ -43,6 +45,10 @@ def write_g2o(estimate: Estimate, path: Path) -> None:
             key = graph.key(robot, stance)
             poses.setdefault(key, gtsam.Pose3(T))
             names.setdefault(key, []).append(f"{robot}@{stance}")
+    still = estimate.landmarks if estimate.map is None else {**estimate.landmarks, MAP: estimate.map}
+    for name, placed in still.items():
+        key = graph.places.still()[name]
+        poses[key], names[key] = placed.T_world_body, ["the map" if name == MAP else f"landmark {name}"]
     ids = {key: number for number, key in enumerate(poses)}
 
     lines = []
@@ -82,7 +88,7 @@ class G2oGraph:
 
     The `fixed` vertices (the lowest id where the file fixes none) hold the world by a prior, the first factors.
     `names` are the robots and stances that our own files give to vertices, and `stay_puts` their constraints: all of
-    `names[id]` are one place.
+    `names[id]` are one place. `landmarks` are the names of the vertices that are landmarks.
     """
 
     factors: gtsam.NonlinearFactorGraph
@@ -90,6 +96,7 @@ class G2oGraph:
     fixed: tuple[int, ...]
     names: dict[int, tuple[Node, ...]]
     stay_puts: tuple[StayPut, ...]
+    landmarks: dict[int, str] = field(default_factory=dict)
 
 
 def read_g2o(path: str | Path) -> G2oGraph:
@@ -108,6 +115,7 @@ class _Reader:
         self.fixed: list[tuple[int, int]] = []
         self.names: dict[int, tuple[Node, ...]] = {}
         self.stay_puts: list[StayPut] = []
+        self.landmarks: dict[int, str] = {}
         self.tags: dict[str, tuple[int | None, Callable[[list[float]], None]]] = {
             "VERTEX_SE2": (4, self._vertex2),
             "VERTEX_SE3:QUAT": (8, self._vertex3),
@@ -146,6 +154,8 @@ class _Reader:
 
     def _comment(self, line: str) -> None:
         if found := _IS.fullmatch(line.strip()):
+            if found[2].startswith("landmark "):
+                self.landmarks[int(found[1])] = found[2].removeprefix("landmark ")
             named = [name.rpartition("@") for name in found[2].split(" = ")]
             if all(robot and stance.isdecimal() for robot, _, stance in named):
                 self.names[int(found[1])] = tuple((robot, int(stance)) for robot, _, stance in named)
@@ -223,4 +233,4 @@ class _Reader:
                 noise = gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA)
                 factors.add(gtsam.PriorFactorPose3(key, self.values.atPose3(key), noise))
         factors.push_back(self.edges)
-        return G2oGraph(factors, self.values, fixed, self.names, tuple(self.stay_puts))
+        return G2oGraph(factors, self.values, fixed, self.names, tuple(self.stay_puts), self.landmarks)

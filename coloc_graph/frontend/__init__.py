@@ -8,6 +8,7 @@ from coloc_graph.frontend.correspondence import Correspondences, correspond, pai
 from coloc_graph.frontend.decomposition import choose_by_normal, decompose_svd, decompose_with_normal, metric_scale
 from coloc_graph.frontend.detection import Blobs, Detector, Threshold, detect_hue, detect_leds, detector_for
 from coloc_graph.frontend.homography import HomographyFit, fit_homography
+from coloc_graph.frontend.landmarks import Doubt, SeenLandmarks, in_words, sight_landmarks
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.plane import distance_from_span, on_plane, plane_from_mount
 from coloc_graph.frontend.refinement import PointPairs, least_squares, refine
@@ -33,12 +34,14 @@ __all__ = [
     "ClockOffset",
     "Correspondences",
     "Detector",
+    "Doubt",
     "FrontendOptions",
     "HomographyFit",
     "MarkerTracker",
     "PairMeasurement",
     "PointPairs",
     "Scale",
+    "SeenLandmarks",
     "StanceTracks",
     "Threshold",
     "Track",
@@ -53,6 +56,7 @@ __all__ = [
     "detector_for",
     "distance_from_span",
     "fit_homography",
+    "in_words",
     "least_squares",
     "little_in_common",
     "measure_pair",
@@ -66,6 +70,7 @@ __all__ = [
     "relative_pose",
     "share_clock_offsets",
     "sight",
+    "sight_landmarks",
     "sight_movers",
     "sight_standing",
 ]

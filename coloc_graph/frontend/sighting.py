@@ -1,7 +1,7 @@
 """Where a robot stands whose two markers a camera at rest sees: position and heading, with a covariance."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -25,10 +25,18 @@ SPAN_TOLERANCE = 0.35
 LEAST_WAY = 0.1
 
 
+@dataclass(frozen=True)
+class Marked:
+    """A body by what is seen of it: a robot's markers, or a landmark's."""
+
+    name: str
+    markers: Markers | None
+
+
 def sight(
     stance: Stance,
     observer: Robot,
-    seen: Robot,
+    seen: Robot | Marked,
     tracks: Sequence[Track],
     plane: Plane,
     wheels: WheelTrack | None = None,
@@ -89,7 +97,7 @@ def at_rest(track: Track, time: float) -> Track:
 
 
 def _marker_tracks(
-    seen: Robot, tracks: Sequence[Track], observer: Robot, plane: Plane, wheels: WheelTrack | None
+    seen: Robot | Marked, tracks: Sequence[Track], observer: Robot, plane: Plane, wheels: WheelTrack | None
 ) -> tuple[Track, Track] | None:
     """The tracks of the robot's first and second marker."""
     named = {track.marker: track for track in tracks}
@@ -111,7 +119,7 @@ def _marker_tracks(
 
 
 def _drives_ahead(
-    seen: Robot, first: Track, second: Track, observer: Robot, plane: Plane, wheels: WheelTrack
+    seen: Robot | Marked, first: Track, second: Track, observer: Robot, plane: Plane, wheels: WheelTrack
 ) -> bool | None:
     """Whether two tracks, taken for the robot's markers in order, make it head the way its wheels drove it.
 

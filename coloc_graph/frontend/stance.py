@@ -20,6 +20,7 @@ from coloc_graph.frontend.correspondence import PAIRING_WINDOW, Correspondences,
 from coloc_graph.frontend.fit_checks import require_agreement, require_determined
 from coloc_graph.frontend.homography import HomographyFit, fit_homography, persisting, shared_error
 from coloc_graph.frontend.interpolation import LONGEST_GAP
+from coloc_graph.frontend.landmarks import SeenLandmarks
 from coloc_graph.frontend.most_likely_pose import most_likely_pose
 from coloc_graph.frontend.paired_tracks import PairedTracks
 from coloc_graph.frontend.plane import distance_from_span
@@ -68,8 +69,9 @@ class PairMeasurement:
 
     Where `homography.unusable` says why, `relative_pose` is None; `correspondences` is None where there are
     none. `tracks` are those of the movers' markers in both cameras, None where it did not come to that; `standing`
-    those of robots that stand. Where clocks are not said to agree, `offset_evidence` is what this stance alone knows of
-    their offset (None: nothing), and `at_offset` measures once more with an offset that is known from elsewhere.
+    those of robots that stand, and `landmarks` what both saw of these. Where clocks are not said to agree,
+    `offset_evidence` is what this stance alone knows of their offset (None: nothing), and `at_offset` measures once
+    more with an offset that is known from elsewhere.
     """
 
     homography: HomographyMeasurement
@@ -79,6 +81,7 @@ class PairMeasurement:
     at_offset: "Callable[[ClockOffset], PairMeasurement] | None" = None
     tracks: tuple[list[Track], list[Track]] | None = None
     standing: tuple[list[Track], list[Track]] = ([], [])
+    landmarks: tuple[SeenLandmarks, SeenLandmarks] = (SeenLandmarks(), SeenLandmarks())
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +165,11 @@ def measure_pair(
             made = _measured(seen, found, fit_homography(found.pairs, options.criterion))
     except DegenerateGeometry as why:
         made = PairMeasurement(_unusable(stance, robot_i, robot_j, found, str(why)), None, found)
-    return replace(made, standing=(tracks.standing(robot_i), tracks.standing(robot_j)))
+    return replace(
+        made,
+        standing=(tracks.standing(robot_i), tracks.standing(robot_j)),
+        landmarks=(tracks.landmarks(robot_i), tracks.landmarks(robot_j)),
+    )
 
 
 def _measure_with_clocks(seen: _Seen, alone: bool) -> PairMeasurement:

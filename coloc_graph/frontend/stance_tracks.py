@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend.bodies import markers_of_movers
 from coloc_graph.frontend.detection import Blobs, detector_for
+from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks
 from coloc_graph.frontend.plane import plane_from_mount
 from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.measurements import Plane
@@ -73,6 +75,9 @@ class StanceTracks:
         self._taken: dict[str, int] = defaultdict(int)
         self._made: dict[str, tuple[float, list[Track]]] = {}
         self._standing: dict[str, list[Track]] = {}
+        self._landmarks = {landmark.name for landmark in run.team.landmarks}
+        self._named_landmarks: dict[str, list[Track]] = {}
+        self._watches: dict[str, LandmarkWatch] = {}
 
     def of(self, robot: str, end: float | None = None) -> list[Track]:
         """Those of an observer, up to an instant (default: the stance's end), which never goes back.
@@ -99,12 +104,26 @@ class StanceTracks:
         """Those of the markers of robots that stand, once `of` has been asked for; only names tell which they are."""
         return self._standing.get(robot, [])
 
+    def landmarks(self, robot: str) -> SeenLandmarks:
+        """What an observer saw of landmarks, up to where `of` was last asked for; else in the whole stance."""
+        if not self._landmarks:
+            return SeenLandmarks()
+        if robot not in self._made:
+            with suppress(DegenerateGeometry):  # of the movers' plane, which is not that of landmarks
+                self.of(robot)
+        if robot in self._watches:
+            return self._watches[robot].seen()
+        return SeenLandmarks(self._named_landmarks.get(robot, []))
+
     def _of(self, robot: str, end: float) -> list[Track]:
         run, stance, camera = self.run, self.stance, self.run.team[robot].camera
         if run.has_detections(robot):
             seen = list(run.detections(robot, stance.start, end))
             if all(marker for one in seen for marker in one.markers):
                 tracks = named_tracks(robot, seen)
+                self._require_known(robot, tracks)
+                self._named_landmarks[robot] = [t for t in tracks if _name(t) in self._landmarks]
+                tracks = [t for t in tracks if _name(t) not in self._landmarks]
                 stand = {f"{name}/" for name in stance.observers}
                 standing = [track for track in tracks if track.marker[: track.marker.rfind("/") + 1] in stand]
                 self._standing[robot] = standing
@@ -118,6 +137,9 @@ class StanceTracks:
         else:
             alike = self._alike or {None: []}
             trackers = self._trackers.setdefault(robot, {hue: self._tracker(robot, m) for hue, m in alike.items()})
+            watch = self._watches.get(robot)
+            if watch is None and self._landmarks:
+                watch = self._watches[robot] = LandmarkWatch(run.team[robot], run.team, stance.movers)
             for number, image in enumerate(run.images(robot, stance.start, end)):
                 if image.pixels.shape[:2] != (camera.height, camera.width):
                     raise InputError(
@@ -128,6 +150,8 @@ class StanceTracks:
                 if number >= self._taken[robot]:
                     for tracker in trackers.values():
                         tracker.step(image)
+                    if watch is not None:
+                        watch.look(image)
                     self._taken[robot] = number + 1
         plane, tracks = stance_plane(run, stance, robot), []
         for hue, tracker in trackers.items():
@@ -139,6 +163,16 @@ class StanceTracks:
             tracks += [replace(t, mover=mover, body=t.body + bodies * (t.body >= 0)) for t in own]
         return tracks
 
+    def _require_known(self, robot: str, tracks: Iterable[Track]) -> None:
+        known = {*self.run.team.names, *self._landmarks}
+        for track in tracks:
+            if _name(track) not in known:
+                raise InputError(
+                    f"{self.run.path}: stance {self.stance.index}: the detections of {robot} name `{track.marker}`, "
+                    f"and there is no robot or landmark `{_name(track)}` in the team; correct the name, or add it "
+                    "under [[landmarks]]"
+                )
+
     def _tracker(self, robot: str, markers: Sequence[Markers]) -> MarkerTracker:
         """One for some markers of one colour."""
         camera, count = self.run.team[robot].camera, sum(len(one.positions) for one in markers)
@@ -146,6 +180,11 @@ class StanceTracks:
         return MarkerTracker(
             robot, detector_for(markers[0] if markers else None, camera), options, (camera.width, camera.height)
         )
+
+
+def _name(track: Track) -> str:
+    """Whose marker a track is by its name."""
+    return track.marker.rpartition("/")[0]
 
 
 def named_tracks(robot: str, detections: Iterable[Detections]) -> list[Track]:

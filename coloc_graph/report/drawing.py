@@ -145,9 +145,22 @@ def held_places(estimate: Estimate, trajectory: Trajectory) -> NDArray[np.int64]
     return index[np.isin(index, standing_places(trajectory))]
 
 
+def draw_landmarks(axes: Axes, estimate: Estimate, scale: float = 1.0) -> None:
+    """A star a landmark with its name, and the 95 % ellipse of its place, its axes drawn `scale` times as long."""
+    for name, placed in estimate.landmarks.items():
+        x, y, _ = placed.planar
+        outline = ellipse_points([x, y], placed.covariance_xy_yaw[:2, :2], K_95 * scale)
+        axes.add_collection(
+            PolyCollection([outline], facecolors=INK + "1a", edgecolors=INK + "80", linewidths=0.7, zorder=2)
+        )
+        axes.plot([x], [y], linestyle="", marker="*", markersize=9, color=INK, zorder=6, gid="landmark")
+        axes.annotate(name, (x, y), (6, 5), textcoords="offset points", color=INK, fontsize=8, zorder=6)
+
+
 def bounds(estimate: Estimate, truth: Truth | None) -> tuple[Array, Array]:
     """The least and greatest x, y [m] of all finite poses; the unit square about 0 where there are none."""
     points = [one.positions[:, :2] for one in trajectories_of(estimate)]
+    points += [np.array([placed.planar[:2]]) for placed in estimate.landmarks.values()]
     points += [T[:, :2, 3] for one in trajectories_of(estimate) if (T := truth_of(one, truth)) is not None]
     every = np.concatenate([np.empty((0, 2)), *points])
     every = every[np.isfinite(every).all(axis=1)]

@@ -10,6 +10,7 @@ import numpy as np
 
 from coloc_graph._version import __version__
 from coloc_graph.evaluation import Accuracy, RobotAccuracy
+from coloc_graph.exchange.landmarks import LandmarkRow, landmark_rows, map_row
 from coloc_graph.frontend import PairMeasurement
 from coloc_graph.pipeline import Solution
 from coloc_graph.report.accuracy import accuracy_section
@@ -33,6 +34,7 @@ def render_report(solution: Solution, accuracy: Accuracy | None, truth: Truth | 
         accuracy_section(accuracy) if accuracy is not None else "",
         warnings_section([*solution.warnings, *(accuracy.warnings if accuracy is not None else ())]),
         _calibration_section(solution),
+        _landmarks_section(solution),
         _figures_section(solution, truth),
         _used_section(solution),
         _measurements_section(solution),
@@ -103,6 +105,27 @@ def _calibration_section(solution: Solution) -> str:
     return f"<h2>Calibration</h2>\n{table(head, cells, [0, 1])}"
 
 
+def _landmarks_section(solution: Solution) -> str:
+    """Where the landmarks are, and the map."""
+    rows = landmark_rows(solution.estimate)
+    if not rows:
+        return ""
+
+    def cells(row: LandmarkRow) -> list[str]:
+        return [
+            escape(row.name),
+            f"{row.x:.3f} ± {row.x_sigma:.3f}",
+            f"{row.y:.3f} ± {row.y_sigma:.3f}",
+            f"{row.yaw_deg:.2f} ± {row.yaw_sigma_deg:.2f}",
+            str(row.sightings),
+        ]
+
+    head = ["Landmark", "x [m]", "y [m]", "Yaw [°]", "Sightings"]
+    here = map_row(solution.estimate)
+    foot = [] if here is None else ["The map's origin", *cells(here)[1:]]
+    return f"<h2>Landmarks</h2>\n{table(head, map(cells, rows), [0], foot)}"
+
+
 def _figures_section(solution: Solution, truth: Truth | None) -> str:
     estimate = solution.estimate
     errors = "Error of position and heading along the way; the band is what the covariances predict (2σ)."
@@ -129,6 +152,7 @@ def _used_section(solution: Solution) -> str:
         ("measurements refused", str(refused)),
         ("poses not tied to the reference", str(len(estimate.untied))),
         ("stay-put constraints", str(len(estimate.graph.stay_puts))),
+        *([("landmarks", str(len(estimate.landmarks)))] if estimate.landmarks else []),
         ("chi²/dof of the graph, expected 1", agreement),
         ("iterations", str(estimate.iterations)),
         *_flat("", dataclasses.asdict(solution.options)),

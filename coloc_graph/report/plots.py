@@ -33,6 +33,7 @@ from coloc_graph.report.drawing import (
     colour_of,
     draw_ellipses,
     draw_headings,
+    draw_landmarks,
     heading_sigmas,
     held_places,
     marker_of,
@@ -71,6 +72,7 @@ def trajectories_figure(estimate: Estimate, truth: Truth | None = None) -> Figur
         if true is not None:
             axes.plot(*true[:, :2, 3].T, color=INK, linewidth=1.0, linestyle=(0, (4, 3)), zorder=5, gid="truth")
         _label_start(axes, trajectory, colour, above=_is_above(estimate, trajectory))
+    draw_landmarks(axes, estimate, scale)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(x=0.05, y=0.12)
     figure.legend(handles=_legend(estimate, truth, scale), loc="outside upper left", ncols=6)
@@ -127,6 +129,8 @@ def _legend(estimate: Estimate, truth: Truth | None, scale: float) -> list[Line2
         ring = Line2D([], [], linestyle="", marker="o", markersize=9, markeredgecolor=GREY, label="stayed put")
         ring.set_markerfacecolor("none")
         handles.append(ring)
+    if estimate.landmarks:
+        handles.append(Line2D([], [], linestyle="", marker="*", markersize=8, color=INK, label="landmark"))
     if any(np.isfinite(position_sigmas(one)).any() for one in trajectories_of(estimate)):
         drawn = f", {scale:g} times enlarged" if scale > 1 else ""
         handles.append(Patch(facecolor=GREY + "40", edgecolor=GREY, label=f"95 % ellipse{drawn}"))

@@ -51,21 +51,29 @@ def simulate(
     theta_deg: float | None = None,
     robots: int | None = None,
     at_once: int | None = None,
+    length: float | None = None,
+    landmark_every: float | None = None,
+    laps: int | None = None,
+    known: bool = False,
     fps: float = 10.0,
     image_format: ImageFormat = "jpeg",
     messy: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> World:
-    """Simulate a scenario (`single-step`, `six-step`, `hallway`, `team`) and write it as a run to `out`.
+    """Simulate a scenario (`single-step`, `six-step`, `hallway`, `team`, `landmarks`), written as a run to `out`.
 
     `points` correspondences a stance (250 for single-step and for images, else 100), two from each frame at
     depth images, which `messy` makes of a world of glare, mirrors, flicker and a person in the way. `l` [m] and
-    `theta_deg` are single-step's; `robots`, and how many move `at_once`, team's. `progress` is called with the stances
-    done and their number. The same arguments give the same bytes. Returns what was true. Raises `InputError`, and
-    leaves no file, where an argument is wrong or the pair has no common view.
+    `theta_deg` are single-step's; `robots`, and how many move `at_once`, team's; `length` [m] in all, in how many
+    `laps`, with a landmark every so many metres, and whether the team is told where these are (`known`), are
+    landmarks'. `progress` is called with the stances done and their number. The same arguments give the same bytes.
+    Returns what was true. Raises `InputError`, and leaves no file, where an argument is wrong or the pair has no common
+    view.
     """
     if depth not in get_args(Depth):
         raise InputError(f"`depth` is {depth!r}; use tracks or images")
+    if known and scenario_name != "landmarks":
+        raise InputError(f"`known` belongs to landmarks, not to {scenario_name}; leave it out")
     if messy and depth != "images":
         raise InputError("`messy` is of images: use it with depth images")
     if image_format not in get_args(ImageFormat):
@@ -74,7 +82,7 @@ def simulate(
         raise InputError(f"`seed` is {seed}; give a whole number that is not negative")
     what = scenario(
         scenario_name, stances=stances, l=l, theta_deg=theta_deg, robots=robots, at_once=at_once,
-        rng=stream(seed, "formation"),
+        length=length, landmark_every=landmark_every, laps=laps, rng=stream(seed, "formation"),
     )  # fmt: skip
     if points is None:
         points = 250 if depth == "images" or scenario_name == "single-step" else 100
@@ -83,7 +91,8 @@ def simulate(
             raise InputError("the scenario team has tracks and no images: leave out `depth`")
         world = build_team_world(what, seed=seed, points=points, imperfections=imperfections)
     else:
-        world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps)
+        world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps,
+                            known=known)  # fmt: skip
 
     with whole_run(out, world.team, image_format=image_format) as writer:
         record(world, writer, depth, progress, messy=messy)

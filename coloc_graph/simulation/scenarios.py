@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 
@@ -13,6 +14,10 @@ Pose = tuple[float, float, float]
 
 #: A team's robots stand in lanes so far apart, one behind the other so far [m].
 LANE, ROW = 0.8, 0.45
+
+#: Round a course the pair comes so much further with each leap, its corners are as wide, and so far aside is its
+#: outer wall [m].
+LEAP, CORNER, WALL = 0.25, 1.2, 0.95
 
 #: Half the angle between the pair's cameras in the multi-step experiments.
 HALF_ANGLE = math.radians(17.0)
@@ -65,6 +70,10 @@ class Scenario:
         """Robot -> number of its standing pose, in stance k."""
         return {self.stander(k): k, self.stander(k + 1): k + 1}
 
+    def heading(self, k: int) -> float:
+        """Which way the team goes in stance k, and its box lies ahead [rad]."""
+        return 0.0
+
     def middle(self, k: int) -> tuple[float, float]:
         """The middle of the pair in stance k [m]."""
         (xi, yi, _), (xj, yj, _) = self.poses[k], self.poses[k + 1]
@@ -105,6 +114,19 @@ class TeamScenario(Scenario):
         """Robot -> number of the standing pose that it takes after stance k."""
         first = k * self.at_once + len(self.names) - self.at_once
         return {self.stander(n): n for n in range(first, first + self.at_once)}
+
+
+@dataclass(frozen=True)
+class CourseScenario(Scenario):
+    """A leap-frog round and round a course: `headings[k]` is the way the team goes in stance k [rad]; `landmarks` are
+    where these stand, facing those who come."""
+
+    headings: tuple[float, ...] = ()
+    landmarks: tuple[Pose, ...] = ()
+
+    def heading(self, k: int) -> float:
+        """Which way the team goes in stance k, and its box lies ahead [rad]."""
+        return self.headings[k]
 
 
 def single_step(l: float = 0.8, theta_deg: float = 35.0) -> Scenario:  # noqa: E741 (the paper's name)
@@ -168,6 +190,60 @@ def team_of(
     return TeamScenario("team", places, Box((0.7, 2.1), (-0.7, 0.7)), names=names, at_once=at_once)
 
 
+def course(
+    length: float = 100.0, landmark_every: float = 10.0, laps: int = 4, rng: np.random.Generator | None = None
+) -> CourseScenario:
+    """A leap-frog of `length` [m] in all, `laps` times round a square with round corners, landmarks on its outer wall
+    every so many metres; each stop is off by a centimetre and a degree."""
+    if laps < 1:
+        raise InputError(f"`laps` is {laps}; give at least 1")
+    for name, value in (("length", length), ("landmark_every", landmark_every)):
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"`{name}` is {value}; give metres, above 0")
+    lap = length / laps
+    if lap < 4 * CORNER * math.pi / 2:
+        raise InputError(
+            f"a lap of {lap:.1f} m has no room for four corners; give fewer laps, or a `length` of at least "
+            f"{4 * CORNER * math.pi / 2 * laps:.0f} m"
+        )
+    rng = np.random.default_rng(0) if rng is None else rng
+    k = np.arange(round(length / LEAP) + 1)
+    side = np.where(k % 2, -1.0, 1.0)
+    x, y, yaw = _along(LEAP * k, lap).T
+    at = np.stack([x - 0.36 * side * np.sin(yaw), y + 0.36 * side * np.cos(yaw), yaw - HALF_ANGLE * side], axis=1)
+    poses = at + rng.standard_normal(at.shape) * (0.01, 0.01, np.deg2rad(1.0))
+    count = max(round(lap / landmark_every), 1)
+    way = np.arange(count) * lap / count + 0.75 * (lap / 4 - CORNER * math.pi / 2)  # the first towards a straight's end
+    x, y, yaw = _along(way, lap).T
+    x, y = x + WALL * np.sin(yaw), y - WALL * np.cos(yaw)
+    faced = _along(way - 2.0, lap)
+    landmarks = np.stack([x, y, np.arctan2(faced[:, 1] - y, faced[:, 0] - x)], axis=1)
+    return CourseScenario(
+        "landmarks",
+        tuple((float(x), float(y), float(w)) for x, y, w in poses),
+        Box((0.3, 2.5), (-0.8, 0.8)),
+        headings=tuple(_along(LEAP * (k[:-1] + 0.5), lap)[:, 2].tolist()),
+        landmarks=tuple((float(x), float(y), float(w)) for x, y, w in landmarks),
+    )
+
+
+def _along(way: NDArray[np.floating], lap: float) -> NDArray[np.float64]:
+    """x, y [m] and heading [rad, unwrapped] after so many metres (n,) round a course, (n, 3)."""
+    arc = CORNER * math.pi / 2
+    straight = lap / 4 - arc
+    quarter = np.floor(way / (straight + arc))
+    into = way - quarter * (straight + arc)
+    turned = np.maximum(into - straight, 0.0) / CORNER
+    ahead = np.minimum(into, straight) + CORNER * np.sin(turned)
+    left = CORNER * (1 - np.cos(turned))
+    reach = straight + CORNER  # a side, from corner to corner but for one radius
+    starts = np.array([[0.0, 0.0], [reach, CORNER], [reach - CORNER, reach + CORNER], [-CORNER, reach]])
+    c, s = np.cos(quarter * math.pi / 2), np.sin(quarter * math.pi / 2)
+    from_x, from_y = starts[quarter.astype(int) % 4].T
+    x, y = from_x + c * ahead - s * left, from_y + s * ahead + c * left
+    return np.stack([x, y, quarter * math.pi / 2 + turned], axis=1)
+
+
 def scenario(
     name: str,
     *,
@@ -176,9 +252,14 @@ def scenario(
     theta_deg: float | None = None,
     robots: int | None = None,
     at_once: int | None = None,
+    length: float | None = None,
+    landmark_every: float | None = None,
+    laps: int | None = None,
     rng: np.random.Generator | None = None,
 ) -> Scenario:
     """The scenario of a name; `InputError` where there is none, or an argument is not one of its own."""
+    if name != "landmarks" and (length is not None or landmark_every is not None or laps is not None):
+        raise InputError(f"`length`, `landmark_every` and `laps` belong to landmarks, not to {name}; leave them out")
     if name != "single-step" and (l is not None or theta_deg is not None):
         raise InputError(f"`l` and `theta_deg` belong to single-step, not to {name}; leave them out")
     if name != "team" and (robots is not None or at_once is not None):
@@ -193,6 +274,11 @@ def scenario(
         return hallway(40 if stances is None else stances, rng)
     if name == "team":
         return team_of(10 if robots is None else robots, at_once, 30 if stances is None else stances, rng)
+    if name == "landmarks":
+        if stances is not None:
+            raise InputError("the scenario landmarks is as long as its `length` [m]; give that instead of `stances`")
+        return course(100.0 if length is None else length, 10.0 if landmark_every is None else landmark_every,
+                      4 if laps is None else laps, rng)  # fmt: skip
     raise InputError(f"there is no scenario `{name}`; choose one of {', '.join(SCENARIOS)}")
 
 
@@ -202,4 +288,5 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
     "six-step": six_step,
     "hallway": hallway,
     "team": team_of,
+    "landmarks": course,
 }

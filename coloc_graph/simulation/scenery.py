@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from coloc_graph.run.messages import Image
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.rendering import Field, Pixels, Sensor, Spots, add_spots, expose, fill, spots
+from coloc_graph.simulation.tags import paint_tag
 from coloc_graph.simulation.world import Capture, World, stream
 from coloc_graph.team import Camera
 
@@ -117,10 +118,19 @@ def frames(world: World, k: int, capture: Capture, scenery: Scenery, sensor: Sen
     index = world.team.names.index(capture.robot)
     rng = stream(world.seed, "sensor", k * len(world.team.names) + index)
     field = backdrop(capture.view.camera, capture.view.T_world_camera, scenery, rng)
+    paint_landmarks(field, world, capture)
     others = others_in_view(world, capture, sensor)
     for i, stamp in enumerate(capture.stamps.tolist()):
         noise = rng.standard_normal(field.shape, dtype=np.float32)
         yield Image(capture.robot, stamp, draw(field, others, i, sensor, noise))
+
+
+def paint_landmarks(field: Field, world: World, capture: Capture) -> None:
+    """Paint the tags of a world's landmarks as an observer sees them, in place."""
+    for landmark in world.true_team.landmarks:
+        if landmark.tag is not None:
+            T_world_landmark = world.T_world_landmark[landmark.name]
+            paint_tag(field, capture.view.camera, capture.view.T_world_camera, T_world_landmark, landmark.tag)
 
 
 def others_in_view(

@@ -1,15 +1,18 @@
 """The true world of one run: who the robots are, where each is at every instant, what happens when."""
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from msgspec.structs import replace as with_fields
 from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.common_view import View
 from coloc_graph.errors import InputError
-from coloc_graph.lie import floor_pose
+from coloc_graph.lie import floor_pose, rotation_z
 from coloc_graph.run.messages import Stance
+from coloc_graph.simulation.landmarks import drawn, in_view, standing_landmarks, unsurveyed, with_landmarks
 from coloc_graph.simulation.paths import Array, Path, PathBuilder, drive, tilt_rotation
 from coloc_graph.simulation.rig import IMAGE_BIAS, MILD_LENS, Imperfections, reference_team, stated_team, true_team
 from coloc_graph.simulation.scenarios import Pose, Scenario
@@ -42,6 +45,7 @@ _STREAMS = (
     "scenery",
     "sensor",
     "person",
+    "landmarks",
 )
 
 
@@ -54,8 +58,8 @@ def stream(seed: int, purpose: str, index: int = 0) -> np.random.Generator:
 class Capture:
     """The captures of one stance by one observer: at true `times` (n,) [s], by its clock at `stamps` (n,).
 
-    `recorded` (n, m) says which of the movers' markers, and then of those of robots that are `standing` in view, its
-    detections hold (tracks depth).
+    `recorded` (n, m) says which of the movers' markers, and then of those of robots and landmarks that are `standing`
+    in view, its detections hold (tracks depth).
     """
 
     robot: str
@@ -72,6 +76,7 @@ class World:
 
     `paths` maps a robot to its movement, `moves` are (robot, start, end) in order, `captures` (one tuple a
     stance) what the observers take. The world frame is the floor, z = 0, not the reference's body.
+    `T_world_landmark` (4, 4) are the landmarks by name.
     """
 
     scenario: Scenario
@@ -83,13 +88,20 @@ class World:
     stances: tuple[Stance, ...]
     moves: tuple[tuple[str, float, float], ...]
     captures: tuple[tuple[Capture, ...], ...]
+    T_world_landmark: dict[str, Array] = field(default_factory=dict)
 
     def clock(self, robot: str, times: ArrayLike) -> Array:
         """What a robot's clock says at true times [s]."""
         return stamp(robot, self.team, self.imperfections, times)
 
     def markers_world(self, robot: str, times: ArrayLike) -> Array:
-        """True places (n, m, 3) [m] of a robot's markers at true times (n,); m may be 0."""
+        """True places (n, m, 3) [m] of a robot's or a landmark's markers at true times (n,); m may be 0."""
+        T_still = self.T_world_landmark.get(robot)
+        if T_still is not None:
+            (seen,) = (one.seen_as for one in self.true_team.landmarks if one.name == robot)
+            p_landmark = np.zeros((0, 3)) if seen is None else seen.p_body
+            places = p_landmark @ T_still[:3, :3].T + T_still[:3, 3]
+            return np.broadcast_to(places, (len(np.atleast_1d(times)), *places.shape))
         markers = self.true_team[robot].markers
         p_body = np.zeros((0, 3)) if markers is None else markers.p_body
         T = self.paths[robot].pose_at(times)
@@ -107,13 +119,15 @@ def build_world(
     team: Team | None = None,
     burst: int | None = None,
     stopping: bool = False,
+    known: bool = False,
 ) -> World:
     """Let a scenario happen once. Nothing is written, nothing rendered: for Monte Carlo, with `observe`.
 
     `points` correspondences a stance at depth tracks, `points` / 2 frames at `fps` at depth images. `team` is
     nominal (the reference rig by default). `burst` captures are made of each pose of the mover at depth
     tracks, 1 by default or 3 where clocks differ. With `stopping` the mover stops and goes on its way at depth
-    images. Raises `InputError` where the pair has no common view.
+    images. Where landmarks stand the team knows if they are `known`. Raises `InputError` where the pair has no common
+    view.
     """
     if points < MINIMUM_POINTS:
         raise InputError(f"`points` is {points}; a homography needs at least {MINIMUM_POINTS} a stance")
@@ -125,8 +139,10 @@ def build_world(
         raise InputError(f"`burst` is {burst}; give 1 to {LONGEST_BURST} captures")
     imperfections = imperfections or Imperfections()
     nominal = team or (reference_team(MILD_LENS, IMAGE_BIAS) if depth == "images" else reference_team())
-    stated = stated_team(nominal, imperfections)
+    stated = with_landmarks(stated_team(nominal, imperfections), scenario, tags=depth == "images")
     true = true_team(stated, stream(seed, "team"))
+    true = with_fields(true, landmarks=drawn(true.landmarks, stream(seed, "landmarks")))
+    stated = stated if known else unsurveyed(stated)
     if burst is None:
         burst = BURST if imperfections.clocks_differ else 1
     return _Builder(scenario, true, imperfections, seed, points, depth, fps, burst, stopping).build(stated)
@@ -152,6 +168,7 @@ class _Builder:
         self.sigma = float(np.deg2rad(imperfections.floor_sigma_deg))
         # drawn for all standing poses first, row by row: those of a longer run begin as a shorter one's do
         self.tilts = self.sigma * stream(seed, "standing").standard_normal((len(scenario.poses), 2))
+        self.T_world_landmark = standing_landmarks(true, self.sigma, stream(seed, "landmarks", 1))
         self.moves: list[tuple[str, float, float]] = []
         self.builders: dict[str, PathBuilder] = {}
 
@@ -186,6 +203,7 @@ class _Builder:
             stances=tuple(stances),
             moves=moves,
             captures=tuple(captures),
+            T_world_landmark=self.T_world_landmark,
         )
 
     def _views(self, k: int) -> tuple[View, View]:
@@ -202,6 +220,18 @@ class _Builder:
         markers = self.true[self.scenario.mover].markers
         if markers is None:
             raise InputError(f"robot `{self.scenario.mover}` moves but has no markers; give it [robots.markers]")
+        middle = self.scenario.middle(k)
+        if heading := self.scenario.heading(k):
+            # drawn where the team goes along x, and turned back
+            T_world_ahead = turned_about(middle, heading)
+            T_ahead_world = turned_about(middle, -heading)
+            first, second = (View(view.camera, T_ahead_world @ view.T_world_camera) for view in views)
+            return _turned(self._drawn_tour(k, (first, second), start), T_world_ahead, heading)
+        return self._drawn_tour(k, views, start)
+
+    def _drawn_tour(self, k: int, views: tuple[View, View], start: float) -> Tour:
+        markers = self.true[self.scenario.mover].markers
+        assert markers is not None
         where, rng, middle = f"stance {k}", stream(self.seed, "tour", k), self.scenario.middle(k)
         if self.depth == "images":
             frames = max(self.points // 2, 1)
@@ -245,8 +275,30 @@ class _Builder:
             order = np.argsort(tour.instants + jitter)
             times = (tour.instants + jitter)[order]
             stamps = stamp(robot, stated, self.imperfections, times)
-            out.append(Capture(robot, view, times, stamps, tour.recorded[order]))
+            still = in_view(view, self.true, self.T_world_landmark)
+            recorded = np.hstack([tour.recorded[order], np.ones((len(order), self._lights(still)), bool)])
+            out.append(Capture(robot, view, times, stamps, recorded, still))
         return tuple(out)
+
+    def _lights(self, landmarks: Collection[str]) -> int:
+        seen = (one.seen_as for one in self.true.landmarks if one.name in landmarks)
+        return sum(len(markers.positions) for markers in seen if markers is not None)
+
+
+def turned_about(middle: tuple[float, float], angle: float) -> Array:
+    """The transform (4, 4) that turns the floor about a place on it [m] by an angle [rad]."""
+    T = np.eye(4)
+    T[:3, :3] = rotation_z(angle)
+    at = np.array([*middle, 0.0])
+    T[:3, 3] = at - T[:3, :3] @ at
+    return T
+
+
+def _turned(tour: Tour, T_world_ahead: Array, angle: float) -> Tour:
+    """A tour in a turned world."""
+    xy = tour.leg.knots[:, :2] @ T_world_ahead[:2, :2].T + T_world_ahead[:2, 3]
+    knots = np.column_stack([xy, tour.leg.knots[:, 2] + angle])
+    return replace(tour, leg=replace(tour.leg, knots=knots))
 
 
 def stamp(robot: str, team: Team, imperfections: Imperfections, times: ArrayLike) -> Array:

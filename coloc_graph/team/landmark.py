@@ -8,6 +8,9 @@ import msgspec
 from coloc_graph.team.body import Markers
 from coloc_graph.team.checks import require_finite, require_not_negative
 
+#: A yaw that is known worse than that [deg] is none: it turns what is measured further than a line follows.
+MOST_YAW_SIGMA_DEG = 45.0
+
 
 class Tag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """An upright AprilTag: its number, the side of its black square [m], and how high its centre is [m].
@@ -31,8 +34,9 @@ class Tag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 class Landmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What does not move: `markers` on a body of its own, a `tag`, or a bare point for sensors of range and bearing.
 
-    `position` (x, y) [m] and `yaw_deg` are on a map of all landmarks, known to `position_sigma` [m] and
-    `yaw_sigma_deg`; where they are left out, they are found along with the robots' poses.
+    Its frame is a body's: x is the way it faces (out of a tag), y to its left, z up, on the floor. `position` (x, y)
+    [m] and `yaw_deg` are on a map of all landmarks, known to `position_sigma` [m] and `yaw_sigma_deg`; where they are
+    left out, they are found along with the robots' poses. What cameras see has both or neither.
     """
 
     name: str
@@ -51,6 +55,38 @@ class Landmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError("`position` holds a number that is not finite")
         if self.markers is not None and self.tag is not None:
             raise ValueError(f"landmark {self.name} has markers and a tag; make two landmarks of it")
+        if self.markers is not None and len(self.markers.positions) < 2:
+            raise ValueError(
+                f"landmark {self.name} has one marker, which does not tell a camera how it is turned; give it two"
+            )
+        if self.yaw_deg is not None and self.position is None:
+            raise ValueError(f"landmark {self.name} has a `yaw_deg` and no `position`; give both, or neither")
+        if self.seen_as is not None and self.position is not None and self.yaw_deg is None:
+            raise ValueError(
+                f"landmark {self.name} has a `position` and no `yaw_deg`; say how it is turned on the map, with a "
+                f"`yaw_sigma_deg` of up to {MOST_YAW_SIGMA_DEG:g}, or leave the position out"
+            )
+        if self.yaw_sigma_deg > MOST_YAW_SIGMA_DEG:
+            raise ValueError(
+                f"landmark {self.name} has a `yaw_sigma_deg` of {self.yaw_sigma_deg:g}; look how it is turned, to "
+                f"{MOST_YAW_SIGMA_DEG:g} deg at least, or leave its position out"
+            )
+
+    @property
+    def seen_as(self) -> Markers | None:
+        """What a camera sees of it: its markers, or the middles of its tag's left and right edge (`frontend.tags`).
+
+        None of a bare point.
+        """
+        if self.tag is None:
+            return self.markers
+        half = self.tag.size / 2
+        return Markers(height=self.tag.height, positions=((0.0, half), (0.0, -half)))
+
+    @property
+    def on_map(self) -> bool:
+        """Whether the team says where it is on the map, and how it is turned."""
+        return self.position is not None and self.yaw_deg is not None
 
 
 def require_name(name: str) -> None:

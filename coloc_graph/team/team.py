@@ -84,6 +84,15 @@ class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         if twice:
             what = "robots" if names.count(twice[0]) > 1 else "robots or landmarks"
             raise ValueError(f"two {what} are called `{twice[0]}`; give each a name of its own")
+        tags: dict[tuple[str, int], str] = {}
+        for landmark in self.landmarks:
+            if landmark.tag is not None:
+                other = tags.setdefault((landmark.tag.family, landmark.tag.id), landmark.name)
+                if other != landmark.name:
+                    raise ValueError(
+                        f"landmarks {other} and {landmark.name} have the same tag {landmark.tag.id}; "
+                        "give each a number of its own"
+                    )
         if len(names) < 2:
             raise ValueError("a team has at least two robots; add another under [[robots]]")
         if self.reference not in names:

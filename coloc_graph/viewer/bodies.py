@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 #: Height of a body [m], of its colour's band, and radius of a marker as drawn.
 BODY_HEIGHT, BAND, LED_RADIUS = 0.09, 0.03, 0.014
-_DARK, _PLATE, _LED = (46, 50, 57), (226, 229, 233), (255, 244, 190)
+_DARK, _PLATE, LED = (46, 50, 57), (226, 229, 233), (255, 244, 190)
 #: Where a robot has no description.
 PLAIN_CAMERA_HEIGHT = 0.25
 
@@ -22,22 +22,22 @@ def robot_mesh(robot: Robot | None, colour: Colours) -> trimesh.Trimesh:
     """A robot in its body frame: a round base with a band of its colour, a nose, markers on posts, a camera's mast."""
     tint = tuple(int(value) for value in colour)
     parts = [
-        _painted(_cylinder(BODY_RADIUS, 0.02, BODY_HEIGHT - 0.02), _DARK),
-        _painted(_cylinder(BODY_RADIUS + 0.004, BODY_HEIGHT - 0.02 - BAND, BAND), tint),
-        _painted(_cylinder(BODY_RADIUS - 0.012, BODY_HEIGHT - 0.02, 0.004), _PLATE),
-        _painted(_nose(BODY_HEIGHT - 0.012), tint),
+        painted(cylinder(BODY_RADIUS, 0.02, BODY_HEIGHT - 0.02), _DARK),
+        painted(cylinder(BODY_RADIUS + 0.004, BODY_HEIGHT - 0.02 - BAND, BAND), tint),
+        painted(cylinder(BODY_RADIUS - 0.012, BODY_HEIGHT - 0.02, 0.004), _PLATE),
+        painted(_nose(BODY_HEIGHT - 0.012), tint),
     ]
     for side in (-1, 1):
         T_wheel = se3(rotation_x(np.pi / 2), np.array([0, side * 0.125, 0.032]))
         wheel = trimesh.creation.cylinder(0.032, 0.03, sections=24)
         wheel.apply_transform(T_wheel)
-        parts.append(_painted(wheel, (28, 30, 34)))
+        parts.append(painted(wheel, (28, 30, 34)))
     markers = None if robot is None else robot.markers
     for x, y, z in np.zeros((0, 3)) if markers is None else markers.p_body:
-        parts.append(_painted(_cylinder(0.005, BODY_HEIGHT - 0.02, max(z - BODY_HEIGHT + 0.02, 0.01), (x, y)), _DARK))
+        parts.append(painted(cylinder(0.005, BODY_HEIGHT - 0.02, max(z - BODY_HEIGHT + 0.02, 0.01), (x, y)), _DARK))
         led = trimesh.creation.icosphere(2, LED_RADIUS)
         led.apply_translation((x, y, z))
-        parts.append(_painted(led, _LED))
+        parts.append(painted(led, LED))
     parts += _camera(robot)
     mesh = trimesh.util.concatenate(parts)
     assert isinstance(mesh, trimesh.Trimesh)
@@ -87,11 +87,12 @@ def _camera(robot: Robot | None) -> list[trimesh.Trimesh]:
     lens = trimesh.creation.cylinder(0.014, 0.012, sections=24)
     lens.apply_transform(T)
     top = max(z - 0.02, BODY_HEIGHT)
-    mast = _cylinder(0.009, BODY_HEIGHT - 0.02, top - BODY_HEIGHT + 0.02, (x - 0.02, y))
-    return [_painted(mast, (120, 126, 134)), _painted(box, _DARK), _painted(lens, (12, 14, 18))]
+    mast = cylinder(0.009, BODY_HEIGHT - 0.02, top - BODY_HEIGHT + 0.02, (x - 0.02, y))
+    return [painted(mast, (120, 126, 134)), painted(box, _DARK), painted(lens, (12, 14, 18))]
 
 
-def _cylinder(radius: float, z: float, height: float, at: tuple[float, float] = (0.0, 0.0)) -> trimesh.Trimesh:
+def cylinder(radius: float, z: float, height: float, at: tuple[float, float] = (0.0, 0.0)) -> trimesh.Trimesh:
+    """An upright cylinder that begins at a height [m]."""
     mesh: trimesh.Trimesh = trimesh.creation.cylinder(radius, height, sections=40)
     mesh.apply_translation((*at, z + height / 2))
     return mesh
@@ -108,6 +109,7 @@ def _nose(z: float) -> trimesh.Trimesh:
     return mesh
 
 
-def _painted(mesh: trimesh.Trimesh, colour: tuple[int, ...]) -> trimesh.Trimesh:
+def painted(mesh: trimesh.Trimesh, colour: tuple[int, ...]) -> trimesh.Trimesh:
+    """The mesh, all of one colour."""
     mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=np.tile([*colour, 255], (len(mesh.vertices), 1)))
     return mesh

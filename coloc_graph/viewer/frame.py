@@ -9,8 +9,17 @@ import numpy as np
 from coloc_graph.viewer import palette
 from coloc_graph.viewer.motion import pose_at
 from coloc_graph.viewer.palette import Colours
-from coloc_graph.viewer.prepared import Z_ODOMETRY, Z_SIGHTING, Float32, doubts_of, edges_of, links_of
-from coloc_graph.viewer.scene import TRUE, Array, Edges, Index, Layer, Links, Mask, Scene
+from coloc_graph.viewer.prepared import (
+    Z_ODOMETRY,
+    Z_SIGHTING,
+    Float32,
+    about_z,
+    doubts_of,
+    edges_of,
+    ellipse_axes,
+    links_of,
+)
+from coloc_graph.viewer.scene import TRUE, Array, Edges, Index, Landmarks, Layer, Links, Mask, Scene
 
 #: So many poses are drawn at most: while time moves, and once it rests.
 MOVING, RESTING = 1_800, 9_000
@@ -112,10 +121,14 @@ def frame_of(scene: Scene, state: ViewState) -> Frame:
                 parts.doubt(layer, rows, colours, state)
             if state.edges:
                 parts.tie(layer, edges, first, row, most, state)
+        if state.ellipses and len(scene.landmarks):
+            parts.ellipses.append(_doubts_of_landmarks(scene.landmarks, state))
         if state.stays:
             parts.rings = _rings(scene, base, row, most, colours)
         if state.sightings:
             parts.lines["sightings"] = [_linked(base, scene.sightings, Z_SIGHTING, palette.SIGHTING, row, most, dark)]
+            if len(scene.landmarks):
+                parts.lines["sightings"].append(_of_landmarks(base, scene.landmarks, row, most, dark))
         if state.odometry:
             parts.lines["odometry"] = [_linked(base, scene.odometry, Z_ODOMETRY, palette.ODOMETRY, row, most, dark)]
     count = row + 1
@@ -257,6 +270,29 @@ def _linked(layer: Layer, links: Links, z: float, colour: Colours, row: int, mos
     ends = links_of(layer, links, z)[ids]
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
     return Lines(ends, np.broadcast_to(palette.seen_on(colour, dark), (len(ends), 2, 3)))
+
+
+def _of_landmarks(layer: Layer, landmarks: Landmarks, row: int, most: int, dark: bool) -> Lines:
+    """Who sighted which landmark so far, thinned as all else."""
+    links = landmarks.sightings
+    ids = thinned_rows(int(np.searchsorted(links.rows_j, row, side="right")) - 1, most)
+    ends = np.zeros((len(ids), 2, 3), np.float32)
+    ends[:, 0, :2] = layer.xyz[links.i[ids], links.rows_i[ids], :2]
+    ends[:, 1, :2] = landmarks.xy[links.j[ids]]
+    ends[..., 2] = Z_SIGHTING
+    ends = ends[np.isfinite(ends).all(axis=(1, 2))]
+    return Lines(ends, np.broadcast_to(palette.seen_on(palette.SIGHTING, dark), (len(ends), 2, 3)))
+
+
+def _doubts_of_landmarks(landmarks: Landmarks, state: ViewState) -> Batch:
+    """The ellipses of their places."""
+    axes, direction = ellipse_axes(landmarks.covariance)
+    scales = np.ones((len(landmarks), 3), np.float32)
+    scales[:, :2] = np.maximum(state.k_sigma * axes, 1e-5)
+    places = np.zeros((len(landmarks), 3), np.float32)
+    places[:, :2], places[:, 2] = landmarks.xy, Z_ELLIPSE
+    colours = np.broadcast_to(palette.LANDMARK, (len(landmarks), 3))
+    return Batch(about_z(direction), places, scales, colours)
 
 
 def _rings(scene: Scene, layer: Layer, row: int, most: int, colours: Colours) -> Batch:

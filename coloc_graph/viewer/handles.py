@@ -7,7 +7,7 @@ import viser
 from numpy.typing import NDArray
 
 from coloc_graph.lie import quaternion
-from coloc_graph.viewer import bodies, palette
+from coloc_graph.viewer import bodies, palette, still
 from coloc_graph.viewer.frame import NO_LINES, Batch, Frame, Lines, ViewState
 from coloc_graph.viewer.motion import extent
 from coloc_graph.viewer.prepared import about_z
@@ -57,6 +57,7 @@ class GraphView:
         add = self.server.scene
         self.robots, self._frustums, self._names, self._anchors, self._bodies = [], {}, [], [], []
         self.size = 1.0
+        self._stills: dict[str, tuple[viser.FrameHandle, viser.MeshHandle | viser.GlbHandle, viser.LabelHandle]] = {}
         for name, colour in zip(scene.robots, palette.robot_colours(len(scene.robots)), strict=True):
             robot = scene.team[name] if scene.team is not None else None
             path, tint = f"/robots/{name}", np.asarray(colour)
@@ -119,6 +120,19 @@ class GraphView:
                     thickness_units="screen",
                 )  # fmt: skip
                 self.names += (name,)
+        for number, name in enumerate(scene.landmarks.names):
+            if name not in self._stills:
+                self._add_landmark(scene, name)
+            x, y = scene.landmarks.xy[number].tolist()
+            self._stills[name][0].position = (x, y, 0.0)
+            self._stills[name][0].wxyz = about_z(scene.landmarks.yaw[number])
+
+    def _add_landmark(self, scene: Scene, name: str) -> None:
+        add, path = self.server.scene, f"/landmarks/{name}"
+        landmark = still.landmark_of(scene.team, name)
+        body = add.add_mesh_trimesh(f"{path}/body", still.landmark_mesh(landmark), receive_shadow=False)
+        label = add.add_label(f"{path}/name", name, position=(0, 0, 0.4), anchor="bottom-center")
+        self._stills[name] = add.add_frame(path, show_axes=False), body, label
 
     def dress(self, scene: Scene, dark: bool, aside: float = 0.0) -> None:
         """The floor beneath a scene, as large as it with what is moved `aside` [m], and in light or dark."""
@@ -201,6 +215,8 @@ class GraphView:
             for body, anchor, name in zip(self._bodies, self._anchors, self._names, strict=True):
                 body.scale = anchor.scale = size
                 name.position = share * name.position
+            for _, standing, name in self._stills.values():
+                standing.scale, name.position = size, share * name.position
             for frustum in self._frustums.values():
                 frustum.scale, frustum.position = FRUSTUM * size, share * frustum.position
 

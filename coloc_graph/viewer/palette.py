@@ -28,6 +28,7 @@ STOPS_A_SIGMA = 2
 MOST_SIGMAS = (len(_STOPS) - 1) / STOPS_A_SIGMA
 PICKED: Colours = np.array([255, 0, 170], np.uint8)
 SIGHTING: Colours = np.array(rgb("#7b5ea7"), np.uint8)
+LANDMARK: Colours = np.array(rgb("#d6a01e"), np.uint8)
 ODOMETRY: Colours = np.array(rgb("#8a6d3b"), np.uint8)
 
 

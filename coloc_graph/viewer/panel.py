@@ -234,6 +234,9 @@ def legend(scene: Scene) -> str:
         f'<span style="color:{_hex(palette.SIGHTING)}">&#8212; sightings</span>, '
         f'<span style="color:{_hex(palette.ODOMETRY)}">&#8212; odometry</span> (where switched on)',
     ]
+    if len(scene.landmarks):
+        lines.insert(1, f'<span style="color:{_hex(palette.LANDMARK)}">&#9733;</span> '
+                     f"{len(scene.landmarks)} landmarks that were sighted")  # fmt: skip
     if scene.other is not None:
         lines.append(f"dashed, or at the side, and pale: {html.escape(scene.other.name)}; its curves are dashed")
     body = "".join(f'<div style="margin:.25em 0">{line}</div>' for line in lines)

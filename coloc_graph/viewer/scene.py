@@ -140,14 +140,33 @@ NO_LINKS = Links(_NONE, _NONE, _NONE, _NONE)
 
 
 @dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Landmarks by number: `names`, places `xy` (l, 2) [m] and `yaw` (l,) [rad] in the world, `covariance` (l, 2, 2) of
+    x, y and `yaw_sigma` (l,) [rad]; `sightings` are of robots i, of landmarks j."""
+
+    names: tuple[str, ...] = ()
+    xy: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    yaw: Array = field(default_factory=lambda: np.zeros(0))
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    yaw_sigma: Array = field(default_factory=lambda: np.zeros(0))
+    sightings: Links = NO_LINKS
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+NO_LANDMARKS = Landmarks()
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """All that is shown of a run and its estimates; immutable.
 
     `layers` are the estimates, the first being the one whose poses the robots stand at. `stayed` are the stay-put
     constraints (q, 2): robot by number, row of the later stance. `sightings` (who sees, who is seen) and `odometry` are
-    what else ties poses. `beside` is the scene of another result, in a comparison: its first layer is `aside`, and its
-    edges are numbered on from `edges`. `team` is as stated and `calibrated` as it turned out. `notes` say what there is
-    none of, and why.
+    what else ties poses, and `landmarks` are where they came out. `beside` is the scene of another result, in a
+    comparison: its first layer is `aside`, and its edges are numbered on from `edges`. `team` is as stated and
+    `calibrated` as it turned out. `notes` say what there is none of, and why.
     Without a `run` there are no images, marker tracks and inspections.
     """
 
@@ -166,6 +185,7 @@ class Scene:
     title: str = ""
     notes: tuple[str, ...] = ()
     beside: "Scene | None" = None
+    landmarks: Landmarks = NO_LANDMARKS
 
     def __len__(self) -> int:
         return len(self.stances)
@@ -240,7 +260,8 @@ class Scene:
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
         """Least and greatest x, y of all poses [m]; a square of a metre about 0 where there are none."""
-        every = np.concatenate([np.empty((0, 2)), *(layer.xyz[layer.there][:, :2] for layer in self.layers)])
+        poses = (layer.xyz[layer.there][:, :2] for layer in self.layers)
+        every = np.concatenate([np.empty((0, 2)), *poses, self.landmarks.xy])
         if not len(every):
             return np.full(2, -0.5), np.full(2, 0.5)
         return every.min(axis=0), every.max(axis=0)

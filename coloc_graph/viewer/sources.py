@@ -15,14 +15,16 @@ from coloc_graph.backend import Estimate, Method, chain, smooth
 from coloc_graph.backend.graph import Places
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.evaluation import align, left_out, with_truth
+from coloc_graph.exchange.landmarks import landmark_rows, read_landmarks
 from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions, WheelTrack
 from coloc_graph.measurements import RelativePose
 from coloc_graph.pipeline import Progress, Solution, SolveOptions, solve
-from coloc_graph.results import read_result
+from coloc_graph.results import LANDMARKS, read_result
 from coloc_graph.run import Run, Stance, open_run, read_truth
 from coloc_graph.team import read_team
 from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.scene import NO_EDGES, TRUE, Edges, Index, Layer, Scene, layer_of
+from coloc_graph.viewer.still import landmarks_in, sighted_in
 from coloc_graph.viewer.ties import ties_in, ties_on_disk
 
 #: What the methods' layers are called.
@@ -50,6 +52,8 @@ def scene_of_estimate(
     team = run.team if run is not None else None
     true, notes = _true(run, graph.robots, graph.stances, estimate.trajectories)
     sightings, odometry = ties_in(graph.measurements, graph.robots, graph.stances)
+    refused = {id(one.measurement) for one in estimate.refused}
+    sighted = sighted_in((m for m in graph.measurements if id(m) not in refused), graph.landmarks)
     return Scene(
         robots=graph.robots,
         stances=graph.stances,
@@ -65,6 +69,7 @@ def scene_of_estimate(
         wheels=_wheels(run),
         title=run.path.name if run is not None else "",
         notes=notes,
+        landmarks=landmarks_in(landmark_rows(estimate), sighted, graph.robots, graph.stances),
     )
 
 
@@ -122,7 +127,7 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
         (stances[row].index, frozenset((robots[i], robots[j])))
         for row, i, j in zip(edges.rows.tolist(), edges.i.tolist(), edges.j.tolist(), strict=True)
     }
-    sightings, odometry = ties_on_disk(result.path / "graph.g2o", pairs, robots, stances)
+    sightings, odometry, sighted = ties_on_disk(result.path / "graph.g2o", pairs, robots, stances)
     return Scene(
         robots=robots,
         stances=stances,
@@ -138,6 +143,7 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
         wheels=_wheels(run),
         title=result.path.absolute().name,
         notes=notes,
+        landmarks=landmarks_in(read_landmarks(result.path / LANDMARKS), sighted, robots, stances),
     )
 
 

@@ -1,0 +1,94 @@
+"""What never moves, in the graph: landmarks, and the map that some of them are on."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.lie import floor_pose
+from coloc_graph.measurements import Node
+from coloc_graph.team import Landmark, Team
+
+Array = NDArray[np.float64]
+
+#: The map's own place in the graph: no robot and no landmark can have this name.
+MAP = "/map"
+#: The stance of a node that is the same at all of them.
+ALWAYS = -1
+#: What the map calls exact is exact to this [m, rad].
+LEAST_SIGMA = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class OnMap:
+    """What the map says of a landmark: its pose there, with the covariance (3, 3) of heading, x, y.
+
+    The map is a frame of its own, whose pose in the world is found along: of one landmark it says nothing, of two
+    where they stand to each other, whatever the world frame is.
+    """
+
+    landmark: str
+    T_map_landmark: gtsam.Pose3
+    covariance: Array
+
+    @property
+    def ends(self) -> tuple[Node, Node]:
+        """The two nodes that it relates, the map first."""
+        return (MAP, ALWAYS), (self.landmark, ALWAYS)
+
+    @property
+    def T_i_j(self) -> gtsam.Pose3:
+        """The pose of the second end in the first."""
+        return self.T_map_landmark
+
+    def __str__(self) -> str:
+        return f"place of {self.landmark} on the map"
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Where something that never moves is: `T_world_body`, and its covariance (6, 6) in GTSAM's tangent (rotation
+    [rad] first, then translation [m], in its own frame)."""
+
+    T_world_body: gtsam.Pose3
+    covariance: Array
+
+    @property
+    def planar(self) -> tuple[float, float, float]:
+        """x, y [m] and yaw [rad] in the world."""
+        T = self.T_world_body
+        return float(T.x()), float(T.y()), float(T.rotation().yaw())
+
+    @property
+    def covariance_xy_yaw(self) -> Array:
+        """Covariance (3, 3) of x, y [m] and yaw [rad], along the world's axes."""
+        R = self.T_world_body.rotation().matrix()
+        turned = np.zeros((3, 6))
+        turned[:2, 3:], turned[2, :3] = R[:2], R[2]
+        return np.asarray(turned @ self.covariance @ turned.T)
+
+
+def landmarks_of(team: Team) -> dict[str, Landmark]:
+    """The landmarks of a team, by name."""
+    return {landmark.name: landmark for landmark in team.landmarks}
+
+
+def map_of(landmarks: Mapping[str, Landmark]) -> tuple[OnMap, ...]:
+    """What the map says of the landmarks that are on it."""
+    return tuple(map(_on_map, (one for one in landmarks.values() if one.on_map)))
+
+
+def of_seen(on_map: Iterable[OnMap], seen: Iterable[str]) -> tuple[OnMap, ...]:
+    """What the map says of some landmarks."""
+    names = set(seen)
+    return tuple(one for one in on_map if one.landmark in names)
+
+
+def _on_map(landmark: Landmark) -> OnMap:
+    assert landmark.position is not None and landmark.yaw_deg is not None
+    x, y = landmark.position
+    sigmas = np.array([np.deg2rad(landmark.yaw_sigma_deg), landmark.position_sigma, landmark.position_sigma])
+    T_map_landmark = floor_pose(x, y, np.deg2rad(landmark.yaw_deg))
+    return OnMap(landmark.name, gtsam.Pose3(T_map_landmark), np.diag(np.maximum(sigmas, LEAST_SIGMA) ** 2))

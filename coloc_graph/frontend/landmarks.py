@@ -1,0 +1,244 @@
+"""Landmarks: found in a resting camera's images, or named in its detections; and sighted as robots that stand are."""
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.frontend.detection import Detector, Pixels, detector_for
+from coloc_graph.frontend.plane import on_plane, plane_from_mount
+from coloc_graph.frontend.sighting import Marked, at_rest, sight
+from coloc_graph.frontend.tags import find_tags
+from coloc_graph.frontend.tracking import DOUBTFUL, Track
+from coloc_graph.lie import se3_inverse
+from coloc_graph.measurements import Sighting
+from coloc_graph.run import Image, Recorded, Stance
+from coloc_graph.team import Camera, Floor, Landmark, Mount, Robot, Team
+
+Array = NDArray[np.float64]
+
+#: A camera that stands looks for landmarks so often [s]: more images are of the same error, but for the sensor's noise.
+EVERY = 2.0
+#: What an image does not average away of a tag's edges (measured on rendered tags from 1 to 2.6 m) [px].
+TAG_BIAS_PX = 0.05
+#: A marker that stands is seen no further than this from where it is seen mostly [sigma, px], at this share of the
+#: instants at least.
+STILL_SIGMAS, STILL_PX, MOSTLY = 5.0, 0.5, 0.6
+#: Two markers are as far apart as a landmark's, to this share of it.
+SPAN_TOLERANCE = 0.35
+#: A bar of two lights that is seen so much along itself [rad] does not say which light is which.
+LEAST_ASIDE = np.deg2rad(10.0)
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """A landmark that an observer saw in a stance and that is not used, and `why`, in words."""
+
+    landmark: str
+    observer: str
+    stance: int
+    why: str
+
+
+@dataclass(frozen=True, eq=False)
+class SeenLandmarks:
+    """What an observer saw of landmarks: tracks with their markers' names, and why others are not used, by name."""
+
+    tracks: list[Track] = field(default_factory=list)
+    doubts: dict[str, str] = field(default_factory=dict)
+
+
+class LandmarkWatch:
+    """Looks for the landmarks of a team in the images of one camera that stands: tags, and pairs of coloured lights.
+
+    White lights are not looked for: nothing tells them from lamps. Nor are colours that a mover carries, or two
+    landmarks.
+    """
+
+    def __init__(self, robot: Robot, team: Team, movers: Collection[str]) -> None:
+        self._robot, self._floor = robot, team.floor or Floor()
+        self._tags = {(one.tag.family, one.tag.id): one for one in team.landmarks if one.tag is not None}
+        carried = {m.hue_deg for name in movers if (m := team[name].markers) is not None}
+        lit = [(one, one.markers.hue_deg) for one in team.landmarks if one.markers is not None]
+        hues = [hue for _, hue in lit]
+        self._lit: list[tuple[Landmark, Detector]] = []
+        self.doubts: dict[str, str] = {}
+        for one, hue in lit:
+            if hue is None:
+                self.doubts[one.name] = (
+                    "in images nothing tells its white lights from lamps; give them a colour (`hue_deg`), or use a tag"
+                )
+            elif hue in carried or hues.count(hue) > 1:
+                self.doubts[one.name] = "others have lights of the same colour; give it one of its own, or use a tag"
+            else:
+                self._lit.append((one, detector_for(one.markers, robot.camera)))
+        self._next = -np.inf
+        self._samples: dict[str, list[tuple[float, Array, Array]]] = {}
+
+    def look(self, image: Image) -> None:
+        """Look at an image, if the last one that was looked at is some time ago."""
+        if image.time < self._next or not (self._tags or self._lit):
+            return
+        self._next = image.time + EVERY
+        camera = self._robot.camera
+        if self._tags:
+            for tag in find_tags(image.pixels, camera, {family for family, _ in self._tags}):
+                landmark = self._tags.get((tag.family, tag.id))
+                if landmark is not None:
+                    self._samples.setdefault(landmark.name, []).append((image.time, tag.uv, tag.covariance))
+        for landmark, detector in self._lit:
+            try:
+                found = self._lights(landmark, detector, image.pixels)
+            except DegenerateGeometry as why:
+                self.doubts[landmark.name] = str(why)
+                continue
+            if found is not None:
+                self._samples.setdefault(landmark.name, []).append((image.time, *found))
+
+    def _lights(self, landmark: Landmark, detector: Detector, pixels: Pixels) -> tuple[Array, Array] | None:
+        """The landmark's first and second light, if they are seen; raises where others might be they."""
+        blobs = detector(pixels)
+        blobs = blobs[(blobs.flags & DOUBTFUL) == 0]
+        if len(blobs) < 2:
+            return None
+        if len(blobs) > 2:
+            raise DegenerateGeometry(f"{len(blobs)} lights of its colour are in view, and it has two")
+        T_observer_landmark = _roughly(self._robot, landmark, blobs.uv, self._floor)
+        toward = se3_inverse(T_observer_landmark)[:2] @ np.array([*self._robot.mount.T_body_camera[:3, 3], 1.0])
+        if abs(np.arctan2(toward[0], abs(toward[1]))) < LEAST_ASIDE:
+            raise DegenerateGeometry("it is seen along its two lights, which tells not which is which")
+        order = [0, 1] if toward[0] > 0 else [1, 0]  # it is seen from the side that it faces
+        return blobs.uv[order], blobs.covariance[order]
+
+    def seen(self) -> SeenLandmarks:
+        """What was seen so far: one sample a marker, since it stands."""
+        tracks = []
+        for name, samples in self._samples.items():
+            times, uv, covariance = (np.array(values) for values in zip(*samples, strict=True))
+            is_tag = any(one.name == name for one in self._tags.values())
+            shared = TAG_BIAS_PX**2 * np.eye(2) if is_tag else np.zeros((2, 2))
+            for n in range(2):
+                track = Track(self._robot.name, f"{name}/{n}", times, uv[:, n], covariance[:, n], np.zeros(len(times)))
+                try:
+                    one = at_rest(still(track), float(times[0]))
+                except DegenerateGeometry as why:
+                    self.doubts[name] = str(why)
+                    break
+                tracks.append(Track(one.robot, one.marker, one.times, one.uv, one.covariance + shared, one.peak))
+        return SeenLandmarks(tracks, dict(self.doubts))
+
+
+def _roughly(observer: Robot, landmark: Landmark, uv: Array, floor: Floor) -> Array:
+    """T_observer_landmark (4, 4) where two pixels (2, 2) are its lights in their order; raises where they are not a
+    span apart."""
+    places = _places(observer.camera, observer.mount, landmark, uv, floor)
+    markers = landmark.seen_as
+    assert markers is not None
+    arm, model = places[1] - places[0], markers.p_body[1, :2] - markers.p_body[0, :2]
+    heading = np.arctan2(arm[1], arm[0]) - np.arctan2(model[1], model[0])
+    c, s = np.cos(heading), np.sin(heading)
+    T = np.eye(4)
+    T[:2, :2] = [[c, -s], [s, c]]
+    T[:2, 3] = places.mean(axis=0) - T[:2, :2] @ markers.p_body[:2, :2].mean(axis=0)
+    return T
+
+
+def _places(camera: Camera, mount: Mount, landmark: Landmark, uv: Array, floor: Floor) -> Array:
+    """Where on the plane of a landmark's markers pixels (2, 2) are, in the observer's body (2, 2) [m]; raises where
+    that is no span."""
+    markers = landmark.seen_as
+    assert markers is not None and markers.span is not None
+    T = mount.T_body_camera
+    p_camera = on_plane(camera.normalise(uv), plane_from_mount(mount, markers, floor))
+    places = (p_camera @ T[:3, :3].T + T[:3, 3])[:, :2]
+    apart = float(np.linalg.norm(places[1] - places[0]))
+    if not abs(apart / markers.span - 1) < SPAN_TOLERANCE:
+        far = "above the horizon" if not np.isfinite(apart) else f"{apart:.2f} m apart"
+        raise DegenerateGeometry(
+            f"its two markers are seen {far}, and are {markers.span:.2f} m apart, {markers.height:.2f} m above the "
+            "floor: another light is taken for it, or its size and height are not as stated"
+        )
+    return np.asarray(places)
+
+
+def still(track: Track) -> Track:
+    """Of a marker that stands the samples that show it; raises `DegenerateGeometry` where it does not stand."""
+    off = track.uv - np.median(track.uv, axis=0)
+    sigmas = np.einsum("nk,nkl,nl->n", off, np.linalg.inv(track.covariance), off)
+    good = (sigmas < STILL_SIGMAS**2) | (np.linalg.norm(off, axis=1) < STILL_PX)
+    if good.mean() < MOSTLY:
+        px = float(np.median(np.linalg.norm(off, axis=1)))
+        raise DegenerateGeometry(f"what is taken for its marker {track.marker} does not stand still ({px:.1f} px)")
+    fields = (getattr(track, name)[good] for name in ("times", "uv", "covariance", "peak"))
+    return Track(track.robot, track.marker, *fields)
+
+
+def sight_landmarks(
+    run: Recorded,
+    stance: Stance,
+    seen: Iterable[tuple[str, SeenLandmarks]],
+    known: Collection[tuple[str, str]] = (),
+) -> tuple[list[Sighting], list[Doubt]]:
+    """Where landmarks stand that observers saw in a stance, and what was seen and is not used; nothing without a floor.
+
+    `seen` is by observer. What an observer that has stayed put saw of a landmark before, (observer, landmark), is
+    `known`.
+    """
+    if run.team.floor is None or stance.index in run.planes:
+        return [], []
+    landmarks = {one.name: one for one in run.team.landmarks}
+    made: list[Sighting] = []
+    doubts: list[Doubt] = []
+    for observer, what in dict(seen).items():
+        doubts += [Doubt(name, observer, stance.index, why) for name, why in what.doubts.items()]
+        for name in dict.fromkeys(track.marker.rpartition("/")[0] for track in what.tracks):
+            if (observer, name) in known:
+                continue
+            own = [track for track in what.tracks if track.marker.rpartition("/")[0] == name]
+            try:
+                sighting = _sighting(run, stance, run.team[observer], landmarks[name], own)
+            except DegenerateGeometry as why:
+                doubts.append(Doubt(name, observer, stance.index, str(why)))
+                continue
+            made += [] if sighting is None else [sighting]
+    return made, doubts
+
+
+def _sighting(
+    run: Recorded, stance: Stance, observer: Robot, landmark: Landmark, tracks: Sequence[Track]
+) -> Sighting | None:
+    """The sighting of one landmark; None where one of its markers is not in view."""
+    markers, named = landmark.seen_as, {track.marker: track for track in tracks}
+    if markers is None:
+        raise DegenerateGeometry("it has neither markers nor a tag in the team; give it what is seen")
+    pair = [named.get(f"{landmark.name}/{n}") for n in range(2)]
+    if pair[0] is None or pair[1] is None:
+        return None
+    both = [at_rest(still(track), stance.start) for track in pair if track is not None]
+    plane = plane_from_mount(observer.mount, markers, run.team.floor)
+    uv = np.concatenate([track.uv for track in both])
+    _places(observer.camera, observer.mount, landmark, uv, run.team.floor or Floor())
+    sighting = sight(stance, observer, Marked(landmark.name, markers), both, plane)
+    if sighting is not None and landmark.tag is not None and not _faces(sighting.T_observer_seen, observer):
+        raise DegenerateGeometry("the camera would be behind its tag: its left and right edge are exchanged")
+    return sighting
+
+
+def _faces(T_observer_landmark: gtsam.Pose3, observer: Robot) -> bool:
+    p_landmark = T_observer_landmark.transformTo(observer.mount.T_body_camera[:3, 3])
+    return bool(p_landmark[0] > 0)
+
+
+def in_words(doubts: Iterable[Doubt]) -> list[str]:
+    """A sentence a landmark, observer and reason: the first of its kind, and how many there are."""
+    kinds: dict[tuple[str, str, str], list[Doubt]] = {}
+    for one in doubts:
+        kinds.setdefault((one.landmark, one.observer, "".join(c for c in one.why if not c.isdigit())), []).append(one)
+    return [
+        f"stance {all_[0].stance}{f' (and {len(all_) - 1} more)' if len(all_) > 1 else ''}: landmark {landmark} is not "
+        f"used as {observer} sees it: {all_[0].why}"
+        for (landmark, observer, _), all_ in kinds.items()
+    ]
