@@ -27,7 +27,7 @@ from coloc_graph.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-LANDMARK_COLUMNS = ("landmark", "x", "y", "cov_xx", "cov_xy", "cov_yy", "stated", "measured")
+LANDMARK_COLUMNS = ("name", "x", "y", "x_sigma", "y_sigma", "xy_correlation", "stated", "measured")
 MEASUREMENT_COLUMNS = (
     *("time", "robot", "target", "range", "bearing", "share_range", "share_bearing"),
     *("residual_range", "residual_bearing", "doubted"),
@@ -127,9 +127,9 @@ def summarise_drive(solution: DriveSolution, assessed: DriveAssessment | None) -
 def _landmarks(solution: DriveSolution) -> str:
     rows = []
     for one in solution.estimate.landmarks:
-        (xx, xy), (_, yy) = one.covariance.tolist()
-        x, y = one.position.tolist()
-        rows.append([one.name, *(f"{v:.9g}" for v in (x, y, xx, xy, yy)), "yes" if one.stated else "no", one.measured])
+        sx, sy = np.sqrt(np.diagonal(one.covariance)).tolist()
+        numbers = (*one.position.tolist(), sx, sy, float(one.covariance[0, 1]) / (sx * sy))
+        rows.append([one.name, *(f"{v:.9g}" for v in numbers), "yes" if one.stated else "no", one.measured])
     return _table(LANDMARK_COLUMNS, rows)
 
 

@@ -35,6 +35,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"wrote {out}: {poses} poses of {len(result.trajectories)} robots")
         return 0
     source = result.path / ("trajectories" if args.format == "tum" else f"graph.{args.format}")
+    if not source.exists() and "world" in result.summary:
+        raise InputError(f"{result.path} is of robots that drive, without stances: there is tum and ros2 of it alone")
     if not source.exists():
         raise InputError(f"{result.path} does not hold {source.name}; solve the run again with this version")
     out.parent.mkdir(parents=True, exist_ok=True)

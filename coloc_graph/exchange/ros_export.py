@@ -80,6 +80,7 @@ class _Messages:
         mounts = [
             self._transform(ns, f"{robot}/base_link", f"{robot}/camera", team[robot].mount.T_body_camera)
             for robot in trajectories
+            if team[robot].camera_if_any is not None
         ]
         return _Message(TF_STATIC, ns, TF, self._new(TF, transforms=mounts))
 

@@ -92,8 +92,17 @@ def scene_of_run(run: Run, progress: Progress | None = None) -> Scene:
 
     Raises as `pipeline.solve` does.
     """
+    _require_stances(run)
     options = SolveOptions().resolved()
     return scene_of_solution(solve(run, options, progress))
+
+
+def _require_stances(run: Run) -> None:
+    if run.has_ranges and not run.stances:
+        raise InputError(
+            f"{run.path} is of robots that drive, without stances, which the viewer does not show; look into "
+            "report.html of its result, or at what `coloc evaluate --plot` draws"
+        )
 
 
 def scene_of_solution(solution: Solution) -> Scene:
@@ -118,6 +127,7 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
     where = run_path or result.run_path
     result.require_run(where)
     run = open_run(where)
+    _require_stances(run)
     name = NAMES.get(str(result.summary.get("method")), str(result.summary.get("method")))
     robots, stances = run.team.names, run.stances
     refined = result.path / "team.toml"
