@@ -8,15 +8,18 @@ import pytest
 from msgspec.structs import replace
 from teams import graph_of_team, largest_difference, of_stance, planar_nees, team_of
 
-from coloc_graph.backend import Estimator, PoseGraph, chain, diagnose, smooth
+from coloc_graph.backend import Estimator, PoseGraph, chain, diagnose, joint, smooth
 from coloc_graph.backend.landmarks import MAP, landmarks_of, map_of
 from coloc_graph.errors import MeasurementError
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import read_g2o, write_g2o
+from coloc_graph.frontend import Track, plane_from_mount, sight
+from coloc_graph.frontend.sighting import Marked
 from coloc_graph.lie import floor_pose, se3_exp, se3_inverse
 from coloc_graph.measurements import Odometry, Sighting
 from coloc_graph.run import Stance
-from coloc_graph.team import Floor, Landmark, Markers, Tag
+from coloc_graph.simulation import reference_team
+from coloc_graph.team import Floor, Landmark, Markers, Mount, Tag
 
 LIGHTS = Markers(height=0.15, positions=((0.0, 0.2), (0.0, -0.2)))
 #: How well a landmark is sighted here: heading [rad], x, y [m].
@@ -273,6 +276,41 @@ def test_a_loop_that_closes_far_off_what_drift_expects_is_judged_by_the_graph_s_
     assert [one.measurement.ends[0] for one in refused] == [("A", 60)]
 
 
+def seen_in_pixels(T_world_robot, stance, place, name, rng):
+    """A sighting made of two pixels, with their rays: what the joint estimate goes on from."""
+    robot = reference_team()["A"]
+    T = se3_inverse(T_world_robot @ robot.mount.T_body_camera) @ floor_pose(*place)
+    uv, inside = robot.camera.project(LIGHTS.p_body @ T[:3, :3].T + T[:3, 3])
+    assert inside.all()
+    uv = uv + 0.1 * rng.standard_normal((2, 2))
+    C = 0.01 * np.eye(2)[None]
+    tracks = [Track("A", f"{name}/{n}", np.array([10.0 * stance]), uv[n : n + 1], C, np.zeros(1)) for n in range(2)]
+    plane = plane_from_mount(robot.mount, LIGHTS)
+    return sight(Stance(stance, 10.0 * stance, 10.0 * stance + 5, ("A",)), robot, Marked(name, LIGHTS), tracks, plane)
+
+
+def test_pixels_of_a_landmark_that_drift_has_put_behind_the_camera_close_the_loop_all_the_same():
+    graph, team = driven(3, 0.05, 1)
+    rng = np.random.default_rng(4)
+    wheels = [m for m in graph.measurements if isinstance(m, Odometry)]
+    seen = [seen_in_pixels(team.T_world_body["A", k], k, (0.6, 0.1, 2.8), "L1", rng) for k in (0, 60)]
+    rigs = {"A": replace(reference_team()["A"], mount_if_any=Mount(height=0.4, tilt_deg=20.0, tilt_sigma_deg=0.1))}
+    graph = dataclasses.replace(graph, measurements=(*wheels, *seen), rigs=rigs)
+    drift = smooth(graph.without(seen[1:]))
+    expected = drift.pose("A", 60).between(drift.landmarks["L1"].T_world_body)
+    off = np.linalg.norm(expected.translation() - seen[1].T_i_j.translation())
+    assert off > 0.4  # of a landmark 0.6 m away
+    estimator = Estimator("A", ("A",), graph.floor, {}, rigs, graph.landmarks)
+    for stance in graph.stances:
+        estimator.add(stance, of_stance(graph.measurements, stance.index))
+    batch = joint(graph)
+    assert not estimator.refused and not batch.refused
+    for estimate in (batch, estimator.estimate()):
+        assert np.linalg.norm(estimate.pose("A", 60).translation()) < 0.02
+    assert largest_difference(batch, estimator.estimate(), graph.nodes) < 1e-5
+    assert np.linalg.norm(estimator.pose("A", 60).translation() - batch.pose("A", 60).translation()) < 0.01
+
+
 def test_a_landmark_neither_watches_nor_drives(team):
     graph = with_landmarks(team, [], landmark("L1"))
     T = gtsam.Pose3()
@@ -316,8 +354,6 @@ def test_a_team_of_landmarks_is_told_what_is_wrong_with_it():
 
 
 def test_a_tag_that_two_landmarks_have_is_named():
-    from coloc_graph.simulation import reference_team
-
     tags = [Landmark(name=name, tag=Tag(id=7, size=0.1, height=0.1)) for name in ("L1", "L2")]
     with pytest.raises(ValueError, match="landmarks L1 and L2 have the same tag 7"):
         replace(reference_team(), landmarks=tuple(tags))

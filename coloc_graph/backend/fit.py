@@ -1,6 +1,5 @@
 """A graph's optimum: where the search starts, and, of a joint estimate, the mounts before all else."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -76,7 +75,6 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
     What a start does not hold is composed, and what nothing ties to the reference is left out. Raises `EstimationError`
     where measurements tie nothing to it, or the optimiser's answer does not pass its check.
     """
-    begun = start
     if method == "joint" and start is None:
         start = _mounts_first(graph)
     factors_of = factors_for(method, graph, start)
@@ -93,8 +91,6 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
     values = gtsam.Values()
     for key, pose in compose(graph, spanning_tree(graph, graph.links), factors_of.start, expected, known).items():
         values.insert(key, pose)
-    if method == "joint" and begun is None and graph.sighted:
-        values = _loops_closed(graph, factors_of, values, expected)
     iterations = 0
     for left in reversed(range(MOST_ANCHORINGS)):
         factors, links = factors_of.of_graph(graph, poses_in(values))
@@ -108,23 +104,6 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
             break
         factors_of = factors_for(method, graph, values)
     return Fit(graph, factors_of, factors, links, values, iterations)
-
-
-def _loops_closed(
-    graph: PoseGraph, factors_of: Factors, composed: gtsam.Values, expected: Callable[[Link], gtsam.Pose3]
-) -> gtsam.Values:
-    """Poses as poses alone have them, what measurements say of two taken for a pose and not for pixels.
-
-    Composed from two sides, a landmark is seen from where it is far off in the image, or behind the camera: there
-    pixels tell a search nothing.
-    """
-    poses = Factors(graph.floor)
-    factors, links = poses.of_graph(graph, poses_in(composed))
-    first = factors.size() - len(links)
-    for number, link in enumerate(links):
-        i, j = map(graph.places.key, link.ends)
-        factors.replace(first + number, poses.between(link, i, j, expected(link)))
-    return optimise(factors, composed)[0]
 
 
 def _mounts_first(graph: PoseGraph) -> gtsam.Values | None:

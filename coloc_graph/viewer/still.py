@@ -60,7 +60,9 @@ def landmark_mesh(landmark: Landmark | None) -> trimesh.Trimesh:
     """A landmark in its frame: a foot, a post, and what is seen of it: a tag's board, or lights on a bar."""
     markers = None if landmark is None else landmark.seen_as
     height = TALL if markers is None else markers.height
-    parts = [painted(cylinder(FOOT, 0.0, 0.012), _AMBER), painted(cylinder(POST, 0.0, height), _STEEL)]
+    is_tag = landmark is not None and landmark.tag is not None
+    behind = (-BOARD - POST if is_tag else 0.0, 0.0)
+    parts = [painted(cylinder(FOOT, 0.0, 0.012), _AMBER), painted(cylinder(POST, 0.0, height, behind), _STEEL)]
     if landmark is not None and landmark.tag is not None:
         size = landmark.tag.size
         for side, thickness, colour in ((1.4 * size, BOARD, _WHITE), (size, 0.6 * BOARD, _BLACK)):
