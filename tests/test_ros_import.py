@@ -39,7 +39,8 @@ MARKERS = Markers(height=0.15, positions=((0.0, 0.1), (0.0, -0.1)))
 TEAM = Team(
     reference="A",
     robots=tuple(
-        Robot(name=name, camera=CAMERA, mount=Mount(height=0.4, tilt_deg=20.0), markers=MARKERS) for name in "ABC"
+        Robot(name=name, camera_if_any=CAMERA, mount_if_any=Mount(height=0.4, tilt_deg=20.0), markers=MARKERS)
+        for name in "ABC"
     ),
     floor=Floor(),
 )

@@ -45,7 +45,9 @@ def with_cameras(bag: Bag, the_map: RosMap, recording: Recording, team: Team) ->
                 f"{bag.path}: {robot.name}'s camera is that of {robot.camera_info}, and the team states another: "
                 + ", ".join(other)
             )
-    robots = tuple(msgspec.structs.replace(one, camera=cameras.get(one.name, one.camera)) for one in team.robots)
+    robots = tuple(
+        msgspec.structs.replace(one, camera_if_any=cameras.get(one.name, one.camera_if_any)) for one in team.robots
+    )
     return msgspec.structs.replace(team, robots=robots), warnings
 
 
