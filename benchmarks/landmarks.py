@@ -161,7 +161,7 @@ def summarised(outcomes: list[Outcome]) -> dict[str, object]:
 def main() -> None:
     """Run it, print it, draw it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=12)
+    parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--length", type=float, default=100.0)
     parser.add_argument("--laps", type=int, default=4)
     parser.add_argument("--picture", type=Path, default=PICTURE)
