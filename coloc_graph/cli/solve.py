@@ -3,7 +3,7 @@
 import argparse
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -102,8 +102,9 @@ def run(args: argparse.Namespace) -> int:
 
         announce(viewer, browser=not args.no_browser)
         solution = _solved(args, logged, options, entered)
-        viewer.publish(scene_of_solution(solution))
-        viewer.wait_closed()
+        with suppress(KeyboardInterrupt):  # the result is there: whoever ends it now ends the viewer
+            viewer.publish(scene_of_solution(solution))
+            viewer.wait_closed()
     return 0
 
 
