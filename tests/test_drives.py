@@ -4,7 +4,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from mrclam_folder import DELAY, LANDMARKS, SCALE, make
+from mrclam_folder import DELAY, LANDMARKS, SCALE, TURN_SCALE, make
 from msgspec.structs import replace as with_fields
 
 from coloc_graph.backend.planar import optimise_drive
@@ -67,12 +67,18 @@ def test_wheels_that_are_not_as_they_say_are_found_out(run, batch):
     for robot in run.team.names:
         errors, C = batch.estimate.errors[robot].wheels
         wheels = run.team[robot].wheels
-        true = np.array([SCALE - wheels.scale, errors[1], DELAY - wheels.delay])
+        true = np.array([SCALE - wheels.scale, TURN_SCALE - wheels.turn_scale, DELAY - wheels.delay])
         assert np.all(np.abs(errors - true) < 4 * np.sqrt(np.diagonal(C)))
         assert np.sqrt(C[2, 2]) < wheels.delay_sigma / 3
     found = calibrated(run.team, batch.estimate)
-    assert found["R1"].wheels.scale == pytest.approx(SCALE, abs=0.1)
-    assert found["R1"].wheels.delay_sigma < run.team["R1"].wheels.delay_sigma
+    stated, errors = run.team["R1"], batch.estimate.errors["R1"]
+    wheels, ranging = found["R1"].wheels, found["R1"].ranging
+    at = [wheels.scale - stated.wheels.scale, wheels.turn_scale - stated.wheels.turn_scale]
+    assert [*at, wheels.delay - stated.wheels.delay] == pytest.approx(errors.wheels[0].tolist())
+    at = [ranging.offset, ranging.scale - 1, np.deg2rad(ranging.bearing_offset_deg), ranging.x, ranging.y]
+    assert at == pytest.approx(errors.ranging[0].tolist())
+    assert wheels.delay_sigma == pytest.approx(np.sqrt(errors.wheels[1][2, 2]))
+    assert ranging.range_sigma == pytest.approx(stated.ranging.range_sigma * batch.estimate.noise[0, 0])
 
 
 def test_each_robot_helps_the_others(run, batch):

@@ -48,7 +48,7 @@ def ranging_key(robot: int) -> int:
 class DriveFactors:
     """Makes the factors of a drive. `noise` (robots, 3) multiplies the standard deviations of ranges, bearings, steps.
 
-    Steps and measurements are robust factors of whitened residuals, so that all noise models are shared.
+    Residuals are whitened, so that all factors of a kind share a noise model; that of measurements is robust.
     """
 
     def __init__(self, drive: Drive, models: Models, noise: Array | None = None) -> None:
