@@ -370,17 +370,55 @@ def test_the_end_of_its_process_stops_the_wheels(robot, how):
         assert ("ZeroDivisionError" if how == "exception" else "KeyboardInterrupt") in err
 
 
-def test_after_a_kill_the_robot_goes_on_as_the_docs_say(robot):
-    child = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM.format(before="", after="pass"), robot.port], stdout=subprocess.PIPE, text=True
-    )
-    assert child.stdout.readline().startswith("moving")
-    child.kill()
-    child.communicate(timeout=5)
-    time.sleep(0.6)
-    assert robot.speeds == pytest.approx((0.2, 0.2))
-    with Create(robot.port, 2):  # whoever opens the port next stops it first
+@contextlib.contextmanager
+def driving_process(robot, **more):
+    """A process of its own that drives on; ended hard."""
+    program = PROGRAM.format(before="", after="while True: create.drive(0.2, 0.0); time.sleep(0.05)")
+    child = subprocess.Popen([sys.executable, "-c", program, robot.port], stdout=subprocess.PIPE, text=True, **more)
+    try:
+        assert child.stdout.readline().startswith("moving")
+        yield child
+    finally:
+        child.kill()
+        child.communicate(timeout=5)
+
+
+@pytest.mark.parametrize("group", [False, True])
+def test_a_kill_stops_the_wheels(robot, group):
+    with driving_process(robot, start_new_session=True) as child:
+        assert robot.speeds == pytest.approx((0.2, 0.2))
+        os.killpg(child.pid, signal.SIGKILL) if group else child.kill()
         stopped_after(robot, time.monotonic())
+        assert until(lambda: robot.mode == Mode.PASSIVE)
+    with Create(robot.port, 2) as create:  # the line is free again
+        set_off(create, robot)
+
+
+def test_a_kill_amid_a_command_stops_the_wheels(robot):
+    with Create(robot.port, 2) as create:
+        set_off(create, robot)
+        create._line._serial.write(oi.drive_direct(200, 200)[:-2])  # the next bytes are taken for its speeds
+        since, stopper = time.monotonic(), create._line._stopper
+        stopper._process.stdin.close()  # as at a kill
+        stopped_after(robot, since)
+
+
+def test_a_process_that_is_paused_has_its_wheels_stopped(robot):
+    with driving_process(robot) as child:
+        child.send_signal(signal.SIGSTOP)
+        stopped_after(robot, time.monotonic())
+
+
+def test_nothing_is_driven_once_the_stopper_is_gone(robot):
+    with Create(robot.port, 2) as create:
+        set_off(create, robot)
+        create._line._stopper._process.kill()
+        since = time.monotonic()
+        with pytest.raises(RobotError, match="stops the wheels when this one is killed has ended.*open it again"):
+            keep(create, 0.2, 0.0, 2.0)
+        stopped_after(robot, since)
+    with Create(robot.port, 2) as create:
+        set_off(create, robot)
 
 
 def test_signal_handlers_are_as_before_after_the_last_is_closed(robot):

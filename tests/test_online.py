@@ -31,7 +31,8 @@ def mission(tmp_path_factory, request):
             m.wait_moving()
 
         in_mid_stance(1)
-        m.field.kill("C")  # its wheels go on: nobody is left to stop them, until its program is back
+        m.field.kill("C")
+        m.time_to_stand("a robot's program is gone")
         m.field.start("C")
         in_mid_stance(2)
         m.relay.cut()
@@ -94,7 +95,7 @@ def test_what_happened_is_named(mission):
 
 
 def test_wheels_stand_soon_after_they_are_let_go(mission):
-    assert len(mission.stops) == 2
+    assert len(mission.stops) == 3
     assert 0.05 < max(mission.stops.values()) < STOP, mission.stops
 
 

@@ -14,7 +14,7 @@ from typing import Self
 from coloc_graph.errors import InputError, RobotError
 from coloc_graph.robot_io import create_protocol as oi
 from coloc_graph.robot_io.create_feed import SensorFeed
-from coloc_graph.robot_io.create_line import CreateLine
+from coloc_graph.robot_io.create_line import LEAVE, CreateLine
 from coloc_graph.robot_io.create_odometry import WHEELS
 from coloc_graph.robot_io.create_protocol import Mode, Packet
 from coloc_graph.robot_io.create_state import HAZARDS, CreateState
@@ -120,7 +120,7 @@ class Create:
         self._wait(lambda: not self._feed.told_to_move, 0.3)
         self._ended.set()
         with contextlib.suppress(RobotError):
-            line.send(oi.HALT + oi.pause_stream() + bytes([oi.START]))
+            line.send(LEAVE)
         for thread in self._threads:
             if thread.is_alive() and thread is not threading.current_thread():
                 thread.join(timeout=1.0)
@@ -297,6 +297,7 @@ class Create:
     def _watch(self, line: CreateLine) -> None:
         """The watchdog thread: ends a motion when nothing else does, and sees to it that a stop is taken."""
         while not self._ended.wait(WATCH):
+            line.beat()
             now, deadline = time.monotonic(), self._deadline
             if deadline is not None and now >= deadline:
                 self._halt(None)

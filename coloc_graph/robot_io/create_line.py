@@ -1,6 +1,7 @@
 """The serial line to a Create: found, opened, written to and read from, each with a timeout; `CreateLine`."""
 
 import contextlib
+import errno
 import select
 import threading
 import time
@@ -11,9 +12,13 @@ from coloc_graph.errors import RobotError
 from coloc_graph.robot_io import create_protocol as oi
 from coloc_graph.robot_io.create_odometry import WHEELS
 from coloc_graph.robot_io.create_state import DELTAS, STREAMED
+from coloc_graph.robot_io.stopper import Stopper
 
-#: How long a robot may take to answer at one baud, a write or a read to end, a lost port to come back [s].
-ANSWER, WRITE, READ, BACK = 1.0, 0.2, 0.05, 10.0
+#: How long a robot may take to answer at one baud, a write or a read to end, a lost port to come back, and one that
+#: another driver held to be free [s].
+ANSWER, WRITE, READ, BACK, FREED = 1.0, 0.2, 0.05, 10.0, 0.5
+#: Leaves a robot still, silent and passive.
+LEAVE = oi.HALT + oi.pause_stream() + bytes([oi.START])
 
 
 class CreateLine:
@@ -26,9 +31,10 @@ class CreateLine:
         self.port = port
         self.lost: str | None = None
         self._lock = threading.RLock()
+        self._stopper: Stopper | None = None
         models = [model] if model else [2, 1]
         try:
-            self._serial = self._opened(models[0])
+            self._serial = self._first_opened(models[0])
         except (OSError, ValueError) as error:
             raise RobotError(f"cannot open {port} ({error}): is it plugged in, free, and yours to use?") from error
         try:
@@ -36,9 +42,21 @@ class CreateLine:
             if not self.model:
                 bauds = " or ".join(str(WHEELS[one].baud) for one in models)
                 raise RobotError(f"no Create answers on {port} at {bauds} baud: switch it on, check model and cable")
+            self._stopper = Stopper(self._serial.fileno(), oi.HALT, LEAVE)
         except BaseException:
             self.close()
             raise
+
+    def _first_opened(self, model: int) -> serial.Serial:
+        """The port, once the stopper of a driver that was killed has let go of it."""
+        until = time.monotonic() + FREED
+        while True:
+            try:
+                return self._opened(model)
+            except OSError as error:
+                if error.errno != errno.EAGAIN or time.monotonic() > until:
+                    raise
+                time.sleep(0.01)
 
     def _answers(self, model: int) -> bool:
         """Whether sound frames come at this model's baud."""
@@ -90,14 +108,21 @@ class CreateLine:
                 f"the line on {self.port} is lost ({self.lost}): check the cable, open it again"
             ) from error
 
+    def beat(self) -> None:
+        """Tell the stopper that this process lives. `RobotError` where that one ended: nobody would stop the robot."""
+        if self._stopper is not None and self.lost is None and not self._stopper.beat():
+            with contextlib.suppress(RobotError):
+                self.send(oi.HALT)
+            self.lost = self.lost or "the process that stops the wheels when this one is killed has ended"
+            raise RobotError(f"the line on {self.port} is lost ({self.lost}): open it again")
+
     def stop_when_back(self, ended: threading.Event) -> bool:
         """For some seconds after the line was lost, stop the robot if its port comes back. Whether it did."""
         until = time.monotonic() + BACK
-        with contextlib.suppress(OSError):
-            self._serial.close()
+        self.close()
         while time.monotonic() < until and not ended.wait(0.05):
             with contextlib.suppress(OSError, ValueError), self._opened(self.model) as again:
-                again.write(oi.HALT + oi.pause_stream() + bytes([oi.START]))
+                again.write(LEAVE)
                 again.flush()
                 return True
         return False
@@ -108,5 +133,8 @@ class CreateLine:
     def close(self) -> None:
         """Let go of the port."""
         self.lost = self.lost or "closed"
+        stopper, self._stopper = self._stopper, None
+        if stopper is not None:
+            stopper.end()
         with contextlib.suppress(OSError):
             self._serial.close()
