@@ -414,7 +414,7 @@ def test_nothing_is_driven_once_the_stopper_is_gone(robot):
         set_off(create, robot)
         create._line._stopper._process.kill()
         since = time.monotonic()
-        with pytest.raises(RobotError, match="stops the wheels when this one is killed has ended.*open it again"):
+        with pytest.raises(RobotError, match=r"stops the wheels when this one is killed has ended.*open it again"):
             keep(create, 0.2, 0.0, 2.0)
         stopped_after(robot, since)
     with Create(robot.port, 2) as create:
@@ -609,11 +609,42 @@ def test_counts_that_no_wheel_can_reach_are_left_out():
     assert [one is None for one in told] == [False, True, True, False, False]
 
 
+def test_a_robot_that_counts_anew_is_said_to_be_anywhere_it_could_have_come_to():
+    way, odometer, samples = EncoderWay(), Odometer("A"), []
+    for n, ticks in enumerate([30000, 30000, 0, 0, 0, *range(16, 200, 16)]):
+        step = way.step({Packet.LEFT_TICKS: ticks, Packet.RIGHT_TICKS: ticks}, 0.3 if n == 2 else 0.015)
+        samples += odometer.add(10 + 0.015 * n + 0.3 * (n > 1), *step) if step else []
+    assert samples[1].covariance[0, 0] > 0.15**2 > samples[-1].covariance[0, 0]
+
+
+@pytest.mark.parametrize("before", [0, 1, 5])
+def test_frames_that_were_held_up_lose_no_way(before):
+    """A reader that was not run for 0.6 s finds `before` old frames, then one with all of the way."""
+    way, odometer, samples = EncoderWay(), Odometer("A"), []
+    late, speed = 0.6, 0.45
+    written = np.arange(0.0, 3.0, 0.015)
+    held = (written > 1.0) & (written < 1.0 + late)
+    come = np.where(held, 1.0 + late, written)
+    kept = ~held | (np.cumsum(held) <= before)
+    previous = -0.015
+    for at, now in zip(written[kept], come[kept], strict=True):
+        ticks = int(speed * at / 4.44589e-4)
+        step = way.step({Packet.LEFT_TICKS: ticks, Packet.RIGHT_TICKS: ticks}, now - previous)
+        samples += odometer.add(100 + now, *step) if step else []
+        previous = now
+    rolled = np.array([one.pose[0] for one in samples])
+    at = np.array([one.time - 100 for one in samples])
+    assert rolled[-1] == pytest.approx(speed * at[-1], abs=1e-3)
+    # nor is it told to have stood, and then to have leapt
+    assert np.diff(rolled / speed - at).max() < 0.02
+
+
 def simulated(model, seed, frames=167, period=0.03, **physics):
     """A random drive through the emulator's body without its clock: the samples, and the true poses at their ends."""
     rng = np.random.default_rng(seed)
     body = Body(model, Physics(seed=seed, step=0.01, **physics), 0.0)
-    odometer, way = Odometer("A"), EncoderWay() if model == 2 else DeltaWay()
+    odometer = Odometer("A", late=0.1 if model == 2 else np.inf)
+    way = EncoderWay() if model == 2 else DeltaWay()
     samples, asked = [], np.zeros(2)
     true_start = body.x, body.y, body.yaw
     for n in range(frames):

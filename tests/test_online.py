@@ -1,6 +1,8 @@
 """A team leads itself down a hallway, with real processes, links, serial lines and images; and things happen to it."""
 
+import signal
 import time
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -65,6 +67,11 @@ def more_happens(m, in_mid_stance):
     m.field.tell("hangup C")
     m.wait_for(9, "holding")
     m.field.tell("plug C")
+    in_mid_stance(10)
+    m.field.kill("B")
+    m.field.start("B", program=[str(Path(__file__).with_name("jumping_clock.py"))])
+    in_mid_stance(11)
+    m.field.programs["B"].send_signal(signal.SIGUSR1)
 
 
 def reasons(mission, stance):
@@ -92,6 +99,7 @@ def test_what_happened_is_named(mission):
     assert f"robot {mission.pushed} was bumped between stances {PUSHED - 1} and {PUSHED}" in reasons(mission, PUSHED)
     assert "A" in reasons(mission, 7) and "image" in reasons(mission, 7)
     assert "C" in reasons(mission, 9)
+    assert "the clock of B jumped" in reasons(mission, 11)
 
 
 def test_wheels_stand_soon_after_they_are_let_go(mission):

@@ -1,5 +1,6 @@
 """What a Create's frames amount to: the newest state, and odometry; `SensorFeed`."""
 
+import math
 import threading
 import time
 from collections import deque
@@ -19,7 +20,8 @@ class SensorFeed:
         #: When the newest frame came [s, monotonic].
         self.last = time.monotonic()
         self._epoch = time.time() - self.last if epoch is None else epoch
-        self._odometer = Odometer(robot, period)
+        # a Create 1 tells its way seldom, and each time all of it
+        self._odometer = Odometer(robot, period) if model == 2 else Odometer(robot, period, math.inf)
         self._way = EncoderWay() if model == 2 else DeltaWay()
         self._samples: deque[OdometrySample] = deque(maxlen=20_000)
         self._fresh = threading.Condition()

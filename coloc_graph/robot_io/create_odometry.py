@@ -23,6 +23,8 @@ SLIP, ENCODER = 0.008, 0.006
 FLOOR_METRES, FLOOR_RADIANS = 1e-5, 1e-5
 #: How far a Create 1 keeps to the speed that it was asked for: share of the way, and time that it is late [s].
 REQUEST_SHARE, REQUEST_LATE = 0.03, 0.05
+#: A frame that comes later than this after the one before was held up, and so may the next ones be for a while [s].
+LATE, HELD_UP = 0.1, 1.0
 
 
 @dataclass(frozen=True)
@@ -80,18 +82,19 @@ class Odometer:
     """Adds increments up to samples: one every `period` [s] while moving, one every second at rest.
 
     The pose is in its own frame, the body at the first increment. Before a movement begins, the rest is closed
-    with a sample, so that who interpolates between samples sees the robot stand until then.
+    with a sample, so that who interpolates between samples sees the robot stand until then. What comes at once after
+    a gap, longer than `late` [s], belongs into the gap: no sample ends amid it.
     """
 
     REST = 1.0
 
-    def __init__(self, robot: str, period: float = 0.05) -> None:
-        self.robot, self.period = robot, period
+    def __init__(self, robot: str, period: float = 0.05, late: float = LATE) -> None:
+        self.robot, self.period, self.late = robot, period, late
         self.pose = np.zeros(3)
         self._way = np.zeros(3)
         self._covariance = np.zeros((3, 3))
         self._opened: float | None = None
-        self._last = 0.0
+        self._last = self._open_until = 0.0
 
     def add(self, time: float, way: tuple[float, float, float], covariance: Array) -> list[OdometrySample]:
         """The samples that this increment, which ends at `time` [UTC s], completes."""
@@ -101,10 +104,14 @@ class Odometer:
             self._last = time
             return [self._close(time)]
         samples = []
-        if moved and not self._way.any() and self._last > self._opened:
+        late = time - self._last > self.late
+        sets_off = moved and not self._way.any() and time > self._open_until
+        if (late or sets_off) and self._last > self._opened:
             samples.append(self._close(self._last))
+        if late:
+            self._open_until = time + self.period
         self.pose = compose(self.pose, way)
-        if moved:
+        if moved or covariance.any():
             # an error in heading at the end of the way so far swings what follows
             c, s = cos(self._way[2]), sin(self._way[2])
             R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -113,7 +120,8 @@ class Odometer:
             self._covariance = F @ self._covariance @ F.T + R @ covariance @ R.T
             self._way += (dx, dy, way[2])
         self._last = time
-        if time - self._opened >= (self.period if self._way.any() else self.REST) - 1e-6:
+        after = max(self._opened + (self.period if self._way.any() else self.REST), self._open_until)
+        if time >= after - 1e-6:
             samples.append(self._close(time))
         return samples
 
@@ -129,12 +137,12 @@ class EncoderWay:
     """Increments of a Create 2 from its encoders (packets 43, 44).
 
     Counts that no wheel can have reached are those of a damaged frame whose checksum fits by chance, and are left
-    out; three in a row are a robot that began to count anew.
+    out; three in a row are a robot that began to count anew, of whose way nothing is known but its bounds.
     """
 
     def __init__(self) -> None:
         self._before: tuple[int, int] | None = None
-        self._elapsed = 0.0
+        self._elapsed = self._gap = self._since_gap = 0.0
         self._left_out = 0
 
     def step(self, frame: Mapping[int, int], elapsed: float) -> tuple[tuple[float, float, float], Array] | None:
@@ -142,14 +150,21 @@ class EncoderWay:
         after = frame[Packet.LEFT_TICKS], frame[Packet.RIGHT_TICKS]
         wheels, before = WHEELS[2], self._before or after
         self._elapsed += elapsed
+        self._since_gap = 0.0 if elapsed > LATE else self._since_gap + elapsed
+        # after a gap, a frame from before it may come first, and then one with all of the way
+        self._gap = elapsed if elapsed > LATE else self._gap if self._since_gap < HELD_UP else 0.0
         left, right = (ticks_between(b, a) * wheels.metres for b, a in zip(before, after, strict=True))
-        if max(abs(left), abs(right)) > 2e-3 * MAX_WHEEL_SPEED * (self._elapsed + 0.1):
+        unknown = 0.0
+        if max(abs(left), abs(right)) > 2e-3 * MAX_WHEEL_SPEED * (self._elapsed + LATE + self._gap):
             self._left_out += 1
             if self._left_out < 3:
                 return None
             left = right = 0.0
+            unknown = 1e-3 * MAX_WHEEL_SPEED * self._elapsed
         self._before, self._elapsed, self._left_out = after, 0.0, 0
-        return arc(left, right, wheels.base), arc_covariance(left, right, wheels.base)
+        covariance = arc_covariance(left, right, wheels.base)
+        covariance += np.diag(np.square([unknown, unknown, 2 * unknown / wheels.base]))
+        return arc(left, right, wheels.base), covariance
 
 
 class DeltaWay:

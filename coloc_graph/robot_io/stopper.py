@@ -1,7 +1,7 @@
 """A small process beside the one that drives, which stops the wheels when that one is killed, paused or hangs.
 
-It shares the open line and hears a beat; nothing in the process that drives can act on its own SIGKILL. Only the standard
-library is imported: it runs as a file, to be there at once and to stay small.
+It shares the open line and hears a beat; nothing in the process that drives can act on its own SIGKILL. Only the
+standard library is imported: it runs as a file, to be there at once and to stay small.
 """
 
 import contextlib

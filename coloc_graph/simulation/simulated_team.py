@@ -5,6 +5,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -78,10 +79,10 @@ class SimulatedTeam:
         """Where the truth is, once it is over."""
         return self.folder / "truth.mcap"
 
-    def start(self, *names: str) -> None:
-        """Start the programs of robots, of all where none is named."""
+    def start(self, *names: str, program: Sequence[str] = ("-m", "coloc_graph.cli")) -> None:
+        """Start the programs of robots, of all where none is named; `program` is what Python is to run as `coloc`."""
         for name in names or self.team.names:
-            command = [sys.executable, "-m", "coloc_graph.cli", "robot", name, str(self.team_path)]
+            command = [sys.executable, *program, "robot", name, str(self.team_path)]
             command += ["--out", str(self.folder / "robots"), "--connect", self.connect]
             command += ["--camera", f"world:{self.about['socket']}", "--wheels", self.about["ports"][name]]
             command += ["--model", "2"]
