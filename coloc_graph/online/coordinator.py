@@ -343,7 +343,8 @@ class Coordinator:
             if found.suffices(self.options):
                 self._end_capture("it is enough")
                 return
-        if not self._measuring.judging and now - self._judged > JUDGED:
+        left = self._stance.start + self.options.longest - self.roster.utc(time.monotonic_ns())
+        if not self._measuring.judging and now - self._judged > JUDGED < left:  # what is measured last waits for none
             self._judged = now
             self._measuring.judge(replace(self._stance, end=self._last_image()))
         self._orders.drive_on()
@@ -351,7 +352,7 @@ class Coordinator:
             self._rounds += 1
             order = self._patrol[::-1] if self._rounds % 2 else self._patrol
             self._orders.drive(self.mover, order)
-        if self.roster.utc(time.monotonic_ns()) - self._stance.start > self.options.longest:
+        if left < 0:
             self._end_capture(f"{self.options.longest:g} s are over")
 
     def _end_capture(self, why: str) -> None:
