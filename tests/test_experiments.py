@@ -6,6 +6,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import distributed
 import matplotlib.image
 import numpy as np
 import pytest
@@ -140,6 +141,15 @@ def test_more_processes_give_the_same_cells(single):
     assert not np.array_equal(cells[0].eq2.lengths, cells[1].eq2.lengths)
 
 
+def test_a_cluster_gives_the_same_cells(single):
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        (cell,) = measure_cells([(0.6, 30.0)], runs=5, cluster=cluster.scheduler_address)
+    (again,) = measure_cells([(0.6, 30.0)], runs=5)
+    assert np.array_equal(cell.ours.lengths, again.ours.lengths)
+
+
 def test_progress_is_told_and_errors_come_through():
     told = []
     assert spread(abs, [-1, 2, -3], progress=lambda done, total: told.append((done, total))) == [1, 2, 3]
@@ -214,7 +224,7 @@ def test_the_commands_options_reach_the_experiment(single, tmp_path, capsys, mon
     arguments = ["--depth", "images", "--seed", "7", "--runs", "25", "--draws", "20", "--processes", "3"]
     assert main(["experiment", "fig4", *arguments, "--json", "--out", str(out)]) == 0
     del given["progress"]
-    assert given == {"depth": "images", "seed": 7, "runs": 25, "draws": 20, "processes": 3}
+    assert given == {"depth": "images", "seed": 7, "runs": 25, "draws": 20, "processes": 3, "cluster": None}
     assert json.loads(capsys.readouterr().out) == json.loads((out / "fig4.json").read_text())
 
 
@@ -228,6 +238,7 @@ def test_the_commands_options_reach_the_experiment(single, tmp_path, capsys, mon
         (["table1", "--draws", "50"], "--draws belongs to fig4 and fig5"),
         (["table2", "--seed", "-1"], "`seed` is -1"),
         (["table2", "--processes", "0"], "`processes` is 0"),
+        (["table1", "--cluster", "tcp://127.0.0.1:1"], "no Dask scheduler at tcp://127.0.0.1:1"),
         (["fig4", "--depth", "video"], "video"),
         (["table1", "--out", "full"], "full holds something else"),
         (["table1", "--out", "full/file"], "full/file exists and is not a folder"),
@@ -236,6 +247,7 @@ def test_the_commands_options_reach_the_experiment(single, tmp_path, capsys, mon
 )
 def test_a_bad_value_is_one_sentence(arguments, what, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("coloc_graph.workers.PATIENCE", 0.5)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("mine")
     try:

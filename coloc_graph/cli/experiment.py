@@ -20,6 +20,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--draws", type=int, metavar="N", help="points drawn in a run (fig4, fig5: 50 of 250)")
     command.add_argument("--out", metavar="DIR", help="folder for figure and numbers (experiment-NAME)")
     command.add_argument("--processes", type=int, default=2, metavar="N", help="how many work at once (2)")
+    command.add_argument("--cluster", metavar="ADDRESS", help="work by the Dask scheduler at tcp://HOST:PORT instead")
     command.add_argument("--json", action="store_true", help="print all numbers as JSON")
     command.set_defaults(run=run)
 
@@ -32,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
 
     out = args.out or f"experiment-{args.name}"
     experiments.require_place(out, args.name)  # before the work, not after it
-    options: dict[str, Any] = {key: getattr(args, key) for key in ("depth", "seed", "processes")}
+    options: dict[str, Any] = {key: getattr(args, key) for key in ("depth", "seed", "processes", "cluster")}
     options |= {key: value for key in ("runs", "draws") if (value := getattr(args, key)) is not None}
     single_step = args.name in ("fig4", "fig5")
     if "draws" in options and not single_step:

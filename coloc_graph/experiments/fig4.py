@@ -96,11 +96,12 @@ def fig4(
     draws: int = 50,
     cells: Sequence[tuple[float, float]] = CELLS,
     processes: int = 1,
+    cluster: str | None = None,
     progress: Progress | None = None,
 ) -> Fig4:
     """Measure Fig. 4; arguments and errors are those of `measure_cells`."""
     measured = measure_cells(
-        cells, depth=depth, seed=seed, runs=runs, draws=draws, processes=processes, progress=progress
+        cells, depth=depth, seed=seed, runs=runs, draws=draws, processes=processes, cluster=cluster, progress=progress
     )
     return Fig4(depth, seed, runs, draws, measured)
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,25 +64,25 @@ class Outing:
         return np.array([getattr(self.courses[self.pair[k % 2]], method)[max(k - 1, 0)] for k in range(stances + 1)])
 
 
-def measure_outing(seed: int, scenario: str, depth: Depth, stances: int | None, folder: Path) -> Outing:
+def measure_outing(seed: int, scenario: str, depth: Depth, stances: int | None) -> Outing:
     """Simulate a scenario and solve it by both methods.
 
     Raises `EstimationError` where a method leaves out a pose: the two could then not be compared.
     """
-    path = folder / f"{scenario}-{seed}.mcap"
-    world = simulate(scenario, path, depth=depth, seed=seed, stances=stances)
-    run = open_run(path)
-    places: dict[str, dict[str, Array]] = {robot: {} for robot in world.scenario.pair}
-    for name, method in SOLVED_BY.items():
-        # without odometry: both see the same pixels, and nothing else
-        solution = solve(run, SolveOptions(method=method, odometry=False))
-        if solution.estimate.untied:
-            raise EstimationError(f"{scenario}, seed {seed}: {solution.warnings[0]}")
-        assessed = assess(solution)
-        assert assessed is not None  # a simulated run holds truth
-        for robot in places:
-            places[robot][name] = solution.estimate.trajectories[robot].positions[:, :2]
-            places[robot]["true"] = assessed[1][robot][:, :2, 3]
-    path.unlink()
+    with TemporaryDirectory(prefix="coloc-") as folder:
+        path = Path(folder) / "run.mcap"
+        world = simulate(scenario, path, depth=depth, seed=seed, stances=stances)
+        run = open_run(path)
+        places: dict[str, dict[str, Array]] = {robot: {} for robot in world.scenario.pair}
+        for name, method in SOLVED_BY.items():
+            # without odometry: both see the same pixels, and nothing else
+            solution = solve(run, SolveOptions(method=method, odometry=False))
+            if solution.estimate.untied:
+                raise EstimationError(f"{scenario}, seed {seed}: {solution.warnings[0]}")
+            assessed = assess(solution)
+            assert assessed is not None  # a simulated run holds truth
+            for robot in places:
+                places[robot][name] = solution.estimate.trajectories[robot].positions[:, :2]
+                places[robot]["true"] = assessed[1][robot][:, :2, 3]
     courses = {robot: Course(robot, one["true"], one["eq2"], one["ours"]) for robot, one in places.items()}
     return Outing(seed, world.scenario.pair, courses)

@@ -15,11 +15,16 @@ Progress = Callable[[int, int], None]
 
 
 def spread(
-    work: Callable[[Item], Result], items: Sequence[Item], processes: int = 1, progress: Progress | None = None
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    processes: int = 1,
+    cluster: str | None = None,
+    progress: Progress | None = None,
 ) -> list[Result]:
-    """`work` of each item, in the order of the items, by new (spawned) processes or, with one, by this.
+    """`work` of each item, in the order of the items, by new (spawned) processes or, with one, by this; or by the Dask
+    scheduler at the address `cluster`.
 
-    What it returns does not depend on `processes`. A script that asks for more than one needs the usual
+    What it returns does not depend on where. A script that asks for more than one needs the usual
     `if __name__ == "__main__":`. The first error of any item ends it all and is raised here.
     """
     results: list[Result] = []
@@ -29,11 +34,11 @@ def spread(
         if progress is not None:
             progress(len(results), len(items))
 
-    if min(processes, len(items)) <= 1:
+    if cluster is None and min(processes, len(items)) <= 1:
         for item in items:
             take(work(item))
         return results
-    with workers(processes) as executor:
+    with workers(processes, cluster) as executor:
         for future in [executor.submit(work, item) for item in items]:
             take(future.result())
     return results

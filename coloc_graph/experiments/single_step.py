@@ -74,6 +74,7 @@ def measure_cells(
     runs: int = 500,
     draws: int = 50,
     processes: int = 1,
+    cluster: str | None = None,
     progress: Progress | None = None,
 ) -> tuple[Cell, ...]:
     """Simulate each cell (l [m], theta [deg]) once, and estimate l from `draws` of its 250 points, `runs` times.
@@ -85,21 +86,20 @@ def measure_cells(
     check(depth, seed, runs, processes)
     if not LEAST_DRAWN <= draws <= RECORDED:
         raise InputError(f"`draws` is {draws}; give {LEAST_DRAWN} to {RECORDED} points a run")
-    with TemporaryDirectory(prefix="coloc-") as folder:
-        work = partial(_measure_cell, depth=depth, seed=seed, runs=runs, draws=draws, folder=Path(folder))
-        return tuple(spread(work, list(cells), processes, progress))
+    work = partial(_measure_cell, depth=depth, seed=seed, runs=runs, draws=draws)
+    return tuple(spread(work, list(cells), processes, cluster, progress))
 
 
-def _measure_cell(cell: tuple[float, float], depth: Depth, seed: int, runs: int, draws: int, folder: Path) -> Cell:
+def _measure_cell(cell: tuple[float, float], depth: Depth, seed: int, runs: int, draws: int) -> Cell:
     baseline, theta_deg = cell
-    path = folder / f"{baseline:g}-{theta_deg:g}.mcap"
-    simulate("single-step", path, depth=depth, seed=seed, points=RECORDED, l=baseline, theta_deg=theta_deg)
-    run = open_run(path)
-    stance = run.stances[0]
-    robot_i, robot_j = (run.team[name] for name in stance.observers)
-    measured = measure_pair(run, stance, robot_i.name, robot_j.name, FrontendOptions())
-    plane = stance_plane(run, stance, robot_i.name)
-    path.unlink()
+    with TemporaryDirectory(prefix="coloc-") as folder:
+        path = Path(folder) / "run.mcap"
+        simulate("single-step", path, depth=depth, seed=seed, points=RECORDED, l=baseline, theta_deg=theta_deg)
+        run = open_run(path)
+        stance = run.stances[0]
+        robot_i, robot_j = (run.team[name] for name in stance.observers)
+        measured = measure_pair(run, stance, robot_i.name, robot_j.name, FrontendOptions())
+        plane = stance_plane(run, stance, robot_i.name)
     found = measured.correspondences
     if found is None or measured.homography.unusable or len(found) < draws:
         why = measured.homography.unusable or f"both see only {len(found or ())} points, fewer than are drawn"

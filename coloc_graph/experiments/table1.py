@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -104,10 +102,15 @@ class Table1:
 
 
 def table1(
-    *, depth: Depth = "tracks", seed: int = 0, runs: int = 10, processes: int = 1, progress: Progress | None = None
+    *,
+    depth: Depth = "tracks",
+    seed: int = 0,
+    runs: int = 10,
+    processes: int = 1,
+    cluster: str | None = None,
+    progress: Progress | None = None,
 ) -> Table1:
     """Simulate six steps in `runs` runs of seeds from `seed` on. Raises `InputError` where an argument is wrong."""
     check(depth, seed, runs, processes)
-    with TemporaryDirectory(prefix="coloc-") as folder:
-        work = partial(measure_outing, scenario="six-step", depth=depth, stances=None, folder=Path(folder))
-        return Table1(depth, tuple(spread(work, range(seed, seed + runs), processes, progress)))
+    work = partial(measure_outing, scenario="six-step", depth=depth, stances=None)
+    return Table1(depth, tuple(spread(work, range(seed, seed + runs), processes, cluster, progress)))

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -125,6 +123,7 @@ def table2(
     runs: int = CASES,
     stances: int = 40,
     processes: int = 1,
+    cluster: str | None = None,
     progress: Progress | None = None,
 ) -> Table2:
     """Simulate the hallway in `runs` runs of seeds from `seed` on; the first two are the paper's cases.
@@ -134,6 +133,5 @@ def table2(
     check(depth, seed, runs, processes)
     if stances < 2:
         raise InputError(f"`stances` is {stances}; give at least 2, so that both robots get somewhere")
-    with TemporaryDirectory(prefix="coloc-") as folder:
-        work = partial(measure_outing, scenario="hallway", depth=depth, stances=stances, folder=Path(folder))
-        return Table2(depth, stances, tuple(spread(work, range(seed, seed + runs), processes, progress)))
+    work = partial(measure_outing, scenario="hallway", depth=depth, stances=stances)
+    return Table2(depth, stances, tuple(spread(work, range(seed, seed + runs), processes, cluster, progress)))
