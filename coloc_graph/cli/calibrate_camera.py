@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
         if not (args.team or args.camera_info):
             raise InputError("--from-camera-info is read to be written: give --team and --robot, or --camera-info")
         camera, left_out = read_camera_info(args.from_camera_info, robot.camera if robot else None)
-        warn(left_out)
+        warn(left_out, kept=False)
         figures = None
     else:
         from coloc_graph.calibration.summary import summarise_camera
@@ -75,7 +75,7 @@ def _calibrated(args: argparse.Namespace) -> "CameraCalibration":
 def _warn_of_images(calibration: "CameraCalibration") -> None:
     from coloc_graph.cli.printing import counted, warn
 
-    warn([f"{image.name} was left out: {image.refused}" for image in calibration.refused])
+    warn([f"{image.name} was left out: {image.refused}" for image in calibration.refused], kept=False)
     missed = calibration.used.missed
     if missed:
         named = ", ".join(missed[:5]) + (", ..." if len(missed) > 5 else "")

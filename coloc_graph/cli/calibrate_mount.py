@@ -42,8 +42,8 @@ def run(args: argparse.Namespace) -> int:
         intrinsics_covariance=known,
     )
     write_mount(args.team, robot.name, calibration.mount, args.out_team)
-    warn([f"{image.name} was left out: {image.refused}" for image in calibration.refused])
-    warn([f"{name}: the board was not found" for name in seen.missed])
+    warn([f"{image.name} was left out: {image.refused}" for image in calibration.refused], kept=False)
+    warn([f"{name}: the board was not found" for name in seen.missed], kept=False)
     if args.json:
         print_json(summarise_mount(calibration, seen.missed))
     else:

@@ -40,7 +40,7 @@ def run_mrclam(args: argparse.Namespace) -> int:
     require_run_place(args.out, force=args.force)
     with progress("measurements imported") as report:
         summary = import_mrclam(args.folder, args.out, map_known=not args.map_unknown, progress=report)
-    warn(summary.warnings)
+    warn(summary.warnings, kept=False)
     print(
         f"{args.out}: {counted(summary.measurements, 'measurement')} in {summary.seconds:.0f} s, "
         f"{counted(len(summary.robots), 'robot')}, {counted(len(summary.landmarks), 'landmark')}"
@@ -59,7 +59,7 @@ def run_tracks(args: argparse.Namespace) -> int:
         summary = import_tracks(
             args.team, args.tracks, args.out, planes_path=args.planes, moves_path=args.moves, progress=report
         )
-    warn(summary.warnings)
+    warn(summary.warnings, kept=False)
     rows, stances = counted(summary.rows, "row"), counted(summary.stances, "stance")
     print(f"{args.out}: {rows}, {stances}, observers {', '.join(summary.observers)}")
     return 0
@@ -75,7 +75,7 @@ def run_ros(args: argparse.Namespace) -> int:
     require_run_place(args.out, force=args.force)
     with progress("messages read") as report:
         summary = import_ros(args.bag, args.map, args.out, image_format=args.image_format, progress=report)
-    warn(summary.warnings)
+    warn(summary.warnings, kept=False)
     if args.json:
         print_json(asdict(summary))
         return 0

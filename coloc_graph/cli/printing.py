@@ -49,9 +49,10 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         print("  ".join([row[0].ljust(widths[0]), *cells]).rstrip())
 
 
-def warn(warnings: Sequence[str]) -> None:
-    """Warnings, one a line; of many the first few and how many more there are."""
-    for warning in warnings[:8]:
+def warn(warnings: Sequence[str], *, kept: bool = True) -> None:
+    """Warnings, one a line; of many that a result keeps, the first few and how many more there are."""
+    shown = 8 if kept else len(warnings)
+    for warning in warnings[:shown]:
         print(f"warning: {warning}", file=sys.stderr)
-    if len(warnings) > 8:
+    if len(warnings) > shown:
         print(f"warning: and {len(warnings) - 8} more, see summary.json and measurements.csv", file=sys.stderr)
