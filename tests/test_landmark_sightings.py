@@ -21,6 +21,8 @@ from coloc_graph.simulation.rendering import expose
 from coloc_graph.simulation.rig import MILD_LENS
 from coloc_graph.simulation.tags import paint_tag
 from coloc_graph.team import Floor, Landmark, Markers, Tag
+from coloc_graph.viewer import LiveStance, empty_scene
+from coloc_graph.viewer.live import LiveScene
 from coloc_graph.viewer.sources import scene_of_estimate, scene_of_result
 
 TAG = Tag(id=11, size=0.2, height=0.15)
@@ -252,7 +254,20 @@ def test_a_result_tells_where_landmarks_are_and_the_viewer_shows_them(lap, solve
 
 def test_landmarks_come_in_stance_by_stance_as_they_do_at_once(lap, solved):
     """With pixels and mounts, too: what is far off when it comes is led in by poses."""
-    by_stance = solve(open_run(lap), SolveOptions(incremental=True))
+    live = LiveScene(empty_scene(open_run(lap), "joint"))
+    counts = []
+
+    def told(one):
+        live.add(LiveStance(one.stance, one.estimate, one.measurements, one.pairs))
+        counts.append(len(live.scene().landmarks))
+
+    by_stance = solve(open_run(lap), SolveOptions(incremental=True), entered=told)
+    # a viewer that looks on shows them as they come
+    assert counts == sorted(counts) and counts[0] < counts[-1] == 2
+    shown = live.scene().landmarks
+    assert len(shown.sightings) == sum(map(len, solved.estimate.graph.sighted.values()))
+    for name, place in zip(shown.names, shown.xy, strict=True):
+        np.testing.assert_allclose(place, solved.estimate.landmarks[name].planar[:2], atol=0.02)
     for name, placed in solved.estimate.landmarks.items():
         assert placed.T_world_body.equals(by_stance.estimate.landmarks[name].T_world_body, 1e-5)
     assert not by_stance.estimate.refused

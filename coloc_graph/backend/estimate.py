@@ -159,7 +159,8 @@ class StanceEstimate:
 
     Robots that nothing ties to the reference are `untied`. `refused` is what was refused in this call, and `agreement`
     says how all that it took in, together, agrees with what was in before; `residuals` are of the measurements that
-    came with the stance, in their order: RMS in units of their noise, NaN where an end of it has no pose.
+    came with the stance, in their order: RMS in units of their noise, NaN where an end of it has no pose. `landmarks`
+    are those that were sighted in it, where they are now.
     """
 
     stance: int
@@ -169,6 +170,7 @@ class StanceEstimate:
     refused: tuple[Refusal, ...] = ()
     agreement: Agreement = UNCHECKED
     residuals: tuple[float, ...] = ()
+    landmarks: Mapping[str, Placed] = field(default_factory=dict)
 
 
 def make_estimate(

@@ -1,6 +1,6 @@
 """The estimate kept up to date while stances come in: ISAM2 with QR, and a log from which it can be rebuilt."""
 
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Collection, Iterable, Mapping, Set
 from dataclasses import replace
 from pathlib import Path
 
@@ -133,12 +133,12 @@ class Estimator:
         """Covariance (6, 6) of that pose: GTSAM's tangent, rotation [rad] first, then translation [m], body frame."""
         return self._live.covariance(self._tied_key(robot, stance))
 
-    def placed(self) -> dict[str, Placed]:
-        """Where the landmarks are that were sighted, and the map (`landmarks.MAP`), by name."""
+    def placed(self, names: Collection[str] | None = None) -> dict[str, Placed]:
+        """Where the landmarks are that were sighted, and the map (`landmarks.MAP`), by name; only of `names`."""
         return {
             name: Placed(self._live.pose(key), self._live.covariance(key))
             for name, key in self._places.still().items()
-            if key in self._live.tied
+            if key in self._live.tied and (names is None or name in names)
         }
 
     def residual(self, measurement: Measurement) -> float:
@@ -322,7 +322,8 @@ class Estimator:
         self._newly = (set() if stance is not None else self._newly) | {id(one.measurement) for one in refused}
         self._loose = entering.loose
         said = self._at(next(reversed(self._stances.values())), refused, agreement)
-        return replace(said, residuals=tuple(map(self.residual, taken)))
+        seen = {one.seen for one in taken if isinstance(one, Sighting)}
+        return replace(said, residuals=tuple(map(self.residual, taken)), landmarks=self.placed(seen))
 
     def _newly_on_map(self, taken: Iterable[Measurement]) -> tuple[Link, ...]:
         """What the map says of the landmarks that are seen for the first time."""

@@ -6,12 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coloc_graph.backend import StanceEstimate
+from coloc_graph.backend.landmarks import Placed
+from coloc_graph.exchange.landmarks import row_of
 from coloc_graph.frontend import PairMeasurement
 from coloc_graph.measurements import Measurement, RelativePose, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.scene import Array, Scene, layer_of
 from coloc_graph.viewer.sources import as_edges, stayed
+from coloc_graph.viewer.still import landmarks_in, sighted_in
 
 #: What the layer is called where the scene it starts from has none.
 LIVE = "live"
@@ -75,6 +78,8 @@ class LiveScene:
         self._stances: dict[int, Stance] = {}
         self._poses: dict[str, dict[int, tuple[float, Array, Array]]] = {robot: {} for robot in start.robots}
         self._found: dict[int, list[tuple[int, str, str, float, str]]] = {}
+        self._landmarks: dict[str, Placed] = {}
+        self._sighted: dict[int, list[tuple[str, int, str]]] = {}
 
     def add(self, one: LiveStance) -> None:
         """Take in a stance; one that is in already is brought up to date."""
@@ -86,6 +91,9 @@ class LiveScene:
             if robot in stance.observers or robot in times:
                 time = times.get(robot, stance.start)
                 self._poses[robot][stance.index] = (time, pose.matrix(), said.covariances[robot])
+        self._landmarks |= said.landmarks
+        used = [m for m in one.measurements if id(m) not in refused]
+        self._sighted[stance.index] = sighted_in(used, self._landmarks)
         # an estimate of a later stance, which had waited for this one, says nothing of this one's measurements
         told = said.residuals if said.stance == stance.index else ()
         residuals = {id(m): off for m, off in zip(one.measurements, told, strict=False)}
@@ -112,6 +120,10 @@ class LiveScene:
                     robot, np.array(times), np.array(T), np.array(indices), np.array(covariances)
                 )
         found = [edge for every in self._found.values() for edge in every]
+        sighted = [one for every in self._sighted.values() for one in every]
+        rows = [
+            row_of(name, placed, sum(seen == name for *_, seen in sighted)) for name, placed in self._landmarks.items()
+        ]
         held = [(robot, stance.index) for stance in stances for robot in stance.anchors]
         return replace(
             self._start,
@@ -119,4 +131,5 @@ class LiveScene:
             layers=(layer_of(self._name, robots, stances, trajectories),) if stances else (),
             edges=as_edges(found, robots, stances, OF_THEN),
             stayed=stayed(robots, stances, held),
+            landmarks=landmarks_in(rows, sighted, robots, stances),
         )
