@@ -12,13 +12,14 @@ from coloc_graph.backend.planar.factors import DriveFactors, landmark_key, pose_
 from coloc_graph.backend.planar.filter import Models, filter_forward
 from coloc_graph.backend.planar.placing import Placing
 from coloc_graph.cli import main
-from coloc_graph.drive_results import assess_drive
+from coloc_graph.drive_results import assess_drive, write_drive_result
 from coloc_graph.driving import DriveOptions, calibrated, solve_drive
 from coloc_graph.errors import InputError, RunError
 from coloc_graph.exchange.mrclam import import_mrclam
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.run import OdometrySample, Ranges, open_run, whole_run
 from coloc_graph.team import Landmark, Ranging, Robot, Team
+from coloc_graph.viewer import scene_of_result
 
 
 @pytest.fixture(scope="module")
@@ -282,13 +283,42 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     assert json.loads(capsys.readouterr().out)["ate_m"] == pytest.approx(summary["accuracy"]["ate_m"])
     assert main(["solve", str(run.path), "--out", str(out), "--method", "chain"]) == 2
     capsys.readouterr()
-    for words in (["export", "g2o", str(out), "--out", str(tmp_path / "x.g2o")], ["view", str(out), "--no-browser"]):
+    for words in (["export", "g2o", str(out), "--out", str(tmp_path / "x.g2o")], ["view", str(run.path)]):
         assert main(words) == 2
         assert "of robots that drive, without stances" in capsys.readouterr().err
     assert main(["export", "ros2", str(out), "--out", str(tmp_path / "x.mcap")]) == 0
     landmarks = (out / "landmarks.csv").read_text().splitlines()
     assert landmarks[0].startswith("name,x,y,x_sigma,y_sigma") and len(landmarks) == 1 + len(LANDMARKS)
     assert main(["info", str(run.path)]) == 0
+    page = tmp_path / "page.html"
+    assert main(["view", str(out), "--export", str(page)]) == 0 and page.stat().st_size > 100_000
+    (out / "measurements.csv").write_text("\n".join([*rows[:9], "soon,R1,R2,1,0,1,1,0,0,no"]) + "\n")
+    assert main(["view", str(out), "--export", str(page)]) == 2
+    assert "measurements.csv is damaged" in capsys.readouterr().err
+
+
+def test_the_viewer_shows_where_each_was_and_what_it_measured(run, batch, tmp_path):
+    write_drive_result(batch, tmp_path / "result")
+    scene = scene_of_result(tmp_path / "result")
+    estimated, true = scene.layers
+    trajectories = batch.estimate.trajectories
+    for number, robot in enumerate(scene.robots):
+        rows = estimated.rows[number]
+        at = np.searchsorted(trajectories[robot].times, estimated.times[number, rows] - 1e-5)
+        # the first of each second, as it is in the estimate; and the truth at that time
+        np.testing.assert_allclose(trajectories[robot].times[at], estimated.times[number, rows], atol=1e-5)
+        np.testing.assert_allclose(trajectories[robot].positions[at], estimated.xyz[number, rows], atol=1e-6)
+        assert (np.diff(np.floor(trajectories[robot].times[at] - scene.starts[0])) >= 1).all()
+        assert np.nanmax(np.linalg.norm(true.xyz[number] - estimated.xyz[number], axis=1)) < 0.1
+    links, seen = scene.sightings, scene.landmarks.sightings
+    assert len(scene.landmarks) == len(LANDMARKS) and len(links) > 20 and len(seen) > 20
+    m, names = batch.estimate.drive.measured, (*batch.estimate.drive.robots, *batch.estimate.drive.landmarks)
+    told = {(names[a], names[b]) for a, b in zip(m.robot, m.target, strict=True)}
+    assert {(scene.robots[i], scene.robots[j]) for i, j in zip(links.i, links.j, strict=True)} <= told
+    assert {(scene.robots[i], scene.landmarks.names[j]) for i, j in zip(seen.i, seen.j, strict=True)} <= told
+    known = {one.name: one.position for one in batch.estimate.landmarks}
+    for name, place in zip(scene.landmarks.names, scene.landmarks.xy, strict=True):
+        np.testing.assert_allclose(place, known[name], atol=1e-6)
 
 
 def test_exact_wheels_and_sensors_are_no_variables(run):

@@ -76,12 +76,18 @@ def run(args: argparse.Namespace) -> int:
     if logged.has_ranges and not logged.stances:
         from coloc_graph.cli.solve_drive import solve_one_drive
 
-        if args.view or args.method != "joint":
+        if args.method != "joint":
             raise InputError(
-                f"{args.run_path} holds ranges of robots that drive, and no stances: --method and --view are not for it"
+                f"{args.run_path} holds ranges of robots that drive, and no stances: --method is not for it"
             )
         with _earlier_result_named(args.out):
-            return solve_one_drive(args, logged)
+            solve_one_drive(args, logged)
+        if args.view:
+            from coloc_graph.viewer import Viewer, scene_of_result
+
+            with Viewer(scene_of_result(args.out), port=args.port) as viewer:
+                show(viewer, browser=not args.no_browser)
+        return 0
     if args.without_robots:
         raise InputError(f"{args.run_path} holds no ranges; --without-robots is for runs that do")
     if not args.view:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from coloc_graph.run import Run
 
 
-def solve_one_drive(args: argparse.Namespace, run: "Run") -> int:
+def solve_one_drive(args: argparse.Namespace, run: "Run") -> None:
     """Solve, write, print."""
     from coloc_graph.drive_results import summarise_drive, write_drive_result
     from coloc_graph.driving import DriveOptions, solve_drive
@@ -25,7 +25,6 @@ def solve_one_drive(args: argparse.Namespace, run: "Run") -> int:
         print_json(summarise_drive(solution, assessed))
     else:
         _print(solution, assessed, args.out)
-    return 0
 
 
 def _print(solution: "DriveSolution", assessed: "DriveAssessment | None", out: str) -> None:

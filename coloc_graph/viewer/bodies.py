@@ -46,8 +46,8 @@ def robot_mesh(robot: Robot | None, colour: Colours) -> trimesh.Trimesh:
 
 def T_body_camera(robot: Robot | None) -> Array:
     """Where a robot's camera is on its body, (4, 4); ahead and a little up where that is not known."""
-    if robot is not None:
-        return robot.mount.T_body_camera
+    if robot is not None and robot.mount_if_any is not None:
+        return robot.mount_if_any.T_body_camera
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     T[2, 3] = PLAIN_CAMERA_HEIGHT

@@ -79,7 +79,7 @@ class GraphView:
                     visible=len(scene.robots) <= MOST_NAMES,
                 )
             )  # fmt: skip
-            if robot is not None:
+            if robot is not None and robot.camera_if_any is not None:
                 T, camera = robot.mount.T_body_camera, robot.camera
                 self._frustums[name] = add.add_camera_frustum(
                     f"{path}/camera", fov=float(2 * np.arctan2(camera.height / 2, camera.fy)),

@@ -81,7 +81,9 @@ def camera_image(run: Run, robot: str, time: float) -> Image | None:
 
     Where there are no images, its detections of the stance are drawn, those of the instant bright.
     """
-    camera = run.team[robot].camera
+    camera = run.team[robot].camera_if_any
+    if camera is None:
+        return None
     if run.has_images(robot):
         image = min(run.images(robot, time - NEAR, time + NEAR), key=lambda one: abs(one.time - time), default=None)
         if image is None:
@@ -305,7 +307,7 @@ def _robot_lines(scene: Scene, number: int, row: int) -> Iterator[str]:
     for layer in (scene.layers[0], scene.other):
         if layer is not None and layer.there[number, row]:
             yield _table((layer.name, ""), _pose_rows(scene, layer, number, row))
-    if scene.team is None:
+    if scene.team is None or scene.team[robot].mount_if_any is None:
         return
     stated = scene.team[robot].mount
     found = scene.calibrated[robot].mount if scene.calibrated is not None else None

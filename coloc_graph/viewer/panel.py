@@ -151,7 +151,10 @@ class Panel:
         stance = scene.stances[frame.row]
         drivers = ", ".join(stance.movers) or "nobody"
         anchors = ", ".join(stance.anchors) or "nobody"
-        self._say(f"**Stance {stance.index}** of {len(scene)}: {drivers} drives, {anchors} stayed put", notes)
+        said = f"**Stance {stance.index}** of {len(scene)}: {drivers} drives, {anchors} stayed put"
+        if not stance.observers:  # of a drive
+            said = f"**Moment {stance.index}** of {len(scene)}: {drivers} drive, nobody stands and watches"
+        self._say(said, notes)
         at = round(min(max(moment - float(scene.starts[0]), 0.0), self.time.max), 1)
         self._lead(self.stance, "stance", frame.row, 0)
         self._lead(self.time, "time", at, 0.05)

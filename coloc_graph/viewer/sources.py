@@ -16,16 +16,17 @@ from coloc_graph.backend.graph import Places
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.evaluation import align, left_out, with_truth
 from coloc_graph.exchange.landmarks import landmark_rows, read_landmarks
-from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions, WheelTrack
+from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions
 from coloc_graph.measurements import RelativePose
 from coloc_graph.pipeline import Progress, Solution, SolveOptions, solve
 from coloc_graph.results import LANDMARKS, read_result
 from coloc_graph.run import Run, Stance, open_run, read_truth
 from coloc_graph.team import read_team
 from coloc_graph.trajectory import Trajectory
+from coloc_graph.viewer.drive import scene_of_drive
 from coloc_graph.viewer.scene import NO_EDGES, TRUE, Edges, Index, Layer, Scene, layer_of
 from coloc_graph.viewer.still import landmarks_in, sighted_in
-from coloc_graph.viewer.ties import ties_in, ties_on_disk
+from coloc_graph.viewer.ties import ties_in, ties_on_disk, wheels_of
 
 #: What the methods' layers are called.
 NAMES = {"chain": "chained", "smooth": "smoothed", "joint": "joint"}
@@ -66,7 +67,7 @@ def scene_of_estimate(
         calibrated=estimate.calibration.of_team(team) if team is not None and estimate.calibration.rows else None,
         run=run,
         frontend=frontend or FrontendOptions(),
-        wheels=_wheels(run),
+        wheels=wheels_of(run),
         title=run.path.name if run is not None else "",
         notes=notes,
         landmarks=landmarks_in(landmark_rows(estimate), sighted, graph.robots, graph.stances),
@@ -82,7 +83,7 @@ def empty_scene(run: Run, method: Method, frontend: FrontendOptions | None = Non
         team=run.team,
         run=run,
         frontend=frontend or FrontendOptions(),
-        wheels=_wheels(run),
+        wheels=wheels_of(run),
         title=run.path.name,
     )
 
@@ -92,17 +93,12 @@ def scene_of_run(run: Run, progress: Progress | None = None) -> Scene:
 
     Raises as `pipeline.solve` does.
     """
-    _require_stances(run)
-    options = SolveOptions().resolved()
-    return scene_of_solution(solve(run, options, progress))
-
-
-def _require_stances(run: Run) -> None:
     if run.has_ranges and not run.stances:
         raise InputError(
-            f"{run.path} is of robots that drive, without stances, which the viewer does not show; look into "
-            "report.html of its result, or at what `coloc evaluate --plot` draws"
+            f"{run.path} is of robots that drive, without stances: solve it, and view the folder of its result"
         )
+    options = SolveOptions().resolved()
+    return scene_of_solution(solve(run, options, progress))
 
 
 def scene_of_solution(solution: Solution) -> Scene:
@@ -127,7 +123,8 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
     where = run_path or result.run_path
     result.require_run(where)
     run = open_run(where)
-    _require_stances(run)
+    if run.has_ranges and not run.stances:
+        return scene_of_drive(result, run)
     name = NAMES.get(str(result.summary.get("method")), str(result.summary.get("method")))
     robots, stances = run.team.names, run.stances
     refined = result.path / "team.toml"
@@ -150,7 +147,7 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
         calibrated=read_team(refined) if refined.exists() else None,
         run=run,
         frontend=_frontend(result.path / "config.toml"),
-        wheels=_wheels(run),
+        wheels=wheels_of(run),
         title=result.path.absolute().name,
         notes=notes,
         landmarks=landmarks_in(read_landmarks(result.path / LANDMARKS), sighted, robots, stances),
@@ -193,13 +190,6 @@ def _true(
         for robot, one in estimated.items()
     }
     return (layer_of(TRUE, robots, stances, trajectories),), left_out(estimated, true)
-
-
-def _wheels(run: Run | None) -> dict[str, WheelTrack]:
-    if run is None:
-        return {}
-    tracks = {robot: WheelTrack(robot, list(run.odometry(robot))) for robot in run.team.names}
-    return {robot: track for robot, track in tracks.items() if len(track)}
 
 
 def _edges(estimate: Estimate, measurements: Sequence[PairMeasurement]) -> Edges:

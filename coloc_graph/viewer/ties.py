@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from coloc_graph.exchange.g2o import read_g2o
+from coloc_graph.frontend import WheelTrack
 from coloc_graph.measurements import Measurement, Node, Odometry, Sighting
-from coloc_graph.run import Stance
+from coloc_graph.run import Run, Stance
 from coloc_graph.viewer.scene import Links
 
 #: Sightings, and odometry.
@@ -69,3 +70,11 @@ def links_of(
     known.sort(key=lambda one: row[one[1][1]])
     table = np.array([(number[a[0]], row[a[1]], of_seen[b[0]], row[b[1]]) for a, b in known], np.int64).reshape(-1, 4)
     return Links(*table.T)
+
+
+def wheels_of(run: Run | None) -> dict[str, WheelTrack]:
+    """What the wheels of each robot say, of those that say anything."""
+    if run is None:
+        return {}
+    tracks = {robot: WheelTrack(robot, list(run.odometry(robot))) for robot in run.team.names}
+    return {robot: track for robot, track in tracks.items() if len(track)}
