@@ -12,6 +12,7 @@ from coloc_graph.calibration import View, Views, calibrate_camera, calibrate_mou
 from coloc_graph.calibration.bundle import adjust, rms, start_pose
 from coloc_graph.calibration.camera import places
 from coloc_graph.calibration.corners import image_paths
+from coloc_graph.calibration.fusion import Said, disagreement, fuse, fuse_scaled
 from coloc_graph.calibration.lens import ray_sigmas
 from coloc_graph.calibration.verdict import GOOD
 from coloc_graph.errors import DegenerateGeometry, InputError
@@ -300,6 +301,27 @@ def test_where_all_boards_are_a_little_off_sigmas_are_larger_and_none_is_refused
     flat = calibrate_mount(lying(rng, 8), CAMERA, MOUNT, BOARD.square)
     assert flat.scale == 1.0 and found.scale > 3 and not found.refused
     assert found.mount.tilt_sigma_deg > 2 * flat.mount.tilt_sigma_deg
+
+
+def test_how_far_one_of_many_is_from_the_others_counts_what_they_share_once(rng):
+    """By sampling: errors that all have alike say nothing of a difference, and each value's own are of its own size."""
+    n, m = 4, 2
+    own = np.array([k * np.array([[2.0, 0.5], [0.5, 1.0]]) for k in range(1, n + 1)])
+    loads = rng.normal(size=(n, m, 3)) * 3  # how much each has of three errors that are shared
+    said = Said(np.zeros((n, m)), own, np.einsum("nip,mjp->nimj", loads, loads))
+    drawn = rng.multivariate_normal(np.zeros(n * m), said.covariance(), size=1500).reshape(-1, n, m)
+    found = np.mean([disagreement(Said(values, own, said.common)) for values in drawn], axis=0)
+    np.testing.assert_allclose(found / m, 1.0, atol=0.13)
+    fused = np.array([fuse(Said(values, own, said.common)).value for values in drawn])
+    np.testing.assert_allclose(np.cov(fused.T), fuse(said).covariance, rtol=0.2, atol=0.3)
+
+
+def test_where_values_disagree_their_own_errors_are_as_much_larger_as_they_scatter(rng):
+    own = np.tile(0.01 * np.eye(3), (40, 1, 1))
+    said = Said(rng.normal(size=(40, 3)), own, np.zeros((40, 3, 40, 3)))  # ten sigmas each
+    fused = fuse_scaled(said, 0.01)
+    assert fused.scale == pytest.approx(100, rel=0.4) and fused.scale == pytest.approx(fused.chi2 / fused.dof)
+    np.testing.assert_allclose(fused.covariance, fused.scale * fuse(said).covariance)
 
 
 def test_a_board_on_the_ceiling_is_refused():
