@@ -80,6 +80,14 @@ def test_the_edges_of_a_rendered_tag_are_found_where_they_are_projected(lens, di
         assert (sigma > 0.005).all() and (sigma < 0.15).all()
 
 
+def test_a_tag_s_middles_scatter_as_their_covariances_say_along_the_edges_too():
+    team, rng, T = team_with(lens=()), np.random.default_rng(1), floor_pose(1.6, 0.1, np.pi + 0.3)
+    tags = [tag for _ in range(25) for tag in find_tags(seen_by(team, T, rng), team["A"].camera, ["36h11"])]
+    scatter = np.var([tag.uv for tag in tags if tag.id == TAG.id], axis=0, ddof=1)
+    ratios = scatter / np.mean([tag.covariance.diagonal(axis1=1, axis2=2) for tag in tags], axis=0)
+    assert (ratios > 0.4).all() and (ratios < 4).all()  # with edges that do not turn, v would be off by 10
+
+
 def test_the_middles_are_those_of_the_edges_in_space_and_not_in_the_image():
     """A tag seen from aside: the middle of an edge is not half way between its corners in the image."""
     team = team_with(lens=())
@@ -140,6 +148,14 @@ def test_a_tag_on_its_side_one_that_is_hidden_in_part_and_a_faint_one_are_no_tag
     hidden[int(v - width / 3) : int(v + width), int(u) - 9 : int(u) + 4] = 12
     with pytest.raises(DegenerateGeometry, match=r"faint|hidden|in front|straight"):
         measure_tag(hidden, camera, corners, 8)
+    vs, us = np.mgrid[0:240, 0:320].astype(np.float32)
+    wave = 1.8 * np.sin(6 * np.pi * (vs - v) / width)
+    bent = cv2.remap(upright, us + wave.astype(np.float32), vs, cv2.INTER_LINEAR)
+    with pytest.raises(DegenerateGeometry, match="not straight"):
+        measure_tag(bent, camera, corners, 8)
+    cut = int(u) - 2  # what is white beside it ends with the image
+    with pytest.raises(DegenerateGeometry, match="beyond the border"):
+        measure_tag(upright[:, cut:], camera, corners - [cut, 0], 8)
     with pytest.raises(DegenerateGeometry, match="white margin, and light"):
         measure_tag((upright // 12).astype(np.uint8), camera, corners, 8)
     with pytest.raises(DegenerateGeometry, match="upright"):
