@@ -84,11 +84,10 @@ def test_incremental_is_batch(solved, wrong_mounts):
         assert np.abs(other.positions - trajectory.positions).max() < 0.05 * sigma + 1e-5, robot
 
 
-@pytest.mark.parametrize("points", [60, 250])
-def test_as_it_comes_mounts_that_are_many_degrees_off_are_found_as_in_batch(points, tmp_path):
+def test_as_it_comes_mounts_that_are_many_degrees_off_are_found_as_in_batch(tmp_path):
     """A camera that is 7 degrees off: one full step from the first stance led to where nothing led on."""
     wrong = Imperfections(mount_sigma_deg=3.0, height_sigma=2e-2, span_sigma=1e-4, floor_sigma_deg=0.1)
-    simulate("hallway", tmp_path / "run.mcap", stances=2, seed=7, points=points, imperfections=wrong)
+    simulate("hallway", tmp_path / "run.mcap", stances=2, seed=7, points=60, imperfections=wrong)
     batch, by_stance = (
         solve(open_run(tmp_path / "run.mcap"), SolveOptions(incremental=incremental)).estimate
         for incremental in (False, True)

@@ -202,7 +202,8 @@ def test_lights_that_may_be_others_are_refused_in_words_and_never_guessed():
     white = team_with(Landmark(name="L1", markers=replace(lights, hue_deg=None)), lens=())
     assert "nothing tells its white lights from lamps" in watched(white, [three]).doubts["L1"]
     both = team_with(*(Landmark(name=name, markers=lights) for name in ("L1", "L2")), lens=())
-    assert set(watched(both, [three]).doubts) == {"L1", "L2"}
+    doubts = watched(both, [bright(team, T, lights, GREEN)[0]]).doubts
+    assert set(doubts) == {"L1", "L2"} and all("lights of the same colour" in why for why in doubts.values())
     for mover, doubted in (("C", True), ("B", False)):  # who stands is not seen in other places
         robots = [replace(r, markers=replace(r.markers, hue_deg=120.0)) if r.name == mover else r for r in team.robots]
         seen = watched(replace(team, robots=tuple(robots)), [bright(team, T, lights, GREEN)[0]])
