@@ -39,6 +39,7 @@ bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/hallway.py --seeds 40
 	$(BIN)/python benchmarks/joint.py
 	$(BIN)/python benchmarks/joint.py --images 10 --six-step 50 --far 50 --honesty 200 --speed
+	$(BIN)/python benchmarks/leapfrog_ekf.py
 	$(BIN)/python benchmarks/relative_pose.py --outliers
 	$(BIN)/python benchmarks/frontend.py
 	$(BIN)/python benchmarks/clock_offset.py

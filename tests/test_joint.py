@@ -84,6 +84,19 @@ def test_incremental_is_batch(solved, wrong_mounts):
         assert np.abs(other.positions - trajectory.positions).max() < 0.05 * sigma + 1e-5, robot
 
 
+def test_as_it_comes_mounts_that_are_many_degrees_off_are_found_as_in_batch(tmp_path):
+    """A camera that is 7 degrees off: one full step from the first stance led to where nothing led on."""
+    wrong = Imperfections(mount_sigma_deg=3.0, height_sigma=2e-2, span_sigma=1e-4, floor_sigma_deg=0.1)
+    simulate("hallway", tmp_path / "run.mcap", stances=2, seed=7, points=60, imperfections=wrong)
+    batch, by_stance = (
+        solve(open_run(tmp_path / "run.mcap"), SolveOptions(incremental=incremental)).estimate
+        for incremental in (False, True)
+    )
+    assert not batch.refused and not by_stance.refused
+    for robot, trajectory in batch.trajectories.items():
+        assert np.abs(by_stance.trajectories[robot].positions - trajectory.positions).max() < 1e-4, robot
+
+
 def test_an_estimator_goes_on_from_its_checkpoint_with_mounts_as_they_were(solved, tmp_path):
     graph = solved.estimate.graph
     whole, before = Estimator.of(solved.run.team), None

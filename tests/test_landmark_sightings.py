@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from coloc_graph.cli import main
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend import StanceTracks, sight_landmarks
-from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks, still
+from coloc_graph.frontend.landmarks import Doubt, LandmarkWatch, SeenLandmarks, in_words, still
 from coloc_graph.frontend.tags import find_tags, measure_tag
 from coloc_graph.frontend.tracking import Track
 from coloc_graph.inspection import inspect, landmarks_seen
@@ -82,6 +82,14 @@ def test_the_edges_of_a_rendered_tag_are_found_where_they_are_projected(lens, di
         assert (sigma > 0.005).all() and (sigma < 0.15).all()
 
 
+def test_a_tag_s_middles_scatter_as_their_covariances_say_along_the_edges_too():
+    team, rng, T = team_with(lens=()), np.random.default_rng(1), floor_pose(1.6, 0.1, np.pi + 0.3)
+    tags = [tag for _ in range(25) for tag in find_tags(seen_by(team, T, rng), team["A"].camera, ["36h11"])]
+    scatter = np.var([tag.uv for tag in tags if tag.id == TAG.id], axis=0, ddof=1)
+    ratios = scatter / np.mean([tag.covariance.diagonal(axis1=1, axis2=2) for tag in tags], axis=0)
+    assert (ratios > 0.4).all() and (ratios < 4).all()  # with edges that do not turn, v would be off by 10
+
+
 def test_the_middles_are_those_of_the_edges_in_space_and_not_in_the_image():
     """A tag seen from aside: the middle of an edge is not half way between its corners in the image."""
     team = team_with(lens=())
@@ -142,6 +150,14 @@ def test_a_tag_on_its_side_one_that_is_hidden_in_part_and_a_faint_one_are_no_tag
     hidden[int(v - width / 3) : int(v + width), int(u) - 9 : int(u) + 4] = 12
     with pytest.raises(DegenerateGeometry, match=r"faint|hidden|in front|straight"):
         measure_tag(hidden, camera, corners, 8)
+    vs, us = np.mgrid[0:240, 0:320].astype(np.float32)
+    wave = 1.8 * np.sin(6 * np.pi * (vs - v) / width)
+    bent = cv2.remap(upright, us + wave.astype(np.float32), vs, cv2.INTER_LINEAR)
+    with pytest.raises(DegenerateGeometry, match="not straight"):
+        measure_tag(bent, camera, corners, 8)
+    cut = int(u) - 2  # what is white beside it ends with the image
+    with pytest.raises(DegenerateGeometry, match="beyond the border"):
+        measure_tag(upright[:, cut:], camera, corners - [cut, 0], 8)
     with pytest.raises(DegenerateGeometry, match="white margin, and light"):
         measure_tag((upright // 12).astype(np.uint8), camera, corners, 8)
     with pytest.raises(DegenerateGeometry, match="upright"):
@@ -188,7 +204,52 @@ def test_lights_that_may_be_others_are_refused_in_words_and_never_guessed():
     white = team_with(Landmark(name="L1", markers=replace(lights, hue_deg=None)), lens=())
     assert "nothing tells its white lights from lamps" in watched(white, [three]).doubts["L1"]
     both = team_with(*(Landmark(name=name, markers=lights) for name in ("L1", "L2")), lens=())
-    assert set(watched(both, [three]).doubts) == {"L1", "L2"}
+    doubts = watched(both, [bright(team, T, lights, GREEN)[0]]).doubts
+    assert set(doubts) == {"L1", "L2"} and all("lights of the same colour" in why for why in doubts.values())
+    for mover, doubted in (("C", True), ("B", False)):  # who stands is not seen in other places
+        robots = [replace(r, markers=replace(r.markers, hue_deg=120.0)) if r.name == mover else r for r in team.robots]
+        seen = watched(replace(team, robots=tuple(robots)), [bright(team, T, lights, GREEN)[0]])
+        assert ("others have lights of the same colour" in seen.doubts.get("L1", "")) is doubted
+        assert bool(seen.tracks) is not doubted
+
+
+def test_a_camera_that_stands_looks_every_other_second_and_more_images_make_it_no_surer():
+    lights = Markers(height=0.15, positions=((0.0, 0.2), (0.0, -0.2)), hue_deg=120.0)
+    team = team_with(Landmark(name="L1", markers=lights), lens=())
+    image, _ = bright(team, floor_pose(1.6, 0.2, np.pi + 0.3), lights, GREEN)
+    sigmas = []
+    for times in ((0.0,), (0.0, 0.5, 1.0, 1.9), (0.0, 2.0, 4.0, 6.0)):
+        watch = LandmarkWatch(team["A"], team, ("C",))
+        for time in times:
+            watch.look(Image("A", time, image))
+        sigmas.append(watch.seen().tracks[0].covariance[0, 0, 0] ** 0.5)
+    assert sigmas[1] == sigmas[0] and sigmas[2] < 0.8 * sigmas[0]
+
+
+def test_what_is_not_used_is_told_once_and_counted():
+    L1, L2 = ([Doubt(name, "A", k, f"it is {px} px off") for k, px in places] for name, places in
+              (("L1", ((3, 4), (5, 7), (8, 9))), ("L2", ((4, 4),))))  # fmt: skip
+    assert in_words([*L1, *L2]) == [
+        "stance 3 (and 2 more): landmark L1 is not used as A sees it: it is 4 px off",
+        "stance 4: landmark L2 is not used as A sees it: it is 4 px off",
+    ]
+
+
+def test_one_false_sample_moves_no_landmark_and_a_plane_that_is_stated_leaves_them_out():
+    team = team_with(Landmark(name="L1", tag=TAG), lens=())
+    T = floor_pose(1.5, 0.1, np.pi + 0.2)
+    uv, rng = edges_of(team, T), np.random.default_rng(2)
+    tracks = []
+    for n in range(2):
+        seen = uv[n] + 0.05 * rng.standard_normal((9, 2))
+        seen[4] += 30.0
+        tracks.append(Track("A", f"L1/{n}", np.arange(9.0), seen, np.tile(0.0025 * np.eye(2), (9, 1, 1)), np.zeros(9)))
+    run = Run(team)
+    (made,), doubts = sight_landmarks(run, STANCE, [("A", SeenLandmarks(tracks))])
+    assert not doubts and np.abs((made.T_observer_seen.matrix() - T)[:2]).max() < 0.01
+    assert sight_landmarks(run, STANCE, [("A", SeenLandmarks(tracks))], {("A", "L1")}) == ([], [])
+    run.planes = {STANCE.index: None}
+    assert sight_landmarks(run, STANCE, [("A", SeenLandmarks(tracks))]) == ([], [])
 
 
 def test_a_light_that_moves_is_no_landmark_and_one_false_sample_is_left_out():
@@ -196,8 +257,9 @@ def test_a_light_that_moves_is_no_landmark_and_one_false_sample_is_left_out():
     uv = 100 + 0.3 * rng.standard_normal((n, 2))
     C = np.broadcast_to(0.09 * np.eye(2), (n, 2, 2))
     uv[7] += 40.0
+    uv[11] += 2.0
     track = Track("A", "L1/0", np.arange(n, dtype=float), uv, C, np.zeros(n))
-    assert len(still(track)) == n - 1
+    assert set(track.times) - set(still(track).times) == {7.0, 11.0}
     moving = Track("A", "L1/0", track.times, uv + np.arange(n)[:, None], C, track.peak)
     with pytest.raises(DegenerateGeometry, match="L1/0 does not stand still"):
         still(moving)

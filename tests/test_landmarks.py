@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from teams import graph_of_team, largest_difference, of_stance, planar_nees, team_of
 
 from coloc_graph.backend import Estimator, PoseGraph, chain, diagnose, joint, smooth
-from coloc_graph.backend.landmarks import MAP, landmarks_of, map_of
+from coloc_graph.backend.landmarks import MAP, Placed, landmarks_of, map_of
 from coloc_graph.errors import MeasurementError
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import read_g2o, write_g2o
@@ -85,6 +85,18 @@ def test_a_landmark_that_two_robots_see_at_different_stances_ties_them():
     # B's x, y: both sightings' noise, and their headings over the arm between B and the landmark
     sx, sy, _ = np.sqrt(estimate.landmarks["L1"].covariance_xy_yaw.diagonal())
     assert sx == pytest.approx(0.004, rel=1e-3) and sy == pytest.approx(0.004, rel=1e-3)
+
+
+def test_a_map_s_doubt_is_of_heading_x_and_y_and_a_place_s_along_the_world_s_axes():
+    (on_map,) = map_of({"L1": landmark("L1", (1.0, 2.0, 0.5), sigma=0.03, sigma_deg=2.0), "L2": landmark("L2")})
+    np.testing.assert_allclose(on_map.covariance, np.diag(np.square([np.deg2rad(2.0), 0.03, 0.03])))
+    np.testing.assert_allclose(on_map.T_i_j.matrix(), floor_pose(1.0, 2.0, 0.5), atol=1e-15)
+    C = np.diag([9.0, 9.0, 0.2, 4.0, 1.0, 9.0])  # surest to its own side
+    placed = Placed(gtsam.Pose3(floor_pose(1.0, 2.0, 0.5)), C)
+    assert placed.planar == pytest.approx((1.0, 2.0, 0.5))
+    c, s = np.cos(0.5), np.sin(0.5)
+    expected = [[4 * c * c + s * s, 3 * s * c, 0], [3 * s * c, 4 * s * s + c * c, 0], [0, 0, 0.2]]
+    np.testing.assert_allclose(placed.covariance_xy_yaw, expected, atol=1e-12)
 
 
 def test_landmarks_that_nobody_saw_change_nothing_at_all(team):

@@ -4,7 +4,9 @@ import itertools
 import json
 import re
 import shutil
+import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import msgspec
@@ -17,12 +19,12 @@ from rosbags.typesys import get_types_from_msg
 
 from coloc_graph.cli import main
 from coloc_graph.errors import BagError, ColocError, TeamError
-from coloc_graph.exchange.ros_bag import open_bag
+from coloc_graph.exchange.ros_bag import BagMessage, open_bag
 from coloc_graph.exchange.ros_images import ENCODINGS, camera_of, image_of
 from coloc_graph.exchange.ros_import import import_ros
 from coloc_graph.exchange.ros_map import OdometrySigmas, RobotTopics, RosMap
 from coloc_graph.exchange.ros_order import InOrder, order_of
-from coloc_graph.exchange.ros_poses import stated_increments
+from coloc_graph.exchange.ros_poses import T_of, stated_increments
 from coloc_graph.exchange.stances import MotionThresholds
 from coloc_graph.frontend.wheels import WheelTrack
 from coloc_graph.inspection import inspect
@@ -428,6 +430,18 @@ def test_the_time_may_be_the_bags(bring_in):
         [one._replace(received=one.received + 100 * SECOND) for one in pictures()], 'time = "bag"\n' + TRIPODS
     )
     assert run.start == T0 / SECOND + 100
+    # of tf, too
+    sent = [*pictures(), *(tf("/tf", T0 + k * SECOND, "world", "C/base", floor_pose(k, 0, 0)) for k in range(4))]
+    later = [one._replace(received=one.received + 100 * SECOND) for one in sent]
+    run, _ = bring_in(later, 'time = "bag"\n' + TRIPODS + 'truth_tf = ["world", "C/base"]\n')
+    np.testing.assert_allclose(read_truth(run.path)["C"].times - T0 / SECOND, [100, 101, 102, 103])
+
+
+def test_a_stamp_is_read_whichever_of_its_bytes_comes_first(tmp_path):
+    with open_bag(write_bag(tmp_path, "bare mcap", pictures(n=1))) as bag:
+        for first, order in ((b"\0\1\0\0", "<iI"), (b"\0\0\0\0", ">iI")):
+            message = BagMessage("/A/image", "sensor_msgs/msg/Image", 0, first + struct.pack(order, 5, 6))
+            assert bag.stamp(message) == 5 * SECOND + 6
 
 
 def without_stamps(sent, topic, every=1):
@@ -485,6 +499,32 @@ def test_tf_between_two_instants_is_in_between():
     assert ns.tolist() == [0, 5, 10]
     np.testing.assert_allclose(T[1], floor_pose(5, 0, 3.2), atol=1e-12)
     assert frames.poses("world", "elsewhere") is None
+
+
+def test_a_static_frame_is_where_it_was_told_last_and_one_that_changes_its_parent_begins_anew():
+    from coloc_graph.exchange.ros_tf import Frames
+
+    frames = Frames()
+    for x in (1.0, 2.0):
+        frames.add("world", "mast", 0, floor_pose(x, 0, 0), static=True)
+    for ns in (0, 10):
+        frames.add("mast", "camera", ns, floor_pose(0, 0.5, 0), static=False)
+    np.testing.assert_allclose(frames.poses("world", "camera")[1][:, :2, 3], [[2, 0.5]] * 2)
+    frames.add("world", "camera", 20, floor_pose(7, 7, 0), static=False)
+    ns, T = frames.poses("world", "camera")
+    assert ns.tolist() == [20] and T[0, 0, 3] == 7
+
+
+def test_what_is_no_unit_quaternion_is_no_pose_and_one_that_nearly_is_becomes_a_rotation():
+    def pose(w, x=1.0):
+        return T_of(SimpleNamespace(x=x, y=2.0, z=3.0), SimpleNamespace(x=0.0, y=0.0, z=0.6, w=w))
+
+    expected = floor_pose(1, 2, 2 * np.arctan2(0.6, 0.8))
+    expected[2, 3] = 3.0
+    np.testing.assert_allclose(pose(0.8), expected, atol=1e-12)
+    R = pose(0.8005)[:3, :3]
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
+    assert pose(0.9) is None and pose(np.nan) is None and pose(0.8, np.inf) is None
 
 
 @pytest.mark.parametrize(

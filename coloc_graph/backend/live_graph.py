@@ -15,7 +15,7 @@ from coloc_graph.backend.entering import Entering, Tie
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.fit import fit_graph
 from coloc_graph.backend.graph import Link, PoseGraph
-from coloc_graph.backend.solver import CALIBRATED, isam_parameters, joint_covariance, with_stack
+from coloc_graph.backend.solver import CALIBRATED, isam_parameters, joint_covariance, optimise, with_stack
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Sighting
 
@@ -100,6 +100,9 @@ class LiveGraph:
             factors.add(factor)
         # what the error rises by is at most what the new factors have before anything moves to please them
         clear = not entering.near or 2 * factors.error(self._with_known(values, factors)) < CLEAR
+        if not self.tied and self._calibrated:
+            # mounts that are degrees off lead a first full step to where nothing leads on
+            values, _ = optimise(factors, values)
         indices = self._into_isam(factors, values) if factors.size() else []
         inside = {index: Entered(tie[0], self.isam.getFactorsUnsafe().at(index))
                   for index, tie in zip(indices[first:], entering.near, strict=True)}  # fmt: skip

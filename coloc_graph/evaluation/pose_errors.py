@@ -86,7 +86,6 @@ def pairs_of(positions: Array, distance: float) -> tuple[NDArray[np.int64], NDAr
     reached = np.searchsorted(path, path[i] + distance)
     arrived = np.searchsorted(path, path)
     near = arrived[(reached[:, None] + np.arange(-2, 2)).clip(0, n - 1)]
-    near = np.maximum(near, i[:, None] + 1)
     off = np.abs(path[near] - path[i, None] - distance)
     which = off.argmin(axis=1)
     kept = off[i, which] <= RPE_TOLERANCE * distance
