@@ -22,8 +22,8 @@ from coloc_graph.team import Floor, Landmark, Ranging, Robot, Team, Wheels
 
 Array = NDArray[np.float64]
 
-#: What is known of the camera of these robots: a range is made of a barcode's height in the image, so that it is how far
-#: in front of the camera the barcode is, and its error grows with its square and lasts while the view stays the same.
+#: What is known of the camera of these robots: a range is made of a barcode's height in the image, so that it is how
+#: far in front of the camera the barcode is, and its error grows with its square and lasts while the view stays the same.
 RANGING = Ranging(
     range_sigma=0.012,
     range_sigma_per_m2=0.0012,
@@ -42,7 +42,7 @@ RANGING = Ranging(
 #: Their odometry is what the wheels were told, which they do a moment later, and not to the full.
 WHEELS = Wheels(delay=0.1, scale_sigma=0.1, turn_scale_sigma=0.1, delay_sigma=0.1)
 #: Noise of the way: along and across it [m per root of a metre, of a second], and of the heading [rad per root of a
-#: radian, of a metre, of a second]. It is what errors add up to in ten seconds: they last, so that a step alone has less.
+#: radian, of a metre, of a second]. It is what errors add up to in ten seconds: they last, and a step alone has less.
 ALONG, ACROSS, TURN = (0.08, 0.004), (0.012, 0.002), (0.1, 0.08, 0.006)
 #: Commands that stay the same are kept so often [s].
 KEPT_EVERY = 0.2

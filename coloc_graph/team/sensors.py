@@ -44,8 +44,8 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         for name in ("range_sigma", "bearing_sigma_deg", "scale"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
-        if not 0 <= self.depth <= 1:
-            raise ValueError(f"`depth` is {self.depth}; give a number from 0 (range) to 1 (depth)")
+        if not -0.5 <= self.depth <= 1.5:
+            raise ValueError(f"`depth` is {self.depth}; give 0 where it measures range, 1 where it measures depth")
         noise = ("range_sigma_per_m2", "across_sigma", "range_memory", "bearing_memory")
         tolerances = ("offset_sigma", "scale_sigma", "bearing_offset_sigma_deg", "depth_sigma", "robot_offset_sigma")
         require_not_negative(self, (*noise, *tolerances, "place_sigma"))

@@ -31,7 +31,7 @@ def optimise_drive(team: Team, drive: Drive, *, calibrate_noise: bool = True) ->
     """The most likely of all, given all steps and measurements, from where a filter sees it.
 
     Noise of measurements is what the team states, times what makes it that of the residuals (`calibrate_noise`), by
-    robot and kind. That of steps is as stated: errors of wheels last, and what is left of one step says nothing of them.
+    robot and kind. That of steps is as stated: errors of wheels last, and one step says nothing of them.
     Raises `EstimationError` where no robot can be placed, or the search leads nowhere.
     """
     filtered = filter_forward(team, drive)

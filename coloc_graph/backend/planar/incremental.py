@@ -27,8 +27,9 @@ Index = NDArray[np.int64]
 LAG, EVERY = 40.0, 1.0
 #: Slices leave so many at a time: each time, covariances of all are worked out.
 LEAVING = 4
-#: Until so long after the first keyframe none leaves [s]: wheels and sensors are being calibrated.
-CALIBRATING = 150.0
+#: Until so long after the first keyframe none leaves [s]: wheels and sensors are being calibrated, and what has left
+#: would stay as it was thought before.
+CALIBRATING = 300.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +50,13 @@ class _Solved:
 
 
 class IncrementalDrive:
-    """Estimates a drive in the order of time: `advance` takes in what was measured until a time."""
+    """Estimates a drive in the order of time: `advance` takes in what was measured until a time.
 
-    def __init__(self, team: Team, drive: Drive, *, lag: float = LAG) -> None:
-        self.drive, self._lag = drive, lag
+    Poses are corrected for `lag` [s] after their time, and all of them until `calibrating` [s] after the first.
+    """
+
+    def __init__(self, team: Team, drive: Drive, *, lag: float = LAG, calibrating: float = CALIBRATING) -> None:
+        self.drive, self._lag, self._calibrating = drive, lag, calibrating
         self._filter = Filter(team, drive)
         self._factors = factors = DriveFactors(drive, self._filter.models)
         self._slice = slices_of(factors)
@@ -173,7 +177,7 @@ class IncrementalDrive:
     def _leave(self, time: float) -> None:
         """Keep what is estimated of slices that are over for longer than the lag, and sum up what they say."""
         solved, factors, times = self._solved, self._factors, self._factors.times
-        if solved is None or time < times.min() + CALIBRATING:
+        if solved is None or time < times.min() + self._calibrating:
             return
         ending = np.flatnonzero(self._inside & (times < time - self._lag))
         if not len(ending):

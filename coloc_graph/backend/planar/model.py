@@ -125,9 +125,7 @@ class Sensors:
         range_sigma, per_m2, bearing_sigma, across = self._noise[robots].T
         return np.stack([range_sigma + per_m2 * ranges**2, np.hypot(bearing_sigma, across / ranges)], axis=-1)
 
-    def expected(
-        self, robots: NDArray[np.int64], xy: Array, errors: Array, of_robot: NDArray[np.bool_]
-    ) -> Expected:
+    def expected(self, robots: NDArray[np.int64], xy: Array, errors: Array, of_robot: NDArray[np.bool_]) -> Expected:
         """What is expected of targets at xy (n, 2) in the body, robots or landmarks, with errors (n, 7)."""
         offset, scale, turned, x0, y0, depth, more = (self._stated[robots] + errors).T
         x, y = xy[:, 0] - x0, xy[:, 1] - y0

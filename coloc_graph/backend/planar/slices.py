@@ -42,14 +42,16 @@ class Summary:
 
 
 class Slices:
-    """Where the numbers of some poses' problem are, in one flat array: of each slice a block (rows of its own variables;
-    columns of these, of the next slice's, of the shared, and the gradient), then one of the shared."""
+    """Where the numbers of some poses' problem are, in one flat array: of each slice a block (rows of its variables;
+    columns of these, of the next slice's, of the shared, and the gradient), then one of the shared.
+
+    `poses` (n,) are in the order of slices, `first` (count + 1,) says which of them is the first of each; `base` is the
+    number of the first slice."""
 
     def __init__(self, factors: DriveFactors, slices: Index, poses: Index) -> None:
         order = np.lexsort((poses, slices[poses]))
         self.poses: Index = poses[order]
         own = slices[self.poses]
-        #: The number of the first slice, and which of `poses` is the first of each slice.
         self.base = int(own[0])
         self.count = int(own[-1]) - self.base + 1
         own = own - self.base
@@ -213,6 +215,6 @@ class Slices:
 
 def _undetermined() -> EstimationError:
     return EstimationError(
-        "what was measured does not determine where everything is: let the robots see more landmarks, or each other more "
-        "often"
+        "what was measured does not determine where everything is: let the robots see more landmarks, or each other "
+        "more often"
     )

@@ -17,8 +17,8 @@ DOUBTED = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What was found, robots and landmarks by number: `state` of all keyframes and of what is shared, with `covariances`
-    (n, 3, 3) of the poses in the body frame; `landmarks` (2,) with covariances; `errors` by robot."""
+    """What was found, robots and landmarks by number: the `state` of all keyframes and of what is shared, with
+    `covariances` (n, 3, 3) of the poses in the body frame; `landmarks` (2,) with covariances; `errors` by robot."""
 
     state: State
     covariances: Array
