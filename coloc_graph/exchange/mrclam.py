@@ -23,7 +23,7 @@ from coloc_graph.team import Floor, Landmark, Ranging, Robot, Team, Wheels
 Array = NDArray[np.float64]
 
 #: What is known of the camera of these robots: a range is made of a barcode's height in the image, so that it is how
-#: far in front of the camera the barcode is, and its error grows with its square and lasts while the view stays the same.
+#: far in front of the camera the barcode is; its error grows with its square, and lasts while the view stays the same.
 RANGING = Ranging(
     range_sigma=0.012,
     range_sigma_per_m2=0.0012,

@@ -105,17 +105,9 @@ def _calibration(solution: DriveSolution) -> str:
                 value(100 * off[6], 100 * sigmas[6], " cm", 1),
             ]
         rows.append([escape(robot), *cells, ", ".join(number(one, 2) for one in estimate.noise[n].tolist())])
-    head = [
-        "Robot",
-        "Way",
-        "Turn",
-        "Delay",
-        "Range",
-        "Scale",
-        "Bearing",
-        "Depth",
-        "To robots",
-        "Noise ×: range, bearing",
-    ]
-    note = "What was found beyond what the team states, ± one sigma. Noise: what the stated one was multiplied with."
+    head = ["Robot", "Way", "Turn", "Delay", "Range", "Scale", "Bearing", "Depth", "To robots", "Noise ×"]
+    note = (
+        "What was found beyond what the team states, ± one sigma. Noise: what the stated one of ranges, and of "
+        "bearings, was multiplied with."
+    )
     return f'<h2>Wheels and sensors</h2>\n{table(head, rows, [0])}\n<p class="soft">{note}</p>'

@@ -13,8 +13,8 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     the hypotenuse of `bearing_sigma_deg` and of `across_sigma` [m] / r of a bearing. Errors of the same target's next
     measurement are alike for `range_memory` and `bearing_memory` [s], their time of correlation (0: independent).
     A camera that makes the range of a size in its image tells how far a target is in front of it, and not how far away:
-    r (1 - `depth` (1 - cos(bearing))), with a `depth` of 1 there, and of 0 of what measures range. Ranges to robots read
-    `robot_offset` [m] more than those to landmarks.
+    its r is r (1 - `depth` (1 - cos(bearing))) with a `depth` of 1, or near it; what measures range has 0. Ranges to
+    robots read `robot_offset` [m] more than those to landmarks.
     It sits at `x`, `y` [m] on the body. `*_sigma` of what is not noise are tolerances (`place_sigma` is that of x and
     of y): what has one is found along with the poses.
     """

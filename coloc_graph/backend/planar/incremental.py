@@ -130,7 +130,8 @@ class IncrementalDrive:
         """The steps between poses, from which they are."""
         factors = self._factors
         ends: Index = np.flatnonzero(inside[:-1] & inside[1:])
-        return ends[factors.robot[ends] == factors.robot[ends + 1]]
+        steps: Index = ends[factors.robot[ends] == factors.robot[ends + 1]]
+        return steps
 
     def _measured(self, inside: NDArray[np.bool_]) -> Index:
         """The measurements so far between poses, or of landmarks that have a place."""
@@ -187,8 +188,10 @@ class IncrementalDrive:
         if leaving < LEAVING:
             return
         self._note_leaving(leaving)
-        near = self._inside & (self._slice <= solved.slices.base + leaving)
-        gone = near & (self._slice < solved.slices.base + leaving)
+        # the first slice that stays: there is none where nothing was measured for a while
+        window = int(self._slice[self._inside & (self._slice >= solved.slices.base + leaving)].min())
+        near = self._inside & (self._slice <= window)
+        gone = near & (self._slice < window)
         slices = Slices(factors, self._slice, np.flatnonzero(near))
         steps, measured = self._steps(near), self._measured(near)
         seen = gone[factors.seen[measured]] & factors.of_robot[measured]
@@ -199,7 +202,7 @@ class IncrementalDrive:
         poses, information, gradient = slices.remaining(problem)
         self._before = Summary(poses, information, gradient, self._at(poses))
         self._inside &= ~gone
-        self._window = solved.slices.base + leaving
+        self._window = window
 
     def _note_leaving(self, leaving: int) -> None:
         """Keep poses of the first so many slices, as they are."""

@@ -50,7 +50,7 @@ class WheelsModel:
         self.covariances = steps.covariances
 
     def __len__(self) -> int:
-        return self._twists.shape[1]
+        return int(self._twists.shape[1])
 
     def steps(self, k: NDArray[np.int64] | slice, errors: Array) -> tuple[Array, Array]:
         """Poses (n, 3) of keyframes k + 1 in k, and by how much they change with each error (n, 3, 3)."""

@@ -150,8 +150,8 @@ class Slices:
         """What a problem says of the poses (n,) of the last slice and of what is shared, where all before the last are
         eliminated: these poses, information (3 n + m, 3 n + m), and gradient."""
         last, shared = self.block(problem, self.count - 1), self.block(problem, self.count)
-        rows = len(last)
-        information = np.block([[last[:, :-1]], [last[:, rows:-1].T, shared[:, :-1]]])
+        across = last[:, len(last) : -1]
+        information = np.block([[last[:, : len(last)], across], [across.T, shared[:, :-1]]])
         return self.poses[self.first[-2] :], information, np.concatenate([last[:, -1], shared[:, -1]])
 
     def shared(self, problem: Array) -> tuple[Array, Array]:
