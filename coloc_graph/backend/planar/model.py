@@ -21,6 +21,8 @@ Pose = tuple[float, float, float]
 WHEELS, RANGING = 3, 7
 #: Less of a turn than this in a step is none [rad].
 STRAIGHT = 1e-6
+#: A depth is at least this part of the distance: what is beside a camera is not seen by it.
+LEAST_PART = 0.1
 
 
 def wrapped(angles: Array) -> Array:
@@ -149,5 +151,6 @@ class Sensors:
     def place(self, robot: int, range_: float, bearing: float, of_robot: bool) -> tuple[float, float]:
         """Where in the body a target is that was measured so, if nothing is off."""
         offset, scale, turned, x0, y0, depth, more = self._stated[robot].tolist()
-        distance = (range_ - offset - more * of_robot) / (scale * (1 - depth * (1 - math.cos(bearing))))
+        part = max(1 - depth * (1 - math.cos(bearing)), LEAST_PART)
+        distance = (range_ - offset - more * of_robot) / (scale * part)
         return x0 + distance * math.cos(bearing - turned), y0 + distance * math.sin(bearing - turned)
