@@ -34,7 +34,9 @@ def uncalibrated(run: Run) -> Run:
         replace(
             robot,
             ranging=replace(
-                robot.ranging, offset_sigma=0.0, scale_sigma=0.0, bearing_offset_sigma_deg=0.0, place_sigma=0.0
+                robot.ranging,
+                **dict.fromkeys(("offset_sigma", "scale_sigma", "bearing_offset_sigma_deg"), 0.0),
+                **dict.fromkeys(("depth_sigma", "robot_offset_sigma", "place_sigma"), 0.0),
             ),
             wheels=replace(robot.wheels, delay=0.0, scale_sigma=0.0, turn_scale_sigma=0.0, delay_sigma=0.0),
         )

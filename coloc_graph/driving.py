@@ -133,7 +133,7 @@ def _calibrated_robot(robot: Robot, estimate: DriveEstimate) -> Robot:
             ),
         )
     if errors.ranging is not None and robot.ranging is not None:
-        offset, scale, bearing, x, y = errors.ranging[0].tolist()
+        offset, scale, bearing, x, y, depth, robot_offset = errors.ranging[0].tolist()
         sigmas = np.sqrt(np.diagonal(errors.ranging[1])).tolist()
         r = robot.ranging
         times = estimate.noise[estimate.drive.robots.index(robot.name)].tolist()
@@ -152,8 +152,12 @@ def _calibrated_robot(robot: Robot, estimate: DriveEstimate) -> Robot:
                 y=r.y + y,
                 offset_sigma=sigmas[0],
                 scale_sigma=sigmas[1],
+                depth=r.depth + depth,
+                robot_offset=r.robot_offset + robot_offset,
                 bearing_offset_sigma_deg=math.degrees(sigmas[2]),
-                place_sigma=max(sigmas[3:]),
+                place_sigma=max(sigmas[3:5]),
+                depth_sigma=sigmas[5],
+                robot_offset_sigma=sigmas[6],
             ),
         )
     return robot

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+#: Keyframes of a robot are no further apart [s]: a long step with turns in it is no arc.
+LONGEST_STEP = 1.0
+
 
 @dataclass(frozen=True, eq=False)
 class Steps:

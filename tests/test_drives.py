@@ -1,16 +1,16 @@
 import json
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
-from mrclam_folder import DELAY, LANDMARKS, SCALE, TURN_SCALE, make
+from mrclam_folder import DELAY, DEPTH, LANDMARKS, ROBOT_OFFSET, SCALE, TURN_SCALE, make
 from msgspec.structs import replace as with_fields
 
-from coloc_graph.backend.planar import optimise_drive
-from coloc_graph.backend.planar.factors import DriveFactors, landmark_key, pose_key, ranging_key, wheels_key
+from coloc_graph.backend.planar import IncrementalDrive, optimise_drive
+from coloc_graph.backend.planar.factors import DriveFactors, State
 from coloc_graph.backend.planar.filter import Models, filter_forward
 from coloc_graph.backend.planar.placing import Placing
+from coloc_graph.backend.planar.slices import Slices, Summary, slices_of
 from coloc_graph.cli import main
 from coloc_graph.drive_results import assess_drive, write_drive_result
 from coloc_graph.driving import DriveOptions, calibrated, solve_drive
@@ -70,13 +70,14 @@ def test_wheels_that_are_not_as_they_say_are_found_out(run, batch):
         wheels = run.team[robot].wheels
         true = np.array([SCALE - wheels.scale, TURN_SCALE - wheels.turn_scale, DELAY - wheels.delay])
         assert np.all(np.abs(errors - true) < 4 * np.sqrt(np.diagonal(C)))
-        assert np.sqrt(C[2, 2]) < wheels.delay_sigma / 3
+        assert np.sqrt(C[2, 2]) < wheels.delay_sigma / 2
     found = calibrated(run.team, batch.estimate)
     stated, errors = run.team["R1"], batch.estimate.errors["R1"]
     wheels, ranging = found["R1"].wheels, found["R1"].ranging
     at = [wheels.scale - stated.wheels.scale, wheels.turn_scale - stated.wheels.turn_scale]
     assert [*at, wheels.delay - stated.wheels.delay] == pytest.approx(errors.wheels[0].tolist())
     at = [ranging.offset, ranging.scale - 1, np.deg2rad(ranging.bearing_offset_deg), ranging.x, ranging.y]
+    at += [ranging.depth - stated.ranging.depth, ranging.robot_offset]
     assert at == pytest.approx(errors.ranging[0].tolist())
     assert wheels.delay_sigma == pytest.approx(np.sqrt(errors.wheels[1][2, 2]))
     assert ranging.range_sigma == pytest.approx(stated.ranging.range_sigma * batch.estimate.noise[0, 0])
@@ -94,7 +95,7 @@ def test_each_robot_helps_the_others(run, batch):
 
 def test_as_it_happens_it_is_nearly_as_good(batch, incremental):
     of_batch, of_one = assess_drive(batch), assess_drive(incremental)
-    assert rms(of_one.accuracy) < 1.6 * rms(of_batch.accuracy)
+    assert rms(of_one.accuracy) < 1.2 * rms(of_batch.accuracy)
     assert rms(of_one.online) < 0.12
     # nothing that comes later is in what was thought at the time
     assert rms(of_one.online) > rms(of_one.accuracy)
@@ -158,37 +159,132 @@ def test_the_filter_needs_no_first_poses(run):
     assert filtered.used.mean() > 0.9
 
 
-def test_derivatives_are_those_of_the_residuals(unmapped):
-    drive, team = keyframes_of(unmapped), unmapped.team
-    models = Models(team, drive)
-    factors = DriveFactors(drive, models)
+def test_that_a_range_is_a_depth_and_longer_to_robots_is_found_out(run, batch):
+    sigmas = []
+    for robot in run.team.names:
+        errors, C = batch.estimate.errors[robot].ranging
+        off = errors[5:] - (DEPTH - run.team[robot].ranging.depth, ROBOT_OFFSET)
+        sigmas.append(np.sqrt(np.diagonal(C)[5:]))
+        assert np.all(np.abs(off) < 4 * sigmas[-1])
+    assert np.max(sigmas, axis=0)[0] < 0.04
+    # one of them hardly sees another
+    assert np.min(sigmas, axis=0)[1] < 0.025
+
+
+@pytest.fixture(scope="module")
+def somewhere(unmapped):
+    """Factors without a map, and a state that is far from their optimum."""
+    drive = keyframes_of(unmapped)
+    factors = DriveFactors(drive, Models(unmapped.team, drive))
     rng = np.random.default_rng(0)
-    values = gtsam.Values()
-    for robot, times in enumerate(drive.times):
-        values.insert(wheels_key(robot), rng.normal(size=3) * 0.01)
-        values.insert(ranging_key(robot), rng.normal(size=5) * 0.05)
-        for k in range(len(times)):
-            values.insert(pose_key(robot, k), gtsam.Pose2(*rng.normal(size=3)))
-    for n in range(len(drive.landmarks)):
-        values.insert(landmark_key(n), 3 + rng.normal(size=2))
-    of_robots = np.flatnonzero(drive.measured.target < 3)[:3]
-    of_landmarks = np.flatnonzero(drive.measured.target >= 3)[:3]
-    made = [factors.step(0, 3), factors.step(1, 7), *(factors.measured(int(n)) for n in (*of_robots, *of_landmarks))]
-    for factor in made:
-        A = np.empty((factor.dim(), 0))
-        for key in factor.keys():  # noqa: SIM118  GTSAM's own
-            size = {ord("x"): 3, ord("w"): 3, ord("r"): 5, ord("l"): 2}[gtsam.mrsymbolChr(key)]
-            for column in range(size):
-                ends = []
-                for sign in (1, -1):
-                    step = gtsam.VectorValues()
-                    step.insert(key, sign * 1e-6 * np.eye(size)[column])
-                    ends.append(factor.unwhitenedError(values.retract(step)))
-                A = np.column_stack([A, (ends[0] - ends[1]) / 2e-6])
-        exact, _ = factor.linearize(values).jacobian()
-        # robust factors are scaled as a whole
-        scale = np.linalg.norm(exact) / np.linalg.norm(A)
-        assert np.abs(scale * A - exact).max() < 1e-5 * np.abs(exact).max()
+    shared = rng.normal(size=len(factors.free)) * 0.05
+    factors.landmarks(shared)[:] += 3 + rng.normal(size=(len(drive.landmarks), 2))
+    return factors, State(rng.normal(size=(len(factors), 3)), shared)
+
+
+def test_derivatives_are_those_of_the_residuals(somewhere):
+    factors, state = somewhere
+    of_robots, of_landmarks = (np.flatnonzero(factors.of_robot == of)[:3] for of in (True, False))
+    index = np.concatenate([of_robots, of_landmarks])
+    steps = np.array([3, factors.first[1] + 7])
+    for rows_at in (lambda at: factors.steps(at, steps), lambda at: factors.measured(at, index)):
+        J, columns = rows_at(state)
+        for n, k in np.ndindex(columns.shape):
+            ends = []
+            for step in (1e-6, -1e-6):
+                both = np.concatenate([state.poses.ravel(), state.shared])
+                both[columns[n, k]] += step
+                moved = State(both[: state.poses.size].reshape(-1, 3), both[state.poses.size :])
+                ends.append(rows_at(moved).residuals[n])
+            assert np.allclose((ends[0] - ends[1]) / 2e-6, J[n, :, k], atol=1e-5 * np.abs(J[n]).max())
+
+
+def dense(factors, slices, rows):
+    """The matrix and gradient of a problem over its own poses and what is shared, by the book."""
+    variables = np.concatenate(
+        [(3 * slices.poses[:, None] + np.arange(3)).ravel(), 3 * len(factors) + np.flatnonzero(factors.free)]
+    )
+    number = np.full(3 * len(factors) + len(factors.free), -1)
+    number[variables] = np.arange(len(variables))
+    A, b = [], []
+    for J, columns in rows:
+        for n in range(len(J)):
+            row = np.zeros((J.shape[1], len(variables) + 1))
+            row[:, number[columns[n]]] = J[n, :, :-1]
+            A.append(row[:, :-1])
+            b.append(J[n, :, -1])
+    A, b = np.concatenate(A), np.concatenate(b)
+    return A.T @ A, A.T @ b
+
+
+def test_second_by_second_it_is_the_same_as_all_at_once(somewhere):
+    factors, state = somewhere
+    slices_all = slices_of(factors)
+    poses = np.flatnonzero(slices_all < 12)
+    slices = Slices(factors, slices_all, poses)
+    inside = np.isin(np.arange(len(factors)), poses)
+    steps = np.flatnonzero(inside[:-1] & inside[1:] & (factors.robot[:-1] == factors.robot[1:]))
+    measured = np.flatnonzero(inside[factors.observer] & (inside[factors.seen] | ~factors.of_robot))
+    gauge = factors.gauge(state, int(poses[0]), state.poses[poses[0]] + 0.1)
+    rows = [factors.steps(state, steps), factors.measured(state, measured), gauge]
+    H, g = dense(factors, slices, rows)
+    weights, off = factors.before(state)
+    n = 3 * len(poses)
+    H[np.arange(n, len(H)), np.arange(n, len(H))] += weights
+    g[n:] += weights * off
+    C = np.linalg.inv(H)
+
+    flat = slices.problem(rows)
+    slices.add_known(flat, weights, off)
+    eliminated = slices.eliminate(flat)
+    shared, of_shared = slices.shared(flat)
+    expected = -C @ g
+    assert np.allclose(shared, expected[n:], rtol=1e-5, atol=1e-7)
+    assert np.allclose(slices.steps(eliminated, shared).ravel(), expected[:n], rtol=1e-5, atol=1e-6)
+    assert np.allclose(of_shared, C[n:, n:], rtol=1e-5, atol=1e-9)
+    for k, joint in slices.covariances(eliminated, of_shared):
+        at = np.r_[3 * slices.first[k] : 3 * slices.first[min(k + 2, slices.count)], n : len(C)]
+        assert np.allclose(joint, C[np.ix_(at, at)], rtol=1e-4, atol=1e-9)
+
+    # in two goes: what the first slices say of the rest is all they have to say
+    gone = slices_all < 5
+    near = Slices(factors, slices_all, np.flatnonzero(slices_all < 6))
+    is_early = [gone[steps] | gone[steps + 1], gone[factors.observer[measured]]]
+    is_early[1] |= gone[factors.seen[measured]] & factors.of_robot[measured]
+    flat = near.problem(
+        [factors.steps(state, steps[is_early[0]]), factors.measured(state, measured[is_early[1]]), gauge]
+    )
+    near.add_known(flat, weights, off)
+    near.eliminate(flat, near.count - 1)
+    left, information, gradient = near.remaining(flat)
+    at = np.concatenate([state.poses[left].ravel(), state.shared[factors.free]])
+    rest = Slices(factors, slices_all, poses[~gone[poses]])
+    flat = rest.problem([factors.steps(state, steps[~is_early[0]]), factors.measured(state, measured[~is_early[1]])])
+    rest.add_summary(flat, Summary(left, information, gradient + 0.0, at), at)
+    eliminated = rest.eliminate(flat)
+    again, _ = rest.shared(flat)
+    assert np.allclose(again, shared, rtol=1e-4, atol=1e-6)
+    assert np.allclose(rest.steps(eliminated, again), expected[3 * slices.first[5] : n].reshape(-1, 3), atol=1e-5)
+
+
+def test_what_has_left_the_window_is_not_forgotten(run, batch):
+    drive = keyframes_of(run)
+    one = IncrementalDrive(run.team, drive, lag=10.0, calibrating=12.0)
+    start = min(times[0] for times in drive.times)
+    for second in range(1, 42):
+        latest = one.advance(start + second)
+    assert set(latest.poses) == set(run.team.names)
+    estimate, _ = one.finish()
+    for robot in run.team.names:
+        # of wheels and sensors as much is known as in batch
+        for kind in ("wheels", "ranging"):
+            found, C = getattr(estimate.errors[robot], kind)
+            best, best_C = getattr(batch.estimate.errors[robot], kind)
+            assert np.all(np.abs(found - best) < 1.5 * np.sqrt(np.diagonal(best_C)))
+            assert np.allclose(np.sqrt(np.diagonal(C)), np.sqrt(np.diagonal(best_C)), rtol=0.3)
+        off = estimate.trajectories[robot].positions - batch.estimate.trajectories[robot].positions
+        assert len(off) == len(batch.estimate.trajectories[robot])
+        assert 1e-4 < np.sqrt((off**2).sum(axis=1).mean()) < 0.03
 
 
 def test_errors_that_last_count_by_how_long_they_do(run):
@@ -309,7 +405,7 @@ def test_the_viewer_shows_where_each_was_and_what_it_measured(run, batch, tmp_pa
         np.testing.assert_allclose(trajectories[robot].times[at], estimated.times[number, rows], atol=1e-5)
         np.testing.assert_allclose(trajectories[robot].positions[at], estimated.xyz[number, rows], atol=1e-6)
         assert (np.diff(np.floor(trajectories[robot].times[at] - scene.starts[0])) >= 1).all()
-        assert np.nanmax(np.linalg.norm(true.xyz[number] - estimated.xyz[number], axis=1)) < 0.1
+        assert np.nanmax(np.linalg.norm(true.xyz[number] - estimated.xyz[number], axis=1)) < 0.2
     links, seen = scene.sightings, scene.landmarks.sightings
     assert len(scene.landmarks) == len(LANDMARKS) and len(links) > 20 and len(seen) > 20
     m, names = batch.estimate.drive.measured, (*batch.estimate.drive.robots, *batch.estimate.drive.landmarks)

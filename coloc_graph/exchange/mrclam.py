@@ -22,25 +22,28 @@ from coloc_graph.team import Floor, Landmark, Ranging, Robot, Team, Wheels
 
 Array = NDArray[np.float64]
 
-#: What is known of the camera of these robots: a range is made of a barcode's height in the image, so that its error
-#: grows with its square, and lasts while the view stays the same.
+#: What is known of the camera of these robots: a range is made of a barcode's height in the image, so that it is how
+#: far in front of the camera the barcode is; its error grows with its square, and lasts while the view stays the same.
 RANGING = Ranging(
-    range_sigma=0.036,
-    range_sigma_per_m2=0.0096,
-    bearing_sigma_deg=0.36,
+    range_sigma=0.012,
+    range_sigma_per_m2=0.0012,
+    bearing_sigma_deg=0.3,
     across_sigma=0.0145,
-    range_memory=3.0,
-    bearing_memory=0.6,
+    range_memory=5.0,
+    bearing_memory=2.0,
+    depth=1.0,
     offset_sigma=0.1,
     scale_sigma=0.05,
     bearing_offset_sigma_deg=2.0,
+    depth_sigma=0.1,
+    robot_offset_sigma=0.05,
     place_sigma=0.05,
 )
 #: Their odometry is what the wheels were told, which they do a moment later, and not to the full.
 WHEELS = Wheels(delay=0.1, scale_sigma=0.1, turn_scale_sigma=0.1, delay_sigma=0.1)
 #: Noise of the way: along and across it [m per root of a metre, of a second], and of the heading [rad per root of a
-#: radian, of a metre, of a second].
-ALONG, ACROSS, TURN = (0.04, 0.002), (0.006, 0.001), (0.05, 0.04, 0.003)
+#: radian, of a metre, of a second]. It is what errors add up to in ten seconds: they last, and a step alone has less.
+ALONG, ACROSS, TURN = (0.08, 0.004), (0.012, 0.002), (0.1, 0.08, 0.006)
 #: Commands that stay the same are kept so often [s].
 KEPT_EVERY = 0.2
 #: Truth is kept so often [s]: motion capture's 100 a second would be most of the run.

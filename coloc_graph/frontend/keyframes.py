@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.keyframes import Drive, RangeBearings, Steps
+from coloc_graph.keyframes import LONGEST_STEP, Drive, RangeBearings, Steps
 from coloc_graph.run import OdometrySample, Ranges, Run
 from coloc_graph.team import Ranging, Wheels
 
@@ -17,8 +17,6 @@ Array = NDArray[np.float64]
 ONE_INSTANT = 0.01
 #: So much of a run is read at a time [s].
 READ_AT_ONCE = 10.0
-#: Nor are keyframes further apart [s]: a long step with turns in it is no arc.
-LONGEST_STEP = 1.0
 #: Odometry with a gap longer than this says nothing there [s].
 LONGEST_GAP = 5.0
 #: A delay that is not known is looked for so far on either side [its sigmas], in steps of so much [s].

@@ -87,7 +87,7 @@ def _calibration(solution: DriveSolution) -> str:
 
     for n, robot in enumerate(estimate.drive.robots):
         errors = estimate.errors[robot]
-        cells = ["–"] * 6
+        cells = ["–"] * 8
         if errors.wheels is not None:
             off, sigmas = errors.wheels[0], np.sqrt(np.diagonal(errors.wheels[1]))
             cells[:3] = [
@@ -101,8 +101,13 @@ def _calibration(solution: DriveSolution) -> str:
                 value(100 * off[0], 100 * sigmas[0], " cm", 1),
                 value(100 * off[1], 100 * sigmas[1], " %", 1),
                 value(math.degrees(off[2]), math.degrees(sigmas[2]), "°", 2),
+                value(off[5], sigmas[5], "", 2),
+                value(100 * off[6], 100 * sigmas[6], " cm", 1),
             ]
         rows.append([escape(robot), *cells, ", ".join(number(one, 2) for one in estimate.noise[n].tolist())])
-    head = ["Robot", "Way", "Turn", "Delay", "Range", "Scale", "Bearing", "Noise ×: range, bearing, way"]
-    note = "What was found beyond what the team states, ± one sigma. Noise: what the stated one was multiplied with."
+    head = ["Robot", "Way", "Turn", "Delay", "Range", "Scale", "Bearing", "Depth", "To robots", "Noise ×"]
+    note = (
+        "What was found beyond what the team states, ± one sigma. Noise: what the stated one of ranges, and of "
+        "bearings, was multiplied with."
+    )
     return f'<h2>Wheels and sensors</h2>\n{table(head, rows, [0])}\n<p class="soft">{note}</p>'

@@ -1,6 +1,6 @@
 """Teams that drive all the time: poses on the floor by odometry, ranges and bearings to each other and to landmarks.
 
-`filter_forward` is an EKF, `optimise_drive` the most likely of all in batch, `IncrementalDrive` with ISAM2.
+`filter_forward` is an EKF, `optimise_drive` the most likely of all in batch, `IncrementalDrive` as it happens.
 """
 
 from coloc_graph.backend.planar.batch import optimise_drive

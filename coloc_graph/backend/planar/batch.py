@@ -3,24 +3,24 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.planar.estimate import DriveEstimate, Errors
-from coloc_graph.backend.planar.factors import DriveFactors, landmark_key, pose_key
+from coloc_graph.backend.planar.factors import DriveFactors, Rows, State, robust
 from coloc_graph.backend.planar.filter import Filtered, Models, filter_forward
-from coloc_graph.backend.planar.gauss_newton import gauss_newton
-from coloc_graph.backend.planar.summary import DOUBTED, Found, measured_off, steps_off, summed_up
-from coloc_graph.backend.solver import joint_covariance, with_stack
+from coloc_graph.backend.planar.slices import Slices, slices_of
+from coloc_graph.backend.planar.summary import DOUBTED, Found, measured_off, summed_up
 from coloc_graph.errors import EstimationError
 from coloc_graph.keyframes import Drive
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
-#: Of so many measurements and steps of each robot it is looked how much of their residual the fit has taken away.
-SAMPLED = 30
+#: The search ends where a step gains less than this much of half chi2 a pose, of which one has about 3.
+ENOUGH = 1e-4
+MOST_ITERATIONS, MOST_HALVINGS = 40, 6
 #: Where the fit has left less than this of residuals, they say nothing of noise.
 LEAST_LEFT = 0.3
 #: Noise is not taken for less, or more, than so many times what is stated.
@@ -30,164 +30,198 @@ NOISE_RANGE = (0.2, 5.0)
 def optimise_drive(team: Team, drive: Drive, *, calibrate_noise: bool = True) -> DriveEstimate:
     """The most likely of all, given all steps and measurements, from where a filter sees it.
 
-    Noise is what the team states, times what makes it that of the residuals (`calibrate_noise`), by robot and kind.
+    Noise of measurements is what the team states, times what makes it that of the residuals (`calibrate_noise`), by
+    robot and kind. That of steps is as stated: errors of wheels last, and one step says nothing of them.
     Raises `EstimationError` where no robot can be placed, or the search leads nowhere.
     """
-    return with_stack(sum(map(len, drive.times)), lambda: _optimised(team, drive, calibrate_noise))
-
-
-@dataclass(frozen=True, eq=False)
-class _Graph:
-    """A graph over the robots that have a place; `first_step` of each robot's and `measured` say which factor is
-    which: the latter are the last, in their order."""
-
-    factors: gtsam.NonlinearFactorGraph
-    first_step: dict[int, int]
-    measured: NDArray[np.int64]
-
-    def of_measured(self, n: int) -> gtsam.NonlinearFactor:
-        """The factor of the n-th of the measured."""
-        return self.factors.at(self.factors.size() - len(self.measured) + n)
-
-
-def _optimised(team: Team, drive: Drive, calibrate_noise: bool) -> DriveEstimate:
     filtered = filter_forward(team, drive)
     models = Models(team, drive)
-    robots = sorted(filtered.placed_at)
-    if not robots:
+    if not filtered.placed_at:
         raise EstimationError(
             "no robot's measurements say where it is: let one see two landmarks of known positions several times"
         )
     factors = DriveFactors(drive, models)
-    values = _start(filtered, factors, robots)
-    graph = _graph(factors, values, robots)
-    values, iterations = gauss_newton(graph.factors, values)
-    absorbed = None
+    fit = _fitted(factors, _start(filtered, factors))
+    iterations, absorbed = fit.iterations, None
     if calibrate_noise:
-        found = _found(factors, values)
-        marginals = gtsam.Marginals(graph.factors, values)
-        noise, absorbed = _noise(factors, graph, found, values, marginals)
+        noise, absorbed = _noise(factors, fit)
         factors = DriveFactors(drive, models, noise)
-        graph = _graph(factors, values, robots)
-        values, more = gauss_newton(graph.factors, values)
-        iterations += more
-    found = _found(factors, values, gtsam.Marginals(graph.factors, values))
+        fit = _fitted(factors, fit.state)
+        iterations += fit.iterations
     taken = np.zeros(len(drive.measured), bool)
-    taken[graph.measured] = True
-    return summed_up(factors, found, taken, iterations, absorbed)
+    taken[fit.problem.measured] = True
+    return summed_up(factors, _found(factors, filtered, fit), taken, iterations, absorbed)
 
 
-def _start(filtered: Filtered, factors: DriveFactors, robots: Sequence[int]) -> gtsam.Values:
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Everything of the robots that have a place: `steps` from which poses, which are `measured`, in `slices`; `gauge`
+    is the pose that the world hangs on, with where it is, if no landmark fixes it."""
+
+    factors: DriveFactors
+    slices: Slices
+    steps: Index
+    measured: Index
+    gauge: tuple[int, Array] | None
+
+    def rows(self, state: State) -> tuple[list[Rows], float]:
+        """All factors linearised, but for what is known before, and what all of it costs (half chi2)."""
+        steps = self.factors.steps(state, self.steps)
+        measured, cost = robust(self.factors.measured(state, self.measured))
+        weights, off = self.factors.before(state)
+        cost += 0.5 * float((steps.residuals**2).sum() + (weights * off**2).sum())
+        rows = [steps, measured]
+        if self.gauge is not None:
+            rows.append(self.factors.gauge(state, *self.gauge))
+        return rows, cost
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The optimum: a state, the problem there eliminated, and the covariance of what is shared."""
+
+    problem: _Problem
+    state: State
+    eliminated: list[tuple[Array, Array]]
+    shared: Array
+    iterations: int
+
+
+def _start(filtered: Filtered, factors: DriveFactors) -> State:
     """Where the search starts: as the filter has it."""
-    values = gtsam.Values()
-    whole = filtered.whole(factors.drive, factors.models)
-    for robot in robots:
-        for k, pose in enumerate(whole[robot].tolist()):
-            values.insert(pose_key(robot, k), gtsam.Pose2(*pose))
-        for key, errors in (
-            (factors.wheels_variable(robot), filtered.wheels),
-            (factors.ranging_variable(robot), filtered.ranging),
-        ):
-            if key is not None:
-                values.insert(key, errors[robot])
-    for landmark, position in enumerate(filtered.landmarks):
-        if np.isfinite(position[0]) and not factors.is_exact(landmark):
-            values.insert(landmark_key(landmark), position)
-    return values
+    poses = np.concatenate(filtered.whole(factors.drive, factors.models))
+    shared = factors.start()
+    factors.wheels(shared)[:] = filtered.wheels
+    factors.ranging(shared)[:] = filtered.ranging
+    seen = np.isfinite(filtered.landmarks[:, 0])
+    factors.landmarks(shared)[seen] = filtered.landmarks[seen]
+    return State(poses, np.where(factors.free, shared, factors.start()))
 
 
-def _graph(factors: DriveFactors, values: gtsam.Values, robots: Sequence[int]) -> _Graph:
-    drive, m = factors.drive, factors.drive.measured
-    graph = gtsam.NonlinearFactorGraph()
+def _posed(factors: DriveFactors, state: State) -> _Problem:
+    placed = np.isfinite(state.poses[:, 0])
+    poses = np.flatnonzero(placed)
+    last = factors.first[1:][np.diff(factors.first) > 0] - 1
+    ends = placed[factors.observer] & (placed[factors.seen] | ~factors.of_robot)
+    gauge = None
     if not factors.models.map_known:
-        key = pose_key(robots[0], 0)
-        graph.add(factors.gauge(key, values.atPose2(key)))
-    landmarks = [n for n in range(len(drive.landmarks)) if values.exists(landmark_key(n))]
-    for factor in factors.priors(robots, landmarks):
-        graph.add(factor)
-    first_step = {}
-    for robot in robots:
-        first_step[robot] = graph.size()
-        for k in range(len(drive.times[robot]) - 1):
-            graph.add(factors.step(robot, k))
-    there = np.zeros(len(drive.robots) + len(drive.landmarks), bool)
-    there[list(robots)] = True
-    there[[len(drive.robots) + n for n in range(len(drive.landmarks)) if n in landmarks or factors.is_exact(n)]] = True
-    measured = np.flatnonzero(there[m.robot] & there[m.target])
-    for index in measured.tolist():
-        graph.add(factors.measured(index))
-    return _Graph(graph, first_step, measured)
+        gauge = int(poses[0]), state.poses[poses[0]].copy()
+    return _Problem(
+        factors,
+        Slices(factors, slices_of(factors), poses),
+        steps=np.setdiff1d(poses, last),
+        measured=np.flatnonzero(ends),
+        gauge=gauge,
+    )
 
 
-def _found(factors: DriveFactors, values: gtsam.Values, marginals: gtsam.Marginals | None = None) -> Found:
-    """What values hold, with covariances where their marginals are given."""
-    drive, models = factors.drive, factors.models
+def _fitted(factors: DriveFactors, state: State) -> _Fit:
+    """The optimum near a state by Gauss-Newton; `EstimationError` where the search does not end.
 
-    def covariance(key: int, size: int) -> Array:
-        return np.full((size, size), np.nan) if marginals is None else np.asarray(marginals.marginalCovariance(key))
-
-    def errors_of(key: int) -> tuple[Array, Array]:
-        errors = values.atVector(key)
-        return errors, covariance(key, len(errors))
-
-    poses, covariances, errors = [], [], []
-    for robot, times in enumerate(drive.times):
-        at, C = np.full((len(times), 3), np.nan), np.full((len(times), 3, 3), np.nan)
-        there = len(times) > 0 and values.exists(pose_key(robot, 0))
-        if there:
-            for k in range(len(times)):
-                pose = values.atPose2(pose_key(robot, k))
-                at[k] = pose.x(), pose.y(), pose.theta()
-                C[k] = covariance(pose_key(robot, k), 3)
-        poses.append(at)
-        covariances.append(C)
-        errors.append(factors.errors_in(robot, errors_of) if there else Errors(None, None))
-    landmarks = {}
-    for number in range(len(drive.landmarks)):
-        key = landmark_key(number)
-        if values.exists(key):
-            landmarks[number] = (np.asarray(values.atPoint2(key)), covariance(key, 2))
-        elif factors.is_exact(number):
-            landmarks[number] = (models.map[number], np.eye(2) * models.map_sigmas[number] ** 2)
-    return Found(poses, covariances, landmarks, errors)
-
-
-def _noise(
-    factors: DriveFactors, graph: _Graph, found: Found, values: gtsam.Values, marginals: gtsam.Marginals
-) -> tuple[Array, float]:
-    """What standard deviations are to be multiplied with, (robots, 3): of ranges, bearings, steps.
-
-    Of a sum of squared residuals the fit has taken away a part: that of the sampled ones. And how many degrees of
-    freedom the fit has left more than shares say: of a measurement with a share s, of which it has taken h, it has left
-    s (1 - h), and not s - h, since errors that last are not fitted as new ones would be.
+    Levenberg-Marquardt gains nothing here.
     """
-    absorbed = 0.0
-    drive, m = factors.drive, factors.drive.measured
-    off = measured_off(factors, found)[graph.measured]
+    problem = _posed(factors, state)
+    slices, free = problem.slices, factors.free
+    rows, cost = problem.rows(state)
+    enough = ENOUGH * len(factors)
+    for iteration in range(1, MOST_ITERATIONS + 1):
+        flat = slices.problem(rows)
+        slices.add_known(flat, *factors.before(state))
+        eliminated = slices.eliminate(flat)
+        of_shared, C = slices.shared(flat)
+        of_poses = slices.steps(eliminated, of_shared)
+        for halving in range(MOST_HALVINGS):
+            poses, shared = state.poses.copy(), state.shared.copy()
+            poses[slices.poses] += 0.5**halving * of_poses
+            shared[free] += 0.5**halving * of_shared
+            tried = State(poses, shared)
+            rows, after = problem.rows(tried)
+            if after <= cost + enough:
+                break
+        else:
+            raise EstimationError(f"the search leads nowhere after {iteration} steps (error {cost:.6g})")
+        gained, state, cost = cost - after, tried, after
+        if abs(gained) < enough and not halving:
+            return _Fit(problem, state, eliminated, C, iteration)
+    raise EstimationError(f"the search did not end in {MOST_ITERATIONS} steps (error {cost:.6g})")
+
+
+def whole_covariance(factors: DriveFactors, of_free: Array) -> Array:
+    """The covariance (m, m) of all that is shared, of that of what is free; the rest is exact."""
+    C = np.zeros((len(factors.free),) * 2)
+    C[np.ix_(factors.free, factors.free)] = of_free
+    return C
+
+
+def pose_covariances(poses: Array, joint: Array) -> Array:
+    """Covariances (n, 3, 3) in the body frame, of that of poses (n, 3) together with whatever comes after them."""
+    n = len(poses)
+    own = joint[: 3 * n, : 3 * n].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    R = np.zeros((n, 3, 3))
+    R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = c, s, -s, c, 1.0
+    return np.asarray(R @ own @ R.mT)
+
+
+def found_landmarks(
+    factors: DriveFactors, shared: Array, C: Array, there: Sequence[int]
+) -> dict[int, tuple[Array, Array]]:
+    """Positions and covariances of the landmarks that are there, and of those that are exact."""
+    return {
+        n: (factors.landmarks(shared)[n], factors.landmark_covariance(n, C))
+        for n in range(len(factors.drive.landmarks))
+        if n in there or factors.is_exact(n)
+    }
+
+
+def _found(factors: DriveFactors, filtered: Filtered, fit: _Fit) -> Found:
+    slices, state = fit.problem.slices, fit.state
+    covariances = np.full((len(factors), 3, 3), np.nan)
+    for n, joint in slices.covariances(fit.eliminated, fit.shared):
+        poses = slices.poses[slices.first[n] : slices.first[n + 1]]
+        covariances[poses] = pose_covariances(state.poses[poses], joint)
+    C = whole_covariance(factors, fit.shared)
+    errors = [
+        factors.errors_in(robot, state.shared, C) if robot in filtered.placed_at else Errors(None, None)
+        for robot in range(len(factors.drive.robots))
+    ]
+    seen = np.flatnonzero(np.isfinite(filtered.landmarks[:, 0])).tolist()
+    return Found(state, covariances, found_landmarks(factors, state.shared, C, seen), errors)
+
+
+def _noise(factors: DriveFactors, fit: _Fit) -> tuple[Array, float]:
+    """What standard deviations of ranges and bearings are to be multiplied with, (robots, 2).
+
+    Of a squared residual the fit has taken away a part. And how many degrees of freedom the fit has left more than
+    shares say: of a measurement with a share s, of which it has taken h, it has left s (1 - h), and not s - h, since
+    errors that last are not fitted as new ones would be.
+    """
+    m, index = factors.drive.measured, fit.problem.measured
+    taken = _taken(fit)
+    share, robots = m.share[index], m.robot[index]
+    off = measured_off(factors, fit.state)[index]
     good = np.abs(off).max(axis=1, initial=0.0) < DOUBTED
     noise = factors.noise.copy()
-    rng = np.random.default_rng(0)
-    for robot, first in graph.first_step.items():
-        own = np.flatnonzero((m.robot[graph.measured] == robot) & good)
-        if len(own):
-            share = m.share[graph.measured[own]]
-            some = rng.choice(own, min(SAMPLED, len(own)), replace=False)
-            taken = np.mean([_taken(graph.of_measured(int(n)), values, marginals) for n in some], axis=0)
-            mean = (share * off[own] ** 2).sum(axis=0) / share.sum(axis=0)
-            noise[robot, :2] *= np.sqrt(mean / np.maximum(1 - taken, LEAST_LEFT))
-            absorbed += float(((1 - share) * taken).sum())
-        steps = len(drive.times[robot]) - 1
-        if steps > 0:
-            some = rng.choice(steps, min(SAMPLED, steps), replace=False)
-            of_steps = [_taken(graph.factors.at(first + int(k)), values, marginals) for k in some]
-            left = 1 - float(np.mean(of_steps))
-            if left > LEAST_LEFT:
-                noise[robot, 2] *= float(np.sqrt((steps_off(factors, found, robot) ** 2).mean() / left))
-    return np.clip(noise, *NOISE_RANGE), absorbed
+    for robot in np.unique(robots[good]).tolist():
+        own = good & (robots == robot)
+        mean = (share[own] * off[own] ** 2).sum(axis=0) / share[own].sum(axis=0)
+        noise[robot] *= np.sqrt(mean / np.maximum(1 - taken[own].mean(axis=0), LEAST_LEFT))
+    return np.clip(noise, *NOISE_RANGE), float(((1 - share) * taken)[good].sum())
 
 
-def _taken(factor: gtsam.NonlinearFactor, values: gtsam.Values, marginals: gtsam.Marginals) -> Array:
-    """How much of a factor's squared residual the fit has taken away, by row, in units of its noise."""
-    A, _ = factor.linearize(values).jacobian()
-    taken: Array = np.einsum("ij,jk,ik->i", A, joint_covariance(marginals, list(map(int, factor.keys()))), A)
+def _taken(fit: _Fit) -> Array:
+    """How much of each measurement's squared residuals (n, 2) the fit has taken away, in units of their noise."""
+    problem, slices = fit.problem, fit.problem.slices
+    rows, _ = robust(problem.factors.measured(fit.state, problem.measured))
+    first = slices.slices(rows.columns)
+    order = np.argsort(first, kind="stable")
+    cuts = np.searchsorted(first[order], np.arange(slices.count + 1))
+    free = slices.is_free(rows.columns)
+    taken = np.empty((len(first), 2))
+    for n, joint in slices.covariances(fit.eliminated, fit.shared):
+        some = order[cuts[n] : cuts[n + 1]]
+        at = slices.within(rows.columns[some], n)
+        C = joint[at[:, :, None], at[:, None, :]]
+        A = rows.jacobians[some, :, :-1] * free[some][:, None, :]
+        taken[some] = np.einsum("nij,njk,nik->ni", A, C, A)
     return taken

@@ -33,7 +33,7 @@ class PlacedLandmark:
 @dataclass(frozen=True, eq=False)
 class Errors:
     """What is off of a robot's wheels (scale, turn scale, delay [s]) and sensor (offset [m], scale, bearing [rad], x,
-    y [m]), with covariances; None where it was stated without a tolerance."""
+    y [m], depth, offset of robots [m]), with covariances; None where it was stated without a tolerance."""
 
     wheels: tuple[Array, Array] | None
     ranging: tuple[Array, Array] | None
@@ -43,8 +43,8 @@ class Errors:
 class DriveEstimate:
     """Poses of all robots at their keyframes, landmarks, errors of wheels and sensors by robot.
 
-    `noise` (robots, 3) is what the standard deviations of ranges, bearings and steps were multiplied with to be those
-    of the residuals. `residuals` (n, 2) are of ranges and bearings in their sigmas, NaN where a measurement was not
+    `noise` (robots, 2) is what the standard deviations of ranges and bearings were multiplied with to be those of the
+    residuals. `residuals` (n, 2) are of ranges and bearings in their sigmas, NaN where a measurement was not
     taken in; `doubted` (n,) are those that all others contradict, which weigh next to nothing.
     `chi2` with `dof` degrees of freedom is of everything else, of what of it is new. `unplaced` are robots whose
     measurements do not say where they are. `on_map` says that the world is the landmarks' map.

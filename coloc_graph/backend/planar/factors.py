@@ -1,214 +1,208 @@
-"""GTSAM's factors of a drive: steps by the wheels, ranges and bearings, and what is known before."""
+"""The factors of a drive, linearised many at once: steps by the wheels, ranges and bearings, what is known before.
 
-import math
-from collections.abc import Callable, Iterable
+Variables are numbered: x, y and heading of all poses, robot after robot, then what all share: errors of wheels, errors
+of sensors, positions of landmarks. Poses change in the world's axes.
+"""
 
-import gtsam
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.planar.estimate import Errors
 from coloc_graph.backend.planar.filter import Models
-from coloc_graph.backend.planar.model import NO_ERRORS, NOTHING_OFF
+from coloc_graph.backend.planar.model import RANGING, WHEELS, wrapped
 from coloc_graph.keyframes import Drive
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
-POSE, LANDMARK, WHEELS, RANGING = (ord(letter) for letter in "xlwr")
 #: A landmark that is known better than this is where it is said to be [m].
 EXACT = 1e-3
-#: What is stated without a tolerance, beside what has one, is exact to this [m, rad, s, relative].
-LEAST_SIGMA = 1e-6
+#: And one of which nothing is said is this near the origin [m].
+ANYWHERE = 1e4
 #: The world's frame is fixed this firmly where no landmark fixes it [m, rad].
 GAUGE_SIGMA = 1e-4
 #: Beyond so many sigmas a measurement weighs less and less: a barcode that was read wrong is tens of sigmas off.
 CAUCHY = 3.0
 
 
-def pose_key(robot: int, keyframe: int) -> int:
-    """The key of a robot's keyframe, both by number."""
-    return int(gtsam.mrsymbol(POSE, robot + 1, keyframe))
+@dataclass(frozen=True, eq=False)
+class State:
+    """What is estimated: `poses` (n, 3) of all keyframes, NaN where there is none yet, and what is `shared` (m,)."""
+
+    poses: Array
+    shared: Array
 
 
-def landmark_key(number: int) -> int:
-    """The key of a landmark, by number."""
-    return int(gtsam.mrsymbol(LANDMARK, 1, number))
+class Rows(NamedTuple):
+    """Linearised factors of one kind: `jacobians` (n, rows, k + 1), whitened, whose last column are the residuals, and
+    the variables of the others, `columns` (n, k)."""
 
+    jacobians: Array
+    columns: Index
 
-def wheels_key(robot: int) -> int:
-    """The key of the errors of a robot's wheels."""
-    return int(gtsam.mrsymbol(WHEELS, robot + 1, 0))
-
-
-def ranging_key(robot: int) -> int:
-    """The key of the errors of a robot's sensor."""
-    return int(gtsam.mrsymbol(RANGING, robot + 1, 0))
+    @property
+    def residuals(self) -> Array:
+        """Whitened residuals (n, rows)."""
+        return self.jacobians[:, :, -1]
 
 
 class DriveFactors:
-    """Makes the factors of a drive. `noise` (robots, 3) multiplies the standard deviations of ranges, bearings, steps.
+    """The factors of a drive. `noise` (robots, 2) multiplies the standard deviations of ranges and bearings.
 
-    Residuals are whitened, so that all factors of a kind share a noise model; that of measurements is robust.
+    `first` (robots + 1,) says which pose is each robot's first, `times` (n,) when all were. `observer` (m,), `seen`
+    (m,) are the poses of who measured and of who was measured, -1 for landmarks. `free` says what of the shared is
+    estimated, and not exact.
     """
 
     def __init__(self, drive: Drive, models: Models, noise: Array | None = None) -> None:
         self.drive, self.models = drive, models
-        self.noise = np.ones((len(drive.robots), 3)) if noise is None else noise
-        self._has_wheels = [bool(row.any()) for row in models.wheels_sigmas]
-        self._has_ranging = [bool(row.any()) for row in models.ranging_sigmas]
-        self._exact: NDArray[np.bool_] = np.isfinite(models.map[:, 0]) & (models.map_sigmas < EXACT)
-        self._whiten: list[Array] = [
-            # e^T C^-1 e with C = L L^T
-            np.linalg.inv(np.linalg.cholesky(model.covariances)).reshape(-1, 3, 3) / self.noise[robot, 2]
-            for robot, model in enumerate(models.wheels)
-        ]
-        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY)
-        self._three = gtsam.noiseModel.Unit.Create(3)
-        self._two = gtsam.noiseModel.Robust.Create(cauchy, gtsam.noiseModel.Unit.Create(2))
+        robots, landmarks = len(drive.robots), len(drive.landmarks)
+        self.noise = np.ones((robots, 2)) if noise is None else noise
+        self.first: Index = np.cumsum([0, *map(len, drive.times)])
+        self.times = np.concatenate(drive.times)
+        self.robot: Index = np.repeat(np.arange(robots), np.diff(self.first))
+        m = drive.measured
+        self.of_robot = m.target < robots
+        self.observer: Index = self.first[m.robot] + m.keyframe
+        self.seen: Index = np.where(self.of_robot, self.first[np.minimum(m.target, robots)] + m.target_keyframe, -1)
+        known = np.isfinite(models.map[:, 0])
+        self._exact: NDArray[np.bool_] = known & (models.map_sigmas < EXACT)
+        self._ranging, self._marks = WHEELS * robots, (WHEELS + RANGING) * robots
+        sigmas = [models.wheels_sigmas.ravel(), models.ranging_sigmas.ravel()]
+        sigmas.append(np.repeat(np.where(known, models.map_sigmas, ANYWHERE), 2))
+        self._sigmas = np.concatenate(sigmas)
+        self.free: NDArray[np.bool_] = self._sigmas > 0
+        self.free[self._marks :] = ~np.repeat(self._exact, 2)
+        self._known_before = np.zeros(len(self.free))
+        self._known_before[self._marks :] = np.where(known[:, None], models.map, 0.0).ravel()
+        # e^T C^-1 e with C = L L^T
+        self._whiten = np.concatenate(
+            [np.linalg.inv(np.linalg.cholesky(each.covariances)).reshape(-1, 3, 3) for each in models.wheels]
+        )
+        self._step_first: Index = np.cumsum([0, *map(len, models.wheels)])
+        self._sigmas_measured = models.sensors.sigmas(m.robot, m.range)
+        self._landmark: Index = np.maximum(m.target - robots, 0) if landmarks else np.zeros(len(m), int)
 
-    def whiten(self, robot: int) -> Array:
-        """What makes a robot's steps (n, 3, 3) those of unit variance."""
-        return self._whiten[robot]
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def start(self) -> Array:
+        """What is shared, as it is known before; landmarks of unknown positions at the origin."""
+        return self._known_before.copy()
+
+    def wheels(self, shared: Array) -> Array:
+        """Errors of all wheels (robots, 3) among what is shared."""
+        return shared[: self._ranging].reshape(-1, WHEELS)
+
+    def ranging(self, shared: Array) -> Array:
+        """Errors of all sensors (robots, 7) among what is shared."""
+        return shared[self._ranging : self._marks].reshape(-1, RANGING)
+
+    def landmarks(self, shared: Array) -> Array:
+        """Positions of all landmarks (m, 2) [m] among what is shared."""
+        return shared[self._marks :].reshape(-1, 2)
 
     def is_exact(self, landmark: int) -> bool:
-        """Whether a landmark is where it is said to be, and so no variable."""
+        """Whether a landmark is where it is said to be, and so not estimated."""
         return bool(self._exact[landmark])
 
-    def step(self, robot: int, k: int) -> gtsam.CustomFactor:
-        """The wheels' word on the way of a robot from keyframe k to the next, on both and on the wheels' errors."""
-        model, W = self.models.wheels[robot], self._whiten[robot][k]
-        (w00, _, _), (w10, w11, _), (w20, w21, w22) = W.tolist()
-        a_key, b_key = pose_key(robot, k), pose_key(robot, k + 1)
-        errors_key = self.wheels_variable(robot)
-
-        def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-            a, b = values.atPose2(a_key), values.atPose2(b_key)
-            errors = NO_ERRORS if errors_key is None else values.atVector(errors_key)
-            yaw = a.theta()
-            c, s = math.cos(yaw), math.sin(yaw)
-            dx, dy = b.x() - a.x(), b.y() - a.y()
-            x, y = c * dx + s * dy, -s * dx + c * dy
-            delta, by_errors = model.step(k, errors)
+    def steps(self, state: State, poses: Index) -> Rows:
+        """The wheels' word on the ways from some poses (n,), ascending, each to its robot's next."""
+        a, b = state.poses[poses], state.poses[poses + 1]
+        c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+        dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
+        x, y = c * dx + s * dy, -s * dx + c * dy
+        robots = self.robot[poses]
+        errors = self.wheels(state.shared)
+        said, by_errors, units = np.empty((len(poses), 3)), np.empty((len(poses), 3, 3)), np.empty((len(poses), 3))
+        for robot in np.unique(robots).tolist():
+            own = robots == robot
+            model = self.models.wheels[robot]
+            said[own], by_errors[own] = model.steps(poses[own] - self.first[robot], errors[robot])
             # in units of what the wheels say: with the noise fixed in metres, a smaller world would have less of it
-            p, q = model.units(errors)
-            e0, e1 = p * (x - delta[0]), p * (y - delta[1])
-            e2 = q * math.remainder(b.theta() - yaw - delta[2], math.tau)
-            if jacobians is not None:
-                turn = b.theta() - yaw
-                ct, st = p * math.cos(turn), p * math.sin(turn)
-                jacobians[0] = W @ np.array([[-p, 0.0, p * y], [0.0, -p, -p * x], [0.0, 0.0, -q]])
-                jacobians[1] = W @ np.array([[ct, -st, 0.0], [st, ct, 0.0], [0.0, 0.0, q]])
-                if errors_key is not None:
-                    (x0, y0, w0), (x1, y1, w1), (x2, y2, w2) = by_errors
-                    jacobians[2] = W @ np.array(
-                        [
-                            [-p * (x0 + e0), -p * x1, -p * x2],
-                            [-p * (y0 + e1), -p * y1, -p * y2],
-                            [-q * w0, -q * (w1 + e2), -q * w2],
-                        ]
-                    )
-            return np.array([w00 * e0, w10 * e0 + w11 * e1, w20 * e0 + w21 * e1 + w22 * e2])
-
-        keys = [a_key, b_key] if errors_key is None else [a_key, b_key, errors_key]
-        return gtsam.CustomFactor(self._three, keys, error)
-
-    def measured(self, index: int) -> gtsam.CustomFactor:
-        """A range and bearing, on the pose it was measured from, the target's, and the errors of the sensor."""
-        m = self.drive.measured
-        robot, target = int(m.robot[index]), int(m.target[index])
-        model = self.models.ranging[robot]
-        range_, bearing = float(m.range[index]), float(m.bearing[index])
-        w_range, w_bearing = (
-            math.sqrt(share) / (sigma * scale)
-            for share, sigma, scale in zip(
-                m.share[index].tolist(), model.sigmas(range_), self.noise[robot, :2].tolist(), strict=True
-            )
+            p, q = 1 / (model.wheels.scale + errors[robot, 0]), 1 / (model.wheels.turn_scale + errors[robot, 1])
+            units[own] = p, p, q
+        off = units * np.stack([x - said[:, 0], y - said[:, 1], wrapped(b[:, 2] - a[:, 2] - said[:, 2])], axis=-1)
+        J = np.zeros((len(poses), 3, 10))
+        J[:, 0, 0], J[:, 0, 1], J[:, 0, 2] = -c, -s, y
+        J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = s, -c, -x
+        J[:, 2, 2] = -1.0
+        J[:, :2, 3:5] = -J[:, :2, :2]
+        J[:, 2, 5] = 1.0
+        J[:, :, 6:9] = -by_errors
+        J[:, :, :9] *= units[:, :, None]
+        J[:, 0, 6] -= units[:, 0] * off[:, 0]
+        J[:, 1, 6] -= units[:, 1] * off[:, 1]
+        J[:, 2, 7] -= units[:, 2] * off[:, 2]
+        J[:, :, 9] = off
+        columns = np.concatenate(
+            [3 * poses[:, None] + np.arange(6), self._shared(WHEELS * robots[:, None] + np.arange(WHEELS))], axis=1
         )
-        key = pose_key(robot, int(m.keyframe[index]))
-        landmark = target - len(self.drive.robots)
-        of_robot = landmark < 0
-        target_key: int | None = None
-        there = (0.0, 0.0)
-        if of_robot:
-            target_key = pose_key(target, int(m.target_keyframe[index]))
-        elif not self._exact[landmark]:
-            target_key = landmark_key(landmark)
-        else:
-            there = (float(self.models.map[landmark, 0]), float(self.models.map[landmark, 1]))
-        errors_key = self.ranging_variable(robot)
+        whiten = self._whiten[self._step_first[robots] + poses - self.first[robots]]
+        return Rows(whiten @ J, columns)
 
-        def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-            pose = values.atPose2(key)
-            errors = NOTHING_OFF if errors_key is None else values.atVector(errors_key)
-            target_yaw = 0.0
-            if target_key is None:
-                tx, ty = there
-            elif of_robot:
-                other = values.atPose2(target_key)
-                tx, ty, target_yaw = other.x(), other.y(), other.theta()
-            else:
-                tx, ty = values.atPoint2(target_key)
-            yaw = pose.theta()
-            c, s = math.cos(yaw), math.sin(yaw)
-            dx, dy = tx - pose.x(), ty - pose.y()
-            x, y = c * dx + s * dy, -s * dx + c * dy
-            expected = model.expected(x, y, errors)
-            if jacobians is not None:
-                rx, ry = (w_range * one for one in expected.range_by_xy)
-                bx, by = (w_bearing * one for one in expected.bearing_by_xy)
-                jacobians[0] = np.array([[-rx, -ry, rx * y - ry * x], [-bx, -by, bx * y - by * x]])
-                place = 1
-                if target_key is not None:
-                    # of the target's own axes, or the world's, in the body
-                    turn = target_yaw - yaw
-                    ct, st = math.cos(turn), math.sin(turn)
-                    rows = [[rx * ct + ry * st, -rx * st + ry * ct], [bx * ct + by * st, -bx * st + by * ct]]
-                    jacobians[1] = np.array([[*row, 0.0] for row in rows] if of_robot else rows)
-                    place = 2
-                if errors_key is not None:
-                    jacobians[place] = np.array(
-                        [
-                            [w_range * one for one in expected.range_by_errors()],
-                            [w_bearing * one for one in expected.bearing_by_errors()],
-                        ]
-                    )
-            off = math.remainder(expected.bearing - bearing, math.tau)
-            return np.array([w_range * (expected.range - range_), w_bearing * off])
+    def measured(self, state: State, index: Index) -> Rows:
+        """Some ranges and bearings (n,), with what of them is new."""
+        m = self.drive.measured
+        robots, observer, of_robot = m.robot[index], self.observer[index], self.of_robot[index]
+        seen, landmark = np.maximum(self.seen[index], 0), self._landmark[index]
+        pose, there = state.poses[observer], state.poses[seen, :2]
+        if len(self.drive.landmarks):
+            there = np.where(of_robot[:, None], there, self.landmarks(state.shared)[landmark])
+        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        dx, dy = (there - pose[:, :2]).T
+        xy = np.stack([c * dx + s * dy, -s * dx + c * dy], axis=-1)
+        expected = self.models.sensors.expected(robots, xy, self.ranging(state.shared)[robots], of_robot)
+        J = np.empty((len(index), 2, 6 + RANGING))
+        J[:, :, 3] = c[:, None] * expected.by_xy[:, :, 0] - s[:, None] * expected.by_xy[:, :, 1]
+        J[:, :, 4] = s[:, None] * expected.by_xy[:, :, 0] + c[:, None] * expected.by_xy[:, :, 1]
+        J[:, :, :2] = -J[:, :, 3:5]
+        J[:, :, 2] = expected.by_xy[:, :, 0] * xy[:, None, 1] - expected.by_xy[:, :, 1] * xy[:, None, 0]
+        J[:, :, 5:-1] = expected.by_errors
+        J[:, 0, -1] = expected.values[:, 0] - m.range[index]
+        J[:, 1, -1] = wrapped(expected.values[:, 1] - m.bearing[index])
+        J *= (np.sqrt(m.share[index]) / (self._sigmas_measured[index] * self.noise[robots]))[:, :, None]
+        target = np.where(of_robot, 3 * seen, self._shared(self._marks + 2 * landmark))
+        errors = self._shared(self._ranging + RANGING * robots[:, None] + np.arange(RANGING))
+        columns = [3 * observer[:, None] + np.arange(3), target[:, None] + np.arange(2), errors]
+        return Rows(J, np.concatenate(columns, axis=1))
 
-        keys = [key, *(one for one in (target_key, errors_key) if one is not None)]
-        return gtsam.CustomFactor(self._two, keys, error)
+    def before(self, state: State) -> tuple[Array, Array]:
+        """What is known before of what is shared and free: weights (m,) and how far it is off (m,)."""
+        return self._sigmas[self.free] ** -2.0, (state.shared - self._known_before)[self.free]
 
-    def priors(self, robots: Iterable[int], landmarks: Iterable[int]) -> list[gtsam.NonlinearFactor]:
-        """What is known before of some robots' wheels and sensors, and of some landmarks."""
-        factors: list[gtsam.NonlinearFactor] = []
-        for robot in robots:
-            for key, sigmas in (
-                (self.wheels_variable(robot), self.models.wheels_sigmas[robot]),
-                (self.ranging_variable(robot), self.models.ranging_sigmas[robot]),
-            ):
-                if key is not None:
-                    noise = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, LEAST_SIGMA))
-                    factors.append(gtsam.PriorFactorVector(key, np.zeros(len(sigmas)), noise))
-        for landmark in landmarks:
-            if np.isfinite(self.models.map[landmark, 0]) and not self._exact[landmark]:
-                isotropic = gtsam.noiseModel.Isotropic.Sigma(2, self.models.map_sigmas[landmark])
-                factors.append(gtsam.PriorFactorPoint2(landmark_key(landmark), self.models.map[landmark], isotropic))
-        return factors
+    def gauge(self, state: State, pose: int, at: Array) -> Rows:
+        """What fixes the world's frame where no landmark does: a pose (3,) that stays where it is."""
+        J = np.zeros((1, 3, 4))
+        J[0, :, :3], J[0, :, 3] = np.eye(3), state.poses[pose] - at
+        return Rows(J / GAUGE_SIGMA, 3 * np.array([[pose]]) + np.arange(3))
 
-    def gauge(self, key: int, pose: gtsam.Pose2) -> gtsam.NonlinearFactor:
-        """What fixes the world's frame where no landmark does."""
-        return gtsam.PriorFactorPose2(key, pose, gtsam.noiseModel.Isotropic.Sigma(3, GAUGE_SIGMA))
+    def errors_in(self, robot: int, shared: Array, covariance: Array) -> Errors:
+        """What is off of a robot's wheels and sensor, of the covariance (m, m) of all that is shared."""
+        found = []
+        for start, size, sigmas in (
+            (WHEELS * robot, WHEELS, self.models.wheels_sigmas[robot]),
+            (self._ranging + RANGING * robot, RANGING, self.models.ranging_sigmas[robot]),
+        ):
+            at = slice(start, start + size)
+            found.append((shared[at], covariance[at, at]) if sigmas.any() else None)
+        return Errors(*found)
 
-    def wheels_variable(self, robot: int) -> int | None:
-        """The key of the errors of a robot's wheels; None where they are exact."""
-        return wheels_key(robot) if self._has_wheels[robot] else None
+    def landmark_covariance(self, landmark: int, covariance: Array) -> Array:
+        """That of a landmark (2, 2), of the covariance (m, m) of all that is shared."""
+        at = slice(self._marks + 2 * landmark, self._marks + 2 * landmark + 2)
+        exact = np.eye(2) * self.models.map_sigmas[landmark] ** 2
+        return exact if self._exact[landmark] else covariance[at, at]
 
-    def ranging_variable(self, robot: int) -> int | None:
-        """The key of the errors of a robot's sensor; None where it is exact."""
-        return ranging_key(robot) if self._has_ranging[robot] else None
+    def _shared(self, numbers: Index) -> Index:
+        return 3 * len(self) + numbers
 
-    def errors_in(self, robot: int, variable: Callable[[int], tuple[Array, Array]]) -> Errors:
-        """What is off of a robot's wheels and sensor, given what is found of a variable by its key."""
-        keys = self.wheels_variable(robot), self.ranging_variable(robot)
-        wheels, ranging = (None if key is None else variable(key) for key in keys)
-        return Errors(wheels, ranging)
+
+def robust(rows: Rows) -> tuple[Rows, float]:
+    """Measurements as they weigh at their residuals, and what they cost together (half chi2)."""
+    squared = (rows.residuals**2).sum(axis=1) / CAUCHY**2
+    weighed = rows.jacobians / np.sqrt(1 + squared)[:, None, None]
+    return Rows(weighed, rows.columns), float(CAUCHY**2 / 2 * np.log1p(squared).sum())

@@ -12,7 +12,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.planar.model import Pose, RangingModel, WheelsModel, between, compose, wrapped
+from coloc_graph.backend.planar.model import (
+    RANGING,
+    WHEELS,
+    Pose,
+    Sensors,
+    WheelsModel,
+    between,
+    compose,
+    wrapped,
+)
 from coloc_graph.backend.planar.placing import Placing
 from coloc_graph.keyframes import Drive
 from coloc_graph.team import Ranging, Team, Wheels
@@ -29,7 +38,7 @@ PLACED, ANYWHERE = (0.15, 0.15, 0.1), 30.0
 class Filtered:
     """What a filter went through: `poses` (n, 3) of each robot's keyframes at their time, NaN before it was placed, and
     `covariances` (n, 3, 3) of x, y, heading; `landmarks` (m, 2) at the end, NaN where never seen; errors of wheels
-    (robots, 3) and ranging (robots, 5) at the end; which measurements were `used`."""
+    (robots, 3) and ranging (robots, 7) at the end; which measurements were `used`."""
 
     poses: list[Array]
     covariances: list[Array]
@@ -46,7 +55,7 @@ class Filtered:
             poses = poses.copy()
             first = self.placed_at.get(robot)
             for k in range((first or 0) - 1, -1, -1):
-                delta, _ = models.wheels[robot].step(k, self.wheels[robot].tolist())
+                delta, _ = models.wheels[robot].step(k, self.wheels[robot])
                 back = between(delta, (0.0, 0.0, 0.0))
                 poses[k] = compose(_pose(poses[k + 1]), back)
             out.append(poses)
@@ -61,21 +70,11 @@ class Models:
         self.wheels = [
             WheelsModel(steps, robot.wheels or Wheels()) for robot, steps in zip(robots, drive.steps, strict=True)
         ]
-        self.ranging = [
-            RangingModel(robot.ranging or Ranging(range_sigma=1.0, bearing_sigma_deg=1.0)) for robot in robots
-        ]
+        self.sensors = Sensors([robot.ranging or Ranging(range_sigma=1.0, bearing_sigma_deg=1.0) for robot in robots])
         self.wheels_sigmas = np.array(
             [(m.wheels.scale_sigma, m.wheels.turn_scale_sigma, m.wheels.delay_sigma) for m in self.wheels]
         )
-        self.ranging_sigmas = np.array(
-            [
-                (
-                    *(m.ranging.offset_sigma, m.ranging.scale_sigma),
-                    *(math.radians(m.ranging.bearing_offset_sigma_deg), m.ranging.place_sigma, m.ranging.place_sigma),
-                )
-                for m in self.ranging
-            ]
-        )
+        self.ranging_sigmas = self.sensors.tolerances
         positions = {one.name: one for one in team.landmarks}
         known = [positions[name] for name in drive.landmarks]
         self.map = np.array([one.position or (math.nan, math.nan) for one in known], float).reshape(-1, 2)
@@ -99,7 +98,8 @@ class Filter:
         self.drive, self.models = drive, Models(team, drive)
         robots, landmarks = len(drive.robots), len(drive.landmarks)
         self._robots = robots
-        self._wheels, self._ranging, self._marks = 3 * robots, 6 * robots, 11 * robots
+        self._wheels, self._ranging = 3 * robots, (3 + WHEELS) * robots
+        self._marks = self._ranging + RANGING * robots
         size = self._marks + 2 * landmarks
         self.mean, self.P = np.zeros(size), np.zeros((size, size))
         self.P[self._wheels : self._marks, self._wheels : self._marks] = np.diag(
@@ -122,8 +122,8 @@ class Filter:
             poses=[np.full((len(t), 3), np.nan) for t in drive.times],
             covariances=[np.full((len(t), 3, 3), np.nan) for t in drive.times],
             landmarks=np.full((landmarks, 2), np.nan),
-            wheels=np.zeros((robots, 3)),
-            ranging=np.zeros((robots, 5)),
+            wheels=np.zeros((robots, WHEELS)),
+            ranging=np.zeros((robots, RANGING)),
             used=np.zeros(len(drive.measured), bool),
         )
         if not self.models.map_known:
@@ -137,8 +137,8 @@ class Filter:
         for robot, times in enumerate(self.drive.times):
             self._go(robot, len(times) - 1)
         self.out.landmarks[self._known] = self.mean[self._marks :].reshape(-1, 2)[self._known]
-        self.out.wheels = self.mean[self._wheels : self._ranging].reshape(-1, 3).copy()
-        self.out.ranging = self.mean[self._ranging : self._marks].reshape(-1, 5).copy()
+        self.out.wheels = self.mean[self._wheels : self._ranging].reshape(-1, WHEELS).copy()
+        self.out.ranging = self.mean[self._ranging : self._marks].reshape(-1, RANGING).copy()
         return self.out
 
     def take(self, index: int) -> None:
@@ -159,9 +159,8 @@ class Filter:
 
     def _ready(self, robot: int, target: int, range_: float, bearing: float) -> bool:
         """Whether both ends of a measurement have a place; else it may help to find one."""
-        model = self.models.ranging[robot]
-        seen = model.place(range_, bearing)
         is_robot = target < self._robots
+        seen = self.models.sensors.place(robot, range_, bearing, is_robot)
         if not self._placed[robot]:
             if is_robot and self._placed[target]:
                 self._place(robot, compose(self._own[robot], (*seen, 0.0))[:2], self._pose(target)[:2])
@@ -203,12 +202,12 @@ class Filter:
     def _go(self, robot: int, k: int) -> None:
         """Follow a robot's wheels up to a keyframe."""
         model = self.models.wheels[robot]
-        of_errors = slice(self._wheels + 3 * robot, self._wheels + 3 * robot + 3)
+        of_errors = slice(self._wheels + WHEELS * robot, self._wheels + WHEELS * (robot + 1))
         at = slice(3 * robot, 3 * robot + 3)
         while self._at[robot] < k:
             step = self._at[robot]
             self._at[robot] += 1
-            delta, by_errors = model.step(step, self.mean[of_errors].tolist())
+            delta, by_errors = model.step(step, self.mean[of_errors])
             if not self._placed[robot]:
                 self._own[robot] = compose(self._own[robot], delta)
                 continue
@@ -218,8 +217,8 @@ class Filter:
             F = np.eye(3)
             F[0, 2], F[1, 2] = -s * delta[0] - c * delta[1], c * delta[0] - s * delta[1]
             self.mean[at] = compose(self._pose(robot), delta)
-            rows = F @ self.P[at] + (R @ np.array(by_errors).T) @ self.P[of_errors]
-            own = rows[:, at] @ F.T + rows[:, of_errors] @ (R @ np.array(by_errors).T).T
+            rows = F @ self.P[at] + (R @ by_errors) @ self.P[of_errors]
+            own = rows[:, at] @ F.T + rows[:, of_errors] @ (R @ by_errors).T
             self.P[at], self.P[:, at] = rows, rows.T
             self.P[at, at] = own + R @ model.covariances[step] @ R.T
             self._note(robot)
@@ -227,25 +226,22 @@ class Filter:
     def _update(self, robot: int, target: int, range_: float, bearing: float, share: list[float]) -> bool:
         is_robot = target < self._robots
         to = 3 * target if is_robot else self._marks + 2 * (target - self._robots)
-        errors = self._ranging + 5 * robot
-        pose, model = self._pose(robot), self.models.ranging[robot]
+        errors = slice(self._ranging + RANGING * robot, self._ranging + RANGING * (robot + 1))
+        pose, one = self._pose(robot), np.array([robot])
         dx, dy = float(self.mean[to]) - pose[0], float(self.mean[to + 1]) - pose[1]
         c, s = math.cos(pose[2]), math.sin(pose[2])
         x, y = c * dx + s * dy, -s * dx + c * dy
-        expected = model.expected(x, y, self.mean[errors : errors + 5].tolist())
-        rows = []
-        for (bx, by), by_errors in (
-            (expected.range_by_xy, expected.range_by_errors()),
-            (expected.bearing_by_xy, expected.bearing_by_errors()),
-        ):
-            wx, wy = c * bx - s * by, s * bx + c * by
-            rows.append([-wx, -wy, bx * y - by * x, wx, wy, *by_errors])
-        H = np.array(rows)
-        columns = [3 * robot, 3 * robot + 1, 3 * robot + 2, to, to + 1, *range(errors, errors + 5)]
+        sensors = self.models.sensors
+        expected = sensors.expected(one, np.array([[x, y]]), self.mean[errors][None], np.array([is_robot]))
+        by_xy = expected.by_xy[0]
+        by_target = by_xy @ np.array([[c, s], [-s, c]])
+        H = np.hstack([-by_target, by_xy @ np.array([[y], [-x]]), by_target, expected.by_errors[0]])
+        columns = [3 * robot, 3 * robot + 1, 3 * robot + 2, to, to + 1, *range(errors.start, errors.stop)]
         PH = self.P[:, columns] @ H.T
-        sigmas = model.sigmas(range_)
+        sigmas = sensors.sigmas(one, np.array([range_]))[0]
         S = H @ PH[columns] + np.diag(np.square(sigmas) / share)
-        off = np.array([range_ - expected.range, wrapped(bearing - expected.bearing)])
+        off = np.array([range_, bearing]) - expected.values[0]
+        off[1] = wrapped(off[1])
         gain = np.linalg.solve(S, PH.T).T
         if off @ np.linalg.solve(S, off) > GATE:
             return False

@@ -1,4 +1,4 @@
-"""A drive as it happens: ISAM2 over the last seconds, whose older poses are summed up: `IncrementalDrive`.
+"""A drive as it happens: the most likely of the last while, and what came before summed up: `IncrementalDrive`.
 
 A filter goes along for where robots and landmarks first appear. What is estimated of a keyframe is kept twice: at its
 time, and as it leaves the window, by when what came after it has had its say.
@@ -6,27 +6,30 @@ time, and as it leaves the window, by when what came after it has had its say.
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.planar.batch import found_landmarks, pose_covariances, whole_covariance
 from coloc_graph.backend.planar.estimate import DriveEstimate, Errors, trajectory
-from coloc_graph.backend.planar.factors import DriveFactors, landmark_key, pose_key
+from coloc_graph.backend.planar.factors import DriveFactors, State, robust
 from coloc_graph.backend.planar.filter import Filter
 from coloc_graph.backend.planar.model import compose
+from coloc_graph.backend.planar.slices import Slices, Summary, slices_of
 from coloc_graph.backend.planar.summary import Found, summed_up
 from coloc_graph.keyframes import Drive
 from coloc_graph.team import Team
 from coloc_graph.trajectory import Trajectory
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 #: Poses this far back are still corrected [s], and what came in meanwhile is taken in so often [s].
-LAG, EVERY = 20.0, 1.0
-#: Covariances of a robot's keyframes closer than this [s] are those of the first of them: they change slowly.
-ALIKE = 0.5
-#: A variable is linearised anew where it has changed by more than this: poses [m, rad], errors and landmarks.
-MOVED, TURNED, CHANGED = 0.1, 0.05, 0.05
+LAG, EVERY = 40.0, 1.0
+#: Slices leave so many at a time: each time, covariances of all are worked out.
+LEAVING = 4
+#: Until so long after the first keyframe none leaves [s]: wheels and sensors are being calibrated, and what has left
+#: would stay as it was thought before.
+CALIBRATING = 300.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,216 +40,220 @@ class Latest:
     poses: dict[str, tuple[Array, Array]]
 
 
-class IncrementalDrive:
-    """Estimates a drive in the order of time: `advance` takes in what was measured until a time."""
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """A window at its newest step: what is in it, eliminated, and the covariance of what is shared."""
 
-    def __init__(self, team: Team, drive: Drive, *, lag: float = LAG) -> None:
-        self.drive, self._lag = drive, lag
+    slices: Slices
+    eliminated: list[tuple[Array, Array]]
+    shared: Array
+
+
+class IncrementalDrive:
+    """Estimates a drive in the order of time: `advance` takes in what was measured until a time.
+
+    Poses are corrected for `lag` [s] after their time, and all of them until `calibrating` [s] after the first.
+    """
+
+    def __init__(self, team: Team, drive: Drive, *, lag: float = LAG, calibrating: float = CALIBRATING) -> None:
+        self.drive, self._lag, self._calibrating = drive, lag, calibrating
         self._filter = Filter(team, drive)
-        self._factors = DriveFactors(drive, self._filter.models)
-        parameters = gtsam.ISAM2Params()
-        parameters.setFactorization("CHOLESKY")
-        parameters.relinearizeSkip = 1
-        parameters.findUnusedFactorSlots = True
-        thresholds = gtsam.ISAM2ThresholdMap()
-        for kind, size in (
-            ("x", [MOVED, MOVED, TURNED]),
-            ("l", [CHANGED] * 2),
-            ("w", [CHANGED] * 3),
-            ("r", [CHANGED] * 5),
-        ):
-            thresholds.insert((kind, np.array(size)))
-        parameters.setRelinearizeThreshold(thresholds)
-        self._smoother = gtsam.IncrementalFixedLagSmoother(lag, parameters)
-        robots = len(drive.robots)
-        self._entered = [0] * robots  # how many keyframes of each are in
-        self._left = [0] * robots  # and how many have left again
-        self._newest: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0)] * robots
+        self._factors = factors = DriveFactors(drive, self._filter.models)
+        self._slice = slices_of(factors)
+        self._state = State(np.full((len(factors), 3), np.nan), factors.start())
+        self._entered = [0] * len(drive.robots)  # how many keyframes of each are in, or have been
+        self._inside = np.zeros(len(factors), bool)
+        self._window = 0  # the first slice that has not left
+        self._before: Summary | None = None
+        self._gauge: tuple[int, Array] | None = None
         self._landmarks: set[int] = set()
         self._next = 0
-        self._waiting: list[int] = []
         self._taken = np.zeros(len(drive.measured), bool)
-        self._smoothed = [np.full((len(times), 3), np.nan) for times in drive.times]
-        self._online = [np.full((len(times), 3), np.nan) for times in drive.times]
-        self._smoothed_C = [np.full((len(times), 3, 3), np.nan) for times in drive.times]
-        self._online_C = [np.full((len(times), 3, 3), np.nan) for times in drive.times]
+        self._solved: _Solved | None = None
+        self._smoothed, self._online = (np.full((len(factors), 3), np.nan) for _ in range(2))
+        self._smoothed_C, self._online_C = (np.full((len(factors), 3, 3), np.nan) for _ in range(2))
 
     def advance(self, time: float) -> Latest:
         """Take in all that was measured before a time [UTC s]; where the robots are then."""
         m = self.drive.measured
         while self._next < len(m) and m.time[self._next] < time:
             self._filter.take(self._next)
-            self._waiting.append(self._next)
             self._next += 1
-        graph, values, stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), dict[int, float]()
-        first = self._enter_robots(time, graph, values, stamps)
-        self._enter_measured(time, graph, values, stamps)
-        for robot, count in enumerate(self._entered):
-            if count:
-                stamps[pose_key(robot, count - 1)] = time
-                variables = self._factors.wheels_variable(robot), self._factors.ranging_variable(robot)
-                stamps |= {key: time for key in variables if key is not None}
-        stamps |= {landmark_key(number): time for number in self._landmarks}
-        if not stamps:
-            return Latest(time, {})
-        self._note_leaving(time)
-        self._smoother.update(graph, values, gtsam.FixedLagSmootherKeyTimestampMap(stamps))
-        return self._latest(time, first)
-
-    def _enter_robots(
-        self, time: float, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[int, float]
-    ) -> list[int]:
-        """New keyframes of the robots that have a place; how many each had before."""
-        drive, factors = self.drive, self._factors
         before = list(self._entered)
-        for robot, times in enumerate(drive.times):
-            if robot not in self._filter.out.placed_at:
-                continue
-            until = int(np.searchsorted(times, time))
-            if not self._entered[robot] and until:
-                self._enter_first(robot, until, graph, values, stamps, time)
-            model = factors.models.wheels[robot]
-            errors = self._errors(robot)
-            for k in range(self._entered[robot], until):
-                delta, _ = model.step(k - 1, errors)
-                self._newest[robot] = compose(self._newest[robot], delta)
-                values.insert(pose_key(robot, k), gtsam.Pose2(*self._newest[robot]))
-                graph.add(factors.step(robot, k - 1))
-                stamps[pose_key(robot, k)] = float(times[k])
-            self._entered[robot] = max(until, self._entered[robot])
-        return before
-
-    def _enter_first(
-        self,
-        robot: int,
-        until: int,
-        graph: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        stamps: dict[int, float],
-        time: float,
-    ) -> None:
-        """All keyframes so far of a robot that has just been placed, its errors, and what is known of them."""
-        factors = self._factors
-        for key, size in ((factors.wheels_variable(robot), 3), (factors.ranging_variable(robot), 5)):
-            if key is not None:
-                values.insert(key, np.zeros(size))
-        for prior in factors.priors([robot], []):
-            graph.add(prior)
-        poses = self._filter.out.whole(self.drive, factors.models)[robot]
-        if not factors.models.map_known and not any(self._entered):
-            graph.add(factors.gauge(pose_key(robot, 0), gtsam.Pose2(*poses[0].tolist())))
-        known = min(until, int(np.isfinite(poses[:, 0]).sum()))
-        for k in range(known):
-            values.insert(pose_key(robot, k), gtsam.Pose2(*poses[k].tolist()))
-            stamps[pose_key(robot, k)] = time
-            if k:
-                graph.add(factors.step(robot, k - 1))
-        x, y, yaw = poses[known - 1].tolist()
-        self._entered[robot], self._newest[robot] = known, (x, y, yaw)
-
-    def _enter_measured(
-        self, time: float, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[int, float]
-    ) -> None:
-        """What was measured between what is in; what is measured of robots without a place waits for it."""
-        m, robots, factors = self.drive.measured, len(self.drive.robots), self._factors
-        waiting = []
-        for index in self._waiting:
-            ends = [(int(m.robot[index]), int(m.keyframe[index]))]
-            target = int(m.target[index])
-            if target < robots:
-                ends.append((target, int(m.target_keyframe[index])))
-            if any(k < self._left[robot] for robot, k in ends):
-                continue  # it came too late
-            if any(k >= self._entered[robot] for robot, k in ends):
-                waiting.append(index)
-                continue
-            landmark = target - robots
-            if landmark >= 0 and not factors.is_exact(landmark) and landmark not in self._landmarks:
-                place = self._filter.landmark(landmark)
-                if place is None:
-                    waiting.append(index)
-                    continue
-                values.insert(landmark_key(landmark), place)
-                self._landmarks.add(landmark)
-                for prior in factors.priors([], [landmark]):
-                    graph.add(prior)
-            graph.add(factors.measured(index))
-            self._taken[index] = True
-        self._waiting = waiting
-
-    def _errors(self, robot: int) -> Array:
-        key = self._factors.wheels_variable(robot)
-        if key is None or not self._smoother.getLinearizationPoint().exists(key):
-            return np.zeros(3)
-        return np.asarray(self._smoother.calculateEstimateVector(key))
-
-    def _note_leaving(self, time: float) -> None:
-        """Keep what is estimated of keyframes that the next update leaves behind."""
-        for robot, times in enumerate(self.drive.times):
-            last = self._entered[robot] - 1
-            while self._left[robot] < last and times[self._left[robot]] < time - self._lag:
-                k = self._left[robot]
-                if not self._note(self._smoothed, self._smoothed_C, robot, k):
-                    break
-                self._left[robot] += 1
-
-    def _note(self, poses: list[Array], covariances: list[Array], robot: int, k: int) -> bool:
-        key = pose_key(robot, k)
-        if not self._smoother.getLinearizationPoint().exists(key):
-            return False
-        pose = self._smoother.calculateEstimatePose2(key)
-        poses[robot][k] = pose.x(), pose.y(), pose.theta()
-        times, C = self.drive.times[robot], covariances[robot]
-        first = int(np.searchsorted(times, times[k] - ALIKE))
-        if first < k and np.isfinite(C[first, 0, 0]) and np.array_equal(C[first], C[k - 1]):
-            C[k] = C[k - 1]
-        else:
-            C[k] = self._smoother.marginalCovariance(key)
-        return True
-
-    def _latest(self, time: float, before: list[int]) -> Latest:
-        """Where the robots are, and what is to be kept of their new keyframes."""
+        self._enter_robots(time)
+        self._enter_landmarks()
+        if self._inside.any():
+            self._solved = self._step()
+            self._note_latest(before)
+            self._leave(time)
         latest = {}
-        for robot, name in enumerate(self.drive.robots):
-            k = self._entered[robot] - 1
-            if k >= before[robot]:
-                self._note(self._online, self._online_C, robot, k)
-            if k >= 0:
-                x, y, yaw = self._online[robot][k].tolist()
-                self._newest[robot] = x, y, yaw
-                latest[name] = self._online[robot][k], self._online_C[robot][k]
+        for robot, (name, count) in enumerate(zip(self.drive.robots, self._entered, strict=True)):
+            if count:
+                last = int(self._factors.first[robot]) + count - 1
+                latest[name] = self._online[last], self._online_C[last]
         return Latest(time, latest)
 
-    def _found(self) -> Found:
-        smoother, factors, models = self._smoother, self._factors, self._factors.models
+    def _enter_robots(self, time: float) -> None:
+        """New keyframes of the robots that have a place: as the filter has the first ones, then by their wheels."""
+        factors, poses = self._factors, self._state.poses
+        for robot, times in enumerate(self.drive.times):
+            if robot not in self._filter.out.placed_at:
+                continue
+            first, until = int(factors.first[robot]), int(np.searchsorted(times, time))
+            entered = self._entered[robot]
+            if not entered and until:
+                whole = self._filter.out.whole(self.drive, factors.models)[robot][:until]
+                entered = max(int(np.isfinite(whole[:, 0]).sum()), 1)
+                poses[first : first + entered] = whole[:entered]
+                if not factors.models.map_known and self._gauge is None:
+                    self._gauge = first, poses[first].copy()
+            if until > entered:
+                deltas, _ = factors.models.wheels[robot].steps(
+                    slice(entered - 1, until - 1), factors.wheels(self._state.shared)[robot]
+                )
+                for k, (x, y, yaw) in enumerate(deltas.tolist(), start=first + entered):
+                    a, b, c = poses[k - 1].tolist()
+                    poses[k] = compose((a, b, c), (x, y, yaw))
+            new = np.arange(first + self._entered[robot], first + max(until, entered))
+            self._inside[new] = self._slice[new] >= self._window
+            self._entered[robot] = max(until, entered)
 
-        def variable(key: int) -> tuple[Array, Array]:
-            return smoother.calculateEstimateVector(key), smoother.marginalCovariance(key)
-
-        errors = [
-            factors.errors_in(robot, variable) if count else Errors(None, None)
-            for robot, count in enumerate(self._entered)
-        ]
-        landmarks = {}
+    def _enter_landmarks(self) -> None:
+        """Landmarks that the filter has a place for since the last time."""
         for number in range(len(self.drive.landmarks)):
-            key = landmark_key(number)
-            if number in self._landmarks:
-                landmarks[number] = (smoother.calculateEstimatePoint2(key), smoother.marginalCovariance(key))
-            elif factors.is_exact(number):
-                landmarks[number] = (models.map[number], np.eye(2) * models.map_sigmas[number] ** 2)
-        return Found(self._smoothed, self._smoothed_C, landmarks, errors)
+            place = self._filter.landmark(number)
+            if place is not None and number not in self._landmarks and not self._factors.is_exact(number):
+                self._factors.landmarks(self._state.shared)[number] = place
+                self._landmarks.add(number)
+
+    def _steps(self, inside: NDArray[np.bool_]) -> Index:
+        """The steps between poses, from which they are."""
+        factors = self._factors
+        ends: Index = np.flatnonzero(inside[:-1] & inside[1:])
+        steps: Index = ends[factors.robot[ends] == factors.robot[ends + 1]]
+        return steps
+
+    def _measured(self, inside: NDArray[np.bool_]) -> Index:
+        """The measurements so far between poses, or of landmarks that have a place."""
+        factors, m = self._factors, self.drive.measured
+        earliest = factors.times[inside].min() - 1.0
+        index = np.arange(np.searchsorted(m.time, earliest), self._next)
+        landmark = m.target[index] - len(self.drive.robots)
+        placed = np.array([n in self._landmarks or factors.is_exact(n) for n in range(len(self.drive.landmarks))], bool)
+        there = inside[factors.seen[index]]
+        if len(placed):
+            there = np.where(landmark < 0, there, placed[np.maximum(landmark, 0)])
+        found: Index = index[inside[factors.observer[index]] & there]
+        return found
+
+    def _problem(self, slices: Slices, steps: Index, measured: Index) -> Array:
+        """Some factors in the window, and what is summed up of those before it, at what is estimated."""
+        factors, state = self._factors, self._state
+        rows = [factors.steps(state, steps), robust(factors.measured(state, measured))[0]]
+        if self._before is None and self._gauge is not None:
+            rows.append(factors.gauge(state, *self._gauge))
+        problem = slices.problem(rows)
+        if self._before is None:
+            slices.add_known(problem, *factors.before(state))
+        else:
+            slices.add_summary(problem, self._before, self._at(self._before.poses))
+        return problem
+
+    def _at(self, poses: Index) -> Array:
+        """What is estimated of some poses and of what is shared, as one vector."""
+        return np.concatenate([self._state.poses[poses].ravel(), self._state.shared[self._factors.free]])
+
+    def _step(self) -> _Solved:
+        """One step of Gauss-Newton in the window: it was at its optimum a moment ago."""
+        slices = Slices(self._factors, self._slice, np.flatnonzero(self._inside))
+        measured = self._measured(self._inside)
+        self._taken[measured] = True
+        problem = self._problem(slices, self._steps(self._inside), measured)
+        eliminated = slices.eliminate(problem)
+        shared, C = slices.shared(problem)
+        self._state.poses[slices.poses] += slices.steps(eliminated, shared)
+        self._state.shared[self._factors.free] += shared
+        return _Solved(slices, eliminated, C)
+
+    def _leave(self, time: float) -> None:
+        """Keep what is estimated of slices that are over for longer than the lag, and sum up what they say."""
+        solved, factors, times = self._solved, self._factors, self._factors.times
+        if solved is None or time < times.min() + self._calibrating:
+            return
+        ending = np.flatnonzero(self._inside & (times < time - self._lag))
+        if not len(ending):
+            return
+        until = int(self._slice[ending].max())  # which may not be over
+        leaving = min(until - solved.slices.base, solved.slices.count - 1)
+        if leaving < LEAVING:
+            return
+        self._note_leaving(leaving)
+        # the first slice that stays: there is none where nothing was measured for a while
+        window = int(self._slice[self._inside & (self._slice >= solved.slices.base + leaving)].min())
+        near = self._inside & (self._slice <= window)
+        gone = near & (self._slice < window)
+        slices = Slices(factors, self._slice, np.flatnonzero(near))
+        steps, measured = self._steps(near), self._measured(near)
+        seen = gone[factors.seen[measured]] & factors.of_robot[measured]
+        problem = self._problem(
+            slices, steps[gone[steps] | gone[steps + 1]], measured[gone[factors.observer[measured]] | seen]
+        )
+        slices.eliminate(problem, slices.count - 1)
+        poses, information, gradient = slices.remaining(problem)
+        self._before = Summary(poses, information, gradient, self._at(poses))
+        self._inside &= ~gone
+        self._window = window
+
+    def _note_leaving(self, leaving: int) -> None:
+        """Keep poses of the first so many slices, as they are."""
+        solved = self._solved
+        assert solved is not None
+        slices = solved.slices
+        for n, joint in slices.covariances(solved.eliminated, solved.shared):
+            if n < leaving:
+                poses = slices.poses[slices.first[n] : slices.first[n + 1]]
+                self._smoothed[poses] = self._state.poses[poses]
+                self._smoothed_C[poses] = pose_covariances(self._state.poses[poses], joint)
+
+    def _note_latest(self, before: list[int]) -> None:
+        """Keep what is thought of each robot's newest keyframe at its time."""
+        solved = self._solved
+        assert solved is not None
+        wanted = {
+            int(self._factors.first[robot]) + count - 1
+            for robot, (count, had) in enumerate(zip(self._entered, before, strict=True))
+            if count > had
+        }
+        for n, joint in solved.slices.covariances(solved.eliminated, solved.shared):
+            poses = solved.slices.poses[solved.slices.first[n] : solved.slices.first[n + 1]]
+            some = np.isin(poses, list(wanted))
+            self._online[poses[some]] = self._state.poses[poses[some]]
+            self._online_C[poses[some]] = pose_covariances(self._state.poses[poses], joint)[some]
+            wanted -= set(poses.tolist())
+            if not wanted:
+                return
 
     def finish(self) -> tuple[DriveEstimate, dict[str, Trajectory]]:
         """The estimate of all keyframes as they left, and, by robot, what was thought of each at its time."""
-        for robot, count in enumerate(self._entered):
-            for k in range(self._left[robot], count):
-                self._note(self._smoothed, self._smoothed_C, robot, k)
-        estimate = summed_up(self._factors, self._found(), self._taken, 0)
+        factors, state = self._factors, self._state
+        C = np.zeros((len(factors.free),) * 2)
+        if self._solved is not None:
+            self._solved = self._step()
+            self._note_leaving(self._solved.slices.count)
+            C = whole_covariance(factors, self._solved.shared)
+        errors = [
+            factors.errors_in(robot, state.shared, C) if count else Errors(None, None)
+            for robot, count in enumerate(self._entered)
+        ]
+        landmarks = found_landmarks(factors, state.shared, C, sorted(self._landmarks))
+        found = Found(State(self._smoothed, state.shared), self._smoothed_C, landmarks, errors)
+        estimate = summed_up(factors, found, self._taken, 0)
         online = {}
         for robot, name in enumerate(self.drive.robots):
-            there = np.isfinite(self._online[robot][:, 0])
+            own = slice(factors.first[robot], factors.first[robot + 1])
+            there = np.isfinite(self._online[own, 0])
             if there.any():
                 online[name] = trajectory(
-                    name, self.drive.times[robot][there], self._online[robot][there], self._online_C[robot][there]
+                    name, self.drive.times[robot][there], self._online[own][there], self._online_C[own][there]
                 )
         return estimate, online

@@ -1,12 +1,10 @@
-"""What wheels and a sensor of range and bearing measure of poses on the floor, with derivatives.
+"""What wheels and a sensor of range and bearing measure of poses on the floor, with derivatives, for many at once.
 
 Poses are (x [m], y [m], heading [rad]). Calibration errors are what is off what the team states: of wheels (scale, turn
-scale, delay [s]), of ranging (offset [m], scale, bearing [rad], x, y of the sensor [m]). In plain floats, since there
-are tens of thousands of them.
+scale, delay [s]), of ranging (offset [m], scale, bearing [rad], x, y of the sensor [m], depth, offset of robots [m]).
 """
 
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,13 +17,17 @@ from coloc_graph.team import Ranging, Wheels
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
 
-#: Nothing is off.
-NO_ERRORS, NOTHING_OFF = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0)
+#: How many errors wheels have, and a sensor.
+WHEELS, RANGING = 3, 7
+#: Less of a turn than this in a step is none [rad].
+STRAIGHT = 1e-6
+#: A depth is at least this part of the distance: what is beside a camera is not seen by it.
+LEAST_PART = 0.1
 
 
-def wrapped(angle: float) -> float:
-    """The same angle [rad] from -pi to pi."""
-    return math.remainder(angle, math.tau)
+def wrapped(angles: Array) -> Array:
+    """The same angles [rad] from -pi to pi."""
+    return (angles + np.pi) % (2 * np.pi) - np.pi
 
 
 def compose(a: Pose, b: Pose) -> Pose:
@@ -46,101 +48,109 @@ class WheelsModel:
 
     def __init__(self, steps: Steps, wheels: Wheels) -> None:
         self.wheels = wheels
-        self._delays = steps.delays.tolist()
-        self._twists = steps.twists.transpose(1, 0, 2).tolist()  # of each step, at each delay
+        self._delays, self._twists = steps.delays, steps.twists
         self.covariances = steps.covariances
 
     def __len__(self) -> int:
-        return len(self._twists)
+        return int(self._twists.shape[1])
 
-    def step(self, k: int, errors: Sequence[float] | Array) -> tuple[Pose, tuple[Pose, Pose, Pose]]:
-        """The pose of keyframe k + 1 in k, and by how much it changes with each error."""
-        twist, slope = self._twist(k, self.wheels.delay + errors[2])
-        scale, turn_scale = self.wheels.scale + errors[0], self.wheels.turn_scale + errors[1]
-        x, y, w = scale * twist[0], scale * twist[1], turn_scale * twist[2]
-        if abs(w) > 1e-6:
-            sine, cosine = math.sin(w), math.cos(w)
-            a, b = sine / w, (1 - cosine) / w
-            a_by_w, b_by_w = (cosine - a) / w, (sine - b) / w
-        else:
-            a, b, a_by_w, b_by_w = 1.0, w / 2, -w / 3, 0.5
-        by_w = (a_by_w * x - b_by_w * y, b_by_w * x + a_by_w * y)
-        by_scale = (a * twist[0] - b * twist[1], b * twist[0] + a * twist[1], 0.0)
-        by_turn = (twist[2] * by_w[0], twist[2] * by_w[1], twist[2])
-        dx, dy, dw = scale * slope[0], scale * slope[1], turn_scale * slope[2]
-        by_delay = (a * dx - b * dy + by_w[0] * dw, b * dx + a * dy + by_w[1] * dw, dw)
-        return (a * x - b * y, b * x + a * y, w), (by_scale, by_turn, by_delay)
+    def steps(self, k: NDArray[np.int64] | slice, errors: Array) -> tuple[Array, Array]:
+        """Poses (n, 3) of keyframes k + 1 in k, and by how much they change with each error (n, 3, 3)."""
+        twists, slopes = self._twist(k, self.wheels.delay + float(errors[2]))
+        scales = np.array([self.wheels.scale + errors[0]] * 2 + [self.wheels.turn_scale + errors[1]])
+        x, y, w = (scales * twists).T
+        turns = np.where(np.abs(w) > STRAIGHT, w, 1.0)
+        curved = turns == w
+        a = np.where(curved, np.sin(turns) / turns, 1.0)
+        b = np.where(curved, (1 - np.cos(turns)) / turns, w / 2)
+        a_by_w = np.where(curved, (np.cos(turns) - a) / turns, -w / 3)
+        b_by_w = np.where(curved, (np.sin(turns) - b) / turns, 0.5)
+        steps = np.stack([a * x - b * y, b * x + a * y, w], axis=-1)
+        by_twist = np.zeros((len(w), 3, 3))
+        by_twist[:, 0, 0], by_twist[:, 0, 1], by_twist[:, 0, 2] = a, -b, a_by_w * x - b_by_w * y
+        by_twist[:, 1, 0], by_twist[:, 1, 1], by_twist[:, 1, 2] = b, a, b_by_w * x + a_by_w * y
+        by_twist[:, 2, 2] = 1.0
+        twist_by_errors = np.zeros((len(w), 3, 3))
+        twist_by_errors[:, :2, 0], twist_by_errors[:, 2, 1] = twists[:, :2], twists[:, 2]
+        twist_by_errors[:, :, 2] = scales * slopes
+        return steps, by_twist @ twist_by_errors
 
-    def units(self, errors: Sequence[float] | Array) -> tuple[float, float]:
-        """What a metre of the way, and a radian of a turn, are as the wheels say them."""
-        return 1 / (self.wheels.scale + errors[0]), 1 / (self.wheels.turn_scale + errors[1])
+    def step(self, k: int, errors: Array) -> tuple[Pose, Array]:
+        """One of these: the pose of keyframe k + 1 in k, and by how much it changes with each error (3, 3)."""
+        steps, by_errors = self.steps(slice(k, k + 1), errors)
+        x, y, yaw = steps[0].tolist()
+        return (x, y, yaw), by_errors[0]
 
-    def _twist(self, k: int, delay: float) -> tuple[Sequence[float], Sequence[float]]:
-        """The twist that odometry says at a delay, and by how much it changes with it."""
-        delays, twists = self._delays, self._twists[k]
+    def _twist(self, k: NDArray[np.int64] | slice, delay: float) -> tuple[Array, Array]:
+        """The twists that odometry says at a delay, and by how much they change with it."""
+        delays, twists = self._delays, self._twists[:, k]
         if len(delays) == 1:
-            return twists[0], NO_ERRORS
-        n = min(max(bisect_right(delays, delay), 1), len(delays) - 1)
-        before, after = twists[n - 1], twists[n]
-        width = delays[n] - delays[n - 1]
-        share = (delay - delays[n - 1]) / width
+            return twists[0], np.zeros_like(twists[0])
+        n = int(np.clip(np.searchsorted(delays, delay, side="right"), 1, len(delays) - 1))
+        share = (delay - delays[n - 1]) / (delays[n] - delays[n - 1])
         if not 0 <= share <= 1:  # beyond what was looked at it stays as it is at the end
-            return (before if share < 0 else after), NO_ERRORS
-        slope = tuple((q - p) / width for p, q in zip(before, after, strict=True))
-        return tuple(p + share * (q - p) for p, q in zip(before, after, strict=True)), slope
+            return twists[n - 1 if share < 0 else n], np.zeros_like(twists[0])
+        slopes = (twists[n] - twists[n - 1]) / (delays[n] - delays[n - 1])
+        return twists[n - 1] + (delay - delays[n - 1]) * slopes, slopes
 
 
 class Expected(NamedTuple):
-    """What a sensor is expected to say: `range` [m], `bearing` [rad], of a `distance` [m]; and by how much both change
-    with the target's x and y in the body."""
+    """What sensors are expected to say: `values` (n, 2) of range [m] and bearing [rad], not wrapped; by how much both
+    change with the target's x and y in the body (n, 2, 2), and with each error (n, 2, 7)."""
 
-    range: float
-    bearing: float
-    distance: float
-    range_by_xy: tuple[float, float]
-    bearing_by_xy: tuple[float, float]
-
-    def range_by_errors(self) -> tuple[float, ...]:
-        """By how much the range changes with each error."""
-        return 1.0, self.distance, 0.0, -self.range_by_xy[0], -self.range_by_xy[1]
-
-    def bearing_by_errors(self) -> tuple[float, ...]:
-        """By how much the bearing changes with each error."""
-        return 0.0, 0.0, 1.0, -self.bearing_by_xy[0], -self.bearing_by_xy[1]
+    values: Array
+    by_xy: Array
+    by_errors: Array
 
 
-class RangingModel:
-    """What a sensor says of a target at a place, which is off by errors (offset, scale, bearing, x, y)."""
+class Sensors:
+    """What a team's sensors say of targets, which are off by errors; robots by number, (n,) of who measures."""
 
-    def __init__(self, ranging: Ranging) -> None:
-        self.ranging = ranging
-        self._bearing = math.radians(ranging.bearing_offset_deg)
-        self._bearing_variance = math.radians(ranging.bearing_sigma_deg) ** 2
+    def __init__(self, ranging: Sequence[Ranging]) -> None:
+        self.ranging = tuple(ranging)
 
-    def sigmas(self, distance: float) -> tuple[float, float]:
-        """Standard deviations of a range [m] and a bearing [rad] that were measured at a distance."""
-        one = self.ranging
-        return (
-            one.range_sigma + one.range_sigma_per_m2 * distance**2,
-            math.sqrt(self._bearing_variance + (one.across_sigma / distance) ** 2),
+        def column(*names: str) -> Array:
+            return np.array([[getattr(one, name) for name in names] for one in ranging], float)
+
+        self._noise = column("range_sigma", "range_sigma_per_m2", "bearing_sigma_deg", "across_sigma")
+        self._noise[:, 2] = np.deg2rad(self._noise[:, 2])
+        self._stated = column("offset", "scale", "bearing_offset_deg", "x", "y", "depth", "robot_offset")
+        self._stated[:, 2] = np.deg2rad(self._stated[:, 2])
+        self.tolerances = column(
+            *("offset_sigma", "scale_sigma", "bearing_offset_sigma_deg", "place_sigma", "place_sigma"),
+            *("depth_sigma", "robot_offset_sigma"),
         )
+        self.tolerances[:, 2] = np.deg2rad(self.tolerances[:, 2])
 
-    def expected(self, x: float, y: float, errors: Sequence[float] | Array) -> Expected:
-        """What is expected of a target at (x, y) in the body."""
-        one = self.ranging
-        x, y = x - one.x - errors[3], y - one.y - errors[4]
-        distance = max(math.hypot(x, y), 1e-6)
-        scale = one.scale + errors[1]
-        return Expected(
-            one.offset + errors[0] + scale * distance,
-            math.atan2(y, x) + self._bearing + errors[2],
-            distance,
-            (scale * x / distance, scale * y / distance),
-            (-y / distance**2, x / distance**2),
-        )
+    def sigmas(self, robots: NDArray[np.int64], ranges: Array) -> Array:
+        """Standard deviations (n, 2) of ranges [m] and bearings [rad] that were measured at some ranges."""
+        range_sigma, per_m2, bearing_sigma, across = self._noise[robots].T
+        return np.stack([range_sigma + per_m2 * ranges**2, np.hypot(bearing_sigma, across / ranges)], axis=-1)
 
-    def place(self, range_: float, bearing: float) -> tuple[float, float]:
+    def expected(self, robots: NDArray[np.int64], xy: Array, errors: Array, of_robot: NDArray[np.bool_]) -> Expected:
+        """What is expected of targets at xy (n, 2) in the body, robots or landmarks, with errors (n, 7)."""
+        offset, scale, turned, x0, y0, depth, more = (self._stated[robots] + errors).T
+        x, y = xy[:, 0] - x0, xy[:, 1] - y0
+        distance = np.maximum(np.hypot(x, y), 1e-6)
+        bearing = np.arctan2(y, x) + turned
+        c, s = np.cos(bearing), np.sin(bearing)
+        part = 1 - depth * (1 - c)
+        across = -scale * depth * s  # by the bearing, of a metre of distance
+        values = np.stack([offset + more * of_robot + scale * distance * part, bearing], axis=-1)
+        ux, uy = x / distance, y / distance
+        by_xy = np.empty((len(xy), 2, 2))
+        by_xy[:, 0, 0], by_xy[:, 0, 1] = scale * part * ux - across * uy, scale * part * uy + across * ux
+        by_xy[:, 1, 0], by_xy[:, 1, 1] = -uy / distance, ux / distance
+        by_errors = np.zeros((len(xy), 2, RANGING))
+        by_errors[:, 0, 0], by_errors[:, 0, 1], by_errors[:, 0, 2] = 1.0, distance * part, across * distance
+        by_errors[:, 0, 5], by_errors[:, 0, 6] = -scale * distance * (1 - c), of_robot
+        by_errors[:, 1, 2] = 1.0
+        by_errors[:, :, 3:5] = -by_xy
+        return Expected(values, by_xy, by_errors)
+
+    def place(self, robot: int, range_: float, bearing: float, of_robot: bool) -> tuple[float, float]:
         """Where in the body a target is that was measured so, if nothing is off."""
-        one = self.ranging
-        distance, angle = (range_ - one.offset) / one.scale, bearing - self._bearing
-        return one.x + distance * math.cos(angle), one.y + distance * math.sin(angle)
+        offset, scale, turned, x0, y0, depth, more = self._stated[robot].tolist()
+        part = max(1 - depth * (1 - math.cos(bearing)), LEAST_PART)
+        distance = (range_ - offset - more * of_robot) / (scale * part)
+        return x0 + distance * math.cos(bearing - turned), y0 + distance * math.sin(bearing - turned)
