@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.run.messages import Detections
+from coloc_graph.simulation.blinking import blinking
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.rig import detection_sigma
 from coloc_graph.simulation.world import World, stream
@@ -40,16 +41,20 @@ class StanceTracks:
 
 
 def observe(world: World, k: int) -> tuple[StanceTracks, ...]:
-    """What the observers of stance k detect of markers, in the order of `Stance.observers`."""
+    """What the observers of stance k detect of markers, in the order of `Stance.observers`; without their names where
+    robots blink."""
     rng, out = stream(world.seed, "detection", k), []
+    blinks = blinking(world.true_team, stream(world.seed, "blink"))
     for capture in world.captures[k]:
-        places, names = [], []
+        places, names, on = [], [], []
         for robot in (*world.stances[k].movers, *capture.standing):
             places.append(world.markers_world(robot, capture.times))
-            names += [f"{robot}/{m}" for m in range(places[-1].shape[1])]
+            names += ["" if blinks else f"{robot}/{m}" for m in range(places[-1].shape[1])]
+            lit = blinks[robot].on(capture.times) if robot in blinks else np.ones(len(capture.times), bool)
+            on.append(np.repeat(lit[:, None], places[-1].shape[1], axis=1))
         uv, inside = capture.view.project(np.concatenate(places, axis=1))
         noisy = uv + world.imperfections.noise_px * rng.standard_normal(uv.shape)
-        seen = capture.recorded & inside
+        seen = capture.recorded & inside & np.concatenate(on, axis=1)
         sigma = detection_sigma(world.imperfections)
         out.append(StanceTracks(capture.robot, tuple(names), capture.stamps, noisy, seen, sigma))
     return tuple(out)
