@@ -270,7 +270,7 @@ class MarkerTracker:
         tracks, found, doubtful = tracks[good], found[good], none
         if (near.sum(axis=0) > 1).any():
             self._cut(worth, tracks, found)
-            keep = self._apart(tracks, found, near)
+            keep = self._apart(worth, tracks, found, near)
             tracks, found, doubtful = tracks[keep], found[keep], found[~keep]
         there = np.zeros(n, bool)
         there[tracks] = True
@@ -312,15 +312,19 @@ class MarkerTracker:
             self._ended.append(self._live[row])
         self._live[row] = _Live()
 
-    def _apart(self, tracks: NDArray[np.int64], found: NDArray[np.int64], near: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which assignments hold: a detection that may be two markers in one is neither's."""
-        missing = self._lit.on > 0.5  # one that is off is no part of it
+    def _apart(
+        self, worth: Array, tracks: NDArray[np.int64], found: NDArray[np.int64], near: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Which assignments hold: a detection that may be two markers in one, or as well another's, is neither's."""
+        missing = np.ones(len(self._live), bool)
         missing[tracks] = False
-        lost = [row for row in np.flatnonzero(missing).tolist() if self._live[row].confirmed]
         keep = np.ones(len(tracks), bool)
-        for row in lost:
-            touching = np.abs(self._filters.place[tracks] - self._filters.place[row]).max(axis=1) < TOUCHING
-            keep &= ~(touching & near[row, found])
+        for row in np.flatnonzero(missing).tolist():
+            if self._live[row].confirmed:
+                if self._lit.on[row] > 0.5:
+                    touching = np.abs(self._filters.place[tracks] - self._filters.place[row]).max(axis=1) < TOUCHING
+                    keep &= ~(touching & near[row, found])
+                keep &= ~(worth[tracks, found] - worth[row, found] < AMBIGUOUS)
         return keep
 
     def _end(self, time: float, *, births: bool) -> None:
