@@ -78,6 +78,19 @@ def markers_of_movers(
     return [replace(track, body=robots.index(of[n])) for n, track in enumerate(moving) if of[n] in robots]
 
 
+def of_named(tracks: Sequence[Track]) -> list[Track]:
+    """Tracks that are known to be one robot's (`Track.mover`), in pieces or not bound, are one body, if no more than
+    two are seen at once."""
+    out = list(tracks)
+    free = max((track.body for track in tracks), default=-1) + 1
+    for name in dict.fromkeys(track.mover for track in tracks if track.mover):
+        own = {n for n, track in enumerate(tracks) if track.mover == name}
+        if _two_at_once(tracks, own):
+            out = [replace(track, body=free) if n in own else track for n, track in enumerate(out)]
+            free += 1
+    return out
+
+
 def _two_at_once(tracks: Sequence[Track], which: set[int]) -> bool:
     """Whether never more than two of some tracks go on at the same time, a moment apart."""
     moment = 0.02

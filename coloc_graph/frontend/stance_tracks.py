@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend.blinking import BlinkCodes
-from coloc_graph.frontend.bodies import markers_of_movers
+from coloc_graph.frontend.bodies import markers_of_movers, of_named
 from coloc_graph.frontend.detection import Blobs, detector_for
 from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks
 from coloc_graph.frontend.plane import plane_from_mount
@@ -163,7 +163,7 @@ class StanceTracks:
             if len(names) == 1:
                 own = [replace(track, mover=names[0]) for track in own]
             elif codes is not None:
-                own = codes.bodies(own)
+                own = of_named(codes.bodies(own))
             bodies = max((track.body for track in tracks), default=-1) + 1
             tracks += [replace(t, body=t.body + bodies * (t.body >= 0)) for t in own]
         return tracks

@@ -246,9 +246,7 @@ class MarkerTracker:
             self._searched = time
         self._end(time, births=births)
 
-    def _assigned(
-        self, uv: Array, covariance: Array
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def _assigned(self, uv: Array, covariance: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Tracks (k,) and the detections (k,) that they go on with; what that means for their scores; and detections
         (l,) that may be two tracks' in one."""
         options, n = self._options, len(self._live)
@@ -266,7 +264,7 @@ class MarkerTracker:
         gain = np.log(seen / options.clutter)[:, None] + density + 0.5 * (squared - off)
         worth = np.where(near, gain - missed[:, None], 0.0)  # against a missed marker and a false detection
         tracks, found = linear_sum_assignment(worth, maximize=True)
-        good = near[tracks, found] & (worth[tracks, found] > 0)
+        good = near[tracks, found] & (worth[tracks, found] > AMBIGUOUS)
         tracks, found, doubtful = tracks[good], found[good], none
         if (near.sum(axis=0) > 1).any():
             self._cut(worth, tracks, found)
