@@ -29,6 +29,8 @@ LONGEST = 60.0
 PHASES = 8
 #: What share of its bits a light is on that blinks as none of the robots does, the last one all the time.
 DUTIES = np.array([0.5, 0.7, 0.85, 0.95, 1.0])
+#: The chance that a light blinks by a code, of up to so many bits, that no robot is said to have.
+STRANGER, STRANGERS_BITS = 1e-4, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +67,13 @@ class BlinkCodes:
         with np.errstate(divide="ignore"):
             log_on, log_off = np.log(DUTIES)[:, None, None], np.log1p(-DUTIES)[:, None, None]
         of_none = _mean(np.logaddexp(log_on + on, log_off + off).sum(axis=2))
-        evidence = np.array([*(self._evidence(code, on, off) for code in self.codes.values()), of_none])
-        return np.asarray(np.exp(evidence - logsumexp(evidence)))[:-1]
+        strangers = [
+            _mean(np.logaddexp(np.log(0.75) + _folded(on, n), np.log(0.25) + _folded(off, n)).sum(axis=1))
+            for n in range(2, STRANGERS_BITS + 1)
+        ]
+        of_codes = (self._evidence(code, on, off) for code in self.codes.values())
+        evidence = np.array([*of_codes, of_none, _mean(np.array(strangers)) + np.log(STRANGER)])
+        return np.asarray(np.exp(evidence - logsumexp(evidence)))[:-2]
 
     def _bits(self, tracks: Sequence[Track]) -> tuple[Array, Array]:
         """The logarithms of the likelihood of each bit, were it on and were it off, (k, b): at each of k rates and
@@ -99,9 +106,13 @@ class BlinkCodes:
         n = len(code)
         lit = np.array([bit == "1" for bit in code])
         shifts = lit[(np.arange(n)[:, None] + np.arange(n)) % n]
-        padded = np.pad(on - off, ((0, 0), (0, -on.shape[1] % n)))
-        likely = padded.reshape(len(on), -1, n).sum(axis=1) @ shifts.T + off.sum(axis=1)[:, None]
-        return _mean(likely)
+        return _mean(_folded(on, n) @ shifts.T + _folded(off, n) @ ~shifts.T)
+
+
+def _folded(bits: Array, n: int) -> Array:
+    """What is known of the same bits of a code of length n, together: (k, n) of (k, b)."""
+    padded = np.pad(bits, ((0, 0), (0, -bits.shape[1] % n)))
+    return np.asarray(padded.reshape(len(bits), -1, n).sum(axis=1))
 
 
 def _mean(logarithms: Array) -> float:
