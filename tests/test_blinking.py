@@ -1,6 +1,7 @@
 """White lights of robots that blink: whose a track is, or that nobody knows."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,10 +69,19 @@ def test_two_lights_of_one_body_know_together_what_neither_knows_alone():
     for _ in range(20):
         times = rng.uniform() + np.arange(33) / 25
         on = lit("A", times, rng)
-        two = [track_of(on, times, rng, missed=0.1) for _ in range(2)]
-        alone += sum(bool(CODES.whose([one])) for one in two) / 2
-        together += CODES.whose(two) == "A"
+        two = [replace(track_of(on, times, rng, missed=0.1), body=0) for _ in range(2)]
+        each = CODES.each(two)
+        alone += sum(one.mover == "A" for one in each) / 2
+        together += [one.mover for one in CODES.bodies(each)] == ["A", "A"]
     assert together > alone + 3
+
+
+def test_a_clock_that_is_off_by_what_a_clock_may_be_off_is_found_along():
+    rng = np.random.default_rng(4)
+    times = np.arange(1000) / 25
+    for fast in (-4.5e-3, 4.5e-3):
+        assert CODES.whose([track_of(lit("D", times, rng, fast), times, rng)]) == "D"
+    assert CODES.whose([track_of(lit("D", times, rng, 0.03), times, rng)]) == ""
 
 
 def test_as_likely_as_each_other_is_undecided():
