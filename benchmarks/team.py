@@ -2,6 +2,7 @@
 
     python benchmarks/team.py [--seeds 24] [--json]     6 robots, 10 stances: NEES; against the best single chain
     python benchmarks/team.py --table [--large]         time and memory against the number of robots; 50 of 100 stances
+    python benchmarks/team.py --blink [--clock 0.005]   white markers that blink, against coloured ones
 
 Mounts are wrong by 0.5 deg and 3 mm, the floor by 0.1 deg (one sigma each), 0.3 px, about 100 points a pair. The best
 single chain is what the surest way from the reference to each pose makes of the same measurements, one for each pose.
@@ -17,19 +18,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
+from unittest.mock import patch
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `coloc` does, before numpy is there
 
 import numpy as np
 from monte_carlo import MemoryRun, anees_interval, over_seeds, truth_of
 
+from coloc_graph import stance_solver
 from coloc_graph.backend import Estimate, joint
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.evaluation import align, nees_of
+from coloc_graph.frontend import StanceTracks, Track
+from coloc_graph.frontend.bodies import markers_of_movers
+from coloc_graph.frontend.detection import Blobs
+from coloc_graph.frontend.stance_tracks import stance_plane
 from coloc_graph.pipeline import SolveOptions, solve
-from coloc_graph.simulation import Imperfections
+from coloc_graph.simulation import Imperfections, reference_team
+from coloc_graph.simulation.blinking import with_codes
 from coloc_graph.simulation.scenarios import team_of
 from coloc_graph.simulation.teams import build_team_world
+from coloc_graph.simulation.tracks import observe
 from coloc_graph.simulation.world import World, stream
 
 WRONG = Imperfections(mount_sigma_deg=0.5, height_sigma=0.003, floor_sigma_deg=0.1)
@@ -114,6 +123,74 @@ def honesty(seeds: int, robots: int = 6, stances: int = 10) -> dict[str, object]
     }
 
 
+class Coloured(StanceTracks):
+    """What a camera sees where each mover has a colour of its own: a tracker for each, which is told its detections."""
+
+    def _of(self, robot: str, end: float) -> list[Track]:
+        tracks: list[Track] = []
+        for mover in self.stance.movers:
+            tracker = self._tracker(robot, [mover])
+            for one in self.run.detections(robot, self.stance.start, end):
+                own = np.array([marker.startswith(f"{mover}/") for marker in one.markers], bool)
+                tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area)[own])
+            spans = [markers.span] if (markers := self.run.team[mover].markers) and markers.span else []
+            plane = stance_plane(self.run, self.stance, robot)
+            own_tracks = markers_of_movers(tracker.tracks(), self.run.team[robot].camera, plane, spans, 1)
+            bodies = max((track.body for track in tracks), default=-1) + 1
+            tracks += [replace(one, mover=mover, body=one.body + bodies * (one.body >= 0)) for one in own_tracks]
+        return tracks
+
+
+def blinking_seed(seed: int, robots: int, stances: int, clock: float) -> list[dict[str, float]]:
+    """Of one run: errors, promises and NEES, where the movers have colours and where they are white and blink."""
+    what = team_of(robots, 2, stances, stream(seed, "formation"))
+    wrong = replace(WRONG, clock_offset=clock, time_jitter=0.002 if clock else 0.0)
+    rows = []
+    for blinks in (False, True):
+        team = reference_team(names=what.names)
+        team = with_codes(team) if blinks else team
+        world = build_team_world(what, seed=seed, points=2000, imperfections=wrong, team=team)
+        run = MemoryRun(world)
+        with patch.object(stance_solver, "StanceTracks", StanceTracks if blinks else Coloured):
+            solution = solve(run, SolveOptions())  # type: ignore[arg-type]
+        rms, promised, anees = _errors(solution.estimate, world)
+        poses = [m.relative_pose for m in solution.measurements if m.relative_pose is not None]
+        row = {"square": rms**2, "promised": promised**2, "anees": anees, "homographies": solution.used,
+               "points": sum(m.homography.points for m in solution.measurements),
+               "spans": sum(len(pose.spans) for pose in poses),
+               "chi2": solution.estimate.chi2, "dof": solution.estimate.dof}  # fmt: skip
+        rows.append(row | (_whose(run, world) if blinks else {}))
+    return rows
+
+
+def _whose(run: MemoryRun, world: World) -> dict[str, float]:
+    """How many samples of tracks are of the right robot's, of nobody's, and of a wrong one's."""
+    right = undecided = wrong = 0
+    for k, stance in enumerate(run.stances):
+        tracks = StanceTracks(run, stance)  # type: ignore[arg-type]
+        for seen in observe(world, k):
+            for track in tracks.of(seen.robot):
+                middle = len(track) // 2
+                at = seen.uv[np.argmin(np.abs(seen.stamps - track.times[middle]))]
+                owner = seen.markers[np.nanargmin(np.abs(at - track.uv[middle]).sum(axis=1))].split("/")[0]
+                right += len(track) * (track.mover == owner)
+                undecided += len(track) * (not track.mover)
+                wrong += len(track) * (track.mover not in ("", owner))
+    return {"right": right, "undecided": undecided, "wrong": wrong}
+
+
+def blink(seeds: int, clock: float, robots: int = 6, stances: int = 10) -> dict[str, dict[str, float]]:
+    """Over seeds."""
+    rows = over_seeds(partial(blinking_seed, robots=robots, stances=stances, clock=clock), range(seeds), processes=1)
+    found = {}
+    for n, what in enumerate(("coloured", "blinking")):
+        mean = {name: float(np.mean([row[n][name] for row in rows])) for name in rows[0][n]}
+        mean["rms_error_cm"], mean["promised_cm"] = (100 * mean.pop(name) ** 0.5 for name in ("square", "promised"))
+        mean["chi2_per_dof"] = mean.pop("chi2") / mean.pop("dof")
+        found[what] = mean
+    return found
+
+
 def sized(robots: int, stances: int) -> dict[str, float]:
     """Time and memory of one run, from detections in memory, in a process of its own."""
     world = world_of(robots, stances, 0)
@@ -155,10 +232,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=24)
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--large", action="store_true", help="50 robots, 100 stances, too")
+    parser.add_argument("--blink", action="store_true")
+    parser.add_argument("--clock", type=float, default=0.0, help="offset of the robots' clocks, s")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     if options.table:
         found: object = table([(n, 30) for n in (3, 5, 10, 20)] + [(50, 30), (50, 100)][: 1 + options.large])
+    elif options.blink:
+        found = blink(options.seeds, options.clock)
     else:
         found = honesty(options.seeds)
     print(json.dumps(found, indent=None if options.json else 2))

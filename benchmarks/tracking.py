@@ -1,24 +1,32 @@
 """Many markers followed in detections that are missed, false and merged: is a track of one marker, and how fast is it.
 
     python benchmarks/tracking.py [--seeds 20] [--movers 5] [--seconds 60] [--json]
+    python benchmarks/tracking.py --blink [--fps 100]       white lights of robots that blink: whose is a track?
 
 Robots with two lights each drive about before the reference pair of cameras at 100 fps, 2 % of the lights missed and 5
 false detections an image. Beside the tracker: the assignment of each image by itself to where lights were last
 (nearest, all at once), which knows no speed.
+
+With `--blink` each track is cut into pieces of some length, and of each it is asked whose it is, by itself, and with
+the piece of the robot's other light: right, undecided, or wrong (of the light that most of the piece is of).
 """
 
 import argparse
 import json
 import time
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
+from monte_carlo import over_seeds
 from scipy.optimize import linear_sum_assignment
 
 from coloc_graph.common_view import View
+from coloc_graph.frontend.blinking import BlinkCodes
 from coloc_graph.frontend.detection import Blobs, Detector
-from coloc_graph.frontend.tracking import MarkerTracker, Track
+from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.lie import floor_pose
+from coloc_graph.simulation.blinking import blinking, with_codes
 from coloc_graph.simulation.crowd import Faults, Seen, crowd
 from coloc_graph.simulation.rig import reference_team
 from coloc_graph.simulation.scenarios import single_step
@@ -33,11 +41,11 @@ def views() -> list[View]:
     ]
 
 
-def follow(seen: Seen) -> tuple[list[Track], float]:
+def follow(seen: Seen, options: TrackerOptions | None = None) -> tuple[list[Track], float]:
     """The tracks of one camera, and how long they took [s]."""
     blobs = [(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area)) for one in seen.images]
     began = time.process_time()
-    tracker = MarkerTracker("A", Detector(), size=(320, 240))
+    tracker = MarkerTracker("A", Detector(), options, size=(320, 240))
     for when, found in blobs:
         tracker.take(when, found)
     tracks = tracker.tracks()
@@ -66,16 +74,22 @@ def nearest(seen: Seen, gate: float = 20.0, patience: int = 30) -> list[Track]:
     ]
 
 
+def lights_in(track: Track, seen: Seen) -> np.ndarray:
+    """Of which light each sample of a track is, (n,); -1 where it is of none."""
+    number = {one.time: n for n, one in enumerate(seen.images)}
+    lights = np.empty(len(track), np.int64)
+    for n, (when, uv) in enumerate(zip(track.times.tolist(), track.uv, strict=True)):
+        k = number[when]
+        lights[n] = seen.lights[k][np.argmin(np.abs(seen.images[k].uv - uv).sum(axis=1))]
+    return lights
+
+
 def figures(tracks: Sequence[Track], seen: Seen) -> dict[str, float]:
     """Of all samples in tracks: the share that is of the light that most of its track is of, and so on."""
-    number = {one.time: n for n, one in enumerate(seen.images)}
     pure = total = swaps = false = 0
     covered: dict[int, int] = {}
     for track in tracks:
-        lights = np.empty(len(track), np.int64)
-        for n, (when, uv) in enumerate(zip(track.times.tolist(), track.uv, strict=True)):
-            k = number[when]
-            lights[n] = seen.lights[k][np.argmin(np.abs(seen.images[k].uv - uv).sum(axis=1))]
+        lights = lights_in(track, seen)
         real = lights[lights >= 0]
         total += len(track)
         if len(real) < len(track) / 2:
@@ -95,14 +109,81 @@ def figures(tracks: Sequence[Track], seen: Seen) -> dict[str, float]:
     }
 
 
+LENGTHS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
+
+
+def whose(
+    seconds: float, fps: float, movers: int, seed: int
+) -> tuple[list[dict[str, float]], list[tuple[object, ...]]]:
+    """Figures of the tracks of each camera; and of pieces of them (seconds, lights, verdict)."""
+    names = tuple(f"R{n}" for n in range(movers))
+    team = with_codes(reference_team(names=names))
+    codes = BlinkCodes({one.name: one.blink.code for one in team.robots if one.blink}, 0.1)
+    lamps = list(blinking(team, np.random.default_rng((seed, 1))).values())
+    assert team[names[0]].markers is not None
+    both, _ = crowd(views(), team[names[0]].markers.p_body, movers=movers, seconds=seconds, fps=fps, seed=seed,
+                    faults=Faults(), blinking=lamps)  # fmt: skip
+    rows, verdicts = [], []
+    for seen in both:
+        tracks, _ = follow(seen, TrackerOptions(off=codes.bit, off_rate=codes.rate))
+        rows.append(figures(tracks, seen))
+        lights = [lights_in(track, seen) for track in tracks]
+        for length in LENGTHS:
+            for begin in seen.images[0].time + np.arange(0.0, seconds - length + 1e-6, length):
+                pieces: dict[int, list[Track]] = {}
+                for track, own in zip(tracks, lights, strict=True):
+                    within = (track.times >= begin) & (track.times < begin + length)
+                    # a piece of that length, but for what a light is off at its ends
+                    if not within.any() or np.ptp(track.times[within]) < length - 2.5 * codes.bit:
+                        continue
+                    real = own[within][own[within] >= 0]
+                    light = int(np.bincount(real).argmax()) if len(real) else -1
+                    missed = track.missed[(track.missed >= begin) & (track.missed < begin + length)]
+                    columns = (one[within] for one in (track.times, track.uv, track.covariance, track.peak))
+                    piece = Track("A", "", *columns, missed=missed)
+                    pieces.setdefault(light // 2, []).append(piece)
+                    verdicts.append((length, 1, _verdict(codes.whose([piece]), names, light // 2)))
+                verdicts += [
+                    (length, 2, _verdict(codes.whose(two), names, robot))
+                    for robot, two in pieces.items()
+                    if len(two) == 2 and robot >= 0
+                ]
+    return rows, verdicts
+
+
+def _verdict(found: str, names: Sequence[str], robot: int) -> str:
+    return "undecided" if not found else "right" if robot >= 0 and found == names[robot] else "wrong"
+
+
+def blink(options: argparse.Namespace) -> None:
+    """Over seeds: how good tracks of lights that blink are, and how often it is known whose they are."""
+    work = partial(whose, options.seconds, options.fps, options.movers)
+    done = over_seeds(work, range(options.seeds), options.processes)
+    rows = [row for rows, _ in done for row in rows]
+    verdicts = [one for _, verdicts in done for one in verdicts]
+    print(json.dumps({name: float(np.mean([row[name] for row in rows])) for name in rows[0]}, indent=2))
+    for length, lights in sorted({one[:2] for one in verdicts}):
+        own = [verdict for *what, verdict in verdicts if what == [length, lights]]
+        shares = "  ".join(
+            f"{100 * own.count(name) / len(own):7.3f} % {name}" for name in ("right", "undecided", "wrong")
+        )
+        print(f"{length:4g} s, {lights} light{'s' * (lights > 1)}: {shares}  of {len(own)}")
+
+
 def main() -> None:
     """Run it, print it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--movers", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--blink", action="store_true")
+    parser.add_argument("--fps", type=float, default=100.0)
+    parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    if options.blink:
+        blink(options)
+        return
     team, rows = reference_team(), []
     assert team["C"].markers is not None
     for seed in range(options.seeds):

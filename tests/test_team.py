@@ -1,5 +1,7 @@
 """The team file: what is written reads back, and what is wrong is named by its path."""
 
+import contextlib
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from msgspec.structs import replace
 
 from coloc_graph.errors import TeamError
 from coloc_graph.simulation import reference_team
-from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Slip, Team, read_team, write_team
+from coloc_graph.team import Blink, Camera, Floor, Markers, Mount, Robot, Slip, Team, read_team, write_team
 
 LENSES = [
     (),
@@ -42,10 +44,10 @@ cx = 159.5
 cy = 119.5
 [robots.mount]
 height = 0.4
-[robots.markers]
-height = 0.15
-positions = [[0.0, 0.125], [0.0, -0.125]]
 """
+MARKERS = "[robots.markers]\nheight = 0.15\npositions = [[0.0, 0.125], [0.0, -0.125]]\n"
+BLINK = '[robots.blink]\ncode = "110"\n'
+TOML += MARKERS + BLINK
 
 
 def camera(distortion=(), **changes):
@@ -113,6 +115,15 @@ WRONG = {
         "height = 0.15\nhue_deg = 360.0",
         ["`hue_deg`", "$.robots[1].markers"],
     ),
+    "two 0s in a row": ('"110"', '"0110"', ["`code` is `0110`", "two 0s in a row", "$.robots[1].blink"]),
+    "no 0": ('"110"', '"111"', ["`code` is `111`", "both in it"]),
+    "a bit that is too long": (BLINK, BLINK + "bit = 0.5\n", ["`bit` is 0.5", "from 0.02 to 0.25"]),
+    "a camera that is too slow": (
+        "cy = 119.5",
+        "cy = 119.5\nfps = 10.0",
+        ["the camera of robot A takes 10 images a second", "at least 0.2 s"],
+    ),
+    "nothing to blink": (MARKERS, "", ["robot C has a `blink` but no markers"]),
     "a robot twice": ('name = "C"', 'name = "A"', ["two robots are called `A`"]),
     "a name with a slash": ('name = "C"', 'name = "a/b"', ["`a/b`", "$.robots[1]"]),
     "an unknown reference": ('reference = "A"', 'reference = "D"', ["`reference` is `D`", "A, C"]),
@@ -132,6 +143,31 @@ def test_what_is_wrong_with_a_team_is_named(read, old, new, wanted):
     assert "\n" not in message
     for words in wanted:
         assert words in message
+
+
+@pytest.mark.parametrize(
+    ("first", "other", "hue", "words"),
+    [
+        ("11011110", "11110110", None, "robots A and B blink alike, wherever their codes begin"),
+        ("110", "101101", None, "robots A and B blink alike"),
+        ("110", "110", 120.0, ""),
+        ("110", "1110", None, ""),
+    ],
+)
+def test_codes_differ_wherever_they_begin(first, other, hue, words):
+    robots = tuple(
+        replace(one, markers=replace(one.markers, hue_deg=of), blink=Blink(code=code))
+        for one, code, of in zip(reference_team().robots, (first, other), (None, hue), strict=False)
+    )
+    with pytest.raises(ValueError, match=words) if words else contextlib.nullcontext():
+        Team(reference="A", robots=robots)
+
+
+def test_all_bits_are_as_long():
+    a, b, _ = reference_team().robots
+    robots = (replace(a, blink=Blink(code="110")), replace(b, blink=Blink(code="1110", bit=0.2)))
+    with pytest.raises(ValueError, match=r"robot A is 0.1 s long and one of robot B 0.2 s; give all the same `bit`"):
+        Team(reference="A", robots=robots)
 
 
 def test_bytes_that_are_not_utf8_are_an_error_in_words(read):
@@ -154,7 +190,7 @@ def test_a_robot_that_is_not_in_the_team_is_an_error_that_lists_those_who_are(re
 def test_marker_height_is_none_where_the_robots_differ(read):
     team = read(TOML)
     assert team.marker_height() == 0.15
-    higher = replace(team["C"], name="D", markers=replace(team["C"].markers, height=0.2))
+    higher = replace(team["C"], name="D", markers=replace(team["C"].markers, height=0.2), blink=None)
     team = replace(team, robots=(*team.robots, higher))
     assert team.marker_height() is None
     assert team.marker_height(["D"]) == 0.2

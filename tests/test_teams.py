@@ -231,6 +231,27 @@ def coloured(uv, colours):
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
+def lock_step(path, team, image, frames=70, step=0.1):
+    """A run of A and B that watch C and D, who drive the same way side by side; where A and B stand; and where they see
+    the four lights, (frames, 4, 2) [px]. `image` makes one of these in frame k.
+    """
+    seen = {}
+    poses = {"A": floor_pose(0, 0.4, -0.3), "B": floor_pose(0, -0.4, 0.3)}
+    s = np.linspace(0, 2 * np.pi, frames)
+    x, y = 1.4 + 0.3 * np.sin(s), 0.25 * np.sin(2 * s)
+    yaw = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
+    way = np.stack([np.stack([x, y + side, yaw], axis=1) for side in (-0.3, 0.3)], axis=1)
+    p_lights = lights_of(way, STEP * np.arange(frames), team["C"].markers.p_body)
+    with RunWriter(path, team, image_format="raw") as writer:
+        writer.write(Stance(0, 100.0, 110.0, ("A", "B"), ("C", "D")))
+        for robot, T in poses.items():
+            view = View(team[robot].camera, T @ team[robot].mount.T_body_camera)
+            seen[robot], _ = view.project(p_lights.reshape(frames, 4, 3))
+            for k in range(frames):
+                writer.write(Image(robot, 101.0 + step * k, image(seen[robot][k], k)))
+    return open_run(path), poses, seen
+
+
 def test_colours_tell_two_movers_apart_even_in_lock_step(tmp_path):
     """Side by side they drive the same way, and only their colours say which is which."""
     team = reference_team(names=("A", "B", "C", "D"))
@@ -239,21 +260,8 @@ def test_colours_tell_two_movers_apart_even_in_lock_step(tmp_path):
         msgspec_replace(one, markers=msgspec_replace(one.markers, hue_deg=hues.get(one.name))) for one in team.robots
     )
     team = msgspec_replace(team, robots=robots)
-    poses = {"A": floor_pose(0, 0.4, -0.3), "B": floor_pose(0, -0.4, 0.3)}
-    s = np.linspace(0, 2 * np.pi, 70)
-    x, y = 1.4 + 0.3 * np.sin(s), 0.25 * np.sin(2 * s)
-    yaw = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
-    way = np.stack([np.stack([x, y + side, yaw], axis=1) for side in (-0.3, 0.3)], axis=1)
-    p_lights = lights_of(way, STEP * np.arange(70), team["C"].markers.p_body)
     colours = [(0, 0, 230)] * 2 + [(0, 230, 0)] * 2
-    with RunWriter(tmp_path / "run.mcap", team, image_format="raw") as writer:
-        writer.write(Stance(0, 100.0, 110.0, ("A", "B"), ("C", "D")))
-        for robot, T in poses.items():
-            view = View(team[robot].camera, T @ team[robot].mount.T_body_camera)
-            uv, _ = view.project(p_lights.reshape(70, 4, 3))
-            for k in range(70):
-                writer.write(Image(robot, 101.0 + 0.1 * k, coloured(uv[k], colours)))
-    run = open_run(tmp_path / "run.mcap")
+    run, poses, _ = lock_step(tmp_path / "run.mcap", team, lambda uv, k: coloured(uv, colours))
     tracks = StanceTracks(run, run.stances[0])
     for robot in "AB":
         assert {track.mover for track in tracks.of(robot)} == {"C", "D"}

@@ -181,6 +181,23 @@ def test_a_marker_that_stands_for_a_second_among_100_images_is_not_taken_for_a_l
     assert len(track) == 300
 
 
+def test_a_light_that_blinks_is_one_track_and_nothing_is_taken_for_it_while_it_is_off():
+    rng, on = np.random.default_rng(0), np.tile(np.repeat([1, 1, 1, 0], 10), 5).astype(bool)
+    counts = []
+    for off in (0.1, 0.0):
+        tracker = MarkerTracker("A", Detector(), TrackerOptions(off=off, off_rate=3.0), size=(320, 240))
+        for k, shines in enumerate(on):
+            # what is false is as near as a light that changes its way may be
+            uv = np.array([[60.0 + k, 80.0]] if shines else [[60.0 + k, 82.5]] if k % 10 == 5 else []).reshape(-1, 2)
+            uv = uv + 0.1 * rng.standard_normal(uv.shape)
+            flags, none = np.zeros(len(uv), np.uint8), np.full(len(uv), 200.0)
+            covariance = np.broadcast_to(0.01 * np.eye(2), (len(uv), 2, 2))
+            tracker.take(T0 + 0.01 * k, Blobs(uv, covariance, flags, none, none))
+        counts.append([(len(track), len(track.missed)) for track in tracker.tracks()])
+    assert counts[0] == [(150, 36)]  # what is near to something else says nothing
+    assert counts[1] != counts[0]  # what is said to be on all the time takes it
+
+
 @pytest.mark.parametrize("speed", [30.0, 60.0])
 def test_a_marker_that_turns_back_at_once_is_followed(speed):
     tracker = MarkerTracker("A", Detector(), TrackerOptions(markers=1), size=(320, 240))

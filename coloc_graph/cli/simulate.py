@@ -26,6 +26,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--theta", type=float, help="single-step: angle between the observers, deg")
     command.add_argument("--robots", type=int, help="team: how many robots; default 10")
     command.add_argument("--at-once", type=int, help="team: how many of them move at once; default a quarter")
+    command.add_argument("--blink", action="store_true", help="team: markers have no names, and tell them by blinking")
     command.add_argument("--length", type=float, help="landmarks: how far the team goes in all, m; default 100")
     command.add_argument("--laps", type=int, help="landmarks: in how many laps of a square course; default 4")
     command.add_argument("--landmark-every", type=float, help="landmarks: so far apart along the course, m; default 10")
@@ -74,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
             landmark_every=args.landmark_every,
             laps=args.laps,
             known=args.known,
+            blink=args.blink,
             fps=10.0 if args.fps is None else args.fps,
             image_format=args.image_format or "jpeg",
             messy=args.messy,

@@ -53,7 +53,7 @@ def markers_of_movers(
     Lights that do not move are not. Where robots carry two markers, the tracks that are bound by a span are;
     tracks with no partner are kept only if no track has one. The pieces of a track that was lost belong to one robot
     with whatever they are bound to, as long as no more than two lights of it are seen at once; all do where it is
-    known that one robot moves.
+    known that one robot moves. Tracks that are known to be different robots' (`Track.mover`) are not bound.
     """
     moving = [track for track in tracks if len(track) >= 4 and track.extent > STILL]
     bound = [one for span in spans for one in span_samples(moving, camera, plane, span)]
@@ -64,6 +64,8 @@ def markers_of_movers(
     of = list(range(len(moving)))
     for a, b, shared in sorted(bound, key=lambda one: -len(one[2])):
         joined = bodies[of[a]] | bodies[of[b]]
+        if len({moving[n].mover for n in joined} - {""}) > 1:
+            continue
         if of[a] == of[b] or (len(joined) > 2 and (len(shared) < LEAST_SHARED or not _two_at_once(moving, joined))):
             continue
         bodies[of[a]], bodies[of[b]] = joined, set()
@@ -74,6 +76,19 @@ def markers_of_movers(
         return [replace(moving[n], body=0) for n in sorted(every)]
     robots = sorted({body for body in of if len(bodies[body]) > 1}, key=lambda body: min(bodies[body]))
     return [replace(track, body=robots.index(of[n])) for n, track in enumerate(moving) if of[n] in robots]
+
+
+def of_named(tracks: Sequence[Track]) -> list[Track]:
+    """Tracks that are known to be one robot's (`Track.mover`), in pieces or not bound, are one body, if no more than
+    two are seen at once."""
+    out = list(tracks)
+    free = max((track.body for track in tracks), default=-1) + 1
+    for name in dict.fromkeys(track.mover for track in tracks if track.mover):
+        own = {n for n, track in enumerate(tracks) if track.mover == name}
+        if _two_at_once(tracks, own):
+            out = [replace(track, body=free) if n in own else track for n, track in enumerate(out)]
+            free += 1
+    return out
 
 
 def _two_at_once(tracks: Sequence[Track], which: set[int]) -> bool:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry, InputError
-from coloc_graph.frontend.bodies import markers_of_movers
+from coloc_graph.frontend.blinking import BlinkCodes
+from coloc_graph.frontend.bodies import markers_of_movers, of_named
 from coloc_graph.frontend.detection import Blobs, detector_for
 from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks
 from coloc_graph.frontend.plane import plane_from_mount
@@ -57,20 +58,19 @@ class StanceTracks:
     images. Made once a camera; of a stance that goes on they go on too.
 
     Detections that name their marker are tracks already; the others, and images, go through a tracker: one for each
-    colour of the movers' markers. A colour that one mover alone has tells which that is.
+    colour of the movers' markers. A colour that one mover alone has tells which that is; of several of one colour, how
+    they blink.
     """
 
     def __init__(self, run: Recorded, stance: Stance, options: TrackerOptions | None = None) -> None:
         self.run, self.stance = run, stance
         stance_markers(run, stance)  # refuses movers whose markers share no plane
         self._options = options or TrackerOptions()
-        self._alike: dict[float | None, list[Markers]] = {}  # the movers' markers by their colour
-        self._named: dict[float | None, list[str]] = {}
+        self._alike: dict[float | None, list[str]] = {}  # the movers by the colour of their markers
         for name in stance.movers:
             markers = run.team[name].markers
             if markers is not None:
-                self._alike.setdefault(markers.hue_deg, []).append(markers)
-                self._named.setdefault(markers.hue_deg, []).append(name)
+                self._alike.setdefault(markers.hue_deg, []).append(name)
         self._trackers: dict[str, dict[float | None, MarkerTracker]] = {}
         self._taken: dict[str, int] = defaultdict(int)
         self._made: dict[str, tuple[float, list[Track]]] = {}
@@ -129,14 +129,13 @@ class StanceTracks:
                 self._standing[robot] = standing
                 return [track for track in tracks if track not in standing]
             # what was detected elsewhere has lost its colour
-            every = [one for alike in self._alike.values() for one in alike]
-            trackers = self._trackers.setdefault(robot, {None: self._tracker(robot, every)})
+            trackers = self._trackers.setdefault(robot, {None: self._tracker(robot, stance.movers)})
             for one in seen[self._taken[robot] :]:
                 trackers[None].take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
             self._taken[robot] = len(seen)
         else:
             alike = self._alike or {None: []}
-            trackers = self._trackers.setdefault(robot, {hue: self._tracker(robot, m) for hue, m in alike.items()})
+            trackers = self._trackers.setdefault(robot, {hue: self._tracker(robot, own) for hue, own in alike.items()})
             watch = self._watches.get(robot)
             if watch is None and self._landmarks:
                 watch = self._watches[robot] = LandmarkWatch(run.team[robot], run.team, stance.movers)
@@ -155,12 +154,18 @@ class StanceTracks:
                     self._taken[robot] = number + 1
         plane, tracks = stance_plane(run, stance, robot), []
         for hue, tracker in trackers.items():
-            names = self._named.get(hue, []) if len(trackers) > 1 else list(stance.movers)
+            names = self._alike.get(hue, []) if len(trackers) > 1 else list(stance.movers)
             spans = {m.span for name in names if (m := run.team[name].markers) and m.span}
-            own = markers_of_movers(tracker.tracks(), camera, plane, sorted(spans), len(names))
+            own, codes = tracker.tracks(), self._codes(names)
+            if len(names) > 1 and codes is not None:
+                own = codes.each(own)
+            own = markers_of_movers(own, camera, plane, sorted(spans), len(names))
+            if len(names) == 1:
+                own = [replace(track, mover=names[0]) for track in own]
+            elif codes is not None:
+                own = of_named(codes.bodies(own))
             bodies = max((track.body for track in tracks), default=-1) + 1
-            mover = names[0] if len(names) == 1 else ""
-            tracks += [replace(t, mover=mover, body=t.body + bodies * (t.body >= 0)) for t in own]
+            tracks += [replace(t, body=t.body + bodies * (t.body >= 0)) for t in own]
         return tracks
 
     def _require_known(self, robot: str, tracks: Iterable[Track]) -> None:
@@ -175,10 +180,20 @@ class StanceTracks:
                     "under [[landmarks]]"
                 )
 
-    def _tracker(self, robot: str, markers: Sequence[Markers]) -> MarkerTracker:
-        """One for some markers of one colour."""
-        camera, count = self.run.team[robot].camera, sum(len(one.positions) for one in markers)
-        options = replace(self._options, markers=max(count, 1))
+    def _codes(self, names: Iterable[str]) -> BlinkCodes | None:
+        """How robots blink, None where none of them does."""
+        blinks = {name: blink for name in names if (blink := self.run.team[name].blink) is not None}
+        if not blinks:
+            return None
+        return BlinkCodes({name: blink.code for name, blink in blinks.items()}, next(iter(blinks.values())).bit)
+
+    def _tracker(self, robot: str, names: Sequence[str]) -> MarkerTracker:
+        """One for the markers of some movers, which are of one colour."""
+        camera = self.run.team[robot].camera
+        markers = [one for name in names if (one := self.run.team[name].markers) is not None]
+        options = replace(self._options, markers=max(sum(len(one.positions) for one in markers), 1))
+        if (codes := self._codes(names)) is not None:
+            options = replace(options, off=codes.bit, off_rate=codes.rate)
         return MarkerTracker(
             robot, detector_for(markers[0] if markers else None, camera), options, (camera.width, camera.height)
         )

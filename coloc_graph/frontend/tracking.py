@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 
 from coloc_graph.frontend.detection import Blobs, Candidate, Detector, Pixels
 from coloc_graph.frontend.kalman import PointFilters
+from coloc_graph.frontend.lit import Lit
 from coloc_graph.run.messages import Flag, Image
 
 Array = NDArray[np.float64]
@@ -48,7 +49,8 @@ class Track:
 
     `uv` (n, 2) [px] with `covariance` (n, 2, 2) [px^2] at `times` (n,) [s, the camera's clock]; `peak` (n,)
     grey levels. `marker` is its name where its identity is known ("C/0"), or "". Tracks of one camera with the same
-    `body` are markers of one robot; -1 where that is not known. `mover` is that robot's name where its colour tells it.
+    `body` are markers of one robot; -1 where that is not known. `mover` is that robot's name where its colour, or how
+    it blinks, tells it. `missed` (k,) [s] are the images in between in which it should have been, and was not.
     """
 
     robot: str
@@ -59,6 +61,7 @@ class Track:
     peak: Array
     body: int = -1
     mover: str = ""
+    missed: Array = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.times)
@@ -76,7 +79,8 @@ class TrackerOptions:
 
     Of a marker's image `detected` is the chance that it is found; false detections come `clutter` [1/px^2] an image.
     `acceleration` [px^2/s^3] is the spectral density of how markers change their speed, `jerk` [px/s] how they do at
-    once, now and then, `speed` [px/s] what is usual.
+    once, now and then, `speed` [px/s] what is usual. Markers that blink go off for `off` [s] each time, `off_rate`
+    times a second that they are on.
     """
 
     patch: int = 40
@@ -91,6 +95,8 @@ class TrackerOptions:
     acceleration: float = 3e3
     jerk: float = 60.0
     speed: float = 200.0
+    off: float = 0.0
+    off_rate: float = 0.0
 
 
 @dataclass(slots=True)
@@ -103,6 +109,7 @@ class _Live:
     times: list[float] = field(default_factory=list)
     uv: list[tuple[float, float]] = field(default_factory=list)
     samples: list[Candidate | int] = field(default_factory=list)
+    missed: list[float] = field(default_factory=list)
     misses: int = 0
     score: float = 0.0
     confirmed: bool = False
@@ -133,6 +140,7 @@ class MarkerTracker:
         self._detector = detector
         self._options = options or TrackerOptions()
         self._filters = PointFilters(self._options.acceleration, self._options.jerk, self._options.speed)
+        self._lit = Lit(self._options.off, self._options.off_rate)
         self._live: list[_Live] = []  # in the order of the filters
         self._ended: list[_Live] = []
         self._parked: list[_Live] = []
@@ -179,13 +187,15 @@ class MarkerTracker:
                     blobs.uv[own][good],
                     blobs.covariance[own][good],
                     blobs.peak[own][good],
+                    missed=_between(live),
                 )
             )
         return [track for track in tracks if len(track)]
 
     def _track(self, live: _Live, samples: list[tuple[Array, Array, float]]) -> Track:
         uv, covariance, peak = zip(*samples, strict=True)
-        return Track(self.robot, "", np.array(live.times), np.array(uv), np.array(covariance), np.array(peak))
+        fields = np.array(live.times), np.array(uv), np.array(covariance), np.array(peak)
+        return Track(self.robot, "", *fields, missed=_between(live))
 
     def _search_all(self, time: float) -> bool:
         return (
@@ -217,49 +227,54 @@ class MarkerTracker:
         free = [index for index, place in enumerate(places) if not self._is_parked(place)]
         if len(free) < len(places):
             uv, covariance = uv[free], covariance[free]
-        tracks, found = self._assigned(uv, covariance)
+        self._lit.predict(time)
+        tracks, found, doubtful = self._assigned(uv, covariance)
+        self._miss(time, tracks)
         if len(tracks):
             self._filters.update(tracks, uv[found], covariance[found])
         for track, index in zip(tracks.tolist(), found.tolist(), strict=True):
             self._live[track].take(time, places[free[index]], samples[free[index]])
         if births:
-            taken = set(found.tolist())
+            taken = {*found.tolist(), *doubtful.tolist()}
             new = [index for index in range(len(free)) if index not in taken]
             if new:
                 self._filters.add(uv[new], covariance[new])
+                self._lit.add(len(new))
                 for index in new:
                     self._live.append(_Live())
                     self._live[-1].take(time, places[free[index]], samples[free[index]])
             self._searched = time
         self._end(time, births=births)
 
-    def _assigned(self, uv: Array, covariance: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Tracks (k,) and the detections (k,) that they go on with; what that means for their scores."""
+    def _assigned(self, uv: Array, covariance: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Tracks (k,) and the detections (k,) that they go on with; what that means for their scores; and detections
+        (l,) that may be two tracks' in one."""
         options, n = self._options, len(self._live)
-        missed = math.log(1 - options.detected)
+        seen = options.detected * self._lit.on  # how likely each is
+        missed = np.log(1 - seen)
         none = np.zeros(0, np.int64)
         if not n or not len(uv):
-            for track in self._live:
+            for track, one in zip(self._live, missed.tolist(), strict=True):
                 track.misses += 1
-                track.score += missed
-            return none, none
+                track.score += one
+            return none, none, none
         squared, density, jerked = self._filters.against(uv, covariance)
         off = np.minimum(squared, jerked + JERKS)
         near = jerked < GATE
-        gain = math.log(options.detected / options.clutter) + density + 0.5 * (squared - off)
-        worth = np.where(near, gain - missed, 0.0)  # against a missed marker and a false detection
+        gain = np.log(seen / options.clutter)[:, None] + density + 0.5 * (squared - off)
+        worth = np.where(near, gain - missed[:, None], 0.0)  # against a missed marker and a false detection
         tracks, found = linear_sum_assignment(worth, maximize=True)
-        good = near[tracks, found] & (worth[tracks, found] > 0)
-        tracks, found = tracks[good], found[good]
+        good = near[tracks, found] & (worth[tracks, found] > AMBIGUOUS)
+        tracks, found, doubtful = tracks[good], found[good], none
         if (near.sum(axis=0) > 1).any():
             self._cut(worth, tracks, found)
-            keep = self._apart(tracks, found, near)
-            tracks, found = tracks[keep], found[keep]
-        seen = np.zeros(n, bool)
-        seen[tracks] = True
-        gained = np.full(n, missed)
+            keep = self._apart(worth, tracks, found, near)
+            tracks, found, doubtful = tracks[keep], found[keep], found[~keep]
+        there = np.zeros(n, bool)
+        there[tracks] = True
+        gained = missed
         gained[tracks] = gain[tracks, found]
-        for row, (one, is_seen) in enumerate(zip(gained.tolist(), seen.tolist(), strict=True)):
+        for row, (one, is_seen) in enumerate(zip(gained.tolist(), there.tolist(), strict=True)):
             if is_seen and self._live[row].confirmed and self._live[row].score < 0:
                 self._begin_anew(row)  # unseen for so long that it may be anything
             track = self._live[row]
@@ -267,7 +282,17 @@ class MarkerTracker:
             track.score = min(track.score + one, 2 * CONFIRMED)
             track.confirmed |= track.score > CONFIRMED
         self._filters.jerk(tracks[off[tracks, found] < squared[tracks, found]])
-        return tracks, found
+        return tracks, found, doubtful
+
+    def _miss(self, time: float, tracks: NDArray[np.int64]) -> None:
+        """All but some tracks are not seen now; where one might be another's blob that says nothing of it."""
+        seen = np.zeros(len(self._live), bool)
+        seen[tracks] = True
+        self._lit.see(seen, self._options.detected)
+        for row in np.flatnonzero(~seen).tolist():
+            apart = np.abs(self._filters.place - self._filters.place[row]).max(axis=1)
+            if (apart < TOUCHING).sum() == 1:  # itself
+                self._live[row].missed.append(time)
 
     def _cut(self, worth: Array, tracks: NDArray[np.int64], found: NDArray[np.int64]) -> None:
         """End the tracks that could as well have gone on with each other's detections; others go on in their place."""
@@ -285,15 +310,19 @@ class MarkerTracker:
             self._ended.append(self._live[row])
         self._live[row] = _Live()
 
-    def _apart(self, tracks: NDArray[np.int64], found: NDArray[np.int64], near: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which assignments hold: a detection that may be two markers in one is neither's."""
+    def _apart(
+        self, worth: Array, tracks: NDArray[np.int64], found: NDArray[np.int64], near: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Which assignments hold: a detection that may be two markers in one, or as well another's, is neither's."""
         missing = np.ones(len(self._live), bool)
         missing[tracks] = False
-        lost = [row for row in np.flatnonzero(missing).tolist() if self._live[row].confirmed]
         keep = np.ones(len(tracks), bool)
-        for row in lost:
-            touching = np.abs(self._filters.place[tracks] - self._filters.place[row]).max(axis=1) < TOUCHING
-            keep &= ~(touching & near[row, found])
+        for row in np.flatnonzero(missing).tolist():
+            if self._live[row].confirmed:
+                if self._lit.on[row] > 0.5:
+                    touching = np.abs(self._filters.place[tracks] - self._filters.place[row]).max(axis=1) < TOUCHING
+                    keep &= ~(touching & near[row, found])
+                keep &= ~(worth[tracks, found] - worth[row, found] < AMBIGUOUS)
         return keep
 
     def _end(self, time: float, *, births: bool) -> None:
@@ -302,7 +331,8 @@ class MarkerTracker:
         left = self._beyond()
         for row, track in enumerate(self._live):
             unseen = time - track.times[-1] if track.times else math.inf
-            gone = (track.misses > options.patience and unseen > options.patience_s) or (track.misses and left[row])
+            lost = track.misses > options.patience and unseen > options.patience_s + options.off
+            gone = lost or (track.misses and left[row])
             if gone or (not track.confirmed and (track.score < 0 or track.misses > options.patience)):
                 if track.confirmed:
                     self._ended.append(track)
@@ -312,6 +342,7 @@ class MarkerTracker:
                 keep[row] = False
         if not keep.all():
             self._filters.keep(keep)
+            self._lit.keep(keep)
             self._live = [track for track, kept in zip(self._live, keep.tolist(), strict=True) if kept]
 
     def _beyond(self) -> list[bool]:
@@ -337,3 +368,9 @@ class MarkerTracker:
         return any(
             max(abs(place[0] - track.uv[-1][0]), abs(place[1] - track.uv[-1][1])) < STILL_PX for track in self._parked
         )
+
+
+def _between(live: _Live) -> Array:
+    """The images [s] in which a track was missed before it was seen for the last time."""
+    missed = np.array(live.missed)
+    return missed[(missed > live.times[0]) & (missed < live.times[-1])]

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.common_view import View
 from coloc_graph.run.messages import Detections, Flag
+from coloc_graph.simulation.blinking import Blinking
 from coloc_graph.simulation.paths import SPEED, TURN_RATE, Array, wrap
 
 #: Robots keep so far from each other, middle to middle [m], and step so often [s].
@@ -85,9 +86,21 @@ def lights_of(poses: Array, times: Array, p_markers: Array) -> Array:
     return np.concatenate([xy, np.broadcast_to(pz[:, None], (*xy.shape[:-1], 1))], axis=-1)
 
 
-def detect(view: View, robot: str, p_lights: Array, times: Array, faults: Faults, rng: np.random.Generator) -> Seen:
-    """What the camera of a standing robot makes of lights at (k, ..., 3) [m] at `times` (k,) [s]."""
+def detect(
+    view: View,
+    robot: str,
+    p_lights: Array,
+    times: Array,
+    faults: Faults,
+    rng: np.random.Generator,
+    blinking: Sequence[Blinking] = (),
+) -> Seen:
+    """What the camera of a standing robot makes of lights at (k, ..., 3) [m] at `times` (k,) [s]; where robots blink,
+    lights are at (k, movers, m, 3)."""
     uv, inside = view.project(p_lights.reshape(len(times), -1, 3))
+    for n, one in enumerate(blinking):
+        own = slice(n * p_lights.shape[2], (n + 1) * p_lights.shape[2])
+        inside[:, own] &= one.on(times)[:, None]
     images, labels = [], []
     size = np.array([view.camera.width, view.camera.height])
     for time, own, seen in zip(times.tolist(), uv, inside, strict=True):
@@ -131,16 +144,17 @@ def crowd(
     fps: float = 100.0,
     area: tuple[float, float, float, float] = (0.7, 2.4, -0.8, 0.8),
     faults: Faults | None = None,
+    blinking: Sequence[Blinking] = (),
     seed: int = 0,
     start: float = 1_700_000_000.0,
 ) -> tuple[list[Seen], Array]:
     """What cameras (of robots A, B, ...) detect of robots that wander in an area, and where the lights are, (k, movers,
-    m, 3)."""
+    m, 3). They are on all the time, or `blinking`."""
     rng = np.random.default_rng(seed)
     times = np.arange(round(seconds * fps)) / fps
     p_lights = lights_of(wander(movers, seconds + STEP, area, rng), times, p_markers)
     names = [chr(ord("A") + n) for n in range(len(views))]
     faults = faults or Faults()
     return [
-        detect(v, name, p_lights, start + times, faults, rng) for v, name in zip(views, names, strict=True)
+        detect(v, name, p_lights, start + times, faults, rng, blinking) for v, name in zip(views, names, strict=True)
     ], p_lights

@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 from coloc_graph.errors import InputError
 from coloc_graph.run import whole_run
 from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Stance
+from coloc_graph.simulation.blinking import with_codes
 from coloc_graph.simulation.mess import messy_frames
 from coloc_graph.simulation.paths import Array
-from coloc_graph.simulation.rig import Imperfections
+from coloc_graph.simulation.rig import Imperfections, reference_team
 from coloc_graph.simulation.scenarios import TeamScenario, scenario
 from coloc_graph.simulation.scenery import Scenery, frames, make_scenery
 from coloc_graph.simulation.teams import build_team_world
@@ -55,6 +56,7 @@ def simulate(
     landmark_every: float | None = None,
     laps: int | None = None,
     known: bool = False,
+    blink: bool = False,
     fps: float = 10.0,
     image_format: ImageFormat = "jpeg",
     messy: bool = False,
@@ -64,14 +66,16 @@ def simulate(
 
     `points` correspondences a stance (250 for single-step and for images, else 100), two from each frame at
     depth images, which `messy` makes of a world of glare, mirrors, flicker and a person in the way. `l` [m] and
-    `theta_deg` are single-step's; `robots`, and how many move `at_once`, team's; `length` [m] in all, in how many
-    `laps`, with a landmark every so many metres, and whether the team is told where these are (`known`), are
-    landmarks'. `progress` is called with the stances done and their number. The same arguments give the same bytes.
-    Returns what was true. Raises `InputError`, and leaves no file, where an argument is wrong or the pair has no common
-    view.
+    `theta_deg` are single-step's; `robots`, how many move `at_once`, and whether they `blink` and markers have no names
+    (2000 points then) are team's; `length` [m] in all, in how many `laps`, with a landmark every so many metres, and
+    whether the team is told where these are (`known`), are landmarks'. `progress` is called with the stances done and
+    their number. The same arguments give the same bytes. Returns what was true. Raises `InputError`, and leaves no
+    file, where an argument is wrong or the pair has no common view.
     """
     if depth not in get_args(Depth):
         raise InputError(f"`depth` is {depth!r}; use tracks or images")
+    if blink and scenario_name != "team":
+        raise InputError(f"`blink` belongs to team, not to {scenario_name}; leave it out")
     if known and scenario_name != "landmarks":
         raise InputError(f"`known` belongs to landmarks, not to {scenario_name}; leave it out")
     if messy and depth != "images":
@@ -85,11 +89,12 @@ def simulate(
         length=length, landmark_every=landmark_every, laps=laps, rng=stream(seed, "formation"),
     )  # fmt: skip
     if points is None:
-        points = 250 if depth == "images" or scenario_name == "single-step" else 100
+        points = 250 if depth == "images" or scenario_name == "single-step" else 2000 if blink else 100
     if isinstance(what, TeamScenario):
         if depth == "images":
             raise InputError("the scenario team has tracks and no images: leave out `depth`")
-        world = build_team_world(what, seed=seed, points=points, imperfections=imperfections)
+        team = with_codes(reference_team(names=what.names)) if blink else None
+        world = build_team_world(what, seed=seed, points=points, imperfections=imperfections, team=team)
     else:
         world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps,
                             known=known)  # fmt: skip

@@ -5,13 +5,14 @@ import math
 import numpy as np
 
 from coloc_graph.common_view import View
+from coloc_graph.errors import InputError
 from coloc_graph.run.messages import Stance
 from coloc_graph.simulation.crowd import STEP, wander
 from coloc_graph.simulation.paths import Array, Leg, PathBuilder, drive
 from coloc_graph.simulation.rig import Imperfections, reference_team, stated_team, true_team
 from coloc_graph.simulation.scenarios import TeamScenario
 from coloc_graph.simulation.world import EPOCH, REST, Capture, World, stamp, standing_pose, stream
-from coloc_graph.team import Team
+from coloc_graph.team import IMAGES_A_BIT, Team
 
 #: Movers wander so far ahead of the foremost row, from and to, and to either side of their lanes [m]; for so long [s].
 AHEAD, ASIDE, WANDERING = (0.7, 2.1), 0.7, 20.0
@@ -30,9 +31,13 @@ def build_team_world(
     """Let it happen once, at depth tracks: some `points` correspondences for a pair that sees two movers all the time.
 
     Cameras detect the markers of all movers, and of the robots that stand before them. Robots drive through each other
-    where they change places.
+    where they change places. Raises `InputError` where robots blink and so few points are of too few images to see it.
     """
     imperfections = imperfections or Imperfections()
+    bits = [one.blink.bit for one in team.robots if one.blink] if team else []
+    least = max((math.ceil(4 * IMAGES_A_BIT * WANDERING / bit) for bit in bits), default=0)
+    if points < least:
+        raise InputError(f"`points` is {points}, too few to see robots blink; give at least {least}")
     stated = stated_team(team or reference_team(names=scenario.names), imperfections)
     true = true_team(stated, stream(seed, "team"))
     sigma = float(np.deg2rad(imperfections.floor_sigma_deg))

@@ -46,6 +46,7 @@ _STREAMS = (
     "sensor",
     "person",
     "landmarks",
+    "blink",
 )
 
 

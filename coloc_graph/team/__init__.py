@@ -4,6 +4,7 @@ Fields carry the unit a person writes (`tilt_deg`); metres where a name says not
 are one standard deviation: what a simulated truth is drawn from and what the estimators take as a prior.
 """
 
+from coloc_graph.team.blink import IMAGES_A_BIT, Blink
 from coloc_graph.team.body import LEAST_SLIP, R_BODY_OPTICAL, Devices, Markers, Mount, Slip
 from coloc_graph.team.camera import Camera
 from coloc_graph.team.file import read_team, without_none, write_team
@@ -12,8 +13,10 @@ from coloc_graph.team.sensors import Ranging, Wheels
 from coloc_graph.team.team import Floor, Robot, Team
 
 __all__ = [
+    "IMAGES_A_BIT",
     "LEAST_SLIP",
     "R_BODY_OPTICAL",
+    "Blink",
     "Camera",
     "Devices",
     "Floor",

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import msgspec
 
 from coloc_graph.errors import TeamError
+from coloc_graph.team.blink import Blink, require_told_apart
 from coloc_graph.team.body import Devices, Markers, Mount, Slip
 from coloc_graph.team.camera import Camera
 from coloc_graph.team.checks import require_finite, require_not_negative
@@ -15,14 +16,15 @@ from coloc_graph.team.sensors import Ranging, Wheels
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A body with a camera, its mount, and markers (none on a robot that is never watched).
 
-    As an anchor it stays put exactly, or, with a `slip`, within that. `devices` are for its own program. A robot
-    without a camera measures by `ranging` and `wheels`.
+    The markers are on all the time, or `blink`. As an anchor it stays put exactly, or, with a `slip`, within that.
+    `devices` are for its own program. A robot without a camera measures by `ranging` and `wheels`.
     """
 
     name: str
     camera_if_any: Camera | None = msgspec.field(default=None, name="camera")
     mount_if_any: Mount | None = msgspec.field(default=None, name="mount")
     markers: Markers | None = None
+    blink: Blink | None = None
     slip: Slip | None = None
     devices: Devices | None = None
     ranging: Ranging | None = None
@@ -35,6 +37,8 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
             raise ValueError(f"robot {self.name} has a `{there}` but no `{missing}`; give both, or neither")
         if self.camera_if_any is None and self.ranging is None:
             raise ValueError(f"robot {self.name} has no `camera` with its `mount`, and no `ranging`; give it one")
+        if self.blink is not None and self.markers is None:
+            raise ValueError(f"robot {self.name} has a `blink` but no markers; give it [robots.markers], or no `blink`")
 
     @property
     def camera(self) -> Camera:
@@ -84,6 +88,10 @@ class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         if twice:
             what = "robots" if names.count(twice[0]) > 1 else "robots or landmarks"
             raise ValueError(f"two {what} are called `{twice[0]}`; give each a name of its own")
+        require_told_apart(
+            [(one.name, one.markers.hue_deg, one.blink) for one in self.robots if one.blink and one.markers],
+            [(one.name, one.camera_if_any.fps) for one in self.robots if one.camera_if_any],
+        )
         tags: dict[tuple[str, int], str] = {}
         for landmark in self.landmarks:
             if landmark.tag is not None:
