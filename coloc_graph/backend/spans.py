@@ -5,6 +5,7 @@ plane that is nearly right, and then stays, so that the residual is a function o
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,19 +25,24 @@ FEWEST = 4
 
 
 def spans_on_plane(x_i: Array, n: Array) -> tuple[Array, Array, Array, Array]:
-    """Distances (k,) [m] on the plane n . X = 1 (n = N / d, (3,) [1/m]) of pairs of rays (x, y, 1), `x_i` (k, 2, 2).
+    """Distances (..., k) [m] on planes n . X = 1 (n = N / d, (..., 3) [1/m]) of pairs of rays (x, y, 1), `x_i`
+    (..., k, 2, 2).
 
-    With their derivatives by n (k, 3), the rays' ends X (k, 2, 3), and unit vectors (k, 3) from first to second.
-    Rays that do not meet the plane are taken to meet it far away.
+    With their derivatives by n (..., k, 3), the rays' ends X (..., k, 2, 3), and unit vectors (..., k, 3) from first to
+    second. Rays that do not meet the plane are taken to meet it far away.
     """
-    rays = np.concatenate([x_i, np.ones((*x_i.shape[:-1], 1))], axis=-1)
-    X = rays / np.maximum(rays @ n, 1e-3 * math.sqrt(n @ n))[..., None]
-    arm = X[:, 1] - X[:, 0]
-    lengths = np.sqrt((arm * arm).sum(-1))
-    u = arm / lengths[:, None]
+    n = n[..., None, None, :]
+    nearest = 1e-3 * np.sqrt((n * n).sum(-1))
+    depth = 1 / np.maximum(x_i[..., 0] * n[..., 0] + x_i[..., 1] * n[..., 1] + n[..., 2], nearest)
+    X = np.empty((*x_i.shape[:-1], 3))
+    X[..., :2] = x_i * depth[..., None]
+    X[..., 2] = depth
+    arm = X[..., 1, :] - X[..., 0, :]
+    lengths = np.sqrt(np.einsum("...a,...a->...", arm, arm))
+    u = arm / lengths[..., None]
     # dX/dn = -X X^T
-    along = (X @ u[:, :, None])[..., 0]
-    return lengths, along[:, :1] * X[:, 0] - along[:, 1:] * X[:, 1], X, u
+    along = np.einsum("...ma,...a->...m", X, u)
+    return lengths, along[..., :1] * X[..., 0, :] - along[..., 1:] * X[..., 1, :], X, u
 
 
 def _by_rays(X: Array, u: Array, n: Array) -> Array:
@@ -61,10 +67,11 @@ class SpanModel:
     homography.
 
     `weights` (m, k) @ (lengths - `noise` - span) + `by_h` (m, 8) @ h, at the k instants whose rays are clear of the
-    horizon. `noise` (k,) is what noise adds to each length.
+    horizon. `noise` (k,) is what noise adds to each length, `length` [m] the span as stated.
     """
 
     mover: str
+    length: float
     x_i: Array
     noise: Array
     weights: Array
@@ -78,7 +85,7 @@ class SpanModel:
         sine = (span.x_i @ N[:2] + N[2]) / np.sqrt(1 + (span.x_i**2).sum(-1))
         clear = (sine > max(GRAZING, SIGMAS * normal_sigma)).all(axis=1)
         if clear.sum() < FEWEST:
-            return cls(span.mover, span.x_i[:0], np.empty(0), np.empty((0, 0)), np.empty((0, 8)))
+            return cls(span.mover, length, span.x_i[:0], np.empty(0), np.empty((0, 0)), np.empty((0, 8)))
         x_i, covariance = span.x_i[clear], span.covariance[clear]
         lengths, by_n, X, u = spans_on_plane(x_i, n)
         by_x = _by_rays(X, u, n)
@@ -97,6 +104,7 @@ class SpanModel:
         weights = np.linalg.solve(np.linalg.cholesky(np.eye(len(weights)) + shared @ shared.T), weights)
         return cls(
             span.mover,
+            length,
             x_i,
             _lengthening(X, u, n, covariance),
             np.asarray(weights, float),
@@ -108,9 +116,31 @@ class SpanModel:
         root = math.sqrt(share)
         return self if share == 1 else replace(self, weights=root * self.weights, by_h=root * self.by_h)
 
-    def at(self, n: Array, span: float) -> tuple[Array, Array, Array]:
-        """The residual (m,) but for h, and its derivatives by n (m, 3) and by the span (m,)."""
-        if not len(self.weights):
-            return np.empty(0), np.empty((0, 3)), np.empty(0)
-        lengths, by_n, _, _ = spans_on_plane(self.x_i, n)
-        return self.weights @ (lengths - self.noise - span), self.weights @ by_n, -self.weights.sum(axis=1)
+    @property
+    def rows(self) -> int:
+        """How many numbers it measures."""
+        return len(self.weights)
+
+
+class Spans:
+    """As many spans of three rows each, evaluated at once; instants that some have fewer of weigh nothing."""
+
+    rows = 3
+
+    def __init__(self, models: Sequence[SpanModel]) -> None:
+        shape = len(models), max(len(one.x_i) for one in models)
+        self._x_i, self._noise = np.zeros((*shape, 2, 2)), np.zeros(shape)
+        self._weights: Array = np.zeros((len(models), self.rows, shape[1]))
+        for at, one in enumerate(models):
+            k = len(one.x_i)
+            self._x_i[at, :k], self._noise[at, :k], self._weights[at, :, :k] = one.x_i, one.noise, one.weights
+            self._x_i[at, k:] = one.x_i[0]
+        self._length: Array = np.array([one.length for one in models])
+        self._by_longer = -self._length[:, None] * self._weights.sum(axis=2)
+
+    def at(self, n: Array, longer: Array) -> tuple[Array, Array, Array]:
+        """The residuals (s, 3) but for h, and their derivatives by the planes n (s, 3, 3) and by how much `longer` (s,)
+        the spans are than stated, relative (s, 3)."""
+        lengths, by_n, _, _ = spans_on_plane(self._x_i, n)
+        off = lengths - self._noise - (self._length * (1 + longer))[:, None]
+        return (self._weights @ off[..., None])[..., 0], self._weights @ by_n, self._by_longer
