@@ -117,11 +117,17 @@ def so3_log(R: ArrayLike) -> Array:
 def so3_exp(w: ArrayLike) -> Array:
     """Rotations (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     w = np.asarray(w, float)
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
     W = hat(w)
-    a = np.sinc(angle / np.pi)
-    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    return np.asarray(np.eye(3) + a * W + b * (W @ W))
+    _, a, b = _sines(w)
+    return np.asarray(_IDENTITY + a * W + b * (W @ W))
+
+
+def _sines(w: Array) -> tuple[Array, Array, Array]:
+    """Of rotation vectors (..., 3) the angle t, sin t / t, and (1 - cos t) / t^2; (..., 1, 1) each."""
+    angle = np.sqrt((w * w).sum(-1))[..., None, None]
+    half = np.maximum(angle / 2, 1e-150)
+    sinc = np.sin(half) / half
+    return angle, sinc * np.cos(half), sinc * sinc / 2
 
 
 def se3_inverse(T_a_b: ArrayLike) -> Array:
@@ -298,13 +304,13 @@ def se3_exp(xi: ArrayLike) -> Array:
     xi = np.asarray(xi, float)
     w, v = xi[..., :3], xi[..., 3:]
     W = hat(w)
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
-    a = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    square = W @ W
+    angle, a, b = _sines(w)
     small = angle < 1e-4
     safe = np.where(small, 1.0, angle)
-    b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    V = np.eye(3) + a * W + b * (W @ W)
-    return se3(so3_exp(w), (V @ v[..., None])[..., 0])
+    c = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    V = _IDENTITY + b * W + c * square
+    return se3(_IDENTITY + a * W + b * square, (V @ v[..., None])[..., 0])
 
 
 def se3_log(T: ArrayLike) -> Array:

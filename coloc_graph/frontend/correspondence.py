@@ -6,6 +6,7 @@ one pair by what they do (`association`).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,17 +53,22 @@ def pair_by_time(times_i: Array, times_j: Array, window: float = PAIRING_WINDOW)
     """Indices (n, 2) of the samples nearest to each other in two ascending series, at most `window` [s] apart."""
     if not len(times_i) or not len(times_j):
         return np.empty((0, 2), np.int64)
-    after = np.clip(np.searchsorted(times_j, times_i), 1, max(len(times_j) - 1, 1))
-    before = after - 1
+    after = np.searchsorted(times_j, times_i)
+    before = np.maximum(after - 1, 0)
     after = np.minimum(after, len(times_j) - 1)
-    nearest = np.where(np.abs(times_j[before] - times_i) <= np.abs(times_j[after] - times_i), before, after)
-    gap = np.abs(times_j[nearest] - times_i)
-    order = np.lexsort((gap, nearest))  # each sample of j goes to the closest of i
-    first = np.ones(len(order), bool)
-    first[1:] = nearest[order][1:] != nearest[order][:-1]
-    kept = np.sort(order[first])
-    kept = kept[gap[kept] <= window + CLOCK_GRAIN]
-    return np.stack([kept, nearest[kept]], axis=1)
+    gap_before, gap_after = times_i - times_j[before], times_j[after] - times_i
+    np.abs(gap_before, out=gap_before), np.abs(gap_after, out=gap_after)
+    nearest, gap = np.where(gap_before <= gap_after, before, after), np.minimum(gap_before, gap_after)
+    kept = np.flatnonzero(gap <= window + CLOCK_GRAIN)
+    near = nearest[kept]
+    if (near[1:] == near[:-1]).any():  # each sample of j goes to the closest of i
+        order = np.lexsort((gap[kept], near))
+        first = np.ones(len(order), bool)
+        first[1:] = near[order][1:] != near[order][:-1]
+        kept = kept[np.sort(order[first])]
+    pairs = np.empty((len(kept), 2), np.int64)
+    pairs[:, 0], pairs[:, 1] = kept, nearest[kept]
+    return pairs
 
 
 #: Whether a homography, and the tracks of camera i that it pairs, can be right, by what else is known.
@@ -287,6 +293,7 @@ def _in_view(camera: Camera, H: Array, x: Array) -> NDArray[np.bool_]:
         )
 
 
+@lru_cache(maxsize=1000)  # a camera's tracks are in as many pairs as it has partners
 def normalised(track: Track, camera: Camera) -> tuple[Array, Array]:
     """A track in normalised coordinates (n, 2), with covariances (n, 2, 2)."""
     x = camera.normalise(track.uv)

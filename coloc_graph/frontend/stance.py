@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Literal
 
 import numpy as np
@@ -254,7 +254,6 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
         return ()
     robot, movers = seen.run.team[seen.robot_i], seen.stance.movers
     bias = _bias_root(found.uv_i, found.pairs.x_i, robot.camera)
-    bias = bias if robot.camera.bias_px > 0 else bias[..., :0]
     named = {track.marker: number for number, track in enumerate(seen.tracks_i) if track.marker}
     made = []
     for mover in movers:
@@ -312,10 +311,12 @@ def _measurement(
 
 def _bias_root(uv: Array, x: Array, camera: Camera) -> Array:
     """Square root (n, 2, 6) of the covariance of a camera's bias at points, in pixels and normalised (n, 2): an error
-    that is smooth over the image.
+    that is smooth over the image; (n, 2, 0) where there is none.
 
     It has a part that is the same everywhere and one that grows across the points, each `bias_px` large.
     """
+    if not camera.bias_px:
+        return np.empty((len(x), 2, 0))
     across = (uv - uv.mean(axis=0)) / np.maximum(uv.std(axis=0), 1.0)
     root = camera.bias_px * camera.per_pixel(x)
     return np.concatenate([root, across[:, :1, None] * root, across[:, 1:, None] * root], axis=2)
@@ -342,8 +343,14 @@ def _unusable(
 
 def overlap(H_j_i: Array, camera_i: Camera, camera_j: Camera, step: int = 4) -> float:
     """How many pixels of image i see a part of the plane that image j sees as well (sampled every `step`)."""
-    u, v = np.meshgrid(np.arange(step / 2, camera_i.width, step), np.arange(step / 2, camera_i.height, step))
-    x_i = camera_i.normalise(np.stack([u.ravel(), v.ravel()], axis=1))
     # beyond the plane's horizon the third coordinate changes sign, and `project` says behind
-    _, inside = camera_j.project(np.concatenate([x_i, np.ones((len(x_i), 1))], axis=1) @ H_j_i.T)
+    _, inside = camera_j.project(_rays(camera_i, step) @ H_j_i.T)
     return float(inside.sum() * step**2)
+
+
+@lru_cache(maxsize=100)
+def _rays(camera: Camera, step: int) -> Array:
+    """The rays (x, y, 1) of every so many pixels (n, 3)."""
+    u, v = np.meshgrid(np.arange(step / 2, camera.width, step), np.arange(step / 2, camera.height, step))
+    x = camera.normalise(np.stack([u.ravel(), v.ravel()], axis=1))
+    return np.concatenate([x, np.ones((len(x), 1))], axis=1)
