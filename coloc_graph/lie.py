@@ -48,6 +48,11 @@ def hat(v: ArrayLike) -> Array:
     return out
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross products (..., 3) of vectors (..., 3): numpy's own takes four times as long for a few."""
+    return np.asarray((hat(a) @ b[..., None])[..., 0])
+
+
 def across(N: ArrayLike) -> Array:
     """Two unit vectors (2, 3) across a unit vector (3,), and across each other."""
     return np.asarray(np.linalg.svd(np.asarray(N, float)[None])[2][1:])
@@ -222,8 +227,12 @@ def sl3_exp(h: ArrayLike) -> Array:
     norm = float(np.abs(D).sum(-1).max(initial=0.0))
     halvings = max(0, int(np.ceil(np.log2(norm / 0.25)))) if norm > 0.25 else 0
     D = D / 2**halvings
-    E = term = np.broadcast_to(np.eye(3), D.shape)
+    E = term = np.broadcast_to(_IDENTITY, D.shape)
+    largest, norm = 1.0, norm / 2**halvings
     for power in range(1, 13):
+        largest *= norm / power
+        if largest < 1e-18:
+            break
         term = term @ D / power
         E = E + term
     for _ in range(halvings):

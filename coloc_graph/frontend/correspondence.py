@@ -71,6 +71,27 @@ def pair_by_time(times_i: Array, times_j: Array, window: float = PAIRING_WINDOW)
     return pairs
 
 
+def pair_each_by_time(
+    series: Sequence[tuple[Array, Array]], window: float = PAIRING_WINDOW
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """`pair_by_time` of many pairs of series at once: which of them (m,), and the indices (m, 2) in it.
+
+    Laid one behind the other, so far apart that no sample is near one of another pair.
+    """
+    lengths = np.array([(len(a), len(b)) for a, b in series]).reshape(-1, 2)
+    if not lengths.all(axis=1).any():
+        return np.empty(0, np.int64), np.empty((0, 2), np.int64)
+    begin = min(a[0] for a, _ in series if len(a))
+    sides = [np.concatenate(side) - begin for side in zip(*series, strict=True)]
+    apart = 2 * max(float(np.abs(side).max()) for side in sides if len(side)) + 10 * window + 1.0
+    numbers = np.arange(len(series))
+    first = np.cumsum(lengths, axis=0) - lengths
+    laid = [side + apart * np.repeat(numbers, count) for side, count in zip(sides, lengths.T, strict=True)]
+    pairs = pair_by_time(laid[0], laid[1], window)
+    which = np.repeat(numbers, lengths[:, 0])[pairs[:, 0]]
+    return which, pairs - first[which]
+
+
 #: Whether a homography, and the tracks of camera i that it pairs, can be right, by what else is known.
 Plausible = Callable[[Array, Sequence[Track]], bool]
 
@@ -196,16 +217,20 @@ class Candidates:
         self._slopes = [np.empty((0, 2))] * len(self._j)
         if clock is not None:
             self._slopes = [_speed(track.times, x[0]) for track, x in zip(self._j, self._x_j, strict=True)]
-        for a, track_i in enumerate(self._i):
-            for b, track_j in enumerate(self._j):
-                if track_i.marker and track_j.marker and track_i.marker != track_j.marker:
-                    continue
-                if track_i.mover and track_j.mover and track_i.mover != track_j.mover:
-                    continue
-                shared = pair_by_time(track_i.times, track_j.times - offset, window)
-                shared = shared[finite_i[a][shared[:, 0]] & finite_j[b][shared[:, 1]]]
-                if len(shared):
-                    self.indices[a, b] = shared
+        alike = [
+            (a, b)
+            for a, track_i in enumerate(self._i)
+            for b, track_j in enumerate(self._j)
+            if not (track_i.marker and track_j.marker and track_i.marker != track_j.marker)
+            and not (track_i.mover and track_j.mover and track_i.mover != track_j.mover)
+        ]
+        which, every = pair_each_by_time([(self._i[a].times, self._j[b].times - offset) for a, b in alike], window)
+        ends = np.searchsorted(which, np.arange(len(alike) + 1))
+        for (a, b), begin, end in zip(alike, ends[:-1], ends[1:], strict=True):
+            shared = every[begin:end]
+            shared = shared[finite_i[a][shared[:, 0]] & finite_j[b][shared[:, 1]]]
+            if len(shared):
+                self.indices[a, b] = shared
 
     def points(self, chosen: Sequence[tuple[int, int]]) -> PointPairs:
         """All samples that some pairs of tracks share."""

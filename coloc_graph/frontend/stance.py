@@ -27,7 +27,7 @@ from coloc_graph.frontend.plane import distance_from_span
 from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.shared_pixels import Pair, pairs_of, share
-from coloc_graph.frontend.spans import marker_span
+from coloc_graph.frontend.spans import marker_spans
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
 from coloc_graph.frontend.standing import of_some_span, on_one_floor, require_on_floor
 from coloc_graph.frontend.tracking import Track, TrackerOptions
@@ -255,20 +255,20 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
     robot, movers = seen.run.team[seen.robot_i], seen.stance.movers
     bias = _bias_root(found.uv_i, found.pairs.x_i, robot.camera)
     named = {track.marker: number for number, track in enumerate(seen.tracks_i) if track.marker}
-    made = []
+    couples: dict[str, tuple[int, int]] = {}
     for mover in movers:
         markers = seen.run.team[mover].markers
         if markers is None or markers.span is None:
             continue
-        tracks = tuple(named[marker] for n in range(2) if (marker := f"{mover}/{n}") in named)
+        first, second = (named.get(f"{mover}/{n}") for n in range(2))
+        if first is not None and second is not None:
+            couples[mover] = first, second
         own = [n for n, track in enumerate(seen.tracks_i) if not named and (len(movers) == 1 or track.mover == mover)]
         if own:
             couple = couple_of([seen.tracks_i[n] for n in own], robot.camera, seen.plane, markers.span)
-            tracks = () if couple is None else (own[couple[0]], own[couple[1]])
-        if len(tracks) == 2:
-            one = marker_span(mover, tracks, found, fit, bias)
-            made += [] if one is None else [one]
-    return tuple(made)
+            if couple is not None:
+                couples[mover] = own[couple[0]], own[couple[1]]
+    return marker_spans(couples, found, fit, bias) if couples else ()
 
 
 def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: Markers | None) -> Plane:
