@@ -165,12 +165,11 @@ def test_a_span_has_unit_covariance_and_no_bias(rng):
     off, without, by_noisy_weights = [], [], []
     for _ in range(1500):
         noisy = true.x_i + (root @ rng.normal(size=(*true.x_i.shape, 1)))[..., 0]
-        model = SpanModel.near(MarkerSpan("C", noisy, true.covariance, true.by_h, true.shared), n, 0.0, MARKERS.span)
+        span = MarkerSpan("C", noisy, true.covariance, true.by_h, true.shared)
+        (model,) = SpanModel.near([span], n, 0.0, [MARKERS.span])
         off.append(Spans([model]).at(n[None], np.zeros(1))[0][0])
         without.append(off[-1] + model.weights @ model.noise)
-        cautious = SpanModel.near(
-            MarkerSpan("C", noisy, true.covariance, true.by_h, true.shared), n, 6e-3, MARKERS.span
-        )
+        (cautious,) = SpanModel.near([span], n, 6e-3, [MARKERS.span])
         by_noisy_weights.append(Spans([cautious]).at(n[None], np.zeros(1))[0][0])
     off = np.array(off)
     np.testing.assert_allclose(np.cov(off.T), np.eye(3), atol=0.15)
@@ -184,11 +183,23 @@ def test_rays_near_the_horizon_and_few_of_them_say_nothing(rng):
     span = span_of(rng)
     T = T_WORLD_I @ MOUNT_I.T_body_camera
     n = T[:3, :3].T @ np.array([0.0, 0.0, -1.0]) / (T[2, 3] - 0.15)
-    assert len(SpanModel.near(span, n, 0.0, MARKERS.span).x_i) == 40
-    cautious = SpanModel.near(span, n, 0.06, MARKERS.span)
-    assert 4 <= len(cautious.x_i) < 40  # 3 sigmas are 10 deg: farther than 1.4 m
-    nothing = SpanModel.near(span, n, 0.5, MARKERS.span)
-    assert nothing.rows == 0 and nothing.by_h.shape == (0, 8)
+    every, cautious, none = (SpanModel.near([span], n, sigma, [MARKERS.span]) for sigma in (0.0, 0.06, 0.5))
+    assert len(every[0].x_i) == 40
+    assert 4 <= len(cautious[0].x_i) < 40  # 3 sigmas are 10 deg: farther than 1.4 m
+    assert none == ()
+
+
+def test_spans_taken_together_are_those_taken_alone(rng):
+    one, other = span_of(rng, noise=1e-3, n=20), replace(span_of(rng, noise=1e-3, n=45), mover="D")
+    shared = [replace(span, shared=1e-3 * rng.normal(size=(len(span.x_i), 2, 2, 6))) for span in (one, other)]
+    T = T_WORLD_I @ MOUNT_I.T_body_camera
+    n = T[:3, :3].T @ np.array([0.0, 0.0, -1.0]) / (T[2, 3] - 0.15)
+    for spans in ([one, other], shared):
+        alone = [SpanModel.near([span], n, 0.0, [length])[0] for span, length in zip(spans, (0.25, 0.26), strict=True)]
+        for a, b in zip(alone, SpanModel.near(spans, n, 0.0, [0.25, 0.26]), strict=True):
+            assert (a.mover, a.length) == (b.mover, b.length)
+            for name in ("x_i", "noise", "weights", "by_h"):
+                np.testing.assert_allclose(getattr(b, name), getattr(a, name), rtol=1e-9, atol=1e-9)
 
 
 def test_jacobians_of_a_stated_plane(rng):

@@ -49,8 +49,8 @@ class HomographyModel:
         level = see(np.eye(4)[None], Mounts([mount_i]).at(about[None]), np.array([self.height]))
         self.spans: tuple[SpanModel, ...] = ()
         if level.seen[0]:
-            made = (SpanModel.near(one, level.n[0], tilt_sigma, markers[one.mover].span or 0.0) for one in spans)
-            self.spans = tuple(one.weighing(measured.share) for one in made if one.rows)
+            made = SpanModel.near(spans, level.n[0], tilt_sigma, [markers[one.mover].span or 0.0 for one in spans])
+            self.spans = tuple(one.weighing(measured.share) for one in made)
         self.H_inverse: Array = np.asarray(np.linalg.inv(measured.H_j_i), float)
         b = measured.by_time_offset
         self.by_offset = np.zeros(8) if b is None else clock_sign * b
@@ -69,8 +69,8 @@ class HomographyModel:
 
     @property
     def kind(self) -> Hashable:
-        """How many movers there are, whose spans it holds, and whether on a floor."""
-        return self.on_floor, len(self.movers), tuple(self.movers.index(one.mover) for one in self.spans)
+        """How many movers there are, how many spans it holds, and whether on a floor."""
+        return self.on_floor, len(self.movers), len(self.spans)
 
     @staticmethod
     def together(models: Sequence["HomographyModel"]) -> "_Homographies":
@@ -88,8 +88,9 @@ class _Homographies:
         self._H_inverse = np.array([one.H_inverse for one in models])
         self._by_h = np.array([one.by_h for one in models])
         self._by_offset = np.array([one.by_offset for one in models])
+        # one span of each after the other, and which of its movers it is of
         self._spans = [
-            (models[0].movers.index(each[0].mover), Spans(each))
+            (np.array([one.movers.index(span.mover) for one, span in zip(models, each, strict=True)]), Spans(each))
             for each in zip(*(one.spans for one in models), strict=True)
         ]
 
@@ -111,16 +112,16 @@ class _Homographies:
         by_h = self._by_h @ sl3_log_derivative(h)
         by_camera_i = -by_h @ i.generators
         by_camera_j = by_h @ (sl3_adjoint(i.P @ j.P_inverse, j.P @ i.P_inverse) @ j.generators)
-        by_markers = [np.zeros((*e.shape, 2)) for _ in markers]
-        first = 8
+        by_markers, longer = np.zeros((len(markers), *e.shape, 2)), np.array(markers)[:, :, 0]
+        first, every, by_camera = 8, np.arange(len(e)), _by_camera(i)
         for whose, spans in self._spans:
             rows = slice(first, first + spans.rows)
             first = rows.stop
-            off, by_n, by_longer = spans.at(i.n, markers[whose][:, 0])
+            off, by_n, by_longer = spans.at(i.n, longer[whose, every])
             e[:, rows] += off
-            by_markers[whose][:, rows, 0] += by_longer
-            by_camera_i[:, rows] += by_n @ _by_camera(i)
-        by_markers[0][:, :, 1] = (by_camera_i @ i.by_height[..., None] + by_camera_j @ j.by_height[..., None])[..., 0]
+            by_markers[whose, every, rows, 0] += by_longer
+            by_camera_i[:, rows] += by_n @ by_camera
+        by_markers[0, :, :, 1] = (by_camera_i @ i.by_height[..., None] + by_camera_j @ j.by_height[..., None])[..., 0]
         by_j = by_camera_j @ j.cameras.by_body
         # without a floor the plane goes where body i goes, which is body j the other way
         by_i = by_camera_i @ i.cameras.by_body if self._on_floor else -by_j @ _adjoint(se3_inverse(T_plane_j))
