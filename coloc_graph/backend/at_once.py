@@ -125,17 +125,20 @@ class AtOnce:
 
     def at(self, member: Seen, values: gtsam.Values) -> tuple[Array, list[Array]] | None:
         """What `Seen.alone` gives; None where the values are not those of the whole graph."""
-        where = self._where
-        if not (
-            all(values.atPose3(key).matrix().tobytes() == where.get(key) for key in member.poses)
-            and all(values.atVector(key).tobytes() == where.get(key) for _, key in member.variable)
-        ):
+        if not self._is_where(member, values):
             if not all(map(values.exists, (*self._poses, *self._variables))):
                 return None
             self._evaluate(values)
         group, row = self._place[id(member)]
         e, by = self._found[group]
         return e[row], [one[row] for one in by]
+
+    def _is_where(self, member: Seen, values: gtsam.Values) -> bool:
+        """Whether a member is asked for where all were evaluated last."""
+        where = self._where
+        return all(values.atPose3(key).matrix().tobytes() == where.get(key) for key in member.poses) and all(
+            values.atVector(key).tobytes() == where.get(key) for _, key in member.variable
+        )
 
     def _evaluate(self, values: gtsam.Values) -> None:
         poses = [values.atPose3(key).matrix() for key in self._poses]
