@@ -284,11 +284,12 @@ def _cayley(E: Array) -> Array:
 
 def _inverse(M: Array) -> Array:
     """Inverses (n, 3, 3), not finite where there is none."""
-    try:
-        return np.asarray(np.linalg.inv(M), float)
-    except np.linalg.LinAlgError:
-        singular = np.linalg.det(M)[:, None, None] == 0
-        return np.asarray(np.linalg.inv(np.where(singular, np.nan, M)), float)
+    with np.errstate(all="ignore"):
+        try:
+            return np.asarray(np.linalg.inv(M), float)
+        except np.linalg.LinAlgError:
+            singular = np.linalg.det(M)[:, None, None] == 0
+            return np.asarray(np.linalg.inv(np.where(singular, np.nan, M)), float)
 
 
 def sl3_adjoint(H: ArrayLike, H_inverse: ArrayLike) -> Array:
