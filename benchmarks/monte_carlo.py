@@ -3,8 +3,7 @@
 A file per seed would only cost time: this is the same world, seen through the same methods that `Run` has.
 """
 
-import itertools
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -47,7 +46,9 @@ class MemoryRun:
 
     def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
         """As `Run`."""
-        return (one for one in self._detections[robot] if start <= one.time <= end)
+        seen = self._detections[robot]
+        first = bisect_left(seen, start, key=lambda one: one.time)
+        return iter(seen[first : bisect_right(seen, end, key=lambda one: one.time)])
 
     def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
         """As `Run`."""
@@ -59,7 +60,8 @@ class MemoryRun:
             self._odometry[robot] = list(wheels.records(robot, EPOCH, world.stances[-1].end, late))
         samples = self._odometry[robot]
         first = 0 if start is None else bisect_left(samples, start, key=lambda one: one.time)
-        return itertools.takewhile(lambda one: end is None or one.time <= end, itertools.islice(samples, first, None))
+        last = len(samples) if end is None else bisect_right(samples, end, key=lambda one: one.time)
+        return iter(samples[first:last])
 
 
 def truth_of(world: World) -> dict[str, Trajectory]:

@@ -196,9 +196,9 @@ def sized(robots: int, stances: int) -> dict[str, float]:
     world = world_of(robots, stances, 0)
     run = MemoryRun(world)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    began = time.process_time()
-    solution = solve(run, SolveOptions())  # type: ignore[arg-type]
-    taken = time.process_time() - began
+    clock = [time.process_time()]  # of this process alone, whatever else the machine does
+    solution = solve(run, SolveOptions(), lambda *_: clock.append(time.process_time()))  # type: ignore[arg-type]
+    measured, taken = clock[-1] - clock[0], time.process_time() - clock[0]
     accuracy = _errors(solution.estimate, world)
     return {
         "robots": robots,
@@ -206,8 +206,8 @@ def sized(robots: int, stances: int) -> dict[str, float]:
         "poses": len(solution.estimate.graph.nodes),
         "homographies": solution.used,
         "seconds": taken,
-        "front_end_s": solution.seconds_frontend,
-        "graph_s": solution.seconds_backend,
+        "front_end_s": measured,
+        "graph_s": taken - measured,
         "mib_before": before / 1024,
         "mib_at_most": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "ate_cm": 100 * accuracy[0],

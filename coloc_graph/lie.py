@@ -13,22 +13,30 @@ Array = NDArray[np.float64]
 _IDENTITY: Array = np.eye(3)
 
 
-def rotation_x(angle: float) -> Array:
-    """Rotation about x by an angle [rad], (3, 3)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+def rotation_x(angle: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) about x by angles (...) [rad]."""
+    return _turned(angle, 1, 2)
 
 
-def rotation_y(angle: float) -> Array:
-    """Rotation about y by an angle [rad], (3, 3)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+def rotation_y(angle: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) about y by angles (...) [rad]."""
+    return _turned(angle, 2, 0)
 
 
-def rotation_z(angle: float) -> Array:
-    """Rotation about z by an angle [rad], (3, 3)."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def rotation_z(angle: ArrayLike) -> Array:
+    """Rotations (..., 3, 3) about z by angles (...) [rad]."""
+    return _turned(angle, 0, 1)
+
+
+def _turned(angle: ArrayLike, a: int, b: int) -> Array:
+    """Rotations from axis a to axis b."""
+    angle = np.asarray(angle, float)
+    out = np.zeros((*angle.shape, 3, 3))
+    out[..., a, a] = out[..., b, b] = np.cos(angle)
+    out[..., b, a] = sine = np.sin(angle)
+    out[..., a, b] = -sine
+    out[..., 3 - a - b, 3 - a - b] = 1.0
+    return out
 
 
 def hat(v: ArrayLike) -> Array:
@@ -38,6 +46,11 @@ def hat(v: ArrayLike) -> Array:
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
     return out
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Cross products (..., 3) of vectors (..., 3): numpy's own takes four times as long for a few."""
+    return np.asarray((hat(a) @ b[..., None])[..., 0])
 
 
 def across(N: ArrayLike) -> Array:
@@ -109,11 +122,17 @@ def so3_log(R: ArrayLike) -> Array:
 def so3_exp(w: ArrayLike) -> Array:
     """Rotations (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     w = np.asarray(w, float)
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
     W = hat(w)
-    a = np.sinc(angle / np.pi)
-    b = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    return np.asarray(np.eye(3) + a * W + b * (W @ W))
+    _, a, b = _sines(w)
+    return np.asarray(_IDENTITY + a * W + b * (W @ W))
+
+
+def _sines(w: Array) -> tuple[Array, Array, Array]:
+    """Of rotation vectors (..., 3) the angle t, sin t / t, and (1 - cos t) / t^2; (..., 1, 1) each."""
+    angle = np.sqrt((w * w).sum(-1))[..., None, None]
+    half = np.maximum(angle / 2, 1e-150)
+    sinc = np.sin(half) / half
+    return angle, sinc * np.cos(half), sinc * sinc / 2
 
 
 def se3_inverse(T_a_b: ArrayLike) -> Array:
@@ -208,8 +227,12 @@ def sl3_exp(h: ArrayLike) -> Array:
     norm = float(np.abs(D).sum(-1).max(initial=0.0))
     halvings = max(0, int(np.ceil(np.log2(norm / 0.25)))) if norm > 0.25 else 0
     D = D / 2**halvings
-    E = term = np.broadcast_to(np.eye(3), D.shape)
+    E = term = np.broadcast_to(_IDENTITY, D.shape)
+    largest, norm = 1.0, norm / 2**halvings
     for power in range(1, 13):
+        largest *= norm / power
+        if largest < 1e-18:
+            break
         term = term @ D / power
         E = E + term
     for _ in range(halvings):
@@ -222,24 +245,26 @@ def sl3_log(H: ArrayLike) -> Array:
 
     log E = 2 artanh((E - 1)(E + 1)^-1), after square roots (Denman and Beavers, 1976) have brought E near the identity.
     """
-    E = np.asarray(H, float)
-    Z, roots = _cayley(E), 0
-    size = np.abs(Z).max(initial=0.0)
-    while not size < 0.2:
-        if roots == 8:
-            return np.full((*E.shape[:-2], 8), np.nan)
-        E, roots = _square_root(E), roots + 1
-        Z = _cayley(E)
-        size = np.abs(Z).max(initial=0.0)
+    H = np.asarray(H, float)
+    E = H.reshape(-1, 3, 3)
+    Z, scale = _cayley(E), np.full(len(E), 2.0)
+    for _ in range(8):
+        far = ~(np.abs(Z).max(axis=(1, 2)) < 0.2)
+        if not far.any():
+            break
+        E = E.copy()
+        E[far] = _square_root(E[far])
+        Z[far], scale[far] = _cayley(E[far]), 2 * scale[far]
+    else:
+        Z[~(np.abs(Z).max(axis=(1, 2)) < 0.2)] = np.nan
     # Z + Z^3 / 3 + Z^5 / 5 + ..., up to where terms are below rounding; the norm is that of the largest of all
     square = Z @ Z
-    norm = math.sqrt(float((Z * Z).sum(axis=(-2, -1)).max(initial=1e-34)))
+    norm = math.sqrt(float(np.fmax.reduce((Z * Z).sum(axis=(1, 2)), initial=1e-34)))
     terms = max(1, math.ceil(16.5 / (-2 * math.log10(norm)))) if norm < 1 else 60
     series = _IDENTITY / (2 * terms + 1)
     for n in range(2 * terms - 1, 0, -2):
         series = _IDENTITY / n + square @ series
-    logarithm: Array = np.asarray(Z @ series * 2.0 ** (1 + roots), np.float64)
-    return sl3_vee(logarithm)
+    return sl3_vee(Z @ series * scale[:, None, None]).reshape(*H.shape[:-2], 8)
 
 
 def _square_root(E: Array) -> Array:
@@ -248,7 +273,7 @@ def _square_root(E: Array) -> Array:
         for _ in range(12):
             before = Y
             Y, W = (Y + _inverse(W)) / 2, (W + _inverse(Y)) / 2
-            if np.abs(Y - before).max(initial=0.0) < 1e-14:
+            if not np.fmax.reduce(np.abs(Y - before), axis=None, initial=0.0) >= 1e-14:
                 break
         return Y
 
@@ -258,22 +283,25 @@ def _cayley(E: Array) -> Array:
 
 
 def _inverse(M: Array) -> Array:
-    """Inverses (..., 3, 3), not finite where there is none."""
-    try:
-        return np.asarray(np.linalg.inv(M), float)
-    except np.linalg.LinAlgError:
-        return np.full_like(M, np.nan)
+    """Inverses (n, 3, 3), not finite where there is none."""
+    with np.errstate(all="ignore"):
+        try:
+            return np.asarray(np.linalg.inv(M), float)
+        except np.linalg.LinAlgError:
+            singular = np.linalg.det(M)[:, None, None] == 0
+            return np.asarray(np.linalg.inv(np.where(singular, np.nan, M)), float)
 
 
-def sl3_adjoint(H: ArrayLike) -> Array:
-    """The adjoint (8, 8) of a homography (3, 3): H exp(h) H^-1 = exp(Ad h)."""
-    H = np.asarray(H, float)
-    return np.asarray(sl3_vee(H @ SL3_BASIS @ np.linalg.inv(H)).T)
+def sl3_adjoint(H: ArrayLike, H_inverse: ArrayLike) -> Array:
+    """The adjoints (..., 8, 8) of homographies (..., 3, 3) of any scale: H exp(h) H^-1 = exp(Ad h)."""
+    H, H_inverse = (np.asarray(one, float)[..., None, :, :] for one in (H, H_inverse))
+    return np.asarray(sl3_vee(H @ SL3_BASIS @ H_inverse).mT)
 
 
 def sl3_log_derivative(h: ArrayLike) -> Array:
-    """How the coordinates (8,) of exp(h) exp(x) change with x at 0, (8, 8): the inverse right Jacobian of SL(3)."""
-    ad = np.asarray(h, float) @ _SL3_AD
+    """How the coordinates (..., 8) of exp(h) exp(x) change with x at 0, (..., 8, 8): the inverse right Jacobian of
+    SL(3)."""
+    ad = (np.asarray(h, float)[..., None, None, :] @ _SL3_AD)[..., 0, :]
     square = ad @ ad
     one = np.eye(8)
     return np.asarray(
@@ -286,13 +314,13 @@ def se3_exp(xi: ArrayLike) -> Array:
     xi = np.asarray(xi, float)
     w, v = xi[..., :3], xi[..., 3:]
     W = hat(w)
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
-    a = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    square = W @ W
+    angle, a, b = _sines(w)
     small = angle < 1e-4
     safe = np.where(small, 1.0, angle)
-    b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    V = np.eye(3) + a * W + b * (W @ W)
-    return se3(so3_exp(w), (V @ v[..., None])[..., 0])
+    c = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    V = _IDENTITY + b * W + c * square
+    return se3(_IDENTITY + a * W + b * square, (V @ v[..., None])[..., 0])
 
 
 def se3_log(T: ArrayLike) -> Array:

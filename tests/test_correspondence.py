@@ -7,6 +7,7 @@ from planar_scene import CAMERA, MARKERS, MOUNT, Scene, mounted
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend import Track, correspond, fit_homography, pair_by_time, plane_from_mount
 from coloc_graph.frontend.bodies import markers_of_movers, span_samples
+from coloc_graph.frontend.correspondence import pair_each_by_time
 
 T0 = 1_700_000_000.0
 SCENE = Scene()
@@ -205,3 +206,17 @@ def test_the_span_binds_the_two_markers_at_all_their_instants_although_the_tilt_
         plane = plane_from_mount(mounted(MOUNT, tilt_deg=tilt), MARKERS)
         ((a, b, shared),) = span_samples(markers, CAMERA, plane, 0.25)
         assert (a, b, len(shared)) == (0, 1, 80)
+
+
+def test_many_pairs_of_series_are_paired_as_one_by_one():
+    rng = np.random.default_rng(5)
+
+    def series(n):
+        return T0 + np.sort(rng.uniform(0, 0.5, n))
+
+    both = [(series(a), series(b)) for a, b in ((40, 30), (0, 5), (1, 60), (25, 0), (50, 50))]
+    which, pairs = pair_each_by_time(both, 0.01)
+    for number, (a, b) in enumerate(both):
+        assert pairs[which == number].tolist() == pair_by_time(a, b, 0.01).tolist()
+    assert len(pairs) > 40
+    assert [len(one) for one in pair_each_by_time([])] == [0, 0]

@@ -21,6 +21,7 @@ from coloc_graph.lie import (
     se3_log,
     sl3_exp,
     sl3_hat,
+    sl3_log,
     sl3_normalise,
     sl3_vee,
     so3_exp,
@@ -166,3 +167,14 @@ def test_homographies_of_determinant_1_are_a_group(rng):
 def test_sl3_normalise_undoes_any_scale_and_sign(rng, scale):
     H = sl3_exp(0.5 * rng.normal(size=(10, 8)))
     assert sl3_normalise(scale * H) == pytest.approx(H, abs=1e-10)
+
+
+def test_sl3_log_of_many_is_that_of_each_and_one_without_a_logarithm_spoils_no_other(rng):
+    h = 0.5 * rng.normal(size=(20, 8)) * np.logspace(-4, 0, 20)[:, None]
+    E = sl3_exp(h)
+    E[3], E[5] = np.diag([1.0, -1.0, -1.0]), np.nan
+    log = sl3_log(E)
+    assert np.isnan(log[[3, 5]]).all()
+    good = np.delete(np.arange(20), [3, 5])
+    assert log[good] == pytest.approx(h[good], abs=1e-12)
+    assert np.array([sl3_log(one) for one in E[good]]) == pytest.approx(h[good], abs=1e-12)

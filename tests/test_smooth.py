@@ -181,7 +181,7 @@ def test_joint_covariances_hold_the_single_ones_and_say_how_poses_move_together(
     keys = {estimate.graph.key(*node): estimate.pose(*node) for node in estimate.graph.nodes}
     for key, pose in keys.items():
         values.insert(key, pose)
-    factors, _ = Factors(FLOOR).of_graph(estimate.graph, keys)
+    factors, _, _ = Factors(FLOOR).of_graph(estimate.graph, keys)
     marginals = gtsam.Marginals(factors, values)
     wanted = [estimate.graph.key(*node) for node in nodes]
     theirs = marginals.jointMarginalCovariance(wanted)

@@ -16,7 +16,7 @@ from coloc_graph.backend.factors import Method, require_rigs
 from coloc_graph.backend.fit import Fit, fit_graph
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.landmarks import OnMap
-from coloc_graph.backend.solver import Posterior, lm_parameters, with_stack
+from coloc_graph.backend.solver import lm_parameters, with_stack
 from coloc_graph.measurements import RelativePose, Sighting
 from coloc_graph.team import Slip
 
@@ -56,22 +56,20 @@ def joint(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None =
 
 def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Values | None) -> Estimate:
     fit = fit_graph(method, graph, start)
-    posterior = Posterior(fit.factors, fit.values)
     refused: tuple[Refusal, ...] = ()
     bumped: tuple[Bump, ...] = ()
-    if refuse and _is_suspicious(fit, posterior):
+    if refuse and _is_suspicious(fit):
         bumped = _bumps(method, graph)
         for bump in bumped:
             graph = _moved(graph, bump.stay_put)
         refused = _find_wrong(method, graph)
         if refused or bumped:
             fit = fit_graph(method, graph.without(one.measurement for one in refused))
-            posterior = Posterior(fit.factors, fit.values)
     return make_estimate(
         method,
         graph,
         fit.values,
-        posterior.covariances(),
+        fit.posterior.covariances(),
         variables=fit.factors_of.variables,
         chi2=fit.chi2,
         dof=fit.dof,
@@ -81,12 +79,12 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
     )
 
 
-def _is_suspicious(fit: Fit, posterior: Posterior) -> bool:
+def _is_suspicious(fit: Fit) -> bool:
     if fit.dof <= 0:
         return False
     if fit.chance < LEAST_CHANCE_OF_ALL:
         return True
-    tested = fit.agreements(posterior, (*TESTED, StayPut))
+    tested = fit.agreements((*TESTED, StayPut))
     return any(one.chance() < LEAST_CHANCE for one in tested.values())
 
 
@@ -106,11 +104,10 @@ def _find_wrong(method: Method, graph: PoseGraph) -> tuple[Refusal, ...]:
     # twice the same set ends it, as does the last round
     for _ in range(ROUNDS):
         fit = fit_graph(method, graph.without(doubted.values()))
-        posterior = Posterior(fit.factors, fit.values)
-        tested = fit.agreements(posterior, TESTED)
+        tested = fit.agreements(TESTED)
         scale = _scale(tested.values())
         worst = min(tested, key=lambda index: tested[index].chance(scale), default=None)
-        again = {key for key, link in doubted.items() if _agrees(fit, posterior, link, scale)}
+        again = {key for key, link in doubted.items() if _agrees(fit, link, scale)}
         refusing = worst is not None and tested[worst].chance(scale) < LEAST_CHANCE
         if not again and not refusing:
             break
@@ -122,7 +119,7 @@ def _find_wrong(method: Method, graph: PoseGraph) -> tuple[Refusal, ...]:
         Refusal(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
         for link in (*graph.measurements, *graph.on_map)
         if id(link) in doubted
-        for off in [_innovation(fit, posterior, link).sigmas]
+        for off in [_innovation(fit, link).sigmas]
     )
 
 
@@ -148,18 +145,18 @@ def _outliers(fit: Fit) -> dict[int, Link]:
     return {id(fit.links[index]): fit.links[index] for index in suspects if weights[first + index] < 0.5}
 
 
-def _innovation(fit: Fit, posterior: Posterior, link: Link) -> Agreement:
+def _innovation(fit: Fit, link: Link) -> Agreement:
     """How a link that is not in the fit agrees with it; 0 of 0 where an end of it has no pose there."""
     i, j = map(fit.graph.places.key, link.ends)
     factor = fit.factors_of.of_link(link, i, j)
     if not all(map(fit.values.exists, factor.keys())):
         return UNCHECKED
-    return innovation([factor], fit.values, posterior.joint(list(factor.keys())))
+    return innovation([factor], fit.values, fit.posterior.joint(list(factor.keys())))
 
 
-def _agrees(fit: Fit, posterior: Posterior, link: Link, scale: float) -> bool:
+def _agrees(fit: Fit, link: Link, scale: float) -> bool:
     """Whether a link that was left out agrees with the rest, or is all that ties one of its ends."""
-    return _innovation(fit, posterior, link).chance(scale) >= LEAST_CHANCE
+    return _innovation(fit, link).chance(scale) >= LEAST_CHANCE
 
 
 def find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
@@ -177,7 +174,7 @@ def _bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
     bumps: list[Bump] = []
     for _ in range(MOST_BUMPS):
         fit = fit_graph(method, loose)
-        tested = fit.agreements(Posterior(fit.factors, fit.values), (StayPut, *TESTED))
+        tested = fit.agreements((StayPut, *TESTED))
         stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
         if not stays:
             break
@@ -189,7 +186,7 @@ def _bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
         freed = _moved(loose, stay)
         moved = fit_graph(method, freed)
         # by what is left once it may have moved: a bump bends everything else
-        rest = moved.agreements(Posterior(moved.factors, moved.values), TESTED)
+        rest = moved.agreements(TESTED)
         scale = _scale(rest.values())
         if stays[plainest].chance(scale) > LEAST_CHANCE:
             break

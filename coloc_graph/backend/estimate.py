@@ -135,7 +135,9 @@ class Estimate:
     def _posterior(self) -> Posterior:
         used = self.graph.without(one.measurement for one in self.refused)
         factors_of = Factors(self.graph.floor, self.calibration.variables)
-        return Posterior(factors_of.of_graph(used, poses_in(self._values))[0], self._values)
+        factors, _, at_once = factors_of.of_graph(used, poses_in(self._values))
+        with at_once:
+            return Posterior(factors, self._values)
 
     @cached_property
     def _index(self) -> dict[Node, int]:

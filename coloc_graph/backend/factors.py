@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.at_once import AtOnce, SeenFactor
 from coloc_graph.backend.calibration import Variables, is_calibration
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.homography_factor import homography_factor, markers_factor, related, sighted
@@ -150,8 +151,11 @@ class Factors:
             return related(link, factor, errors)
         return link.T_i_j
 
-    def of_graph(self, graph: PoseGraph, keys: Iterable[int]) -> tuple[gtsam.NonlinearFactorGraph, tuple[Link, ...]]:
-        """The factors over these keys, and the links among them; the links' factors come last, in that order."""
+    def of_graph(
+        self, graph: PoseGraph, keys: Iterable[int]
+    ) -> tuple[gtsam.NonlinearFactorGraph, tuple[Link, ...], AtOnce]:
+        """The factors over these keys, and the links among them; the links' factors come last, in that order. With what
+        evaluates all at once that are in Python."""
         wanted = set(keys)
         factors = gtsam.NonlinearFactorGraph()
         reference = graph.reference_key
@@ -170,7 +174,7 @@ class Factors:
             factors.add(self.calibration_prior(key))
         for factor in made:
             factors.add(factor)
-        return factors, tuple(links)
+        return factors, tuple(links), AtOnce([one.seen for one in made if isinstance(one, SeenFactor)])
 
     def nominal(self, key: int) -> Array:
         """Where the search for a calibration variable starts: as stated."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
+from coloc_graph.backend.at_once import AtOnce
 from coloc_graph.backend.chain import compose, spanning_tree
 from coloc_graph.backend.consistency import Agreement, agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
@@ -26,7 +27,8 @@ MOST_ANCHORINGS = 4
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A graph at its optimum; `links` are the last of its `factors`, in that order."""
+    """A graph at its optimum; `links` are the last of its `factors`, in that order, and `at_once` evaluates together
+    those that are in Python."""
 
     graph: PoseGraph
     factors_of: Factors
@@ -34,11 +36,19 @@ class Fit:
     links: tuple[Link, ...]
     values: gtsam.Values
     iterations: int
+    at_once: AtOnce
 
     @cached_property
     def chi2(self) -> float:
         """Of all rows that weigh."""
-        return float(2 * self.factors.error(self.values))
+        with self.at_once:
+            return float(2 * self.factors.error(self.values))
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """Its covariances."""
+        with self.at_once:
+            return Posterior(self.factors, self.values)
 
     @cached_property
     def dof(self) -> int:
@@ -54,8 +64,12 @@ class Fit:
         """The factor of a link, by its index."""
         return self.factors.at(self.factors.size() - len(self.links) + index)
 
-    def agreements(self, posterior: Posterior, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
+    def agreements(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
         """How the links of some kinds agree with all others, by index; see `ALL_TESTED`."""
+        with self.at_once:
+            return self._agreements(kinds)
+
+    def _agreements(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
         found = {}
         for index, link in enumerate(self.links):
             if not isinstance(link, kinds):
@@ -65,7 +79,7 @@ class Fit:
                 self.factors_of.rows(link, factor), LOOKED_INTO
             ):
                 continue
-            found[index] = agreement([factor], self.values, posterior.joint(list(factor.keys())))
+            found[index] = agreement([factor], self.values, self.posterior.joint(list(factor.keys())))
         return found
 
 
@@ -93,17 +107,18 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
         values.insert(key, pose)
     iterations = 0
     for left in reversed(range(MOST_ANCHORINGS)):
-        factors, links = factors_of.of_graph(graph, poses_in(values))
+        factors, links, at_once = factors_of.of_graph(graph, poses_in(values))
         for key in map(int, factors.keyVector()):
             if not values.exists(key):
                 values.insert(key, errors(key))
-        values, used = optimise(factors, values)
+        with at_once:
+            values, used = optimise(factors, values)
         iterations += used
         # spans were taken apart for mounts as stated: once more where they turned out to be elsewhere
         if not left or factors_of.is_anchored(values):
             break
         factors_of = factors_for(method, graph, values)
-    return Fit(graph, factors_of, factors, links, values, iterations)
+    return Fit(graph, factors_of, factors, links, values, iterations, at_once)
 
 
 def _mounts_first(graph: PoseGraph) -> gtsam.Values | None:

@@ -253,7 +253,8 @@ def rebuilt(graph: PoseGraph, method: Method) -> tuple[LiveGraph, tuple[Link, ..
         graph = graph.without(graph.measurements)  # nothing is tied yet but the reference
     fit = with_stack(len(graph.nodes), lambda: fit_graph(method, graph))
     live = LiveGraph(fit.factors_of)
-    live.isam.update(fit.factors, fit.values)
+    with fit.at_once:
+        live.isam.update(fit.factors, fit.values)
     live.tied = set(poses_in(fit.values))
     live._calibrated = calibrations_in(fit.values)
     return live, fit.links

@@ -6,6 +6,7 @@ one pair by what they do (`association`).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,17 +53,43 @@ def pair_by_time(times_i: Array, times_j: Array, window: float = PAIRING_WINDOW)
     """Indices (n, 2) of the samples nearest to each other in two ascending series, at most `window` [s] apart."""
     if not len(times_i) or not len(times_j):
         return np.empty((0, 2), np.int64)
-    after = np.clip(np.searchsorted(times_j, times_i), 1, max(len(times_j) - 1, 1))
-    before = after - 1
+    after = np.searchsorted(times_j, times_i)
+    before = np.maximum(after - 1, 0)
     after = np.minimum(after, len(times_j) - 1)
-    nearest = np.where(np.abs(times_j[before] - times_i) <= np.abs(times_j[after] - times_i), before, after)
-    gap = np.abs(times_j[nearest] - times_i)
-    order = np.lexsort((gap, nearest))  # each sample of j goes to the closest of i
-    first = np.ones(len(order), bool)
-    first[1:] = nearest[order][1:] != nearest[order][:-1]
-    kept = np.sort(order[first])
-    kept = kept[gap[kept] <= window + CLOCK_GRAIN]
-    return np.stack([kept, nearest[kept]], axis=1)
+    gap_before, gap_after = times_i - times_j[before], times_j[after] - times_i
+    np.abs(gap_before, out=gap_before), np.abs(gap_after, out=gap_after)
+    nearest, gap = np.where(gap_before <= gap_after, before, after), np.minimum(gap_before, gap_after)
+    kept = np.flatnonzero(gap <= window + CLOCK_GRAIN)
+    near = nearest[kept]
+    if (near[1:] == near[:-1]).any():  # each sample of j goes to the closest of i
+        order = np.lexsort((gap[kept], near))
+        first = np.ones(len(order), bool)
+        first[1:] = near[order][1:] != near[order][:-1]
+        kept = kept[np.sort(order[first])]
+    pairs = np.empty((len(kept), 2), np.int64)
+    pairs[:, 0], pairs[:, 1] = kept, nearest[kept]
+    return pairs
+
+
+def pair_each_by_time(
+    series: Sequence[tuple[Array, Array]], window: float = PAIRING_WINDOW
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """`pair_by_time` of many pairs of series at once: which of them (m,), and the indices (m, 2) in it.
+
+    Laid one behind the other, so far apart that no sample is near one of another pair.
+    """
+    lengths = np.array([(len(a), len(b)) for a, b in series]).reshape(-1, 2)
+    if not lengths.all(axis=1).any():
+        return np.empty(0, np.int64), np.empty((0, 2), np.int64)
+    begin = min(a[0] for a, _ in series if len(a))
+    sides = [np.concatenate(side) - begin for side in zip(*series, strict=True)]
+    apart = 2 * max(float(np.abs(side).max()) for side in sides if len(side)) + 10 * window + 1.0
+    numbers = np.arange(len(series))
+    first = np.cumsum(lengths, axis=0) - lengths
+    laid = [side + apart * np.repeat(numbers, count) for side, count in zip(sides, lengths.T, strict=True)]
+    pairs = pair_by_time(laid[0], laid[1], window)
+    which = np.repeat(numbers, lengths[:, 0])[pairs[:, 0]]
+    return which, pairs - first[which]
 
 
 #: Whether a homography, and the tracks of camera i that it pairs, can be right, by what else is known.
@@ -190,16 +217,20 @@ class Candidates:
         self._slopes = [np.empty((0, 2))] * len(self._j)
         if clock is not None:
             self._slopes = [_speed(track.times, x[0]) for track, x in zip(self._j, self._x_j, strict=True)]
-        for a, track_i in enumerate(self._i):
-            for b, track_j in enumerate(self._j):
-                if track_i.marker and track_j.marker and track_i.marker != track_j.marker:
-                    continue
-                if track_i.mover and track_j.mover and track_i.mover != track_j.mover:
-                    continue
-                shared = pair_by_time(track_i.times, track_j.times - offset, window)
-                shared = shared[finite_i[a][shared[:, 0]] & finite_j[b][shared[:, 1]]]
-                if len(shared):
-                    self.indices[a, b] = shared
+        alike = [
+            (a, b)
+            for a, track_i in enumerate(self._i)
+            for b, track_j in enumerate(self._j)
+            if not (track_i.marker and track_j.marker and track_i.marker != track_j.marker)
+            and not (track_i.mover and track_j.mover and track_i.mover != track_j.mover)
+        ]
+        which, every = pair_each_by_time([(self._i[a].times, self._j[b].times - offset) for a, b in alike], window)
+        ends = np.searchsorted(which, np.arange(len(alike) + 1))
+        for (a, b), begin, end in zip(alike, ends[:-1], ends[1:], strict=True):
+            shared = every[begin:end]
+            shared = shared[finite_i[a][shared[:, 0]] & finite_j[b][shared[:, 1]]]
+            if len(shared):
+                self.indices[a, b] = shared
 
     def points(self, chosen: Sequence[tuple[int, int]]) -> PointPairs:
         """All samples that some pairs of tracks share."""
@@ -287,6 +318,7 @@ def _in_view(camera: Camera, H: Array, x: Array) -> NDArray[np.bool_]:
         )
 
 
+@lru_cache(maxsize=1000)  # a camera's tracks are in as many pairs as it has partners
 def normalised(track: Track, camera: Camera) -> tuple[Array, Array]:
     """A track in normalised coordinates (n, 2), with covariances (n, 2, 2)."""
     x = camera.normalise(track.uv)

@@ -8,7 +8,7 @@ d > 0 the camera's distance to it. (R, T) is T_c2_c1. All functions are vectoris
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coloc_graph.lie import closest_rotation
+from coloc_graph.lie import closest_rotation, cross
 
 Array = NDArray[np.float64]
 
@@ -27,19 +27,15 @@ def decompose_with_normal(H: ArrayLike, N: ArrayLike, d: ArrayLike) -> tuple[Arr
     W U^T is a rotation. With noise N is made orthogonal for U; T is made of W U^T as the paper prints it, and R
     is the rotation nearest to it.
     """
-    H, N, d = np.asarray(H, float), np.asarray(N, float), np.asarray(d, float)
+    N, d, scaled = np.asarray(N, float), np.asarray(d, float), np.asarray(H, float)
     # the middle eigenvector and eigenvalue of H^T H are the middle right singular vector and value, squared
-    squares, vectors = np.linalg.eigh(H.mT @ H)
+    squares, vectors = np.linalg.eigh(scaled.mT @ scaled)
     v2 = vectors[..., 1]
-    H = H * (np.sign(np.linalg.det(H)) / np.sqrt(squares[..., 1]))[..., None, None]
+    scaled = scaled * (np.sign(np.linalg.det(scaled)) / np.sqrt(squares[..., 1]))[..., None, None]
     N_level = N - np.sum(N * v2, -1, keepdims=True) * v2
     N_level = N_level / np.linalg.norm(N_level, axis=-1, keepdims=True)
-    u = np.cross(N_level, v2)
-    U = np.stack(np.broadcast_arrays(v2, u, N_level), axis=-1)
-    Hv2, Hu = (H @ v2[..., None])[..., 0], (H @ u[..., None])[..., 0]
-    W = np.stack([Hv2, Hu, np.cross(Hv2, Hu)], axis=-1)
-    WUt = W @ np.swapaxes(U, -1, -2)
-    T = d[..., None] * ((H - WUt) @ N[..., None])[..., 0]
+    WUt = _turn(scaled, v2, cross(N_level, v2), N_level)
+    T = d[..., None] * ((scaled - WUt) @ N[..., None])[..., 0]
     return closest_rotation(WUt), np.asarray(T)
 
 
@@ -55,18 +51,19 @@ def decompose_svd(H: ArrayLike) -> tuple[Array, Array, Array]:
     s1, s3 = s[..., 0] ** 2, s[..., 2] ** 2
     width = np.sqrt(np.maximum(s1 - s3, 1e-300))
     a, b = np.sqrt(np.maximum(1 - s3, 0.0)) / width, np.sqrt(np.maximum(s1 - 1, 0.0)) / width
-    solutions = []
-    for sign in (1.0, -1.0):
-        u = a[..., None] * v1 + sign * b[..., None] * v3
-        U = np.stack([v2, u, np.cross(v2, u)], axis=-1)
-        Hv2, Hu = (H @ v2[..., None])[..., 0], (H @ u[..., None])[..., 0]
-        W = np.stack([Hv2, Hu, np.cross(Hv2, Hu)], axis=-1)
-        R = closest_rotation(W @ np.swapaxes(U, -1, -2))
-        N = np.cross(v2, u)
-        N = N * np.where(N[..., 2:] < 0, -1.0, 1.0)
-        solutions.append((R, ((H - R) @ N[..., None])[..., 0], N))
-    R, T, N = (np.stack(parts) for parts in zip(*solutions, strict=True))
-    return R, T, N
+    u = a[..., None] * v1 + np.multiply.outer([1.0, -1.0], b[..., None] * v3)
+    N = cross(v2, u)
+    R = closest_rotation(_turn(H, v2, u, N))
+    N = N * np.where(N[..., 2:] < 0, -1.0, 1.0)
+    return R, ((H - R) @ N[..., None])[..., 0], N
+
+
+def _turn(H: Array, v2: Array, u: Array, N: Array) -> Array:
+    """W U^T (..., 3, 3), the rotation that takes v2, u and N to what H makes of the two first and across them."""
+    U = np.stack(np.broadcast_arrays(v2, u, N), axis=-1)
+    W = H @ U
+    W[..., 2] = cross(W[..., 0], W[..., 1])
+    return np.asarray(W @ U.mT)
 
 
 def choose_by_normal(N_solutions: ArrayLike, N: ArrayLike) -> tuple[NDArray[np.int64], Array]:

@@ -122,12 +122,14 @@ def shared_error(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64
     coordinates. Many points average noise away, but not this: a lens that is calibrated to 0.02 px, a marker
     whose background pulls it.
     """
+    added = np.zeros((8, 8))
+    if not any(root.shape[2] for root in roots):
+        return added
     among, groups = pairs[fit.inliers], groups[fit.inliers]
     at = linearise(fit.H, among.x_i, among)
     rows = whitened_rows(at, among.x_i)
     weighted = np.linalg.inv(rows @ rows.mT) @ rows
     in_i, in_j = (root[fit.inliers] for root in roots)
-    added = np.zeros((8, 8))
     for group in np.unique(groups):
         own = groups == group
         for moved in (-(at.by_z[own] @ in_i[own]), in_j[own]):

@@ -68,15 +68,14 @@ def most_likely_pose(
     width = 1e-4 * np.where(np.isinf(model.sigmas), 1.0, np.minimum(np.maximum(model.sigmas, 1e-3), 1.0))[free]
 
     unknowns = np.zeros(len(free))
+    # central differences, all in one call
+    steps = np.zeros((1 + 2 * len(width), len(free)))
+    steps[1:, free] = np.concatenate([np.diag(width), -np.diag(width)])
     for _ in range(MAX_ITERATIONS):
-        # central differences, all in one call
-        steps = np.zeros((len(width), len(free)))
-        steps[:, free] = np.diag(width)
-        rows = unknowns + np.concatenate([np.zeros((1, len(free))), steps, -steps])
-        _, T_ci_cj, N, d = model.build(rows)
+        _, T_ci_cj, N, d = model.build(unknowns + steps)
         T_cj_ci = se3_inverse(T_ci_cj)
         H = T_cj_ci[:, :3, :3] + T_cj_ci[:, :3, 3:] * (N / d[:, None])[:, None, :]
-        residuals = sl3_log(sl3_normalise(H_inverse @ sl3_normalise(H))) @ root.T
+        residuals = sl3_log(sl3_normalise(H_inverse @ H)) @ root.T
         J = (residuals[1 : 1 + len(width)] - residuals[1 + len(width) :]).T / (2 * width)
         A = np.concatenate([J, np.diag(precision)])
         r = np.concatenate([residuals[0], precision * unknowns[free]])
@@ -103,7 +102,7 @@ def _result(
     width: Array,
     A: Array,
 ) -> RelativePose:
-    T_i_j, T_ci_cj, _, _ = model.build(unknowns + np.concatenate([np.zeros((1, len(unknowns))), steps, -steps]))
+    T_i_j, T_ci_cj, _, _ = model.build(unknowns + steps)
     off = se3_inverse(T_i_j[0]) @ T_i_j[1:]
     xi = np.concatenate([so3_log(off[:, :3, :3]), off[:, :3, 3]], axis=1)
     J = (xi[: len(width)] - xi[len(width) :]).T / (2 * width)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.decomposition import choose_by_normal, decompose_svd, decompose_with_normal, metric_scale
-from coloc_graph.lie import across, rotation_z, se3, se3_inverse, sl3_exp, so3_exp, so3_log
+from coloc_graph.lie import across, rotation_x, rotation_y, rotation_z, se3, se3_inverse, sl3_exp, so3_exp, so3_log
 from coloc_graph.measurements import HomographyMeasurement, Plane, RelativePose
 from coloc_graph.team import R_BODY_OPTICAL, Mount
 
@@ -119,9 +119,10 @@ def turned_normal(plane: Plane, mount: Mount, T_body_camera: Array) -> Array:
 
 def mounted(mount: Mount, errors: Array) -> Array:
     """T_body_camera (m, 4, 4) for errors (m, 3) of height, tilt, roll."""
-    tilt = np.deg2rad(mount.tilt_deg) + errors[:, 1]
-    roll = np.deg2rad(mount.roll_deg) + errors[:, 2]
-    zero = np.zeros_like(tilt)
-    R_tilt, R_roll = so3_exp(np.stack([zero, tilt, zero], 1)), so3_exp(np.stack([roll, zero, zero], 1))
-    t = np.stack([zero + mount.x, zero + mount.y, mount.height + errors[:, 0]], axis=1)
-    return se3(rotation_z(np.deg2rad(mount.yaw_deg)) @ R_tilt @ R_roll @ R_BODY_OPTICAL, t)
+    R_tilt = rotation_y(np.deg2rad(mount.tilt_deg) + errors[:, 1])
+    R_roll = rotation_x(np.deg2rad(mount.roll_deg) + errors[:, 2])
+    T = se3(
+        rotation_z(np.deg2rad(mount.yaw_deg)) @ R_tilt @ (R_roll @ R_BODY_OPTICAL), (mount.x, mount.y, mount.height)
+    )
+    T[:, 2, 3] += errors[:, 0]
+    return T

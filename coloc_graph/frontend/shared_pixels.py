@@ -1,13 +1,11 @@
 """Which pairs of observers are measured, and what several of them measure of the same pixels, which counts once."""
 
 import itertools
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from coloc_graph.frontend.correspondence import Correspondences, pair_by_time
+from coloc_graph.frontend.correspondence import Correspondences, pair_each_by_time
 from coloc_graph.frontend.tracking import Track
 
 #: Of many observers each is measured with so many others at least: those with which it has most in common.
@@ -21,21 +19,20 @@ def pairs_of(observers: Sequence[str], tracks: Mapping[str, Sequence[Track]], wi
     every = list(itertools.combinations(observers, 2))
     if len(observers) <= PARTNERS + 1:
         return every
-    common = {(i, j): _in_common(tracks[i], tracks[j], window) for i, j in every}
+    series, of = [], []
+    for number, (i, j) in enumerate(every):
+        for a, b in itertools.product(tracks[i], tracks[j]):
+            if a.marker == b.marker or not (a.marker and b.marker):
+                series.append((a.times, b.times))
+                of.append(number)
+    which, _ = pair_each_by_time(series, window)
+    counts = np.bincount(np.array(of, np.int64)[which], minlength=len(every))
+    common = dict(zip(every, counts.tolist(), strict=True))
     best: set[Pair] = set()
     for one in observers:
         own = sorted((pair for pair in every if one in pair), key=lambda pair: -common[pair])
         best.update(own[:PARTNERS])
     return [pair for pair in every if pair in best]
-
-
-def _in_common(tracks_i: Sequence[Track], tracks_j: Sequence[Track], window: float) -> int:
-    return sum(
-        len(pair_by_time(a.times, b.times, window))
-        for a in tracks_i
-        for b in tracks_j
-        if a.marker == b.marker or not (a.marker and b.marker)
-    )
 
 
 def share(
@@ -53,26 +50,25 @@ def share(
     """
     if len(pairs) < 2:
         return 1.0
-    names = [name for name in tracks if name not in pair]
-    seen = np.array([_sees(found, tracks[pair[0]], tracks[name], window) for name in names]).reshape(-1, len(found))
-    sets = Counter(map(tuple, seen.T.tolist()))
-    total = 0.0
-    for there, count in sets.items():
-        group = {*pair, *itertools.compress(names, there)}
-        among = sum(i in group and j in group for i, j in pairs)
-        total += count * min(1.0, (len(group) - 1) / max(among, 1))
-    return total / len(found)
-
-
-def _sees(
-    found: Correspondences, tracks_i: Sequence[Track], others: Sequence[Track], window: float
-) -> NDArray[np.bool_]:
-    """Which points (n,) another observer sees too."""
-    there = np.zeros(len(found), bool)
+    names = [*pair, *(name for name in tracks if name not in pair)]
+    seen = np.zeros((len(names), len(found)), bool)
+    seen[:2] = True
+    series, of = [], []
     for number in np.unique(found.markers):
         own = np.flatnonzero(found.markers == number)
-        name = tracks_i[number].marker
-        for track in others:
-            if track.marker == name or not (track.marker and name):
-                there[own[pair_by_time(found.times[own], track.times, window)[:, 0]]] = True
-    return there
+        marker, times = tracks[pair[0]][number].marker, found.times[own]
+        for there, name in zip(seen[2:], names[2:], strict=True):
+            for track in tracks[name]:
+                if track.marker == marker or not (track.marker and marker):
+                    series.append((times, track.times))
+                    of.append((there, own))
+    which, indices = pair_each_by_time(series, window)
+    ends = np.searchsorted(which, np.arange(len(series) + 1))
+    for (there, own), begin, end in zip(of, ends[:-1], ends[1:], strict=True):
+        there[own[indices[begin:end, 0]]] = True
+    measured = np.zeros((len(names), len(names)))
+    places = {name: place for place, name in enumerate(names)}
+    for i, j in pairs:
+        measured[places[i], places[j]] = 1.0
+    among = ((measured @ seen) * seen).sum(axis=0)
+    return float(np.minimum(1.0, (seen.sum(axis=0) - 1) / np.maximum(among, 1.0)).mean())

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 SPAN_TOLERANCE = 0.35
 #: A track without a name must see the robot drive this far for its wheels to tell front from back [m].
 LEAST_WAY = 0.1
+_NO_ERRORS = np.zeros((1, 6))
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def sight(
     shared = pair_by_time(pair[0].times, pair[1].times)
     uv = np.stack([pair[0].uv[shared[:, 0]], pair[1].uv[shared[:, 1]]], axis=1)
     times = pair[0].times[shared[:, 0]]
-    places = _on_floor(observer, plane, uv, np.zeros((len(uv), 6)))
+    places = _on_floor(observer, plane, uv)
     span = np.linalg.norm(places[:, 1] - places[:, 0], axis=1)
     length = np.linalg.norm(np.diff(markers.p_body[:2, :2], axis=0))
     with np.errstate(invalid="ignore"):
@@ -130,7 +131,7 @@ def _drives_ahead(
     if len(shared) < 2:
         return None
     uv = np.stack([first.uv[shared[:, 0]], second.uv[shared[:, 1]]], axis=1)
-    places = _on_floor(observer, plane, uv, np.zeros((len(uv), 6)))
+    places = _on_floor(observer, plane, uv)
     finite = np.isfinite(places).all(axis=(1, 2))
     if finite.sum() < 2:
         return None
@@ -145,10 +146,11 @@ def _drives_ahead(
     return None if abs(agreement) < 0.5 else agreement > 0
 
 
-def _on_floor(observer: Robot, plane: Plane, uv: Array, errors: Array) -> Array:
+def _on_floor(observer: Robot, plane: Plane, uv: Array, errors: Array = _NO_ERRORS) -> Array:
     """Places (n, m, 2) [m] on the marker plane, in the observer's body, of pixels (n, m, 2).
 
-    `errors` (n, 6) are of the normal about two axes across it [rad], of d [m], and of the mount: height, tilt, roll.
+    `errors` (n, 6), or (1, 6) of all, are of the normal about two axes across it [rad], of d [m], and of the mount:
+    height, tilt, roll.
     """
     n, m, _ = uv.shape
     T_body_camera = mounted(observer.mount, errors[:, 3:])
@@ -158,9 +160,9 @@ def _on_floor(observer: Robot, plane: Plane, uv: Array, errors: Array) -> Array:
     d = plane.d + errors[:, 2] + errors[:, 3]
     x = observer.camera.normalise(uv.reshape(-1, 2)).reshape(n, m, 2)
     rays = np.concatenate([x, np.ones((n, m, 1))], axis=2)
-    along = np.einsum("nmk,nk->nm", rays, N)
+    along = (rays @ N[..., None])[..., 0]
     p_camera = rays * (d[:, None] / np.where(along > 1e-6, along, np.nan))[..., None]
-    p_body = np.einsum("nij,nmj->nmi", T_body_camera[:, :3, :3], p_camera) + T_body_camera[:, None, :3, 3]
+    p_body = p_camera @ T_body_camera[:, :3, :3].mT + T_body_camera[:, None, :3, 3]
     return np.asarray(p_body[..., :2])
 
 

@@ -1,6 +1,6 @@
 """Two markers of a robot at the same instants in both images: what the joint estimate takes scale and tilt from."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,19 +13,18 @@ from coloc_graph.measurements import MarkerSpan
 Array = NDArray[np.float64]
 
 
-def marker_span(
-    mover: str, tracks: tuple[int, int], found: Correspondences, fit: HomographyFit, bias: Array
-) -> MarkerSpan | None:
-    """The span of a mover's markers, which are camera i's `tracks`; None where no instant shows both.
+def marker_spans(
+    couples: Mapping[str, tuple[int, int]], found: Correspondences, fit: HomographyFit, bias: Array
+) -> tuple[MarkerSpan, ...]:
+    """The spans of the markers of movers, by name, which are two of camera i's tracks; of those that some instant shows
+    both of.
 
     `bias` (n, 2, q) is the square root of the covariance of what all points of one track share in camera i.
     """
-    both = _same_instants(found, fit, tracks)
-    if not len(both):
-        return None
-    x, C, by_h = _from_both_images(found.pairs[both.ravel()], fit)
-    return MarkerSpan(
-        mover, x.reshape(-1, 2, 2), C.reshape(-1, 2, 2, 2), by_h.reshape(-1, 2, 2, 8), np.ascontiguousarray(bias[both])
+    instants = {mover: _same_instants(found, fit, tracks) for mover, tracks in couples.items()}
+    x, C, by_h = _from_both_images(found.pairs, fit)
+    return tuple(
+        MarkerSpan(mover, x[both], C[both], by_h[both], bias[both]) for mover, both in instants.items() if len(both)
     )
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Literal
 
 import numpy as np
@@ -27,7 +27,7 @@ from coloc_graph.frontend.plane import distance_from_span
 from coloc_graph.frontend.refinement import Criterion
 from coloc_graph.frontend.relative_pose import relative_pose
 from coloc_graph.frontend.shared_pixels import Pair, pairs_of, share
-from coloc_graph.frontend.spans import marker_span
+from coloc_graph.frontend.spans import marker_spans
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
 from coloc_graph.frontend.standing import of_some_span, on_one_floor, require_on_floor
 from coloc_graph.frontend.tracking import Track, TrackerOptions
@@ -254,22 +254,21 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
         return ()
     robot, movers = seen.run.team[seen.robot_i], seen.stance.movers
     bias = _bias_root(found.uv_i, found.pairs.x_i, robot.camera)
-    bias = bias if robot.camera.bias_px > 0 else bias[..., :0]
     named = {track.marker: number for number, track in enumerate(seen.tracks_i) if track.marker}
-    made = []
+    couples: dict[str, tuple[int, int]] = {}
     for mover in movers:
         markers = seen.run.team[mover].markers
         if markers is None or markers.span is None:
             continue
-        tracks = tuple(named[marker] for n in range(2) if (marker := f"{mover}/{n}") in named)
+        first, second = (named.get(f"{mover}/{n}") for n in range(2))
+        if first is not None and second is not None:
+            couples[mover] = first, second
         own = [n for n, track in enumerate(seen.tracks_i) if not named and (len(movers) == 1 or track.mover == mover)]
         if own:
             couple = couple_of([seen.tracks_i[n] for n in own], robot.camera, seen.plane, markers.span)
-            tracks = () if couple is None else (own[couple[0]], own[couple[1]])
-        if len(tracks) == 2:
-            one = marker_span(mover, tracks, found, fit, bias)
-            made += [] if one is None else [one]
-    return tuple(made)
+            if couple is not None:
+                couples[mover] = own[couple[0]], own[couple[1]]
+    return marker_spans(couples, found, fit, bias) if couples else ()
 
 
 def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: Markers | None) -> Plane:
@@ -312,10 +311,12 @@ def _measurement(
 
 def _bias_root(uv: Array, x: Array, camera: Camera) -> Array:
     """Square root (n, 2, 6) of the covariance of a camera's bias at points, in pixels and normalised (n, 2): an error
-    that is smooth over the image.
+    that is smooth over the image; (n, 2, 0) where there is none.
 
     It has a part that is the same everywhere and one that grows across the points, each `bias_px` large.
     """
+    if not camera.bias_px:
+        return np.empty((len(x), 2, 0))
     across = (uv - uv.mean(axis=0)) / np.maximum(uv.std(axis=0), 1.0)
     root = camera.bias_px * camera.per_pixel(x)
     return np.concatenate([root, across[:, :1, None] * root, across[:, 1:, None] * root], axis=2)
@@ -342,8 +343,14 @@ def _unusable(
 
 def overlap(H_j_i: Array, camera_i: Camera, camera_j: Camera, step: int = 4) -> float:
     """How many pixels of image i see a part of the plane that image j sees as well (sampled every `step`)."""
-    u, v = np.meshgrid(np.arange(step / 2, camera_i.width, step), np.arange(step / 2, camera_i.height, step))
-    x_i = camera_i.normalise(np.stack([u.ravel(), v.ravel()], axis=1))
     # beyond the plane's horizon the third coordinate changes sign, and `project` says behind
-    _, inside = camera_j.project(np.concatenate([x_i, np.ones((len(x_i), 1))], axis=1) @ H_j_i.T)
+    _, inside = camera_j.project(_rays(camera_i, step) @ H_j_i.T)
     return float(inside.sum() * step**2)
+
+
+@lru_cache(maxsize=100)
+def _rays(camera: Camera, step: int) -> Array:
+    """The rays (x, y, 1) of every so many pixels (n, 3)."""
+    u, v = np.meshgrid(np.arange(step / 2, camera.width, step), np.arange(step / 2, camera.height, step))
+    x = camera.normalise(np.stack([u.ravel(), v.ravel()], axis=1))
+    return np.concatenate([x, np.ones((len(x), 1))], axis=1)

@@ -206,14 +206,17 @@ def _name(track: Track) -> str:
 
 def named_tracks(robot: str, detections: Iterable[Detections]) -> list[Track]:
     """Tracks of detections that carry their marker's name; clipped and merged ones are left out."""
-    samples: dict[str, list[tuple[float, Array, Array, float]]] = defaultdict(list)
-    for one in detections:
-        whole = (one.flags & (Flag.CLIPPED | Flag.MERGED)) == 0
-        for index in np.flatnonzero(whole):
-            sample = (one.time, one.uv[index], one.covariance[index], float(one.peak[index]))
-            samples[one.markers[index]].append(sample)
+    every = [one for one in detections if len(one.uv)]
+    if not every:
+        return []
+    times = np.repeat([one.time for one in every], [len(one.uv) for one in every])
+    uv, covariance, peak, flags = (
+        np.concatenate([getattr(one, name) for one in every]) for name in ("uv", "covariance", "peak", "flags")
+    )
+    markers = np.array([marker for one in every for marker in one.markers])
+    whole = (flags & (Flag.CLIPPED | Flag.MERGED)) == 0
     tracks = []
-    for marker in sorted(samples):
-        times, uv, covariance, peak = zip(*samples[marker], strict=True)
-        tracks.append(Track(robot, marker, np.array(times), np.array(uv), np.array(covariance), np.array(peak)))
+    for marker in np.unique(markers[whole]).tolist():
+        own = whole & (markers == marker)
+        tracks.append(Track(robot, marker, times[own], uv[own], covariance[own], peak[own].astype(float)))
     return tracks

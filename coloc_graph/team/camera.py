@@ -118,14 +118,14 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     def per_pixel(self, x: ArrayLike) -> Array:
         """How far one pixel to the right, and one down, go at normalised coordinates x (n, 2): (n, 2, 2)."""
         at = np.asarray(x, float)
-        seen_by_x = np.broadcast_to(np.eye(2), (len(at), 2, 2))
-        if self.distortion:
-            step = 1e-6
-            sides = [
-                np.stack(self._distort(*(at + off).T), -1) - np.stack(self._distort(*(at - off).T), -1)
-                for off in ((step, 0.0), (0.0, step))
-            ]
-            seen_by_x = np.stack(sides, axis=-1) / (2 * step)
+        if not self.distortion:
+            return np.broadcast_to(np.diag([1 / self.fx, 1 / self.fy]), (len(at), 2, 2))
+        step = 1e-6
+        sides = [
+            np.stack(self._distort(*(at + off).T), -1) - np.stack(self._distort(*(at - off).T), -1)
+            for off in ((step, 0.0), (0.0, step))
+        ]
+        seen_by_x = np.stack(sides, axis=-1) / (2 * step)
         (a, b), (c, d) = np.moveaxis(seen_by_x, 0, -1)
         with np.errstate(all="ignore"):
             inverse = np.array([[d / self.fx, -b / self.fy], [-c / self.fx, a / self.fy]]) / (a * d - b * c)

@@ -1,0 +1,212 @@
+"""Measured homographies against what poses, mounts and markers predict; with the spans of the movers in the same
+images.
+
+Vectorised, with the tangents of `camera_model`. Plain numpy, no graph.
+"""
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.backend.camera_model import HATS, Mounts, SeenPlanes, see
+from coloc_graph.backend.spans import SpanModel, Spans
+from coloc_graph.lie import hat, se3_inverse, sl3_adjoint, sl3_log, sl3_log_derivative, sl3_vee
+from coloc_graph.measurements import HomographyMeasurement, MarkerSpan
+from coloc_graph.team import Markers, Mount
+
+Array = NDArray[np.float64]
+
+
+class HomographyModel:
+    """A measured homography, and the spans of the movers in the same images, against what poses and mounts predict.
+
+    Rows 0 to 7 are the sl(3) coordinates h of log(H_measured^-1 H_predicted), whitened by the information; each span
+    adds three, see `SpanModel`: what counts of it is decided for mount i off by `about` (3,), known to `tilt_sigma`.
+    The plane is level at the markers' height: in the world where robots stand on a floor, and else in body i. `movers`
+    is whose markers they are, the first one's height being that of the plane.
+
+    Variables: both mounts (3,), the markers (2,) of each of the movers, and the clocks' offset (1,) [s], whose sign is
+    `clock_sign` times what is said of camera i and j.
+    """
+
+    def __init__(
+        self,
+        measured: HomographyMeasurement,
+        spans: tuple[MarkerSpan, ...],
+        mount_i: Mount,
+        mount_j: Mount,
+        markers: dict[str, Markers],
+        on_floor: bool,
+        about: Array,
+        tilt_sigma: float,
+        clock_sign: float = 1.0,
+    ) -> None:
+        self.on_floor, self.movers = on_floor, tuple(markers)
+        self.height = next(iter(markers.values())).height
+        self.mount_i, self.mount_j = mount_i, mount_j
+        level = see(np.eye(4)[None], Mounts([mount_i]).at(about[None]), np.array([self.height]))
+        self.spans: tuple[SpanModel, ...] = ()
+        if level.seen[0]:
+            made = SpanModel.near(spans, level.n[0], tilt_sigma, [markers[one.mover].span or 0.0 for one in spans])
+            self.spans = tuple(one.weighing(measured.share) for one in made)
+        self.H_inverse: Array = np.asarray(np.linalg.inv(measured.H_j_i), float)
+        b = measured.by_time_offset
+        self.by_offset = np.zeros(8) if b is None else clock_sign * b
+        # with the offset as a variable of its own the information is that at the right offset
+        own = np.linalg.inv(measured.information) - measured.time_offset_sigma**2 * np.outer(
+            self.by_offset, self.by_offset
+        )
+        root = np.linalg.cholesky(np.linalg.inv((own + own.T) / 2)).T
+        # what is linear in h: first the whitening, then what it does to the spans
+        self.by_h = np.vstack([root, *(one.by_h for one in self.spans)])
+
+    @property
+    def rows(self) -> int:
+        """How many numbers it measures."""
+        return len(self.by_h)
+
+    @property
+    def kind(self) -> Hashable:
+        """How many movers there are, how many spans it holds, and whether on a floor."""
+        return self.on_floor, len(self.movers), len(self.spans)
+
+    @staticmethod
+    def together(models: Sequence["HomographyModel"]) -> "_Homographies":
+        """Many of them, of one kind."""
+        return _Homographies(models)
+
+
+class _Homographies:
+    """`Together` of homographies of one kind."""
+
+    def __init__(self, models: Sequence[HomographyModel]) -> None:
+        self._on_floor = models[0].on_floor
+        self._height = np.array([one.height for one in models])
+        self._mounts_i, self._mounts_j = Mounts([m.mount_i for m in models]), Mounts([m.mount_j for m in models])
+        self._H_inverse = np.array([one.H_inverse for one in models])
+        self._by_h = np.array([one.by_h for one in models])
+        self._by_offset = np.array([one.by_offset for one in models])
+        # one span of each after the other, and which of its movers it is of
+        self._spans = [
+            (np.array([one.movers.index(span.mover) for one, span in zip(models, each, strict=True)]), Spans(each))
+            for each in zip(*(one.spans for one in models), strict=True)
+        ]
+
+    def at(
+        self, T_world_i: Array, T_world_j: Array, errors: Sequence[Array]
+    ) -> tuple[Array, list[Array], NDArray[np.bool_]]:
+        mount_i, mount_j, *markers, offset = errors
+        height = self._height + markers[0][:, 1]
+        if self._on_floor:
+            T_plane_i, T_plane_j = T_world_i, T_world_j
+        else:
+            T_plane_j = se3_inverse(T_world_i) @ T_world_j
+            T_plane_i = np.broadcast_to(np.eye(4), T_plane_j.shape)
+        i = see(T_plane_i, self._mounts_i.at(mount_i), height)
+        j = see(T_plane_j, self._mounts_j.at(mount_j), height)
+        h, there = _off(self._H_inverse, j.P @ i.P_inverse)
+        e = (self._by_h @ (h - offset * self._by_offset)[..., None])[..., 0]
+
+        by_h = self._by_h @ sl3_log_derivative(h)
+        by_camera_i = -by_h @ i.generators
+        by_camera_j = by_h @ (sl3_adjoint(i.P @ j.P_inverse, j.P @ i.P_inverse) @ j.generators)
+        by_markers, longer = np.zeros((len(markers), *e.shape, 2)), np.array(markers)[:, :, 0]
+        first, every, by_camera = 8, np.arange(len(e)), _by_camera(i)
+        for whose, spans in self._spans:
+            rows = slice(first, first + spans.rows)
+            first = rows.stop
+            off, by_n, by_longer = spans.at(i.n, longer[whose, every])
+            e[:, rows] += off
+            by_markers[whose, every, rows, 0] += by_longer
+            by_camera_i[:, rows] += by_n @ by_camera
+        by_markers[0, :, :, 1] = (by_camera_i @ i.by_height[..., None] + by_camera_j @ j.by_height[..., None])[..., 0]
+        by_j = by_camera_j @ j.cameras.by_body
+        # without a floor the plane goes where body i goes, which is body j the other way
+        by_i = by_camera_i @ i.cameras.by_body if self._on_floor else -by_j @ _adjoint(se3_inverse(T_plane_j))
+        by_mounts = [by_camera_i @ i.cameras.by_errors, by_camera_j @ j.cameras.by_errors]
+        by_offset = -self._by_h @ self._by_offset[..., None]
+        return e, [by_i, by_j, *by_mounts, *by_markers, by_offset], i.seen & j.seen & there
+
+
+def _by_camera(seen: SeenPlanes) -> Array:
+    """How the planes n . X = 1 (n, 3) change with the cameras' tangents, (n, 3, 6)."""
+    n = seen.n
+    return np.concatenate([hat(n), n[:, :, None] * n[:, None, :]], axis=2)
+
+
+def _off(H_measured_inverse: Array, H: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """The coordinates (n, 8) of homographies in those of the measured ones, and which are not beyond all bounds (n,):
+    the others are 0."""
+    E = H_measured_inverse @ H
+    scale = np.linalg.det(E)
+    near = scale > 1e-9
+    h = sl3_log(np.where(near[:, None, None], E / np.cbrt(np.where(near, scale, 1.0))[:, None, None], np.eye(3)))
+    near &= np.isfinite(h).all(axis=1)
+    return np.where(near[:, None], h, 0.0), near
+
+
+def _adjoint(T: Array) -> Array:
+    """The adjoints (n, 6, 6) of poses (n, 4, 4)."""
+    R = T[:, :3, :3]
+    out = np.zeros((len(T), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = R
+    out[:, 3:, :3] = hat(T[:, :3, 3]) @ R
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class StatedPlaneModel:
+    """A measured homography of a plane that is stated in camera i, against what two cameras and the plane predict.
+
+    The plane's own variable is the error (3,) of n = N / d, across two directions and along the normal, relative to
+    the stated |n|.
+    """
+
+    measured: HomographyMeasurement
+    n: Array
+    mount_i: Mount
+    mount_j: Mount
+
+    rows = 8
+    kind = "stated plane"
+
+    @staticmethod
+    def together(models: Sequence["StatedPlaneModel"]) -> "_StatedPlanes":
+        """Many of them."""
+        return _StatedPlanes(models)
+
+
+class _StatedPlanes:
+    """`Together` of homographies of stated planes."""
+
+    def __init__(self, models: Sequence[StatedPlaneModel]) -> None:
+        self._T_bi_ci = np.array([one.mount_i.T_body_camera for one in models])
+        self._T_cj_bj = se3_inverse(np.array([one.mount_j.T_body_camera for one in models]))
+        self._n = np.array([one.n for one in models])
+        sides = np.linalg.svd(self._n[:, None])[2].copy()
+        size = np.linalg.norm(self._n, axis=1)[:, None]
+        sides[:, 0] = self._n / size
+        self._by_error = size[..., None] * sides[:, [1, 2, 0]].mT
+        self._root = np.linalg.cholesky(np.array([one.measured.information for one in models])).mT
+        self._H_inverse = np.linalg.inv(np.array([one.measured.H_j_i for one in models]))
+
+    def at(
+        self, T_world_i: Array, T_world_j: Array, errors: Sequence[Array]
+    ) -> tuple[Array, list[Array], NDArray[np.bool_]]:
+        n = self._n + (self._by_error @ errors[0][..., None])[..., 0]
+        T_bj_bi = se3_inverse(T_world_j) @ T_world_i
+        T_cj_ci = self._T_cj_bj @ T_bj_bi @ self._T_bi_ci
+        R, t = T_cj_ci[:, :3, :3], T_cj_ci[:, :3, 3]
+        H = R + t[:, :, None] * n[:, None, :]
+        h, near = _off(self._H_inverse, H)
+        by_h = self._root @ sl3_log_derivative(h)
+        back = np.linalg.inv(np.where(near[:, None, None], H, np.eye(3)))[:, None]
+        # a point X on the plane goes to R X + t: camera i turned by w and shifted by v adds R (w x X + v)
+        by_camera = np.concatenate([R[:, None] @ HATS, R.mT[..., None] * n[:, None, None]], axis=1)
+        by_ci = sl3_vee(back @ by_camera).mT
+        by_i = by_h @ by_ci @ _adjoint(se3_inverse(self._T_bi_ci))
+        by_j = -by_i @ _adjoint(se3_inverse(T_bj_bi))
+        by_n = sl3_vee(back @ (t[:, None, :, None] * np.eye(3)[:, None, :])).mT
+        return (self._root @ h[..., None])[..., 0], [by_i, by_j, by_h @ by_n @ self._by_error], near
