@@ -1,5 +1,6 @@
 """What is worked out while robots drive and while they wait, in a thread of its own; `Measuring`."""
 
+import gc
 import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
@@ -89,6 +90,7 @@ class Measuring:
             one = self._solver.enter(self._record, stance, pairs)
         except ColocError as error:
             raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
+        gc.freeze()  # what is recorded and known stays: to look through it for garbage would hold up later stances
         if not one.estimate.refused and one.estimate.agreement.chance() > CONTRADICTED:
             return one
         # contradicted: was an anchor pushed on the way to here?
