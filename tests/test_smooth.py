@@ -12,7 +12,7 @@ from teams import FLOOR, ate, graph_of_team, planar_nees, team_of
 from coloc_graph.backend import PoseGraph, chain, diagnose, smooth
 from coloc_graph.backend.consistency import Agreement
 from coloc_graph.backend.factors import Factors
-from coloc_graph.backend.solver import Posterior
+from coloc_graph.backend.posterior import Posterior
 from coloc_graph.errors import EstimationError
 from coloc_graph.lie import floor_pose
 from coloc_graph.measurements import Odometry, RelativePose, Sighting

@@ -13,7 +13,7 @@ from coloc_graph.backend.consistency import UNCHECKED, Agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.graph import PoseGraph, StayPut
 from coloc_graph.backend.landmarks import MAP, OnMap, Placed
-from coloc_graph.backend.solver import Posterior
+from coloc_graph.backend.posterior import Posterior
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Measurement, Node
 from coloc_graph.trajectory import Trajectory

@@ -13,7 +13,8 @@ from coloc_graph.backend.chain import compose, spanning_tree
 from coloc_graph.backend.consistency import Agreement, agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
 from coloc_graph.backend.graph import Link, PoseGraph
-from coloc_graph.backend.solver import Posterior, optimise
+from coloc_graph.backend.posterior import Posterior
+from coloc_graph.backend.solver import optimise
 
 Array = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""The numerical work: Levenberg-Marquardt with QR, its answer checked, and covariances from the same QR."""
+"""The numerical work: Levenberg-Marquardt with QR, and its answer checked."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -127,30 +127,7 @@ def _one_step(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsa
     return isam.calculateEstimate()
 
 
-class Posterior:
-    """Covariances of poses at the optimum, by one ISAM2 elimination with QR (GTSAM's `Marginals` knows no QR)."""
-
-    def __init__(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        self.values = values
-        parameters = gtsam.ISAM2Params()
-        parameters.setFactorization("QR")
-        self._isam = gtsam.ISAM2(parameters)
-        self._isam.update(factors, values)
-
-    def covariance(self, key: int) -> Array:
-        """Covariance of one variable: of a pose (6, 6), rotation first, body frame."""
-        return np.asarray(self._isam.marginalCovariance(key))
-
-    def covariances(self) -> dict[int, Array]:
-        """The covariances of all variables, by key."""
-        return {int(key): self.covariance(key) for key in self.values.keys()}  # noqa: SIM118  GTSAM's own
-
-    def joint(self, keys: Sequence[int]) -> Array:
-        """Joint covariance of different variables, in the order given: (6 n, 6 n) of n poses."""
-        return joint_covariance(self._isam, keys)
-
-
-def joint_covariance(isam: gtsam.ISAM2 | gtsam.Marginals, keys: Sequence[int]) -> Array:
+def joint_covariance(isam: gtsam.ISAM2, keys: Sequence[int]) -> Array:
     """Joint covariance of different variables, in the order given: (6 n, 6 n) of n poses."""
     joint = isam.jointMarginalCovariance(list(keys))
     return np.block([[joint.at(a, b) for b in keys] for a in keys])
