@@ -12,6 +12,7 @@ from teams import FLOOR, ate, graph_of_team, planar_nees, team_of
 from coloc_graph.backend import PoseGraph, chain, diagnose, smooth
 from coloc_graph.backend.consistency import Agreement
 from coloc_graph.backend.factors import Factors
+from coloc_graph.backend.fit import fit_graph
 from coloc_graph.backend.posterior import Posterior
 from coloc_graph.errors import EstimationError
 from coloc_graph.lie import floor_pose
@@ -193,12 +194,37 @@ def test_joint_covariances_hold_the_single_ones_and_say_how_poses_move_together(
     assert np.array_equal(twice[:6, :6], twice[6:, :6])
 
 
-def test_all_covariances_in_bulk_are_those_one_by_one():
-    estimate = smooth(graph_of_team(team_of(4, 8)))
-    posterior: Posterior = estimate._posterior
-    for node in estimate.graph.nodes:
-        key = estimate.graph.key(*node)
-        np.testing.assert_allclose(posterior.covariance(key), estimate.covariance(*node), rtol=1e-6, atol=1e-14)
+def test_covariances_are_those_of_the_dense_inverse():
+    fit = fit_graph("smooth", graph_of_team(team_of(4, 8)))
+    linear = fit.factors.linearize(fit.values)
+    keys = [int(key) for key in fit.values.keys()]  # noqa: SIM118  GTSAM's own
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    A = linear.jacobian(ordering)[0]
+    dense = np.linalg.inv(A.T @ A).reshape(len(keys), 6, len(keys), 6)
+    posterior = Posterior(fit.factors, fit.values)
+    scale = np.abs(dense).max()
+    for n, key in enumerate(keys):
+        np.testing.assert_allclose(posterior.covariance(key), dense[n, :, n], atol=1e-9 * scale)
+    for some in (keys[::-1], keys[2:5], [keys[-1], keys[0]]):  # the whole, near ones, far ones
+        at = [keys.index(key) for key in some]
+        expected = dense[at][:, :, at].reshape(6 * len(at), -1)
+        np.testing.assert_allclose(posterior.joint(some), expected, atol=1e-9 * scale)
+    covariances = posterior.covariances()
+    assert set(covariances) == set(keys) and np.array_equal(covariances[keys[3]], posterior.covariance(keys[3]))
+
+
+def test_a_variable_that_nothing_measures_has_no_covariance():
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    unit = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
+    keys = [gtsam.symbol("x", n) for n in range(3)]
+    factors.add(gtsam.PriorFactorPose3(keys[0], gtsam.Pose3(), unit))
+    factors.add(gtsam.BetweenFactorPose3(keys[1], keys[2], gtsam.Pose3(), unit))
+    for key in keys:
+        values.insert(key, gtsam.Pose3())
+    with pytest.raises(EstimationError, match="leaves a variable open"):
+        Posterior(factors, values)
 
 
 def straight(count, sigmas):

@@ -2,8 +2,8 @@
 follows from the root down.
 
 GTSAM's `Marginals` knows no QR, and its ISAM2 goes down the tree once for each variable, which takes hours where fifty
-robots' poses and mounts are in every clique. Sources: J. Liu, "The Multifrontal Method for Sparse Matrix Solution", 1992;
-A. Erisman and W. Tinney, "On Computing Certain Elements of the Inverse of a Sparse Matrix", 1975.
+robots' poses and mounts are in every clique. Sources: J. Liu, "The Multifrontal Method for Sparse Matrix Solution",
+1992; A. Erisman and W. Tinney, "On Computing Certain Elements of the Inverse of a Sparse Matrix", 1975.
 """
 
 from collections import defaultdict
@@ -129,9 +129,7 @@ class Posterior:
             R = np.triu(lapack.dgeqrf(stacked, overwrite_a=1)[0])[: clique.width]
             sizes = np.abs(np.diagonal(R)[:own])
             if len(R) < own or sizes.min(initial=np.inf) <= NOTHING * sizes.max(initial=0.0):
-                raise EstimationError(
-                    "the graph leaves a variable open: nothing measures it, nothing is said of it"
-                )
+                raise EstimationError("the graph leaves a variable open: nothing measures it, nothing is said of it")
             clique.R, clique.T, left[id(clique)] = R[:own, :own], R[:own, own:], R[own:, own:]
 
     def _spread(self) -> None:
