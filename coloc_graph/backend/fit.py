@@ -24,6 +24,8 @@ ALL_TESTED, LOOKED_INTO = 500, 1e-3
 LONG_RUN, PART = 30, 3
 #: Rounds of finding the mounts and taking spans apart there; mounts 3 degrees off take two.
 MOST_ANCHORINGS = 4
+#: From so many robots on each clique of the graph holds a hundred variables.
+MANY_ROBOTS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +115,7 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
             if not values.exists(key):
                 values.insert(key, errors(key))
         with at_once:
-            values, used = optimise(factors, values)
+            values, used = optimise(factors, values, roughly_first=len(graph.robots) >= MANY_ROBOTS)
         iterations += used
         # spans were taken apart for mounts as stated: once more where they turned out to be elsewhere
         if not left or factors_of.is_anchored(values):
