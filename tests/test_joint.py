@@ -315,7 +315,9 @@ def test_a_long_run_finds_its_mounts_in_its_first_part(solved, monkeypatch):
     started = []
     genuine = module.optimise
     monkeypatch.setattr(
-        module, "optimise", lambda factors, values: started.append(factors.error(values)) or genuine(factors, values)
+        module,
+        "optimise",
+        lambda factors, values, **how: started.append(factors.error(values)) or genuine(factors, values, **how),
     )
     estimate = joint(solved.estimate.graph)
     for robot, trajectory in solved.estimate.trajectories.items():

@@ -3,13 +3,14 @@
 import itertools
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 from crowd_scene import FACTS, movers, seen_by_both
 from msgspec.structs import replace as msgspec_replace
 
 from coloc_graph import stance_solver
-from coloc_graph.backend import Estimator
+from coloc_graph.backend import Estimator, joint
 from coloc_graph.common_view import View
 from coloc_graph.errors import InputError
 from coloc_graph.frontend import FrontendOptions, StanceTracks, Track, correspond, little_in_common, measure_pair
@@ -93,6 +94,24 @@ def test_a_team_is_solved_and_its_covariances_are_believable(ten):
     assert apart
     assert len(stance.observers) <= sum(m.relative_pose is not None for m in pairs) < len(pairs)
     assert not [warning for warning in solution.warnings if "never see a marker" in warning]
+
+
+def test_many_robots_come_out_the_same_though_most_of_the_way_is_by_cholesky(ten, monkeypatch):
+    graph = solve(ten, SolveOptions()).estimate.graph
+    by_qr = joint(graph)
+    taken = []
+    genuine = gtsam.LevenbergMarquardtParams.setLinearSolverType
+    monkeypatch.setattr(
+        gtsam.LevenbergMarquardtParams,
+        "setLinearSolverType",
+        lambda self, kind: taken.append(kind) or genuine(self, kind),
+    )
+    monkeypatch.setattr("coloc_graph.backend.fit.MANY_ROBOTS", 10)
+    both = joint(graph)
+    assert "MULTIFRONTAL_CHOLESKY" in taken and taken[-1] == "MULTIFRONTAL_QR"
+    assert both.chi2 == pytest.approx(by_qr.chi2, rel=1e-6)
+    for robot, trajectory in by_qr.trajectories.items():
+        np.testing.assert_allclose(both.trajectories[robot].positions, trajectory.positions, atol=1e-6)
 
 
 def test_incrementally_a_team_comes_out_the_same(ten):
