@@ -212,6 +212,7 @@ def test_covariances_are_those_of_the_dense_inverse():
         expected = dense[at][:, :, at].reshape(6 * len(at), -1)
         np.testing.assert_allclose(posterior.joint(some), expected, atol=1e-9 * scale)
     covariances = posterior.covariances()
+    assert all(np.array_equal(one, one.T) for one in covariances.values())  # to the bit, as files hold one half
     assert set(covariances) == set(keys) and np.array_equal(covariances[keys[3]], posterior.covariance(keys[3]))
 
 

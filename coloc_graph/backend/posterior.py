@@ -144,7 +144,8 @@ class Posterior:
             back = solve_triangular(clique.R, np.eye(clique.own), check_finite=False)
             gain = -back @ clique.T
             across = gain @ rest
-            clique.covariance = np.concatenate([back @ back.T + across @ gain.T, across], axis=1)
+            own = back @ back.T + across @ gain.T
+            clique.covariance = np.concatenate([(own + own.T) / 2, across], axis=1)
             if clique.children:
                 whole = np.concatenate([clique.covariance, np.concatenate([across.T, rest], axis=1)])
                 ready += [(child, whole) for child in clique.children]
