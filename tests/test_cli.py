@@ -14,6 +14,7 @@ import pytest
 
 from coloc_graph._version import __version__
 from coloc_graph.cli import main
+from coloc_graph.cli.printing import warn
 from coloc_graph.pipeline import solve
 from coloc_graph.run import open_run
 
@@ -222,3 +223,11 @@ def test_interrupting_ends_with_130_and_leaves_nothing(tmp_path):
     assert process.returncode == 130
     assert err.splitlines()[-1] == "coloc: interrupted" and "Traceback" not in err and out == ""
     assert list(tmp_path.iterdir()) == []
+
+
+def test_of_many_warnings_those_are_said_that_no_file_keeps(capsys):
+    many = [f"number {n}" for n in range(12)]
+    warn(many)
+    assert capsys.readouterr().err.count("\n") == 9
+    warn(many, kept=False)
+    assert capsys.readouterr().err.splitlines() == [f"warning: {one}" for one in many]

@@ -49,7 +49,6 @@ class Posterior:
     """Covariances of the variables of a graph at its optimum. `EstimationError` where factors leave one open."""
 
     def __init__(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        self.values = values
         linear = factors.linearize(values)
         ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         keys = [int(ordering.at(n)) for n in range(ordering.size())]
@@ -90,7 +89,7 @@ class Posterior:
                 parent = min(later[n])
                 later[parent] |= later[n]
                 later[parent].discard(parent)
-        cliques: list[_Clique] = [None] * count  # type: ignore[list-item]
+        cliques: dict[int, _Clique] = {}
         for n in reversed(range(count)):
             parent = min(later[n], default=-1)
             if parent >= 0 and len(later[n]) == len(later[parent]) + 1:
@@ -100,12 +99,12 @@ class Posterior:
             cliques[n] = _Clique([n], sorted(later[n]), cliques[parent] if parent >= 0 else None)
             if parent >= 0:
                 cliques[parent].children.append(cliques[n])
-        for clique in {id(one): one for one in cliques}.values():
+        for clique in {id(one): one for one in cliques.values()}.values():
             for n in (*clique.first, *clique.rest):
                 clique.begin[n] = clique.width
                 clique.width += self._sizes[n]
             clique.own = sum(self._sizes[n] for n in clique.first)
-        return cliques
+        return [cliques[n] for n in range(count)]
 
     def _span(self, clique: _Clique, variables: Sequence[int]) -> Index:
         """The columns of variables, one after the other."""

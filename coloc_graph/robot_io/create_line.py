@@ -42,10 +42,18 @@ class CreateLine:
             if not self.model:
                 bauds = " or ".join(str(WHEELS[one].baud) for one in models)
                 raise RobotError(f"no Create answers on {port} at {bauds} baud: switch it on, check model and cable")
-            self._stopper = Stopper(self._serial.fileno(), oi.HALT, LEAVE)
+            self._stopper = self._stood_by()
         except BaseException:
             self.close()
             raise
+
+    def _stood_by(self) -> Stopper:
+        try:
+            return Stopper(self._serial.fileno(), oi.HALT, LEAVE)
+        except OSError as error:
+            raise RobotError(
+                f"the process that stops the wheels on {self.port} when this one is killed cannot be started ({error})"
+            ) from error
 
     def _first_opened(self, model: int) -> serial.Serial:
         """The port, once the stopper of a driver that was killed has let go of it."""

@@ -1,7 +1,8 @@
 """What moves is stopped when its process ends: at exit, and on SIGTERM, SIGINT and SIGHUP.
 
 The user's own signal handlers are kept: ours stops what moves, then calls the one that was there before, or lets
-the signal do what it does by default. Nothing in a process can act on SIGKILL, SIGSTOP or a lost computer.
+the signal do what it does by default. Nothing in a process can act on SIGKILL or SIGSTOP: that
+is what `stopper.py` is for. Nothing acts on a lost computer.
 """
 
 import atexit

@@ -1,19 +1,21 @@
 """The scene of a drive: robots that drive all the time, whose moments stand where others have stances."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from coloc_graph.errors import InputError
-from coloc_graph.evaluation import Alignment, align, left_out, with_truth
+from coloc_graph.evaluation import Alignment
 from coloc_graph.results import LANDMARKS, Result
-from coloc_graph.run import Run, Stance, read_truth
+from coloc_graph.run import Run, Stance
 from coloc_graph.trajectory import Trajectory
-from coloc_graph.viewer.scene import TRUE, Array, Landmarks, Layer, Scene, layer_of
+from coloc_graph.viewer.scene import Array, Landmarks, Scene, layer_of
 from coloc_graph.viewer.ties import links_of, wheels_of
+from coloc_graph.viewer.truth import true_layers
 
 #: How long a moment is at least [s], and how many there are at most.
 MOMENT, MOST = 1.0, 2000
@@ -27,7 +29,8 @@ def scene_of_drive(result: Result, run: Run) -> Scene:
     robots = run.team.names
     moments = _moments(result)
     first = {robot: _firsts(one, moments) for robot, one in result.trajectories.items()}
-    true, notes = _true(result, run, first, robots, moments)
+    how: Alignment = "none" if result.summary.get("world") == "map" else "team"
+    true, notes = true_layers(run, robots, moments, first, on_floor=True, alignment=how)
     measured = _measured(result.path / "measurements.csv", moments)
     between = [((a, k), (b, k)) for k, a, b in measured if b in robots]
     return Scene(
@@ -69,48 +72,32 @@ def _firsts(one: Trajectory, moments: Sequence[Stance]) -> Trajectory:
     return replace(one.where(kept), stances=moment.astype(np.int64))
 
 
-def _true(
-    result: Result, run: Run, first: dict[str, Trajectory], robots: Sequence[str], moments: Sequence[Stance]
-) -> tuple[tuple[Layer, ...], tuple[str, ...]]:
-    """The true poses at the same instants; and why not, where there are none."""
-    truth = read_truth(run.path)
-    if not truth:
-        return (), ()
-    how: Alignment = "none" if result.summary.get("world") == "map" else "team"
+@contextmanager
+def _rows(path: Path) -> Iterator[list[dict[str, str]]]:
+    """The rows of a file of the result; what is wrong with them is an `InputError` that names it."""
     try:
-        true = align(first, truth, run.team.reference, on_floor=True, alignment=how)
-    except InputError as error:
-        return (), (f"the truth in the run is not shown: {error}",)
-    poses = {
-        robot: replace(one, T_world_body=true[robot], covariances=None).where(with_truth(true[robot]))
-        for robot, one in first.items()
-    }
-    return (layer_of(TRUE, robots, moments, poses),), left_out(first, true)
+        with path.open(encoding="utf-8", newline="") as file:
+            yield list(csv.DictReader(file))
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is damaged ({error}); solve the run again") from error
 
 
 def _measured(path: Path, moments: Sequence[Stance]) -> list[tuple[int, str, str]]:
     """(moment, who, whom) of what is in the estimate, each once."""
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row["residual_range"] and row["doubted"] == "no"]
-        at = _moment_of(np.array([float(row["time"]) for row in rows]), moments)
-        return sorted({(int(k), row["robot"], row["target"]) for k, row in zip(at, rows, strict=True) if k >= 0})
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is damaged ({error}); solve the run again") from error
+    with _rows(path) as rows:
+        used = [row for row in rows if row["residual_range"] and row["doubted"] == "no"]
+        at = _moment_of(np.array([float(row["time"]) for row in used]), moments)
+        return sorted({(int(k), row["robot"], row["target"]) for k, row in zip(at, used, strict=True) if k >= 0})
 
 
 def _landmarks(
     path: Path, measured: Sequence[tuple[int, str, str]], robots: Sequence[str], moments: Sequence[Stance]
 ) -> Landmarks:
     """Landmarks, which have a place and no heading."""
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
+    columns = ("x", "y", "x_sigma", "y_sigma", "xy_correlation")
+    with _rows(path) as rows:
         names = tuple(row["name"] for row in rows)
-        columns = ("x", "y", "x_sigma", "y_sigma", "xy_correlation")
         numbers = np.array([[float(row[name]) for name in columns] for row in rows]).reshape(-1, len(columns))
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is damaged ({error}); solve the run again") from error
     sigmas = numbers[:, 2:4]
     covariance = sigmas[:, :, None] * sigmas[:, None]
     covariance[:, 0, 1] *= numbers[:, 4]

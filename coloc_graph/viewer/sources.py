@@ -4,7 +4,7 @@ import csv
 import itertools
 import os
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,19 +14,18 @@ import numpy as np
 from coloc_graph.backend import Estimate, Method, chain, smooth
 from coloc_graph.backend.graph import Places
 from coloc_graph.errors import EstimationError, InputError
-from coloc_graph.evaluation import align, left_out, with_truth
 from coloc_graph.exchange.landmarks import landmark_rows, read_landmarks
 from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions
 from coloc_graph.measurements import RelativePose
 from coloc_graph.pipeline import Progress, Solution, SolveOptions, solve
 from coloc_graph.results import LANDMARKS, read_result
-from coloc_graph.run import Run, Stance, open_run, read_truth
+from coloc_graph.run import Run, Stance, open_run
 from coloc_graph.team import read_team
-from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.drive import scene_of_drive
-from coloc_graph.viewer.scene import NO_EDGES, TRUE, Edges, Index, Layer, Scene, layer_of
+from coloc_graph.viewer.scene import NO_EDGES, Edges, Index, Scene, layer_of
 from coloc_graph.viewer.still import landmarks_in, sighted_in
 from coloc_graph.viewer.ties import ties_in, ties_on_disk, wheels_of
+from coloc_graph.viewer.truth import true_layers
 
 #: What the methods' layers are called.
 NAMES = {"chain": "chained", "smooth": "smoothed", "joint": "joint"}
@@ -51,7 +50,8 @@ def scene_of_estimate(
     every = (estimate, *others)
     layers = [layer_of(NAMES[one.method], graph.robots, graph.stances, one.trajectories) for one in every]
     team = run.team if run is not None else None
-    true, notes = _true(run, graph.robots, graph.stances, estimate.trajectories)
+    on_floor = run is not None and run.team.floor is not None
+    true, notes = true_layers(run, graph.robots, graph.stances, estimate.trajectories, on_floor=on_floor)
     sightings, odometry = ties_in(graph.measurements, graph.robots, graph.stances)
     refused = {id(one.measurement) for one in estimate.refused}
     sighted = sighted_in((m for m in graph.measurements if id(m) not in refused), graph.landmarks)
@@ -128,7 +128,8 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
     name = NAMES.get(str(result.summary.get("method")), str(result.summary.get("method")))
     robots, stances = run.team.names, run.stances
     refined = result.path / "team.toml"
-    true, notes = _true(run, robots, stances, result.trajectories)
+    on_floor = run.team.floor is not None
+    true, notes = true_layers(run, robots, stances, result.trajectories, on_floor=on_floor)
     edges = _edges_on_disk(result.path / "measurements.csv", robots, stances)
     pairs = {
         (stances[row].index, frozenset((robots[i], robots[j])))
@@ -170,26 +171,6 @@ def with_other(scene: Scene, path: str | Path) -> Scene:
 def is_run(path: str | Path) -> bool:
     """Whether a path is to be opened as a run, and not as the folder of a result."""
     return not os.path.isdir(path)  # noqa: PTH112  a path that is not there is opened, and says so
-
-
-def _true(
-    run: Run | None, robots: Sequence[str], stances: Sequence[Stance], estimated: Mapping[str, Trajectory]
-) -> tuple[tuple[Layer, ...], tuple[str, ...]]:
-    """The true poses in the estimate's world, if there are any; and why not, where they do not cover the estimate."""
-    if run is None or not any(len(one) for one in estimated.values()):
-        return (), ()
-    truth = read_truth(run.path)
-    if not truth:
-        return (), ()
-    try:
-        true = align(estimated, truth, run.team.reference, on_floor=run.team.floor is not None)
-    except InputError as error:
-        return (), (f"the truth in the run is not shown: {error}",)
-    trajectories = {
-        robot: replace(one, T_world_body=true[robot], covariances=None).where(with_truth(true[robot]))
-        for robot, one in estimated.items()
-    }
-    return (layer_of(TRUE, robots, stances, trajectories),), left_out(estimated, true)
 
 
 def _edges(estimate: Estimate, measurements: Sequence[PairMeasurement]) -> Edges:
