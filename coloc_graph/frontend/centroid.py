@@ -16,7 +16,11 @@ MAX_ITERATIONS = 12
 #: The search ends when centres move by less than this [px].
 CONVERGED = 1e-3
 #: No spot is narrower than this [px^2]: a lens and a pixel blur as much.
-LEAST_VARIANCE = 0.1
+LEAST_VARIANCE = 0.25
+#: So many times each of several spots in a window is measured without the others.
+APART = 4
+#: Spots nearer than this many times their half axis, a Gaussian's sigma, cannot be told apart.
+TOUCHING = 4.0
 #: Nor wider than this [px^2].
 MOST_VARIANCE = 400.0
 
@@ -25,16 +29,51 @@ MOST_VARIANCE = 400.0
 class Spots:
     """Spots in n windows: `centre` (n, 2) [px in the window: u, v], `covariance` (n, 2, 2) [px^2].
 
-    `shape` (n, 2, 2) [px^2] are the spot's own second moments, `signal` (n, h, w) the light without background,
-    `noise` (n,) that of a pixel [grey levels]. `found` (n,) is False where there is no spot to measure.
+    `shape` (n, 2, 2) [px^2] are the spot's own second moments, `flux` (n,) all its light [grey levels], `signal`
+    (n, h, w) the light without background, `noise` (n,) that of a pixel [grey levels]. `found` (n,) is False where
+    there is no spot to measure.
     """
 
     centre: Array
     covariance: Array
     shape: Array
+    flux: Array
     signal: Array
     noise: Array
     found: NDArray[np.bool_]
+
+    def models(self) -> Array:
+        """The light (n, h, w) of Gaussian spots like these; nothing where none was found."""
+        height, width = self.signal.shape[1:]
+        dx = (np.arange(width) - self.centre[:, :1])[:, None, :]
+        dy = (np.arange(height) - self.centre[:, 1:])[:, :, None]
+        a, b, c = (self.shape[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+        det = a * c - b * b
+        square = (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / det
+        peak = np.where(self.found, self.flux, 0.0)[:, None, None] / (2 * np.pi * np.sqrt(det))
+        return np.asarray(peak * np.exp(-0.5 * square))
+
+
+def measure_first(
+    light: Array, inner: NDArray[np.bool_], levels: float, shot_gain: float
+) -> tuple[Spots, NDArray[np.bool_]]:
+    """Measure the first of k spots a window: `inner` (n, k, h, w) are the pixels that each was found by.
+
+    Each is measured in what the others, as Gaussian spots, leave of the light, in turns. Also says which (n,) are so
+    near another that they cannot be told apart. Otherwise as `measure_spots`.
+    """
+    n, k = inner.shape[:2]
+    if k == 1:
+        return measure_spots(light, inner[:, 0], levels, shot_gain), np.zeros(n, bool)
+    others = np.zeros_like(inner, float)
+    for _ in range(APART):
+        left = (light[:, None] - others).reshape(n * k, *light.shape[1:])
+        spots = measure_spots(left, inner.reshape(left.shape), levels, shot_gain)
+        models = spots.models().reshape(inner.shape)
+        others = models.sum(axis=1, keepdims=True) - models
+    first = measure_spots(light - others[:, 0], inner[:, 0], levels, shot_gain)
+    off = np.linalg.norm(spots.centre.reshape(n, k, 2)[:, 1:] - first.centre[:, None], axis=2)
+    return first, off.min(axis=1) < TOUCHING * axes(first.shape)[1]
 
 
 def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_gain: float) -> Spots:
@@ -82,7 +121,11 @@ def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_ga
     of_mean = np.stack([xx, variance[:, 1, 1], variance[:, 1, 1], yy], axis=1).reshape(-1, 2, 2)
     covariance = gain @ of_mean @ gain.mT / np.maximum(total**2, 1e-9)[:, None, None]
     found &= (total > 0) & np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(centre).all(axis=1)
-    return Spots(centre, covariance, shape, signal, noise, found)
+    # what a Gaussian window lets through of a Gaussian spot
+    window = shape[:, [0, 1], [0, 1]]
+    both = (shape[:, 0, 0] + window[:, 0]) * (shape[:, 1, 1] + window[:, 1]) - shape[:, 0, 1] ** 2
+    flux = total * np.sqrt(both / window.prod(axis=1))
+    return Spots(centre, covariance, shape, flux, signal, noise, found)
 
 
 def _rough_shape(inner: NDArray[np.bool_], x: Array, y: Array) -> Array:
@@ -92,8 +135,8 @@ def _rough_shape(inner: NDArray[np.bool_], x: Array, y: Array) -> Array:
     dx, dy = x - lit.sum(axis=1) @ x[:, None] / area, y - lit.sum(axis=2) @ y[:, None] / area
     m = _moments(lit, np.ones_like(dx), np.ones_like(dy), dx, dy) / area[:, :, None]
     moments = np.stack([m[:, 0, 2], m[:, 1, 1], m[:, 1, 1], m[:, 2, 0]], axis=1).reshape(-1, 2, 2)
-    # the part of a Gaussian above a third of its peak has half the moments of the whole
-    return np.asarray(2 * moments + 0.2 * np.eye(2))
+    # the part of a Gaussian above a third of its peak has half the moments of the whole; one or two pixels have none
+    return np.asarray(2 * moments + 0.4 * np.eye(2))
 
 
 def _windows(centre: Array, variances: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.frontend.centroid import at_points, axes, measure_spots
+from coloc_graph.frontend.centroid import at_points, axes, measure_first
 from coloc_graph.run.messages import Flag
 from coloc_graph.team import Camera, Markers
 
@@ -60,7 +60,8 @@ class Candidate:
     """A blob as it was found: roughly its centre `uv` [px], and the `window` of light around it.
 
     `corner` is the pixel (u, v) of the window's first element; `box` (left, top, width, height) [px in the
-    window] is what the blob covers above `level` [grey levels].
+    window] is what the blob covers above `level` [grey levels], `others` what other blobs there do. `touched` says that
+    one of these is too large to be measured with it.
     """
 
     uv: tuple[float, float]
@@ -70,6 +71,8 @@ class Candidate:
     box: tuple[int, int, int, int]
     level: float
     clipped: bool
+    others: tuple[tuple[int, int, int, int], ...] = ()
+    touched: bool = False
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,7 @@ class Detector:
             area = (0, 0, light.shape[1], light.shape[0])
             blobs = _components(light, level)
         found = []
+        everything: list[tuple[list[int], list[float]]] | None = None
         for (left, top, width, height, pixels), (x, y) in blobs:
             left, top = left + area[0], top + area[1]
             u, v = x + area[0] + u0, y + area[1] + v0
@@ -139,7 +143,17 @@ class Detector:
             if inside and t.min_area <= pixels <= t.max_area:
                 clipped = left + u0 <= 0 or top + v0 <= 0
                 clipped |= left + u0 + width >= image.shape[1] or top + v0 + height >= image.shape[0]
-                found.append(_cut(light, (left, top, width, height), (u0, v0), (u, v), pixels, level, clipped))
+                own = (left, top, width, height)
+                window = _window(own, light.shape)
+                # any other light there?
+                around = light[window[1] : window[3], window[0] : window[2]]
+                group = [own]
+                touched = False
+                if np.count_nonzero(around > level) > pixels:
+                    if everything is None:
+                        everything = _components(light, level)
+                    group, touched = _together(own, [tuple(blob) for blob, _ in everything], light.shape, t.max_area)
+                found.append(_cut(light, group, (u0, v0), (u, v), pixels, level, clipped, touched))
         return found
 
     def measure(self, candidates: Sequence[Candidate]) -> tuple[Blobs, NDArray[np.bool_]]:
@@ -147,10 +161,10 @@ class Detector:
         n = len(candidates)
         uv, covariance = np.zeros((n, 2)), np.zeros((n, 2, 2))
         flags, peak, real = np.zeros(n, np.uint8), np.zeros(n), np.zeros(n, bool)
-        by_shape: dict[tuple[int, ...], list[int]] = {}
+        alike: dict[tuple[int, ...], list[int]] = {}
         for index, candidate in enumerate(candidates):
-            by_shape.setdefault(candidate.window.shape, []).append(index)
-        for rows in by_shape.values():
+            alike.setdefault((*candidate.window.shape, len(candidate.others)), []).append(index)
+        for rows in alike.values():
             own = [candidates[row] for row in rows]
             uv[rows], covariance[rows], flags[rows], peak[rows], real[rows] = self._measure(own)
         return Blobs(uv, covariance, flags, peak, np.array([one.area for one in candidates], float)), real
@@ -158,10 +172,10 @@ class Detector:
     def _measure(self, candidates: list[Candidate]) -> tuple[Array, Array, NDArray[np.uint8], Array, NDArray[np.bool_]]:
         t = self.threshold
         light = np.array([one.window for one in candidates], float)
-        inner = _in_boxes(light.shape, candidates) & (
-            light > np.array([one.level for one in candidates])[:, None, None]
-        )
-        spots = measure_spots(light, inner, t.levels, t.shot_gain)
+        level = np.array([one.level for one in candidates])[:, None, None, None]
+        each = _in_boxes(light.shape, candidates) & (light[:, None] > level)
+        inner = each[:, 0]
+        spots, touching = measure_first(light, each, t.levels, t.shot_gain)
         peak = np.where(inner, spots.signal, 0.0).max(axis=(1, 2))
         pixel = np.clip(np.rint(spots.centre), 0, (light.shape[2] - 1, light.shape[1] - 1)).astype(int)
         # a window that slid off its candidate found no spot there
@@ -178,7 +192,8 @@ class Detector:
         flags[(inner & (light >= t.saturation)).any(axis=(1, 2))] |= np.uint8(Flag.SATURATED)
         flags[np.array([one.clipped for one in candidates])] |= np.uint8(Flag.CLIPPED)
         flags[long > t.elongation * short] |= np.uint8(Flag.BLURRED)
-        flags[(long > 1.4 * short) & dip] |= np.uint8(Flag.MERGED)
+        touching |= np.array([one.touched for one in candidates])
+        flags[touching | ((long > 1.4 * short) & dip)] |= np.uint8(Flag.MERGED)
         corners = np.array([one.corner for one in candidates], float)
         return spots.centre + corners, spots.covariance, flags, peak, real
 
@@ -211,32 +226,73 @@ def _cut_off(blob: list[int], area: Box, shape: tuple[int, ...]) -> bool:
     )
 
 
+def _window(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> Box:
+    """The window of the least size that holds a box with a margin, moved to lie in the light (h, w)."""
+    left, top, width, height = box
+    wanted = max(width, height) + 2 * MARGIN
+    size = SIZE_FOR[wanted] if wanted < len(SIZE_FOR) else wanted
+    x = max(min(left + (width - size) // 2, shape[1] - size), 0)
+    y = max(min(top + (height - size) // 2, shape[0] - size), 0)
+    return x, y, x + size, y + size
+
+
+def _together(
+    own: tuple[int, int, int, int], blobs: Sequence[tuple[int, ...]], shape: tuple[int, ...], max_area: int
+) -> tuple[list[tuple[int, int, int, int]], bool]:
+    """The boxes of a blob and of all others (left, top, width, height, pixels) that must be measured with it, since
+    they lie in its window, or in that of all of them; or its own box, and True, where that is too much."""
+    group = [own]
+    while True:
+        left, top = min(box[0] for box in group), min(box[1] for box in group)
+        right, bottom = max(box[0] + box[2] for box in group), max(box[1] + box[3] for box in group)
+        window = _window((left, top, right - left, bottom - top), shape)
+        more = [
+            blob
+            for blob in blobs
+            if blob[0] < window[2]
+            and blob[1] < window[3]
+            and blob[0] + blob[2] > window[0]
+            and blob[1] + blob[3] > window[1]
+            and blob[:4] not in group
+        ]
+        if not more:
+            return group, False
+        if window[2] - window[0] > SIZES[-1] or any(blob[4] > max_area for blob in more):
+            return [own], True
+        group += [(blob[0], blob[1], blob[2], blob[3]) for blob in more]
+
+
 def _cut(
     light: NDArray[np.uint8] | NDArray[np.float32],
-    box: tuple[int, int, int, int],
+    group: Sequence[tuple[int, int, int, int]],
     origin: tuple[int, int],
     uv: tuple[float, float],
     area: int,
     level: float,
     clipped: bool,
+    touched: bool,
 ) -> Candidate:
-    """A candidate with its window: of the least size that holds it with a margin, moved to lie in the image."""
-    left, top, width, height = box
-    wanted = max(width, height) + 2 * MARGIN
-    size = SIZE_FOR[wanted] if wanted < len(SIZE_FOR) else wanted
-    x = max(min(left + (width - size) // 2, light.shape[1] - size), 0)
-    y = max(min(top + (height - size) // 2, light.shape[0] - size), 0)
-    window = light[y : y + size, x : x + size].copy()
-    return Candidate(
-        uv, area, window, (x + origin[0], y + origin[1]), (left - x, top - y, width, height), level, clipped
-    )
+    """A candidate with its window, which holds all boxes of a group, the first of which is its own."""
+    left, top = min(box[0] for box in group), min(box[1] for box in group)
+    right, bottom = max(box[0] + box[2] for box in group), max(box[1] + box[3] for box in group)
+    x, y, end_x, end_y = _window((left, top, right - left, bottom - top), light.shape)
+    box, *others = ((left - x, top - y, width, height) for left, top, width, height in group)
+    window = light[y:end_y, x:end_x].copy()
+    corner = (x + origin[0], y + origin[1])
+    return Candidate(uv, area, window, corner, box, level, clipped, tuple(others), touched)
 
 
 def _in_boxes(shape: tuple[int, ...], candidates: list[Candidate]) -> NDArray[np.bool_]:
-    left, top, width, height = np.array([one.box for one in candidates]).T[:, :, None]
+    """Which pixels (n, k, h, w) of the windows lie in the boxes of their blobs; one in two boxes is the nearer's."""
+    left, top, width, height = np.moveaxis(np.array([(one.box, *one.others) for one in candidates]), 2, 0)[..., None]
     x, y = np.arange(shape[2]), np.arange(shape[1])
     in_x, in_y = (x >= left) & (x < left + width), (y >= top) & (y < top + height)
-    return np.asarray(in_y[:, :, None] & in_x[:, None, :])
+    within = in_y[..., :, None] & in_x[..., None, :]
+    if within.shape[1] > 1:
+        dx, dy = (x - left - (width - 1) / 2)[..., None, :], (y - top - (height - 1) / 2)[..., :, None]
+        far = np.where(within, dx * dx + dy * dy, np.inf)
+        within &= far <= far.min(axis=1, keepdims=True)
+    return np.asarray(within)
 
 
 def detector_for(markers: Markers | None, camera: Camera | None = None) -> Detector:
