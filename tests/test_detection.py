@@ -55,6 +55,52 @@ def test_the_stated_sigma_is_that_of_the_errors_to_35_percent(measured):
     assert abs(covariance[0, 1]) < 0.1 * covariance[0, 0]
 
 
+def near_another(radius, apart, n=120, seed=2):
+    """Errors (n, 2) along and across the direction of another LED, and chi2 per number, of the centres of LEDs."""
+    rng = np.random.default_rng(seed)
+    errors, square = [], []
+    for k in range(n):
+        uv = np.array([30.0, 22.0]) + rng.uniform(-0.5, 0.5, 2)
+        angle = rng.uniform(-np.pi, np.pi)
+        along = np.array([np.cos(angle), np.sin(angle)])
+        blobs = detect_leds(led_image([uv, uv + apart * along], radius, sensor=Sensor(), seed=k))
+        assert len(blobs) == 2
+        own = np.linalg.norm(blobs.uv - uv, axis=1).argmin()
+        off = blobs.uv[own] - uv
+        if blobs.flags[own] == Flag.NONE:
+            errors.append((off @ along, along[0] * off[1] - along[1] * off[0]))
+            square.append(off @ np.linalg.solve(blobs.covariance[own], off) / 2)
+    assert len(errors) > 0.8 * n
+    return np.array(errors), np.mean(square)
+
+
+@pytest.mark.parametrize(("radius", "apart"), [(0.7, 4.2), (0.7, 6.0), (1.5, 6.0), (1.5, 8.0)])
+def test_a_light_beside_another_is_where_it_would_be_without(radius, apart):
+    errors, square = near_another(radius, apart)
+    assert (np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(len(errors))).all()
+    assert square < 1.9
+
+
+def test_a_spot_of_two_pixels_is_as_sure_as_it_says():
+    rng = np.random.default_rng(3)
+    square = []
+    for seed in range(200):
+        uv = np.array([30.0, 22.0]) + rng.uniform(-0.5, 0.5, 2)
+        blobs = detect_leds(led_image(uv, 0.62, sensor=Sensor(), seed=seed))
+        for off, covariance in zip(blobs.uv - uv, blobs.covariance, strict=True):
+            square.append(off @ np.linalg.solve(covariance, off) / 2)
+    assert len(square) > 150
+    assert 0.7 < np.mean(square) < 1.5
+
+
+def test_a_light_in_the_glare_of_a_lamp_is_not_believed():
+    for apart, flag in ((24.5, Flag.MERGED), (40, Flag.NONE)):
+        image = render(spots([(30, 40), (30 + apart, 40)], (1.5, 20.0), 220.0), size=(160, 80), background=12.0)
+        blobs = detect_leds(image)
+        assert blobs.uv == pytest.approx(np.array([(30, 40)]), abs=0.5)
+        assert blobs.flags.tolist() == [flag]
+
+
 def test_a_dim_led_is_less_certain_than_a_bright_one():
     dim, bright = (detect_leds(led_image((30.2, 22.4), 0.7, level)) for level in (240.0, 700.0))
     assert dim.covariance[0, 0, 0] > 4 * bright.covariance[0, 0, 0]
@@ -122,6 +168,14 @@ def test_noise_holds_nothing_and_does_not_take_long():
 
 def test_a_lamp_larger_than_any_marker_is_not_one():
     assert len(detect_leds(led_image((160, 120), 20.0, 200.0, size=(320, 240)))) == 0
+
+
+def test_a_light_just_outside_the_box_is_known_too():
+    image = led_image([(160.3, 120.2), (166.9, 121.5)], size=(320, 240))
+    whole, part = detect_leds(image), detect_leds(image, (140, 100, 162, 140))
+    assert len(part) == 1
+    assert part.uv == pytest.approx(whole.uv[[0]], abs=0.02)
+    assert part.uv[0] == pytest.approx((160.3, 120.2), abs=0.04)
 
 
 @pytest.mark.parametrize("uv", [(160.3, 120.2), (141.0, 120.0), (178.9, 101.4)])

@@ -19,7 +19,7 @@ CONVERGED = 1e-3
 LEAST_VARIANCE = 0.25
 #: So many times each of several spots in a window is measured without the others.
 APART = 4
-#: Spots nearer than this many times their half axis, a Gaussian's sigma, cannot be told apart.
+#: Spots nearer than this many times a half axis, which is a Gaussian's sigma, cannot be told apart.
 TOUCHING = 4.0
 #: Nor wider than this [px^2].
 MOST_VARIANCE = 400.0
@@ -72,8 +72,10 @@ def measure_first(
         models = spots.models().reshape(inner.shape)
         others = models.sum(axis=1, keepdims=True) - models
     first = measure_spots(light - others[:, 0], inner[:, 0], levels, shot_gain)
-    off = np.linalg.norm(spots.centre.reshape(n, k, 2)[:, 1:] - first.centre[:, None], axis=2)
-    return first, off.min(axis=1) < TOUCHING * axes(first.shape)[1]
+    off = (spots.centre.reshape(n, k, 2)[:, 1:] - first.centre[:, None])[..., None]
+    shape = (spots.shape.reshape(n, k, 2, 2)[:, 1:] + first.shape[:, None]) / 2
+    square = (off.mT @ np.linalg.solve(shape, off))[..., 0, 0]
+    return first, np.asarray(square.min(axis=1) < TOUCHING**2)
 
 
 def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_gain: float) -> Spots:
