@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -12,16 +12,19 @@ from scipy.special import chdtri
 
 from coloc_graph.backend.consistency import LEAST_CHANCE, UNCHECKED, Agreement, innovation
 from coloc_graph.backend.estimate import Bump, Estimate, Refusal, make_estimate
-from coloc_graph.backend.factors import Method, require_rigs
-from coloc_graph.backend.fit import Fit, fit_graph
+from coloc_graph.backend.factors import Method, calibrations_in, require_rigs
+from coloc_graph.backend.fit import ALL_TESTED, Fit, fit_graph
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
-from coloc_graph.backend.landmarks import OnMap
+from coloc_graph.backend.landmarks import ALWAYS, OnMap
 from coloc_graph.backend.solver import lm_parameters, with_stack
 from coloc_graph.measurements import RelativePose, Sighting
 from coloc_graph.team import Slip
 
 #: A fit that noise alone makes this bad less often than this is looked into.
 LEAST_CHANCE_OF_ALL = 1e-4
+#: Nor is one whose chi2 is less than this times its dof: of 100,000 residuals 2 % more than stated would be a sign, and
+#: no model is that good.
+LITTLE = 1.1
 #: A stay-put constraint is loosened by so much to see whether the others contradict it.
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)
 MOST_BUMPS = 3
@@ -58,13 +61,13 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
     fit = fit_graph(method, graph, start)
     refused: tuple[Refusal, ...] = ()
     bumped: tuple[Bump, ...] = ()
-    if refuse and _is_suspicious(fit):
-        bumped = _bumps(method, graph)
+    suspects = _suspects(fit) if refuse else None
+    if suspects is not None:
+        near = Near(fit, suspects) if suspects and len(fit.links) > ALL_TESTED else None
+        bumped = _bumps(method, graph, near)
         for bump in bumped:
             graph = _moved(graph, bump.stay_put)
-        refused = _find_wrong(method, graph)
-        if refused or bumped:
-            fit = fit_graph(method, graph.without(one.measurement for one in refused))
+        refused, fit = _find_wrong(method, graph, near)
     return make_estimate(
         method,
         graph,
@@ -79,13 +82,39 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
     )
 
 
-def _is_suspicious(fit: Fit) -> bool:
+def _suspects(fit: Fit) -> tuple[Link, ...] | None:
+    """The links that contradict the others; () where all together are further off than noise puts them, None
+    where nothing is suspicious."""
     if fit.dof <= 0:
-        return False
-    if fit.chance < LEAST_CHANCE_OF_ALL:
-        return True
+        return None
+    if fit.chance < LEAST_CHANCE_OF_ALL and fit.chi2 > LITTLE * fit.dof:
+        return ()
     tested = fit.agreements((*TESTED, StayPut))
-    return any(one.chance() < LEAST_CHANCE for one in tested.values())
+    return tuple(fit.links[index] for index, one in tested.items() if one.chance() < LEAST_CHANCE) or None
+
+
+@dataclass(frozen=True, eq=False)
+class Near:
+    """The fit of a large graph that is right but for a few links, the `suspects`: the search goes on from there."""
+
+    fit: Fit
+    suspects: tuple[Link, ...]
+
+    @property
+    def robots(self) -> set[str]:
+        """Who may have been pushed."""
+        return {robot for link in self.suspects for robot, _ in link.ends}
+
+    def start(self, graph: PoseGraph) -> gtsam.Values:
+        """All that was found, for a graph with the same nodes, fewer of which are one place."""
+        start = gtsam.Values()
+        for key, errors in calibrations_in(self.fit.values).items():
+            start.insert(key, errors)
+        for node in (*graph.nodes, *((name, ALWAYS) for name in graph.places.still())):
+            before, now = self.fit.graph.places.key(node), graph.places.key(node)
+            if self.fit.values.exists(before) and not start.exists(now):
+                start.insert(now, self.fit.values.atPose3(before))
+        return start
 
 
 def _scale(tested: Iterable[Agreement]) -> float:
@@ -97,30 +126,32 @@ def _scale(tested: Iterable[Agreement]) -> float:
     return max(1.0, float(np.median(ratios))) if ratios else 1.0
 
 
-def _find_wrong(method: Method, graph: PoseGraph) -> tuple[Refusal, ...]:
-    """The measurements that all others contradict."""
+def _find_wrong(method: Method, graph: PoseGraph, near: Near | None) -> tuple[tuple[Refusal, ...], Fit]:
+    """The measurements that all others contradict, and the fit of these."""
     # poses alone for a start: GTSAM's optimiser copies its factors, which those that are Python cannot be
-    doubted = _outliers(fit_graph("smooth", graph))
+    doubted = {} if near else _outliers(fit_graph("smooth", graph))
+    start = near.start(graph) if near else None
     # twice the same set ends it, as does the last round
-    for _ in range(ROUNDS):
-        fit = fit_graph(method, graph.without(doubted.values()))
+    for left in reversed(range(ROUNDS)):
+        fit = fit_graph(method, graph.without(doubted.values()), start)
         tested = fit.agreements(TESTED)
         scale = _scale(tested.values())
         worst = min(tested, key=lambda index: tested[index].chance(scale), default=None)
         again = {key for key, link in doubted.items() if _agrees(fit, link, scale)}
         refusing = worst is not None and tested[worst].chance(scale) < LEAST_CHANCE
-        if not again and not refusing:
+        if not left or not (again or refusing):
             break
         for key in again:
             del doubted[key]
         if worst is not None and refusing:
             doubted[id(fit.links[worst])] = fit.links[worst]
-    return tuple(
+    refused = tuple(
         Refusal(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
         for link in (*graph.measurements, *graph.on_map)
         if id(link) in doubted
         for off in [_innovation(fit, link).sigmas]
     )
+    return refused, fit
 
 
 def _outliers(fit: Fit) -> dict[int, Link]:
@@ -165,15 +196,16 @@ def find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
     Where a bump and a wrong measurement explain the same, as they may in a stance that nothing has followed yet, it is
     a bump.
     """
-    return with_stack(len(graph.nodes), lambda: _bumps(method, graph))
+    return with_stack(len(graph.nodes), lambda: _bumps(method, graph, None))
 
 
-def _bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
-    slips = {robot: graph.slips.get(robot, TEST_SLIP) for robot in graph.robots}
-    loose = replace(graph, slips=slips)
+def _bumps(method: Method, graph: PoseGraph, near: Near | None) -> tuple[Bump, ...]:
+    robots = near.robots.intersection(graph.robots) if near else graph.robots
+    loose = replace(graph, slips={**dict.fromkeys(robots, TEST_SLIP), **graph.slips})
+    start = near.start(loose) if near else None
     bumps: list[Bump] = []
     for _ in range(MOST_BUMPS):
-        fit = fit_graph(method, loose)
+        fit = fit_graph(method, loose, start)
         tested = fit.agreements((StayPut, *TESTED))
         stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
         if not stays:
@@ -184,7 +216,7 @@ def _bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
         stay = fit.links[plainest]
         assert isinstance(stay, StayPut)
         freed = _moved(loose, stay)
-        moved = fit_graph(method, freed)
+        moved = fit_graph(method, freed, start)
         # by what is left once it may have moved: a bump bends everything else
         rest = moved.agreements(TESTED)
         scale = _scale(rest.values())
@@ -193,7 +225,7 @@ def _bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
         others = {index: one for index, one in tested.items() if index not in stays}
         if others:
             wrong = min(others, key=lambda index: others[index].log_chance())
-            without = fit_graph(method, loose.without([fit.links[wrong]]))
+            without = fit_graph(method, loose.without([fit.links[wrong]]), start)
             more = Agreement(max(moved.chi2 - without.chi2, 0.0), max(moved.dof - without.dof, 1))
             if more.chance(scale) < LEAST_CHANCE:
                 break

@@ -6,7 +6,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc
 
 from coloc_graph.backend.at_once import AtOnce
 from coloc_graph.backend.chain import compose, spanning_tree
@@ -18,7 +18,7 @@ from coloc_graph.backend.solver import optimise
 
 Array = NDArray[np.float64]
 
-#: In larger graphs only the measurements are tested whose residual noise exceeds less often than `LOOKED_INTO`.
+#: In larger graphs, measurements whose residual noise exceeds more often than `LOOKED_INTO` agree as well as that says.
 ALL_TESTED, LOOKED_INTO = 500, 1e-3
 #: Of a run of so many stances the mounts are found in the first part of this many.
 LONG_RUN, PART = 30, 3
@@ -78,10 +78,11 @@ class Fit:
             if not isinstance(link, kinds):
                 continue
             factor = self.factor(index)
-            if len(self.links) > ALL_TESTED and 2 * factor.error(self.values) < chdtri(
-                self.factors_of.rows(link, factor), LOOKED_INTO
-            ):
-                continue
+            if len(self.links) > ALL_TESTED:
+                alone = Agreement(2 * factor.error(self.values), self.factors_of.rows(link, factor))
+                if alone.chance() > LOOKED_INTO:
+                    found[index] = alone
+                    continue
             found[index] = agreement([factor], self.values, self.posterior.joint(list(factor.keys())))
         return found
 
