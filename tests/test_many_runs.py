@@ -19,14 +19,21 @@ from coloc_graph.run import open_run
 from coloc_graph.workers import workers
 
 
-@pytest.fixture
-def folder(tmp_path, short, copied, hallway):
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory, short, copied):
     """Two runs, and one that is none."""
-    (tmp_path / "runs" / "deep").mkdir(parents=True)
-    shutil.copy(short, tmp_path / "runs" / "a.mcap")
-    copied(hallway, tmp_path / "runs" / "deep" / "b.mcap", stances=open_run(hallway).stances[:2])
-    (tmp_path / "runs" / "bad.mcap").write_bytes(Path(short).read_bytes()[:2000])
-    return tmp_path / "runs"
+    folder = tmp_path_factory.mktemp("runs")
+    (folder / "deep").mkdir(parents=True)
+    shutil.copy(short, folder / "a.mcap")
+    copied(short, folder / "deep" / "b.mcap", stances=open_run(short).stances[:2])
+    (folder / "bad.mcap").write_bytes(Path(short).read_bytes()[:2000])
+    return folder
+
+
+@pytest.fixture
+def folder(runs, tmp_path):
+    """A copy of these, to be spoiled."""
+    return Path(shutil.copytree(runs, tmp_path / "runs"))
 
 
 def kills_its_process_once(run, out, options):
@@ -52,26 +59,28 @@ def solved(folder, out, executors, options=None):
 
 
 def test_a_folder_is_solved_and_a_bad_run_ends_none_of_the_others_and_what_is_there_stays(folder, tmp_path):
-    out, two = tmp_path / "out", partial(workers, 2)
-    first = solved(folder, out, two)
+    out, one = tmp_path / "out", partial(workers, 1)
+    first = solved(folder, out, partial(workers, 2))
     assert first["a"].summary["stances"] and not first["a"].failed and not first["b"].failed
     assert "bad.mcap" in first["bad"].failed and not (out / "bad").exists()
     assert (out / "deep" / "b" / "summary.json").is_file()
-    again = solved(folder, out, two)
+    again = solved(folder, out, one)
     assert {name: one.resumed for name, one in again.items()} == {"a": True, "bad": False, "b": True}
     assert again["a"].summary == first["a"].summary
     # other options, another run, or a later one are solved anew
-    assert not solved(folder, out, two, SolveOptions(odometry=False))["a"].resumed
+    assert not solved(folder, out, one, SolveOptions(odometry=False))["a"].resumed
     shutil.copy(folder / "deep" / "b.mcap", folder / "a.mcap")
-    later = solved(folder, out, two, SolveOptions(odometry=False))
+    later = solved(folder, out, one, SolveOptions(odometry=False))
     assert not later["a"].resumed and later["b"].resumed
 
 
 def test_a_run_that_kills_its_process_is_tried_again_and_then_given_up(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(many_runs, "solve_one", kills_its_process_once)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    (folder / "bad.mcap").unlink()
     once = solved(folder, tmp_path / "once", partial(workers, 1))
     assert not once["a"].failed and not once["b"].failed
+    shutil.rmtree(folder / "deep")
     always = solved(folder, tmp_path / "always", partial(workers, 1))
     assert "the process that solved it ended" in always["a"].failed
 
