@@ -94,6 +94,39 @@ def test_right_measurements_that_are_doubted_are_taken_back(monkeypatch):
     assert {id(r.measurement) for r in estimate.refused} == set(map(id, team.wrong))
 
 
+@pytest.fixture
+def large(monkeypatch):
+    """Graphs of a few links are taken for large ones, in which the search goes on from where the fit was."""
+    batch, fit = (sys.modules[f"coloc_graph.backend.{name}"] for name in ("batch", "fit"))
+    monkeypatch.setattr(batch, "ALL_TESTED", 0)
+    monkeypatch.setattr(fit, "ALL_TESTED", 0)
+    monkeypatch.setattr(batch, "LEAST_CHANCE_OF_ALL", 0.0)
+    monkeypatch.setattr(batch, "_outliers", lambda fit: pytest.fail("all is searched anew"))
+
+
+def test_in_a_large_graph_a_few_wrong_homographies_are_found_from_where_the_fit_was(large, monkeypatch):
+    team = team_of(6, 20, seed=4, wrong=0.03)
+    assert 1 < len(team.wrong) < 8
+    graph = graph_of_team(team)
+    estimate = smooth(graph)
+    assert {id(r.measurement) for r in estimate.refused} == set(map(id, team.wrong)) and not estimate.bumped
+    right = smooth(graph.without(team.wrong), refuse=False)
+    for robot, trajectory in right.trajectories.items():
+        np.testing.assert_allclose(estimate.trajectories[robot].positions, trajectory.positions, atol=1e-5)
+        np.testing.assert_allclose(estimate.trajectories[robot].covariances, trajectory.covariances, rtol=1e-3)
+
+
+def test_of_many_residuals_a_little_too_much_is_no_suspicion(monkeypatch):
+    team = team_of(6, 8, seed=1)
+    graph = graph_of_team(team)
+    monkeypatch.setattr(sys.modules["coloc_graph.backend.batch"], "_bumps", lambda *_: pytest.fail("searched"))
+    monkeypatch.setattr(sys.modules["coloc_graph.backend.batch"], "LEAST_CHANCE_OF_ALL", 1.0)
+    assert 0.5 < smooth(graph).chi2 / smooth(graph).dof < 1.1
+    worse = [replace(m, covariance=m.covariance / 1.4) for m in team.measurements]
+    with pytest.raises(pytest.fail.Exception):
+        smooth(graph_of_team(team, worse))
+
+
 def test_what_all_measurements_share_is_no_reason_to_refuse_a_few():
     """Deviations that are truly twice as large as stated, as with mounts that are not as thought."""
     team = team_of(6, 15, seed=2)
@@ -121,7 +154,10 @@ def test_in_a_chain_of_three_odometry_contradicts_a_wrong_homography():
     assert ate(estimate, team) < 0.5 * ate(alone, team)
 
 
-def test_a_bumped_anchor_is_found_and_named_and_no_homography_is_blamed():
+@pytest.mark.parametrize("size", ["small", "large"])
+def test_a_bumped_anchor_is_found_and_named_and_no_homography_is_blamed(size, request):
+    if size == "large":
+        request.getfixturevalue("large")
     team = three(5)
     bump = floor_pose(0.06, -0.05, 0.12)
     # B observes at stances 5 and 6; from 6 on everything B measured is from where it was pushed to
