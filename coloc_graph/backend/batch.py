@@ -63,7 +63,8 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
     bumped: tuple[Bump, ...] = ()
     suspects = _suspects(fit) if refuse else None
     if suspects is not None:
-        near = Near(fit, suspects) if suspects and len(fit.links) > ALL_TESTED else None
+        near = Near(graph, fit.values, suspects) if suspects and len(fit.links) > ALL_TESTED else None
+        del fit  # of a large graph it holds gigabytes
         bumped = _bumps(method, graph, near)
         for bump in bumped:
             graph = _moved(graph, bump.stay_put)
@@ -97,7 +98,8 @@ def _suspects(fit: Fit) -> tuple[Link, ...] | None:
 class Near:
     """The fit of a large graph that is right but for a few links, the `suspects`: the search goes on from there."""
 
-    fit: Fit
+    graph: PoseGraph
+    values: gtsam.Values
     suspects: tuple[Link, ...]
 
     @property
@@ -108,12 +110,12 @@ class Near:
     def start(self, graph: PoseGraph) -> gtsam.Values:
         """All that was found, for a graph with the same nodes, fewer of which are one place."""
         start = gtsam.Values()
-        for key, errors in calibrations_in(self.fit.values).items():
+        for key, errors in calibrations_in(self.values).items():
             start.insert(key, errors)
         for node in (*graph.nodes, *((name, ALWAYS) for name in graph.places.still())):
-            before, now = self.fit.graph.places.key(node), graph.places.key(node)
-            if self.fit.values.exists(before) and not start.exists(now):
-                start.insert(now, self.fit.values.atPose3(before))
+            before, now = self.graph.places.key(node), graph.places.key(node)
+            if self.values.exists(before) and not start.exists(now):
+                start.insert(now, self.values.atPose3(before))
         return start
 
 
