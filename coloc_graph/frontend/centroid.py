@@ -17,10 +17,10 @@ MAX_ITERATIONS = 12
 CONVERGED = 1e-3
 #: No spot is narrower than this [px^2]: a lens and a pixel blur as much.
 LEAST_VARIANCE = 0.25
-#: So many times each of several spots in a window is measured without the others.
-APART = 4
+#: Several spots in a window are measured in so many turns at most, until none moves by more than this [px].
+TURNS, SETTLED = 24, 3e-3
 #: Spots nearer than this many times a half axis, which is a Gaussian's sigma, cannot be told apart.
-TOUCHING = 4.0
+TOUCHING = 3.5
 #: Nor wider than this [px^2].
 MOST_VARIANCE = 400.0
 
@@ -42,16 +42,15 @@ class Spots:
     noise: Array
     found: NDArray[np.bool_]
 
-    def models(self) -> Array:
-        """The light (n, h, w) of Gaussian spots like these; nothing where none was found."""
-        height, width = self.signal.shape[1:]
-        dx = (np.arange(width) - self.centre[:, :1])[:, None, :]
-        dy = (np.arange(height) - self.centre[:, 1:])[:, :, None]
-        a, b, c = (self.shape[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
-        det = a * c - b * b
-        square = (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / det
-        peak = np.where(self.found, self.flux, 0.0)[:, None, None] / (2 * np.pi * np.sqrt(det))
-        return np.asarray(peak * np.exp(-0.5 * square))
+
+def gaussians(centre: Array, shape: Array, flux: Array, size: tuple[int, ...]) -> Array:
+    """The light (n, h, w) of n Gaussian spots in windows of a size (h, w)."""
+    dx = (np.arange(size[1]) - centre[:, :1])[:, None, :]
+    dy = (np.arange(size[0]) - centre[:, 1:])[:, :, None]
+    a, b, c = (shape[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    det = a * c - b * b
+    square = (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / det
+    return np.asarray(flux[:, None, None] / (2 * np.pi * np.sqrt(det)) * np.exp(-0.5 * square))
 
 
 def measure_first(
@@ -65,17 +64,26 @@ def measure_first(
     n, k = inner.shape[:2]
     if k == 1:
         return measure_spots(light, inner[:, 0], levels, shot_gain), np.zeros(n, bool)
-    others = np.zeros_like(inner, float)
-    for _ in range(APART):
-        left = (light[:, None] - others).reshape(n * k, *light.shape[1:])
-        spots = measure_spots(left, inner.reshape(left.shape), levels, shot_gain)
-        models = spots.models().reshape(inner.shape)
-        others = models.sum(axis=1, keepdims=True) - models
+    centre, shape, models = _rough_models(light, inner)
+    others = models.sum(axis=1, keepdims=True) - models
+    going = np.arange(n)
+    for _ in range(TURNS):
+        left = (light[going, None] - others[going]).reshape(-1, *light.shape[1:])
+        spots = measure_spots(left, inner[going].reshape(left.shape), levels, shot_gain)
+        flux = np.where(spots.found, spots.flux, 0.0)
+        models = gaussians(spots.centre, spots.shape, flux, light.shape[1:]).reshape(len(going), *inner.shape[1:])
+        others[going] = models.sum(axis=1, keepdims=True) - models
+        moved = np.abs(spots.centre.reshape(-1, k, 2) - centre[going]).max(axis=(1, 2))
+        centre[going], shape[going] = spots.centre.reshape(-1, k, 2), spots.shape.reshape(-1, k, 2, 2)
+        going = going[moved >= SETTLED]
+        if not len(going):
+            break
     first = measure_spots(light - others[:, 0], inner[:, 0], levels, shot_gain)
-    off = (spots.centre.reshape(n, k, 2)[:, 1:] - first.centre[:, None])[..., None]
-    shape = (spots.shape.reshape(n, k, 2, 2)[:, 1:] + first.shape[:, None]) / 2
-    square = (off.mT @ np.linalg.solve(shape, off))[..., 0, 0]
-    return first, np.asarray(square.min(axis=1) < TOUCHING**2)
+    off = (centre[:, 1:] - first.centre[:, None])[..., None]
+    square = (off.mT @ np.linalg.solve((shape[:, 1:] + first.shape[:, None]) / 2, off))[..., 0, 0]
+    touching = square.min(axis=1) < TOUCHING**2
+    touching[going] = True
+    return first, touching
 
 
 def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_gain: float) -> Spots:
@@ -89,10 +97,7 @@ def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_ga
     n, height, width = light.shape
     x, y = np.arange(width, dtype=float), np.arange(height, dtype=float)
 
-    first = signal * inner
-    total = np.maximum(first.sum(axis=(1, 2)), 1e-9)
-    centre = np.stack([(first.sum(axis=1) @ x) / total, (first.sum(axis=2) @ y) / total], axis=1)
-    start = _rough_shape(inner, x, y)
+    centre, start = _rough_centre(signal * inner, x, y), _rough_shape(inner, x, y)
     shape, found = start.copy(), np.ones(n, bool)
     gain = np.broadcast_to(2 * np.eye(2), (n, 2, 2)).copy()
     total = np.ones(n)
@@ -128,6 +133,24 @@ def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_ga
     both = (shape[:, 0, 0] + window[:, 0]) * (shape[:, 1, 1] + window[:, 1]) - shape[:, 0, 1] ** 2
     flux = total * np.sqrt(both / window.prod(axis=1))
     return Spots(centre, covariance, shape, flux, signal, noise, found)
+
+
+def _rough_models(light: Array, inner: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    """Centres (n, k, 2), shapes (n, k, 2, 2) and light (n, k, h, w) of spots, roughly, by their bright pixels."""
+    n, k, height, width = inner.shape
+    x, y = np.arange(width, dtype=float), np.arange(height, dtype=float)
+    dark = np.nanmedian(np.where(inner.any(axis=1), np.nan, light), axis=(1, 2))
+    lit = np.where(inner, (light - dark[:, None, None])[:, None], 0.0).reshape(-1, height, width)
+    centre, shape = _rough_centre(lit, x, y), _rough_shape(inner.reshape(lit.shape), x, y)
+    flux = lit.max(axis=(1, 2)) * 2 * np.pi * np.sqrt(np.linalg.det(shape))
+    models = gaussians(centre, shape, flux, (height, width))
+    return centre.reshape(n, k, 2), shape.reshape(n, k, 2, 2), models.reshape(inner.shape)
+
+
+def _rough_centre(light: Array, x: Array, y: Array) -> Array:
+    """The centroids (n, 2) of light (n, h, w)."""
+    total = np.maximum(light.sum(axis=(1, 2)), 1e-9)
+    return np.stack([(light.sum(axis=1) @ x) / total, (light.sum(axis=2) @ y) / total], axis=1)
 
 
 def _rough_shape(inner: NDArray[np.bool_], x: Array, y: Array) -> Array:
