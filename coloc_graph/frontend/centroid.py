@@ -18,7 +18,7 @@ CONVERGED = 1e-3
 #: No spot is narrower than this [px^2]: a lens and a pixel blur as much.
 LEAST_VARIANCE = 0.25
 #: Several spots in a window are measured in so many turns at most, until none moves by more than this [px].
-TURNS, SETTLED = 24, 3e-3
+TURNS, SETTLED = 10, 3e-3
 #: Spots nearer than this many times a half axis, which is a Gaussian's sigma, cannot be told apart.
 TOUCHING = 3.5
 #: Nor wider than this [px^2].
@@ -66,10 +66,10 @@ def measure_first(
         return measure_spots(light, inner[:, 0], levels, shot_gain), np.zeros(n, bool)
     centre, shape, models = _rough_models(light, inner)
     others = models.sum(axis=1, keepdims=True) - models
-    going = np.arange(n)
+    begin, going = None, np.arange(n)
     for _ in range(TURNS):
         left = (light[going, None] - others[going]).reshape(-1, *light.shape[1:])
-        spots = measure_spots(left, inner[going].reshape(left.shape), levels, shot_gain)
+        spots = measure_spots(left, inner[going].reshape(left.shape), levels, shot_gain, begin)
         flux = np.where(spots.found, spots.flux, 0.0)
         models = gaussians(spots.centre, spots.shape, flux, light.shape[1:]).reshape(len(going), *inner.shape[1:])
         others[going] = models.sum(axis=1, keepdims=True) - models
@@ -78,6 +78,7 @@ def measure_first(
         going = going[moved >= SETTLED]
         if not len(going):
             break
+        begin = centre[going].reshape(-1, 2), shape[going].reshape(-1, 2, 2)
     first = measure_spots(light - others[:, 0], inner[:, 0], levels, shot_gain)
     off = (centre[:, 1:] - first.centre[:, None])[..., None]
     square = (off.mT @ np.linalg.solve((shape[:, 1:] + first.shape[:, None]) / 2, off))[..., 0, 0]
@@ -86,19 +87,27 @@ def measure_first(
     return first, touching
 
 
-def measure_spots(light: Array, inner: NDArray[np.bool_], levels: float, shot_gain: float) -> Spots:
+def measure_spots(
+    light: Array,
+    inner: NDArray[np.bool_],
+    levels: float,
+    shot_gain: float,
+    begin: tuple[Array, Array] | None = None,
+) -> Spots:
     """Measure one spot a window: `light` (n, h, w) [grey levels], `inner` the pixels that it was found by.
 
     `levels` bounds how far the background may differ from its median; `shot_gain` is the variance that a grey
-    level of light adds to a pixel.
+    level of light adds to a pixel. The search may `begin` with centres (n, 2) and shapes (n, 2, 2) that are nearly
+    right.
     """
     background, noise = coons_background(light, levels)
     signal = light - background
     n, height, width = light.shape
     x, y = np.arange(width, dtype=float), np.arange(height, dtype=float)
 
-    centre, start = _rough_centre(signal * inner, x, y), _rough_shape(inner, x, y)
-    shape, found = start.copy(), np.ones(n, bool)
+    start = _rough_shape(inner, x, y)
+    centre, shape = (_rough_centre(signal * inner, x, y), start.copy()) if begin is None else begin
+    found = np.ones(n, bool)
     gain = np.broadcast_to(2 * np.eye(2), (n, 2, 2)).copy()
     total = np.ones(n)
     going = np.arange(n)

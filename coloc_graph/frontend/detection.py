@@ -32,6 +32,8 @@ MARGIN = 3
 #: Windows come in these sizes [px], so that many are measured at once.
 SIZES = (11, 15, 21, 31, 45, 63)
 SIZE_FOR = [next(size for size in SIZES if size >= wanted) for wanted in range(SIZES[-1] + 1)]
+#: Blobs that fit into a window of this size [px] are measured together where one lies in another's.
+TOGETHER = 21
 #: A blob's peak is at least this many times the noise around it.
 LEAST_CONTRAST = 4.0
 #: Two spots touch where it is darker between them than this part of the darker one.
@@ -149,10 +151,10 @@ class Detector:
                 around = light[window[1] : window[3], window[0] : window[2]]
                 group = [own]
                 touched = False
-                if np.count_nonzero(around > level) > pixels:
+                if len(around) <= TOGETHER and np.count_nonzero(around > level) > pixels:
                     if everything is None:
                         everything = _components(light, level)
-                    group, touched = _together(own, [tuple(blob) for blob, _ in everything], light.shape, t.max_area)
+                    group, touched = _together(own, [tuple(blob) for blob, _ in everything], light.shape)
                 found.append(_cut(light, group, (u0, v0), (u, v), pixels, level, clipped, touched))
         return found
 
@@ -237,7 +239,7 @@ def _window(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> Box:
 
 
 def _together(
-    own: tuple[int, int, int, int], blobs: Sequence[tuple[int, ...]], shape: tuple[int, ...], max_area: int
+    own: tuple[int, int, int, int], blobs: Sequence[tuple[int, ...]], shape: tuple[int, ...]
 ) -> tuple[list[tuple[int, int, int, int]], bool]:
     """The boxes of a blob and of all others (left, top, width, height, pixels) that must be measured with it, since
     they lie in its window, or in that of all of them; or its own box, and True, where that is too much."""
@@ -246,6 +248,8 @@ def _together(
         left, top = min(box[0] for box in group), min(box[1] for box in group)
         right, bottom = max(box[0] + box[2] for box in group), max(box[1] + box[3] for box in group)
         window = _window((left, top, right - left, bottom - top), shape)
+        if window[2] - window[0] > TOGETHER:
+            return [own], True
         more = [
             blob
             for blob in blobs
@@ -257,8 +261,6 @@ def _together(
         ]
         if not more:
             return group, False
-        if window[2] - window[0] > SIZES[-1] or any(blob[4] > max_area for blob in more):
-            return [own], True
         group += [(blob[0], blob[1], blob[2], blob[3]) for blob in more]
 
 
