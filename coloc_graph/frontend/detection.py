@@ -238,16 +238,20 @@ def _window(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> Box:
     return x, y, x + size, y + size
 
 
+def _around(boxes: Sequence[tuple[int, int, int, int]]) -> tuple[int, int, int, int]:
+    """The box around boxes (left, top, width, height)."""
+    left, top = min(box[0] for box in boxes), min(box[1] for box in boxes)
+    return left, top, max(box[0] + box[2] for box in boxes) - left, max(box[1] + box[3] for box in boxes) - top
+
+
 def _together(
     own: tuple[int, int, int, int], blobs: Sequence[tuple[int, ...]], shape: tuple[int, ...]
 ) -> tuple[list[tuple[int, int, int, int]], bool]:
     """The boxes of a blob and of all others (left, top, width, height, pixels) that must be measured with it, since
-    they lie in its window, or in that of all of them; or its own box, and True, where that is too much."""
+    they lie in its window, or in that of all of them; or its own, and True, where that is larger than `TOGETHER`."""
     group = [own]
     while True:
-        left, top = min(box[0] for box in group), min(box[1] for box in group)
-        right, bottom = max(box[0] + box[2] for box in group), max(box[1] + box[3] for box in group)
-        window = _window((left, top, right - left, bottom - top), shape)
+        window = _window(_around(group), shape)
         if window[2] - window[0] > TOGETHER:
             return [own], True
         more = [
@@ -275,9 +279,7 @@ def _cut(
     touched: bool,
 ) -> Candidate:
     """A candidate with its window, which holds all boxes of a group, the first of which is its own."""
-    left, top = min(box[0] for box in group), min(box[1] for box in group)
-    right, bottom = max(box[0] + box[2] for box in group), max(box[1] + box[3] for box in group)
-    x, y, end_x, end_y = _window((left, top, right - left, bottom - top), light.shape)
+    x, y, end_x, end_y = _window(_around(group), light.shape)
     box, *others = ((left - x, top - y, width, height) for left, top, width, height in group)
     window = light[y:end_y, x:end_x].copy()
     corner = (x + origin[0], y + origin[1])
