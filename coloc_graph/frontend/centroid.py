@@ -18,7 +18,7 @@ CONVERGED = 1e-3
 #: No spot is narrower than this [px^2]: a lens and a pixel blur as much.
 LEAST_VARIANCE = 0.25
 #: Several spots in a window are measured in so many turns at most, until none moves by more than this [px].
-TURNS, SETTLED = 10, 3e-3
+TURNS, SETTLED = 6, 4e-3
 #: Spots nearer than this many times a half axis, which is a Gaussian's sigma, cannot be told apart.
 TOUCHING = 3.5
 #: Nor wider than this [px^2].

@@ -34,6 +34,8 @@ SIZES = (11, 15, 21, 31, 45, 63)
 SIZE_FOR = [next(size for size in SIZES if size >= wanted) for wanted in range(SIZES[-1] + 1)]
 #: Blobs that fit into a window of this size [px] are measured together where one lies in another's.
 TOGETHER = 21
+#: Larger ones [px] are no LEDs that could be told apart.
+LED = 8
 #: A blob's peak is at least this many times the noise around it.
 LEAST_CONTRAST = 4.0
 #: Two spots touch where it is darker between them than this part of the darker one.
@@ -151,7 +153,7 @@ class Detector:
                 around = light[window[1] : window[3], window[0] : window[2]]
                 group = [own]
                 touched = False
-                if len(around) <= TOGETHER and np.count_nonzero(around > level) > pixels:
+                if max(width, height) <= LED and np.count_nonzero(around > level) > pixels:
                     if everything is None:
                         everything = _components(light, level)
                     group, touched = _together(own, [tuple(blob) for blob, _ in everything], light.shape)
@@ -248,11 +250,11 @@ def _together(
     own: tuple[int, int, int, int], blobs: Sequence[tuple[int, ...]], shape: tuple[int, ...]
 ) -> tuple[list[tuple[int, int, int, int]], bool]:
     """The boxes of a blob and of all others (left, top, width, height, pixels) that must be measured with it, since
-    they lie in its window, or in that of all of them; or its own, and True, where that is larger than `TOGETHER`."""
+    they lie in its window, or in that of all of them; or its own, and True, where that is too much."""
     group = [own]
     while True:
         window = _window(_around(group), shape)
-        if window[2] - window[0] > TOGETHER:
+        if window[2] - window[0] > TOGETHER or max(max(box[2:]) for box in group) > LED:
             return [own], True
         more = [
             blob
