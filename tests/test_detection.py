@@ -55,7 +55,7 @@ def test_the_stated_sigma_is_that_of_the_errors_to_35_percent(measured):
     assert abs(covariance[0, 1]) < 0.1 * covariance[0, 0]
 
 
-def near_another(radius, apart, n=120, seed=2):
+def near_another(radius, apart, level, n=120, seed=2):
     """Errors (n, 2) along and across the direction of another LED, and chi2 per number, of the centres of LEDs."""
     rng = np.random.default_rng(seed)
     errors, square = [], []
@@ -63,7 +63,7 @@ def near_another(radius, apart, n=120, seed=2):
         uv = np.array([30.0, 22.0]) + rng.uniform(-0.5, 0.5, 2)
         angle = rng.uniform(-np.pi, np.pi)
         along = np.array([np.cos(angle), np.sin(angle)])
-        blobs = detect_leds(led_image([uv, uv + apart * along], radius, sensor=Sensor(), seed=k))
+        blobs = detect_leds(led_image([uv, uv + apart * along], radius, level, sensor=Sensor(), seed=k))
         assert len(blobs) == 2
         own = np.linalg.norm(blobs.uv - uv, axis=1).argmin()
         off = blobs.uv[own] - uv
@@ -74,9 +74,11 @@ def near_another(radius, apart, n=120, seed=2):
     return np.array(errors), np.mean(square)
 
 
-@pytest.mark.parametrize(("radius", "apart"), [(0.7, 3.75), (0.7, 6.0), (1.5, 6.0), (1.5, 8.0)])
-def test_a_light_beside_another_is_where_it_would_be_without(radius, apart):
-    errors, square = near_another(radius, apart)
+@pytest.mark.parametrize(
+    ("radius", "apart", "level"), [(0.7, 3.75, 240.0), (0.7, 6.0, 240.0), (1.5, 8.0, 240.0), (2.5, 12.0, 200.0)]
+)
+def test_a_light_beside_another_is_where_it_would_be_without(radius, apart, level):
+    errors, square = near_another(radius, apart, level)
     assert (np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(len(errors))).all()
     assert square < 1.9
 

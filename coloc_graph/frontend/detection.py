@@ -33,9 +33,9 @@ MARGIN = 3
 SIZES = (11, 15, 21, 31, 45, 63)
 SIZE_FOR = [next(size for size in SIZES if size >= wanted) for wanted in range(SIZES[-1] + 1)]
 #: Blobs that fit into a window of this size [px] are measured together where one lies in another's.
-TOGETHER = 21
-#: Larger ones [px] are no LEDs that could be told apart.
-LED = 8
+TOGETHER = 31
+#: Larger ones [px] are lamps, for which there is no time.
+LED = 14
 #: A blob's peak is at least this many times the noise around it.
 LEAST_CONTRAST = 4.0
 #: Two spots touch where it is darker between them than this part of the darker one.
