@@ -19,8 +19,6 @@ CONVERGED = 1e-3
 LEAST_VARIANCE = 0.25
 #: Several spots in a window are measured in so many turns at most, until none moves by more than this [px].
 TURNS, SETTLED = 6, 4e-3
-#: Spots nearer than this many times a half axis, which is a Gaussian's sigma, cannot be told apart.
-TOUCHING = 3.5
 #: Nor wider than this [px^2].
 MOST_VARIANCE = 400.0
 
@@ -59,7 +57,7 @@ def measure_first(
     """Measure the first of k spots a window: `inner` (n, k, h, w) are the pixels that each was found by.
 
     Each is measured in what the others, as Gaussian spots, leave of the light, in turns. Also says which (n,) are so
-    near another that they cannot be told apart. Otherwise as `measure_spots`.
+    near another that they do not settle. Otherwise as `measure_spots`.
     """
     n, k = inner.shape[:2]
     if k == 1:
@@ -80,9 +78,7 @@ def measure_first(
             break
         begin = centre[going].reshape(-1, 2), shape[going].reshape(-1, 2, 2)
     first = measure_spots(light - others[:, 0], inner[:, 0], levels, shot_gain)
-    off = (centre[:, 1:] - first.centre[:, None])[..., None]
-    square = (off.mT @ np.linalg.solve((shape[:, 1:] + first.shape[:, None]) / 2, off))[..., 0, 0]
-    touching = square.min(axis=1) < TOUCHING**2
+    touching = np.zeros(n, bool)
     touching[going] = True
     return first, touching
 

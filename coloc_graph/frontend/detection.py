@@ -289,16 +289,11 @@ def _cut(
 
 
 def _in_boxes(shape: tuple[int, ...], candidates: list[Candidate]) -> NDArray[np.bool_]:
-    """Which pixels (n, k, h, w) of the windows lie in the boxes of their blobs; one in two boxes is the nearer's."""
+    """Which pixels (n, k, h, w) of the windows lie in the boxes of their blobs."""
     left, top, width, height = np.moveaxis(np.array([(one.box, *one.others) for one in candidates]), 2, 0)[..., None]
     x, y = np.arange(shape[2]), np.arange(shape[1])
     in_x, in_y = (x >= left) & (x < left + width), (y >= top) & (y < top + height)
-    within = in_y[..., :, None] & in_x[..., None, :]
-    if within.shape[1] > 1:
-        dx, dy = (x - left - (width - 1) / 2)[..., None, :], (y - top - (height - 1) / 2)[..., :, None]
-        far = np.where(within, dx * dx + dy * dy, np.inf)
-        within &= far <= far.min(axis=1, keepdims=True)
-    return np.asarray(within)
+    return np.asarray(in_y[..., :, None] & in_x[..., None, :])
 
 
 def detector_for(markers: Markers | None, camera: Camera | None = None) -> Detector:
