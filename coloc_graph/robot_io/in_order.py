@@ -3,8 +3,9 @@
 from collections.abc import Iterator
 from typing import Any
 
-#: So many are asked for at once [messages]; each answer is progress, on a bad network too.
-AT_ONCE = 200
+#: So many are asked for at once [messages]: each answer is progress, on a bad network too, and does not fill zenoh's
+#: queue, which would stop the robot's whole link.
+AT_ONCE = 100
 #: After so many answers without what is missing there is none of it any more.
 TRIES = 3
 
@@ -25,13 +26,17 @@ class InOrder:
 
     def take(self, number: int, message: Any) -> Iterator[Any]:
         """Take one in; those whose turn it is come out."""
-        if number < self._next or number in self._held:
+        if self.knows(number):
             self.again += 1
             return
         self._held[number] = message
         if len(self._held) > self._most:
             self._give_up(min(self._held))
         yield from self._turn()
+
+    def knows(self, number: int) -> bool:
+        """Whether it came already, or was given up."""
+        return number < self._next or number in self._held
 
     def missing(self) -> tuple[int, int] | None:
         """The numbers to ask for, first and last."""

@@ -14,7 +14,6 @@ from typing import Any, Self, TypeVar
 
 import msgspec
 import zenoh
-import zenoh.ext
 
 from coloc_graph.errors import RobotError
 from coloc_graph.robot_io.clock import ClockFilter
@@ -46,8 +45,8 @@ Clock = Callable[[], int]
 
 #: How often clocks are compared [s].
 COMPARED = 0.1
-#: How often what zenoh's own recovery did not get is asked for [s].
-RECOVERED = 0.2
+#: How often what is missing is asked for, and whether there is something newer [s].
+RECOVERED, NEWER = 0.2, 1.0
 #: A command is asked again so often until its deadline [s].
 AGAIN = 0.25
 
@@ -184,8 +183,11 @@ class CoordinatorLink:
                 return reply
         return None
 
-    def _taker(self, type_: type[M]) -> Callable[[zenoh.Sample], None]:
-        """What takes messages of one kind from zenoh, and never raises into its threads."""
+    def _taker(self, type_: type[M], asked: bool = False) -> Callable[[zenoh.Sample], None]:
+        """What takes messages of one kind from zenoh, and never raises into its threads.
+
+        Those that were `asked` for may have come already: that is no replay.
+        """
 
         def take(sample: zenoh.Sample) -> None:
             robot = robot_of(sample)
@@ -198,11 +200,11 @@ class CoordinatorLink:
                 self._counter.refuse(error, f"a {type_.__name__} of {robot}")
                 return
             with self._lock:
-                self._hand_over(robot, message)
+                self._hand_over(robot, message, asked)
 
         return take
 
-    def _hand_over(self, robot: str, message: Any) -> None:
+    def _hand_over(self, robot: str, message: Any, asked: bool) -> None:
         if isinstance(message, Status):
             self._counter.add("taken")
             self._calls[Status](robot, message)
@@ -213,7 +215,8 @@ class CoordinatorLink:
             order = self._orders[key] = InOrder(CACHED)
             while len(self._orders) > 12 * len(self.team.names):
                 self._orders.popitem(last=False)
-        self._call(key, order, order.take(message.number, message))
+        if not (asked and order.knows(message.number)):
+            self._call(key, order, order.take(message.number, message))
 
     def _call(self, key: tuple[str, type, str], order: InOrder, messages: Iterator[Any]) -> None:
         """Hand over messages whose turn it is, and count what is not among them."""
@@ -230,30 +233,45 @@ class CoordinatorLink:
 
     def _recover(self) -> None:
         """The thread that asks robots for what is missing of what they measured, until it comes or is no more."""
-        while not self._ended.wait(RECOVERED):
-            with self._lock:
-                orders = list(self._orders.items())
-            for key, order in orders:
-                robot, type_, session = key
-                with self._lock:
-                    missing = order.missing()
-                    if missing is not None and self._sessions.get(robot, session) != session:
-                        self._call(key, order, order.end())  # who kept what is missing has ended
-                        continue
-                if missing is None or not self._present[robot] or robot not in self._sessions:
-                    continue
-                answered = self._ask_again(robot, type_, *missing)
-                with self._lock:
-                    if answered and self._present[robot]:
-                        self._call(key, order, order.asked(*missing))
+        looked: dict[tuple[str, type], float] = {}
+        while not self._ended.wait(0.0 if self._recovered() else RECOVERED):
+            # after a cut, or of what is rare, the newest tells what is missing before it
+            for robot, (session, _) in list(self._heard.items()):
+                for type_ in KEPT_KINDS.values():
+                    due = looked.get((robot, type_), 0.0) + NEWER <= time.monotonic()
+                    if due and self._present[robot] and self._sessions.get(robot) == session:
+                        self._ask_again(robot, type_, "_max=1")
+                        looked[robot, type_] = time.monotonic()
 
-    def _ask_again(self, robot: str, type_: type[M], first: int, last: int) -> bool:
-        """Have what a robot keeps come again, by numbers; whether it answered."""
+    def _recovered(self) -> bool:
+        """Ask once for what is missing of each kind of each robot; whether anything came, and there is more."""
+        with self._lock:
+            orders = list(self._orders.items())
+        more = False
+        for key, order in orders:
+            robot, type_, session = key
+            with self._lock:
+                missing = order.missing()
+                if missing is not None and self._sessions.get(robot, session) != session:
+                    self._call(key, order, order.end())  # who kept what is missing has ended
+                    continue
+            if missing is None or not self._present[robot] or robot not in self._sessions:
+                continue
+            answered = self._ask_again(robot, type_, f"_sn={missing[0]}..{missing[1]}")
+            with self._lock:
+                if answered and self._present[robot]:
+                    self._call(key, order, order.asked(*missing))
+                left = order.missing()
+                more |= left is not None and left[0] != missing[0]
+        return more
+
+    def _ask_again(self, robot: str, type_: type[M], which: str) -> bool:
+        """Have some of what a robot keeps come again; whether it answered."""
         kind = next(kind for kind, one in KEPT_KINDS.items() if one is type_)
-        take = self._taker(type_)
+        take = self._taker(type_, asked=True)
         try:
             replies = self._session.zenoh.get(
-                f"coloc/{robot}/{kind}/@adv/pub/**?_sn={first}..{last}",
+                f"coloc/{robot}/{kind}/@adv/pub/**?{which}",
                 timeout=5.0,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -285,9 +303,8 @@ class CoordinatorLink:
     def _listen_to(self, robot: str) -> None:
         """Have what a session of a robot measured come, from its first on, once it has told its time.
 
-        Asked for session by session: what a subscriber that is there already hears first of a new publisher may be
-        newer than what that has kept for it. Publishers are not detected by zenoh, which would send all that is kept
-        anew after each cut, more than a bad network carries within the lease.
+        What is missing is asked for by `_recover`, some at a time, and not by zenoh, which has a robot send all of it at
+        once: more than a bad network carries before zenoh takes the connection for dead.
         """
         session = self._sessions.get(robot)
         before, subscribers = self._heard.get(robot, (None, []))
@@ -298,13 +315,7 @@ class CoordinatorLink:
         self._heard[robot] = (
             session,
             [
-                zenoh.ext.declare_advanced_subscriber(
-                    self._session.zenoh,
-                    f"coloc/{robot}/{kind}",
-                    self._taker(type_),
-                    history=zenoh.ext.HistoryConfig(),
-                    recovery=zenoh.ext.RecoveryConfig(heartbeat=True),  # type: ignore[call-arg]
-                )
+                self._session.zenoh.declare_subscriber(f"coloc/{robot}/{kind}", self._taker(type_))
                 for kind, type_ in KEPT_KINDS.items()
             ],
         )

@@ -30,8 +30,6 @@ from coloc_graph.robot_io.wire import (
 
 Clock = Callable[[], int]
 
-#: How often what was lost is noticed [s].
-NOTICED = 0.2
 #: So many commands wait at a robot at most; more are dropped, and asked again.
 WAITING = 64
 
@@ -68,8 +66,7 @@ class RobotLink:
                         f"coloc/{name}/{kind}",
                         congestion_control=zenoh.CongestionControl.DROP,
                         cache=zenoh.ext.CacheConfig(max_samples=CACHED),
-                        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=NOTICED),  # type: ignore[call-arg]
-                        publisher_detection=True,
+                        sample_miss_detection=zenoh.ext.MissDetectionConfig(),  # type: ignore[call-arg]
                     )
                 )
                 for kind, type_ in KEPT_KINDS.items()
