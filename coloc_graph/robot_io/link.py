@@ -303,8 +303,8 @@ class CoordinatorLink:
     def _listen_to(self, robot: str) -> None:
         """Have what a session of a robot measured come, from its first on, once it has told its time.
 
-        What is missing is asked for by `_recover`, some at a time, and not by zenoh, which has a robot send all of it at
-        once: more than a bad network carries before zenoh takes the connection for dead.
+        What is missing is asked for by `_recover`, some at a time, and not by zenoh, which has a robot send all of it
+        at once: more than a bad network carries before zenoh takes the connection for dead.
         """
         session = self._sessions.get(robot)
         before, subscribers = self._heard.get(robot, (None, []))
