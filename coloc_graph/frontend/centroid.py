@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Counts = NDArray[np.int64]
 
 MAX_ITERATIONS = 12
 #: The search ends when centres move by less than this [px].
@@ -52,39 +53,45 @@ def gaussians(centre: Array, shape: Array, flux: Array, size: tuple[int, ...]) -
 
 
 def measure_first(
-    light: Array, inner: NDArray[np.bool_], levels: float, shot_gain: float
+    light: Array, size: Counts, inner: NDArray[np.bool_], window: Counts, levels: float, shot_gain: float
 ) -> tuple[Spots, NDArray[np.bool_]]:
-    """Measure the first of k spots a window: `inner` (n, k, h, w) are the pixels that each was found by.
+    """Measure the first spot in each window of `light` (n, h, w), of which only `size` (n, 2) [px: u, v] is real.
 
-    Each is measured in what the others, as Gaussian spots, leave of the light, in turns. Also says which (n,) are so
-    near another that they do not settle. Otherwise as `measure_spots`.
+    There are m spots: `window` (m,), ascending, says in which each lies, `inner` (m, h, w) by which pixels it was
+    found. Where several lie in one, each is measured in what the others, as Gaussian spots, leave of the light, in
+    turns. Also says in which windows (n,) they are so near each other that they do not settle. Otherwise as
+    `measure_spots`.
     """
-    n, k = inner.shape[:2]
-    if k == 1:
-        return measure_spots(light, inner[:, 0], levels, shot_gain), np.zeros(n, bool)
-    centre, shape, models = _rough_models(light, inner)
-    others = models.sum(axis=1, keepdims=True) - models
-    begin, going = None, np.arange(n)
-    for _ in range(TURNS):
-        left = (light[going, None] - others[going]).reshape(-1, *light.shape[1:])
-        spots = measure_spots(left, inner[going].reshape(left.shape), levels, shot_gain, begin)
-        flux = np.where(spots.found, spots.flux, 0.0)
-        models = gaussians(spots.centre, spots.shape, flux, light.shape[1:]).reshape(len(going), *inner.shape[1:])
-        others[going] = models.sum(axis=1, keepdims=True) - models
-        moved = np.abs(spots.centre.reshape(-1, k, 2) - centre[going]).max(axis=(1, 2))
-        centre[going], shape[going] = spots.centre.reshape(-1, k, 2), spots.shape.reshape(-1, k, 2, 2)
-        going = going[moved >= SETTLED]
-        if not len(going):
-            break
-        begin = centre[going].reshape(-1, 2), shape[going].reshape(-1, 2, 2)
-    first = measure_spots(light - others[:, 0], inner[:, 0], levels, shot_gain)
-    touching = np.zeros(n, bool)
-    touching[going] = True
-    return first, touching
+    first = np.flatnonzero(np.diff(window, prepend=-1))
+    touching = np.zeros(len(light), bool)
+    spots = np.flatnonzero(np.bincount(window)[window] > 1)
+    if len(spots):
+        window = window[spots]
+        centre, shape, models = _rough_models(light[window], size[window], inner[spots])
+        others = _of_others(models, window)
+        begin, going = None, np.arange(len(spots))
+        for _ in range(TURNS):
+            own = window[going]
+            found = measure_spots(light[own] - others[going], size[own], inner[spots[going]], levels, shot_gain, begin)
+            flux = np.where(found.found, found.flux, 0.0)
+            others[going] = _of_others(gaussians(found.centre, found.shape, flux, light.shape[1:]), own)
+            moved = np.zeros(len(light))
+            np.maximum.at(moved, own, np.abs(found.centre - centre[going]).max(axis=1))
+            centre[going], shape[going] = found.centre, found.shape
+            going = going[moved[own] >= SETTLED]
+            if not len(going):
+                break
+            begin = centre[going], shape[going]
+        touching[window[going]] = True
+        light = light.copy()
+        own = np.flatnonzero(np.isin(spots, first))
+        light[window[own]] -= others[own]
+    return measure_spots(light, size, inner[first], levels, shot_gain), touching
 
 
 def measure_spots(
     light: Array,
+    size: Counts,
     inner: NDArray[np.bool_],
     levels: float,
     shot_gain: float,
@@ -92,112 +99,171 @@ def measure_spots(
 ) -> Spots:
     """Measure one spot a window: `light` (n, h, w) [grey levels], `inner` the pixels that it was found by.
 
-    `levels` bounds how far the background may differ from its median; `shot_gain` is the variance that a grey
-    level of light adds to a pixel. The search may `begin` with centres (n, 2) and shapes (n, 2, 2) that are nearly
-    right.
+    Of a window only `size` (n, 2) [px: u, v] is real. `levels` bounds how far the background may differ from its
+    median; `shot_gain` is the variance that a grey level of light adds to a pixel. The search may `begin` with centres
+    (n, 2) and shapes (n, 2, 2) that are nearly right.
     """
-    background, noise = coons_background(light, levels)
+    background, noise = coons_background(light, size, levels)
     signal = light - background
-    n, height, width = light.shape
-    x, y = np.arange(width, dtype=float), np.arange(height, dtype=float)
+    grid = _Grid.of(size, light.shape[1:])
 
-    start = _rough_shape(inner, x, y)
-    centre, shape = (_rough_centre(signal * inner, x, y), start.copy()) if begin is None else begin
-    found = np.ones(n, bool)
-    gain = np.broadcast_to(2 * np.eye(2), (n, 2, 2)).copy()
-    total = np.ones(n)
-    going = np.arange(n)
+    start = _rough_shape(inner, grid)
+    if begin is None:
+        centre, shape = _rough_centre(signal * inner, grid), start.copy()
+    else:
+        centre, shape = begin[0].copy(), begin[1][:, [0, 0, 1], [0, 1, 1]]
+    gain = np.broadcast_to([2.0, 0.0, 0.0, 2.0], (len(light), 4)).copy()
+    total = np.ones(len(light))
+    going, lit, there = np.arange(len(light)), signal, grid
     for _ in range(MAX_ITERATIONS):
-        window = shape[going][:, [0, 1], [0, 1]]
-        moments = _moments(signal[going], *_windows(centre[going], window, x, y))
-        total[going] = moments[:, 0, 0]
-        inside = np.maximum(moments[:, 0, 0], 1e-9)
-        mean = np.stack([moments[:, 0, 1], moments[:, 1, 0]], axis=1) / inside[:, None]
-        spread = np.stack([moments[:, 0, 2], moments[:, 1, 1], moments[:, 1, 1], moments[:, 2, 0]], axis=1)
-        seen = (spread / inside[:, None]).reshape(-1, 2, 2) - mean[:, :, None] * mean[:, None, :]
+        window = shape[going]
+        m = _moments(lit, *_windows(centre[going], window, there))
+        flux = m[:, 0, 0]
+        scale = 1 / np.maximum(flux, 1e-9)
+        x, y = m[:, 0, 1] * scale, m[:, 1, 0] * scale
+        seen = m[:, 0, 2] * scale - x * x, m[:, 1, 1] * scale - x * y, m[:, 2, 0] * scale - y * y
         # of a Gaussian spot in a Gaussian window their precisions add up, and so what is seen is undone
-        shape[going], gain[going] = _undone(seen, window, start[going])
-        step = (gain[going] @ mean[:, :, None])[:, :, 0]
-        centre[going] += np.clip(step, -1.0, 1.0)
-        going = going[(np.abs(step).max(axis=1) >= CONVERGED) & (total[going] > 0)]
-        if not len(going):
-            break
+        spot, more = _undone(seen, window, start[going])
+        step = np.empty((len(going), 2))
+        step[:, 0], step[:, 1] = more[:, 0] * x + more[:, 1] * y, more[:, 2] * x + more[:, 3] * y
+        shape[going], gain[going], total[going] = spot, more, flux
+        centre[going] += np.minimum(np.maximum(step, -1.0), 1.0)
+        on = (np.abs(step).max(axis=1) >= CONVERGED) & (flux > 0)
+        if not on.all():
+            going = going[on]
+            if not len(going):
+                break
+            lit, there = lit[on], there[on]
 
-    wx, wy, dx, dy = _windows(centre, shape[:, [0, 1], [0, 1]], x, y)
+    wx, wy, dx, dy = _windows(centre, shape, grid)
     shot = _moments(np.maximum(signal, 0.0), wx * wx, wy * wy, dx, dy)
-    even = _moments(np.ones((1, height, width)), wx * wx, wy * wy, dx, dy)
-    variance = (noise**2)[:, None, None] * even + shot_gain * shot
-    # the background's own noise: a row (column) of it is the mean of four pixels, and off as a whole
-    xx = variance[:, 0, 2] + noise**2 / 4 * wy.sum(1) ** 2 * ((wx * dx) ** 2).sum(1)
-    yy = variance[:, 2, 0] + noise**2 / 4 * wx.sum(1) ** 2 * ((wy * dy) ** 2).sum(1)
-    of_mean = np.stack([xx, variance[:, 1, 1], variance[:, 1, 1], yy], axis=1).reshape(-1, 2, 2)
-    covariance = gain @ of_mean @ gain.mT / np.maximum(total**2, 1e-9)[:, None, None]
-    found &= (total > 0) & np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(centre).all(axis=1)
+    # where there is light or none, a pixel has that noise; and the background has its own: a row (column) of it is the
+    # mean of four pixels, and off as a whole
+    square_x, square_y, x2, y2 = wx * wx, wy * wy, (wx * dx) ** 2, (wy * dy) ** 2
+    even, dark = (square_x * dx).sum(1) * (square_y * dy).sum(1), noise**2
+    xx = x2.sum(1) * (square_y.sum(1) + wy.sum(1) ** 2 / 4) * dark + shot_gain * shot[:, 0, 2]
+    yy = y2.sum(1) * (square_x.sum(1) + wx.sum(1) ** 2 / 4) * dark + shot_gain * shot[:, 2, 0]
+    xy = even * dark + shot_gain * shot[:, 1, 1]
+    gain = gain.reshape(-1, 2, 2)
+    covariance = gain @ _matrices(xx, xy, yy) @ gain.mT / np.maximum(total**2, 1e-9)[:, None, None]
+    found = (total > 0) & np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(centre).all(axis=1)
     # what a Gaussian window lets through of a Gaussian spot
-    window = shape[:, [0, 1], [0, 1]]
-    both = (shape[:, 0, 0] + window[:, 0]) * (shape[:, 1, 1] + window[:, 1]) - shape[:, 0, 1] ** 2
-    flux = total * np.sqrt(both / window.prod(axis=1))
-    return Spots(centre, covariance, shape, flux, signal, noise, found)
+    a, b, c = shape.T
+    flux = total * np.sqrt((4 * a * c - b * b) / (a * c))
+    return Spots(centre, covariance, _matrices(a, b, c), flux, signal, noise, found)
 
 
-def _rough_models(light: Array, inner: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
-    """Centres (n, k, 2), shapes (n, k, 2, 2) and light (n, k, h, w) of spots, roughly, by their bright pixels."""
-    n, k, height, width = inner.shape
-    x, y = np.arange(width, dtype=float), np.arange(height, dtype=float)
-    dark = np.nanmedian(np.where(inner.any(axis=1), np.nan, light), axis=(1, 2))
-    lit = np.where(inner, (light - dark[:, None, None])[:, None], 0.0).reshape(-1, height, width)
-    centre, shape = _rough_centre(lit, x, y), _rough_shape(inner.reshape(lit.shape), x, y)
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """The pixels of windows: `x` (w,), `y` (h,), and whether they are real, `in_x` (n, w), `in_y` (n, h)."""
+
+    x: Array
+    y: Array
+    in_x: NDArray[np.bool_]
+    in_y: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, size: Counts, shape: tuple[int, ...]) -> "_Grid":
+        x, y = np.arange(shape[1], dtype=float), np.arange(shape[0], dtype=float)
+        return cls(x, y, x < size[:, :1], y < size[:, 1:])
+
+    def __getitem__(self, which: NDArray[np.bool_]) -> "_Grid":
+        return _Grid(self.x, self.y, self.in_x[which], self.in_y[which])
+
+
+def _of_others(models: Array, window: Counts) -> Array:
+    """What the other spots (m, h, w) of each one's window (m,), ascending, add to its light."""
+    begins = np.flatnonzero(np.diff(window, prepend=-1))
+    counts = np.diff(begins, append=len(window))
+    return np.asarray(np.repeat(np.add.reduceat(models, begins, axis=0), counts, axis=0) - models)
+
+
+def _rough_models(light: Array, size: Counts, inner: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    """Centres (m, 2), shapes (m, 2, 2) and light (m, h, w) of spots, roughly, by their bright pixels."""
+    grid = _Grid.of(size, light.shape[1:])
+    dark = _median(
+        light.reshape(len(light), -1), (grid.in_y[:, :, None] & grid.in_x[:, None, :]).reshape(len(light), -1)
+    )
+    lit = np.where(inner, light - dark[:, None, None], 0.0)
+    shape = _matrices(*_rough_shape(inner, grid).T)
+    centre = _rough_centre(lit, grid)
     flux = lit.max(axis=(1, 2)) * 2 * np.pi * np.sqrt(np.linalg.det(shape))
-    models = gaussians(centre, shape, flux, (height, width))
-    return centre.reshape(n, k, 2), shape.reshape(n, k, 2, 2), models.reshape(inner.shape)
+    return centre, shape, gaussians(centre, shape, flux, light.shape[1:])
 
 
-def _rough_centre(light: Array, x: Array, y: Array) -> Array:
+def _matrices(xx: Array, xy: Array, yy: Array) -> Array:
+    """Symmetric matrices (n, 2, 2)."""
+    out = np.empty((len(xx), 2, 2))
+    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = xx, xy, xy, yy
+    return out
+
+
+def _median(values: Array, real: NDArray[np.bool_]) -> Array:
+    """The medians (n,) of rows (n, m), of the values that are real, at least one in each."""
+    ordered, counts = np.sort(np.where(real, values, np.inf), axis=1), real.sum(axis=1)
+    rows = np.arange(len(values))
+    return np.asarray((ordered[rows, (counts - 1) // 2] + ordered[rows, counts // 2]) / 2)
+
+
+def _rough_centre(light: Array, grid: _Grid) -> Array:
     """The centroids (n, 2) of light (n, h, w)."""
     total = np.maximum(light.sum(axis=(1, 2)), 1e-9)
-    return np.stack([(light.sum(axis=1) @ x) / total, (light.sum(axis=2) @ y) / total], axis=1)
+    return np.stack([(light.sum(axis=1) @ grid.x) / total, (light.sum(axis=2) @ grid.y) / total], axis=1)
 
 
-def _rough_shape(inner: NDArray[np.bool_], x: Array, y: Array) -> Array:
-    """Second moments (n, 2, 2) of the spots that these pixels are the bright part of."""
+def _rough_shape(inner: NDArray[np.bool_], grid: _Grid) -> Array:
+    """Second moments (n, 3: xx, xy, yy) of the spots that these pixels are the bright part of."""
     lit = inner.astype(float)
     area = np.maximum(lit.sum(axis=(1, 2)), 1.0)[:, None]
-    dx, dy = x - lit.sum(axis=1) @ x[:, None] / area, y - lit.sum(axis=2) @ y[:, None] / area
+    dx, dy = grid.x - lit.sum(axis=1) @ grid.x[:, None] / area, grid.y - lit.sum(axis=2) @ grid.y[:, None] / area
     m = _moments(lit, np.ones_like(dx), np.ones_like(dy), dx, dy) / area[:, :, None]
-    moments = np.stack([m[:, 0, 2], m[:, 1, 1], m[:, 1, 1], m[:, 2, 0]], axis=1).reshape(-1, 2, 2)
     # the part of a Gaussian above a third of its peak has half the moments of the whole; one or two pixels have none
-    return np.asarray(2 * moments + 0.4 * np.eye(2))
+    return np.asarray(2 * m[:, [0, 1, 2], [2, 1, 0]] + (0.4, 0.0, 0.4))
 
 
-def _windows(centre: Array, variances: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+def _windows(centre: Array, shape: Array, grid: _Grid) -> tuple[Array, Array, Array, Array]:
     """A Gaussian window's factors (n, w) and (n, h), and the distances from its centre along x and y.
 
-    Its axes are the image's: it is then a product, and moments are two small matrix products.
+    Its axes are the image's: it is then a product, and moments are two small matrix products. It is as wide as a spot
+    of a `shape` (n, 3: xx, xy, yy).
     """
-    dx, dy = x - centre[:, :1], y - centre[:, 1:]
-    return np.exp(-0.5 / variances[:, :1] * dx * dx), np.exp(-0.5 / variances[:, 1:] * dy * dy), dx, dy
+    dx, dy = grid.x - centre[:, :1], grid.y - centre[:, 1:]
+    wx, wy = np.exp(-0.5 / shape[:, :1] * dx * dx), np.exp(-0.5 / shape[:, 2:] * dy * dy)
+    return wx * grid.in_x, wy * grid.in_y, dx, dy
 
 
 def _moments(light: Array, wx: Array, wy: Array, dx: Array, dy: Array) -> Array:
     """Moments (n, 3, 3) of windowed light: [i, j] is the sum over the window of wy dy^i light wx dx^j."""
-    in_y = np.stack([wy, wy * dy, wy * dy * dy], axis=1)
-    in_x = np.stack([wx, wx * dx, wx * dx * dx], axis=2)
+    in_y, in_x = np.empty((len(wy), 3, wy.shape[1])), np.empty((len(wx), wx.shape[1], 3))
+    in_y[:, 0], in_x[:, :, 0] = wy, wx
+    np.multiply(wy, dy, out=in_y[:, 1])
+    np.multiply(in_y[:, 1], dy, out=in_y[:, 2])
+    np.multiply(wx, dx, out=in_x[:, :, 1])
+    np.multiply(in_x[:, :, 1], dx, out=in_x[:, :, 2])
     return np.asarray(in_y @ light @ in_x)
 
 
-def _undone(seen: Array, window: Array, otherwise: Array) -> tuple[Array, Array]:
-    """A spot's own moments (n, 2, 2) from those seen through a window with variances (n, 2), and by how much a
-    shift of the spot is more than is seen of it (n, 2, 2); `otherwise` where the moments are no spot's."""
-    det = seen[:, 0, 0] * seen[:, 1, 1] - seen[:, 0, 1] ** 2
-    det = np.where(det > 1e-6, det, np.inf)
-    a, c = seen[:, 1, 1] / det - 1 / window[:, 0], seen[:, 0, 0] / det - 1 / window[:, 1]
-    b = -seen[:, 0, 1] / det
+def _undone(seen: tuple[Array, Array, Array], window: Array, otherwise: Array) -> tuple[Array, Array]:
+    """A spot's own moments (n, 3: xx, xy, yy) from those seen through a window of such moments, of which it has no xy,
+    and by how much a shift of the spot is more than is seen of it (n, 4: a matrix's elements); `otherwise` where the
+    moments are no spot's."""
+    xx, xy, yy = seen
+    det = xx * yy - xy * xy
+    scale = np.where(det > 1e-6, 1 / np.where(det > 1e-6, det, 1.0), 0.0)
+    wx, wy = 1 / window[:, 0], 1 / window[:, 2]
+    a, b, c = yy * scale - wx, -xy * scale, xx * scale - wy
     det = a * c - b * b
-    spot = np.stack([c, -b, -b, a], axis=1).reshape(-1, 2, 2) / np.where(det > 0, det, np.inf)[:, None, None]
-    half, apart = (spot[:, 0, 0] + spot[:, 1, 1]) / 2, np.hypot((spot[:, 0, 0] - spot[:, 1, 1]) / 2, spot[:, 0, 1])
+    scale = np.where(det > 0, 1 / np.where(det > 0, det, 1.0), 0.0)
+    spot = np.empty_like(window)
+    spot[:, 0], spot[:, 1], spot[:, 2] = c * scale, -b * scale, a * scale
+    half, apart = (spot[:, 0] + spot[:, 2]) / 2, np.hypot((spot[:, 0] - spot[:, 2]) / 2, spot[:, 1])
     good = (a > 0) & (det > 0) & (half - apart >= LEAST_VARIANCE) & (half + apart < MOST_VARIANCE)
-    shape = np.where(good[:, None, None], spot, otherwise)
-    return shape, np.eye(2) + shape / window[:, None, :]
+    if not good.all():
+        spot = np.where(good[:, None], spot, otherwise)
+    gain = np.empty((len(window), 4))
+    gain[:, 0], gain[:, 1] = 1 + spot[:, 0] * wx, spot[:, 1] * wy
+    gain[:, 2], gain[:, 3] = spot[:, 1] * wx, 1 + spot[:, 2] * wy
+    return spot, gain
 
 
 def axes(shape: Array) -> tuple[Array, Array, Array]:
@@ -207,38 +273,49 @@ def axes(shape: Array) -> tuple[Array, Array, Array]:
     return short, long, vectors[:, :, 1]
 
 
-def at_points(signal: Array, points: Array) -> Array:
-    """Bilinear values (n,) of windows (n, h, w) at points (n, 2) [px: u, v], held inside."""
-    height, width = signal.shape[1:]
-    u = np.clip(points[:, 0], 0, width - 1.001)
-    v = np.clip(points[:, 1], 0, height - 1.001)
-    i, j, n = v.astype(int), u.astype(int), np.arange(len(points))
-    a, b = v - i, u - j
-    upper = signal[n, i, j] * (1 - b) + signal[n, i, j + 1] * b
-    lower = signal[n, i + 1, j] * (1 - b) + signal[n, i + 1, j + 1] * b
+def at_points(signal: Array, window: Counts, points: Array, size: Counts) -> Array:
+    """Bilinear values (m,) of windows (n, h, w) of a `size` (n, 2) [px: u, v] at points (m, 2) [px: u, v] of each one's
+    window (m,), held inside."""
+    points = np.maximum(np.minimum(points, size[window] - 1.001), 0.0)
+    corner = points.astype(int)
+    j, i = corner.T
+    b, a = (points - corner).T
+    upper = signal[window, i, j] * (1 - b) + signal[window, i, j + 1] * b
+    lower = signal[window, i + 1, j] * (1 - b) + signal[window, i + 1, j + 1] * b
     return np.asarray(upper * (1 - a) + lower * a)
 
 
-def coons_background(light: Array, levels: float) -> tuple[Array, Array]:
+def coons_background(light: Array, size: Counts, levels: float) -> tuple[Array, Array]:
     """The light (n, h, w) that would be there without the spot, and the noise (n,) of a pixel [grey levels].
 
-    Between the window's borders (two pixels wide) rows and columns are interpolated (a Coons patch), which is
-    exact for whatever is a sum of a profile in x and one in y. A marker stands on a robot whose dark rim often
-    passes right behind it: with a constant background that edge pulls the centre by 0.04 px.
+    Between the borders (two pixels wide) of what of a window is real, `size` (n, 2) [px: u, v], rows and columns are
+    interpolated (a Coons patch), which is exact for whatever is a sum of a profile in x and one in y. A marker stands
+    on a robot whose dark rim often passes right behind it: with a constant background that edge pulls the centre by
+    0.04 px.
     """
-    left, right = light[:, :, :2].mean(axis=2), light[:, :, -2:].mean(axis=2)
-    top, bottom = light[:, :2].mean(axis=1), light[:, -2:].mean(axis=1)
-    middle = np.median(np.concatenate([left, right, top, bottom], axis=1), axis=1)[:, None]
-    left, right, top, bottom = (np.clip(side, middle - levels, middle + levels) for side in (left, right, top, bottom))
-    x = np.linspace(0, 1, light.shape[2])
-    y = np.linspace(0, 1, light.shape[1])[:, None]
-    rows = left[:, :, None] * (1 - x) + right[:, :, None] * x
-    columns = top[:, None, :] * (1 - y) + bottom[:, None, :] * y
-    corner = [(left[:, 0] + top[:, 0]) / 2, (right[:, 0] + top[:, -1]) / 2]
-    corner += [(left[:, -1] + bottom[:, 0]) / 2, (right[:, -1] + bottom[:, -1]) / 2]
-    a, b, c, d = (value[:, None, None] for value in corner)
-    corners = (1 - y) * (a * (1 - x) + b * x) + y * (c * (1 - x) + d * x)
-    along = [np.diff(light[:, [0, -1]], axis=2), np.diff(light[:, :, [0, -1]], axis=1)]
-    steps = np.concatenate([np.abs(part).reshape(len(light), -1) for part in along], axis=1)
-    noise = 1.4826 / np.sqrt(2) * np.median(steps, axis=1)
-    return rows + columns - corners, np.maximum(noise, 12**-0.5)
+    n, height, width = light.shape
+    each, end_x, end_y = np.arange(n), size[:, 0] - 1, size[:, 1] - 1
+    u, v = np.arange(width), np.arange(height)
+    in_x, in_y = u <= end_x[:, None], v <= end_y[:, None]
+    outer_left, outer_right = light[:, :, 0], light[each, :, end_x]
+    outer_top, outer_bottom = light[:, 0], light[each, end_y]
+    sides = [
+        (outer_left + light[:, :, 1]) / 2,
+        (outer_right + light[each, :, end_x - 1]) / 2,
+        (outer_top + light[:, 1]) / 2,
+        (outer_bottom + light[each, end_y - 1]) / 2,
+    ]
+    real = np.concatenate([in_y, in_y, in_x, in_x], axis=1)
+    middle = _median(np.concatenate(sides, axis=1), real)[:, None]
+    left, right, top, bottom = (np.minimum(np.maximum(side, middle - levels), middle + levels) for side in sides)
+    x, y = (u / end_x[:, None])[:, None, :], (v / end_y[:, None])[:, :, None]
+    a, b = (left[:, 0] + top[:, 0]) / 2, (right[:, 0] + top[each, end_x]) / 2
+    c, d = (left[each, end_y] + bottom[:, 0]) / 2, (right[each, end_y] + bottom[each, end_x]) / 2
+    a, b, c, d = (value[:, None, None] for value in (a, b, c, d))
+    # what is left of rows and columns less what both have of the corners
+    left, right = left[:, :, None] - a - (c - a) * y, right[:, :, None] - b - (d - b) * y
+    background = left + (right - left) * x + top[:, None, :] * (1 - y) + bottom[:, None, :] * y
+    steps = [np.abs(np.diff(side, axis=1)) for side in (outer_left, outer_right, outer_top, outer_bottom)]
+    real = np.concatenate([in_y[:, 1:], in_y[:, 1:], in_x[:, 1:], in_x[:, 1:]], axis=1)
+    noise = 1.4826 / np.sqrt(2) * _median(np.concatenate(steps, axis=1), real)
+    return background, np.maximum(noise, 12**-0.5)

@@ -7,6 +7,7 @@ a time.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 
 import cv2
 import numpy as np
@@ -32,6 +33,8 @@ MARGIN = 3
 #: Windows come in these sizes [px], so that many are measured at once.
 SIZES = (11, 15, 21, 31, 45, 63)
 SIZE_FOR = [next(size for size in SIZES if size >= wanted) for wanted in range(SIZES[-1] + 1)]
+#: Windows are measured with larger ones while they are no more pixels than this then.
+FEW = 1 << 16
 #: Blobs that fit into a window of this size [px] are measured together where one lies in another's.
 TOGETHER = 31
 #: Larger ones [px] are lamps, for which there is no time.
@@ -165,32 +168,33 @@ class Detector:
         n = len(candidates)
         uv, covariance = np.zeros((n, 2)), np.zeros((n, 2, 2))
         flags, peak, real = np.zeros(n, np.uint8), np.zeros(n), np.zeros(n, bool)
-        alike: dict[tuple[int, ...], list[int]] = {}
-        for index, candidate in enumerate(candidates):
-            alike.setdefault((*candidate.window.shape, len(candidate.others)), []).append(index)
-        for rows in alike.values():
+        for rows in _alike([max(one.window.shape) for one in candidates]):
             own = [candidates[row] for row in rows]
             uv[rows], covariance[rows], flags[rows], peak[rows], real[rows] = self._measure(own)
         return Blobs(uv, covariance, flags, peak, np.array([one.area for one in candidates], float)), real
 
     def _measure(self, candidates: list[Candidate]) -> tuple[Array, Array, NDArray[np.uint8], Array, NDArray[np.bool_]]:
         t = self.threshold
-        light = np.array([one.window for one in candidates], float)
-        level = np.array([one.level for one in candidates])[:, None, None, None]
-        each = _in_boxes(light.shape, candidates) & (light[:, None] > level)
-        inner = each[:, 0]
-        spots, touching = measure_first(light, each, t.levels, t.shot_gain)
+        light, size = _padded([one.window for one in candidates])
+        boxes = np.array([box for one in candidates for box in (one.box, *one.others)])
+        counts = np.array([1 + len(one.others) for one in candidates])
+        window, first = np.repeat(np.arange(len(candidates)), counts), np.cumsum(counts) - counts
+        level = np.array([one.level for one in candidates])[:, None, None]
+        each = _in_boxes(light.shape, boxes) & (light > level)[window]
+        inner = each[first]
+        spots, touching = measure_first(light, size, each, window, t.levels, t.shot_gain)
         peak = np.where(inner, spots.signal, 0.0).max(axis=(1, 2))
-        pixel = np.clip(np.rint(spots.centre), 0, (light.shape[2] - 1, light.shape[1] - 1)).astype(int)
+        n = np.arange(len(candidates))
+        pixel = np.clip(np.rint(spots.centre), 0, size - 1).astype(int)
         # a window that slid off its candidate found no spot there
-        on_it = inner[np.arange(len(candidates)), pixel[:, 1], pixel[:, 0]]
+        on_it = inner[n, pixel[:, 1], pixel[:, 0]]
         real = spots.found & on_it & (peak >= LEAST_CONTRAST * spots.noise)
 
         short, long, along = axes(spots.shape)
         # a spot, drawn out or not, has one hump along its long axis; two that touch have a dip between two
         steps = np.linspace(-1.25, 1.25, 11)
-        points = spots.centre[None] + steps[:, None, None] * (long[:, None] * along)[None]
-        humps = np.array([at_points(spots.signal, place) for place in points])
+        points = spots.centre + steps[:, None, None] * (long[:, None] * along)
+        humps = at_points(spots.signal, np.tile(n, len(steps)), points.reshape(-1, 2), size).reshape(len(steps), -1)
         dip = humps[3:8].min(axis=0) < DIP * np.minimum(humps[:5].max(axis=0), humps[6:].max(axis=0))
         flags = np.zeros(len(candidates), np.uint8)
         flags[(inner & (light >= t.saturation)).any(axis=(1, 2))] |= np.uint8(Flag.SATURATED)
@@ -288,9 +292,29 @@ def _cut(
     return Candidate(uv, area, window, corner, box, level, clipped, tuple(others), touched)
 
 
-def _in_boxes(shape: tuple[int, ...], candidates: list[Candidate]) -> NDArray[np.bool_]:
-    """Which pixels (n, k, h, w) of the windows lie in the boxes of their blobs."""
-    left, top, width, height = np.moveaxis(np.array([(one.box, *one.others) for one in candidates]), 2, 0)[..., None]
+def _alike(sizes: Sequence[int]) -> list[list[int]]:
+    """Which windows of so many pixels a side are measured together, those that are few as if they were larger."""
+    order = sorted(range(len(sizes)), key=sizes.__getitem__)
+    together: list[list[int]] = []
+    for size, rows in groupby(order, key=sizes.__getitem__):
+        if not together or len(together[-1]) * size**2 > FEW:
+            together.append([])
+        together[-1] += rows
+    return together
+
+
+def _padded(windows: Sequence[NDArray[np.uint8] | NDArray[np.float32]]) -> tuple[Array, NDArray[np.int64]]:
+    """Windows of several sizes in one array (n, h, w), and their sizes (n, 2) [px: u, v]."""
+    shapes = np.array([window.shape for window in windows])
+    light = np.zeros((len(windows), *shapes.max(axis=0)))
+    for row, window in zip(light, windows, strict=True):
+        row[: window.shape[0], : window.shape[1]] = window
+    return light, shapes[:, ::-1]
+
+
+def _in_boxes(shape: tuple[int, ...], boxes: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which pixels (m, h, w) of windows lie in boxes (m, 4)."""
+    left, top, width, height = boxes.T[..., None]
     x, y = np.arange(shape[2]), np.arange(shape[1])
     in_x, in_y = (x >= left) & (x < left + width), (y >= top) & (y < top + height)
     return np.asarray(in_y[..., :, None] & in_x[..., None, :])
