@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from coloc_graph.frontend import detect_hue, detect_leds, detector_for
+from coloc_graph.frontend import Detector, detect_hue, detect_leds, detector_for
 from coloc_graph.run import Flag
 from coloc_graph.simulation import Sensor, render, spots
 from coloc_graph.team import Markers
@@ -196,6 +196,26 @@ def test_noise_holds_nothing_and_does_not_take_long():
     begin = time.process_time()
     assert len(detect_leds(rng.integers(0, 256, (240, 320)).astype(np.uint8))) == 0
     assert time.process_time() - begin < 2.0
+
+
+def test_spots_measured_together_are_as_they_are_alone():
+    rng = np.random.default_rng(4)
+    radii = np.tile([0.8, 1.0, 1.5, 2.5, 4.0, 6.0, 8.0], 3)
+    uv = np.stack(np.meshgrid(30.0 + 40 * np.arange(7), 20.0 + 38 * np.arange(3)), axis=-1).reshape(-1, 2)
+    uv = [*(uv + rng.uniform(0, 1, uv.shape)), (36.5, 20.3), (316.0, 60.0), (316.4, 66.0)]  # these are near others
+    lights = spots(uv, [*radii, 1.0, 1.5, 1.5], [*rng.uniform(80, 230, len(radii)), 200.0, 200.0, 150.0])
+    image = render(lights, size=(320, 120), background=20.0, sensor=Sensor(), rng=rng)
+    detector = Detector()
+    candidates = detector.find(image)
+    assert len({one.window.shape for one in candidates}) >= 4 and any(one.others for one in candidates)
+    together, real = detector.measure(candidates)
+    assert real.sum() >= 20
+    for index, one in enumerate(candidates):
+        alone, its_real = detector.measure([one])
+        assert its_real[0] == real[index] and alone.flags[0] == together.flags[index]
+        assert alone.uv[0] == pytest.approx(together.uv[index], abs=1e-6)
+        assert alone.covariance[0] == pytest.approx(together.covariance[index], rel=1e-5)
+        assert alone.peak[0] == pytest.approx(together.peak[index], abs=1e-6)
 
 
 def test_a_lamp_larger_than_any_marker_is_not_one():
