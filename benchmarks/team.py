@@ -1,6 +1,7 @@
 """Teams of many robots, several of which move at once: honesty, what loops are worth, time and memory.
 
     python benchmarks/team.py [--seeds 24] [--json]     6 robots, 10 stances: NEES; against the best single chain
+    python benchmarks/team.py --robots 10 --stances 30  the same of others
     python benchmarks/team.py --table [--large]         time and memory against the number of robots; 50 of 100 stances
     python benchmarks/team.py --blink [--clock 0.005]   white markers that blink, against coloured ones
 
@@ -98,7 +99,7 @@ def _errors(estimate: Estimate, world: World) -> tuple[float, float, float]:
     return *rms, float(np.concatenate(nees).mean())
 
 
-def honesty(seeds: int, robots: int = 6, stances: int = 10) -> dict[str, object]:
+def honesty(seeds: int, robots: int, stances: int) -> dict[str, object]:
     """Over seeds."""
     rows = over_seeds(partial(of_seed, robots=robots, stances=stances), range(seeds))
     low, high = anees_interval(seeds, 3)
@@ -230,6 +231,8 @@ def main() -> None:
     """Run it, print it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=24)
+    parser.add_argument("--robots", type=int, default=6)
+    parser.add_argument("--stances", type=int, default=10)
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--large", action="store_true", help="50 robots, 100 stances, too")
     parser.add_argument("--blink", action="store_true")
@@ -241,7 +244,7 @@ def main() -> None:
     elif options.blink:
         found = blink(options.seeds, options.clock)
     else:
-        found = honesty(options.seeds)
+        found = honesty(options.seeds, options.robots, options.stances)
     print(json.dumps(found, indent=None if options.json else 2))
 
 
