@@ -103,6 +103,7 @@ def test_what_happened_is_named(mission):
 
 
 def test_wheels_stand_soon_after_they_are_let_go(mission):
+    print(f"    the wheels stood after {mission.stops} s")
     assert len(mission.stops) == 3
     assert 0.05 < max(mission.stops.values()) < STOP, mission.stops
 

@@ -12,7 +12,7 @@ from coloc_graph.robot_io.link import CoordinatorLink
 from coloc_graph.robot_io.wire import Body, Drive, EndCapture, Halt
 
 #: The permission to move is renewed so often while the coordinator is at work, which may take so long [s].
-RENEWED, AT_WORK = 0.1, 0.4
+RENEWED, AT_WORK = 0.05, 0.4
 #: How long a robot has to answer [s], and one that is only told to stop.
 ANSWER, STOP_ANSWER = 1.0, 0.3
 

@@ -43,8 +43,8 @@ log = logging.getLogger(__name__)
 
 #: Control of the motion, and word of how it is [s].
 CONTROL, REPORT = 0.04, 0.1
-#: Without a word from the coordinator for this long it stops [s].
-LEASE = 0.25
+#: Without a word from the coordinator for this long it stops [s]; wheels take up to 0.25 s more to stand.
+LEASE = 0.18
 #: So long a camera may be without an image [s]; a lost one, or lost wheels, are opened again so often [s].
 NO_IMAGE, REOPEN = 1.0, 1.0
 
