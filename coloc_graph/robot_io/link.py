@@ -45,7 +45,7 @@ Clock = Callable[[], int]
 
 #: How often clocks are compared [s].
 COMPARED = 0.1
-#: How often what is missing is asked for, and whether there is something newer [s].
+#: How often what is missing is asked for, and, of a kind of which nothing comes, whether there is something newer [s].
 RECOVERED, NEWER = 0.2, 1.0
 #: A command is asked again so often until its deadline [s].
 AGAIN = 0.25
@@ -86,6 +86,7 @@ class CoordinatorLink:
         self._sessions: dict[str, str] = {}
         self._orders: OrderedDict[tuple[str, type, str], InOrder] = OrderedDict()
         self._heard: dict[str, tuple[str, list[Any]]] = {}
+        self._came: dict[tuple[str, type], float] = {}
         self._ended = threading.Event()
         self._session = LinkSession(listen, config_of(listen=listen, tls=tls, robots=team.names, exposed=exposed))
         session, keep = self._session.zenoh, self._session.keep
@@ -209,6 +210,7 @@ class CoordinatorLink:
             self._counter.add("taken")
             self._calls[Status](robot, message)
             return
+        self._came[robot, type(message)] = time.monotonic()
         key = robot, type(message), message.session
         order = self._orders.get(key)
         if order is None:
@@ -233,15 +235,14 @@ class CoordinatorLink:
 
     def _recover(self) -> None:
         """The thread that asks robots for what is missing of what they measured, until it comes or is no more."""
-        looked: dict[tuple[str, type], float] = {}
         while not self._ended.wait(0.0 if self._recovered() else RECOVERED):
-            # after a cut, or of what is rare, the newest tells what is missing before it
+            # of what is rare the newest tells what is missing before it; of the rest the next one that comes does
             for robot, (session, _) in list(self._heard.items()):
                 for type_ in KEPT_KINDS.values():
-                    due = looked.get((robot, type_), 0.0) + NEWER <= time.monotonic()
+                    due = self._came.get((robot, type_), 0.0) + NEWER <= time.monotonic()
                     if due and self._present[robot] and self._sessions.get(robot) == session:
                         self._ask_again(robot, type_, "_max=1")
-                        looked[robot, type_] = time.monotonic()
+                        self._came[robot, type_] = time.monotonic()
 
     def _recovered(self) -> bool:
         """Ask once for what is missing of each kind of each robot; whether anything came, and there is more."""
