@@ -15,16 +15,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coloc_graph.common_view import View
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend import MarkerTracker, Track, plane_from_mount
-from coloc_graph.frontend.association import SURE, Association, associate
-from coloc_graph.frontend.bodies import markers_of_movers
-from coloc_graph.frontend.correspondence import Candidates
-from coloc_graph.frontend.detection import Blobs, Detector
-from coloc_graph.lie import floor_pose
+from coloc_graph.frontend.images.detection import Blobs, Detector
+from coloc_graph.frontend.pairing.association import SURE, Association, associate
+from coloc_graph.frontend.pairing.correspondence import Candidates
+from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.simulation.crowd import STEP, Faults, Seen, detect, lights_of, wander
 from coloc_graph.simulation.rig import reference_team
+from coloc_graph.team.shared_view import View
 
 TEAM = reference_team()
 ROBOT = TEAM["A"]

@@ -15,13 +15,15 @@ import numpy as np
 from monte_carlo import MemoryRun, over_seeds, simulated
 
 from coloc_graph.backend import joint
-from coloc_graph.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.pipeline.incremental import StanceSolver
 from coloc_graph.run import Detections
 from coloc_graph.simulation import Imperfections
-from coloc_graph.stance_solver import StanceSolver
 
-STANCES, POINTS = 10, 100
-FAR, TURNED = (0.02, 0.04, 0.08, 0.15), (2.0, 4.0, 8.0, 15.0)
+STANCES = 10
+POINTS = 100
+FAR = (0.02, 0.04, 0.08, 0.15)
+TURNED = (2.0, 4.0, 8.0, 15.0)
 
 
 class Pushed:

@@ -19,7 +19,7 @@ import numpy as np
 from monte_carlo import MemoryRun, anees_interval, over_seeds
 
 from coloc_graph.frontend import ClockOffset, FrontendOptions, PairMeasurement, measure_pair, share_clock_offsets
-from coloc_graph.lie import se3_inverse
+from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.simulation import Imperfections, World, build_world, reference_team, scenario
 from coloc_graph.simulation.paths import SPEED, Path
 from coloc_graph.simulation.rig import MILD_LENS

@@ -25,12 +25,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.comparison import of_files
 from coloc_graph.evaluation import absolute_errors, align, relative_errors
 from coloc_graph.evaluation.pose_errors import Spread, spread
 from coloc_graph.exchange.tum import write_tum
-from coloc_graph.lie import floor_pose, se3, se3_exp, so3_exp
-from coloc_graph.trajectory import Trajectory
+from coloc_graph.geometry.lie import floor_pose, se3, se3_exp, so3_exp
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.results.comparison import of_files
 
 Array = NDArray[np.float64]
 DISTANCES = (1.0, 2.0, 5.0, 10.0)

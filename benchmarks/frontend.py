@@ -34,7 +34,7 @@ from coloc_graph.frontend import (
     fit_homography,
     measure_pair,
 )  # fmt: skip
-from coloc_graph.frontend.refinement import least_squares
+from coloc_graph.frontend.homography.refinement import least_squares
 from coloc_graph.frontend.stance_tracks import stance_plane
 from coloc_graph.run import Image, open_run
 from coloc_graph.simulation import Sensor, render, simulate, spots

@@ -12,7 +12,7 @@ import numpy as np
 from monte_carlo import over_seeds, rms_interval, simulated, solved
 
 from coloc_graph.frontend import FrontendOptions
-from coloc_graph.pipeline import SolveOptions
+from coloc_graph.pipeline.batch import SolveOptions
 
 METHODS = {
     "eq. (2), chained (the paper)": SolveOptions("chain"),

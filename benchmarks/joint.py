@@ -28,9 +28,9 @@ from msgspec.structs import replace as with_fields
 
 from coloc_graph.backend import replay
 from coloc_graph.evaluation import align
-from coloc_graph.lie import se3_inverse, so3_log
-from coloc_graph.pipeline import SolveOptions, solve
-from coloc_graph.results import assess
+from coloc_graph.geometry.lie import se3_inverse, so3_log
+from coloc_graph.pipeline.batch import SolveOptions, solve
+from coloc_graph.results.writer import assess
 from coloc_graph.run import open_run
 from coloc_graph.simulation import Imperfections, World, simulate
 

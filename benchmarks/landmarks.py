@@ -20,14 +20,14 @@ from msgspec.structs import replace as with_fields
 from scipy.stats import t as student
 
 from coloc_graph.evaluation import align, evaluate, nees_of
-from coloc_graph.lie import floor_pose, se3_inverse, yaw
-from coloc_graph.pipeline import SolveOptions, solve
+from coloc_graph.geometry.lie import floor_pose, se3_inverse, yaw
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.report.drawing import COLOURS, styled
 from coloc_graph.run import Detections
 from coloc_graph.simulation import Imperfections, World, build_world, scenario
 from coloc_graph.simulation.scenarios import LEAP
 from coloc_graph.simulation.world import stream
-from coloc_graph.trajectory import Trajectory
 
 FIELD = Imperfections(mount_sigma_deg=0.5, height_sigma=0.003, span_sigma=1e-4, floor_sigma_deg=0.05)
 MODES = ("none", "unknown", "known")

@@ -39,7 +39,7 @@ from coloc_graph.backend.graph import Link
 from coloc_graph.evaluation import align, evaluate, nees_of
 from coloc_graph.evaluation.nees import PLANAR
 from coloc_graph.measurements import Odometry
-from coloc_graph.pipeline import SolveOptions, solve
+from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.simulation import Imperfections, World
 
 Array = NDArray[np.float64]
@@ -50,7 +50,8 @@ FIELDS = {
     "mounts off by 3 deg": Imperfections(mount_sigma_deg=3.0, height_sigma=2e-2, span_sigma=1e-4, floor_sigma_deg=0.1),
 }
 #: An update is iterated until a step is far within what is known, at most so often.
-STEPS, FAR_WITHIN = 10, 1e-3
+STEPS = 10
+FAR_WITHIN = 1e-3
 #: Rounds of an update in which mounts turn out to be far from where they were thought to be.
 ANCHORINGS = 4
 
@@ -165,7 +166,8 @@ def ekf(graph: PoseGraph, method: Method = "joint", steps: int = STEPS) -> Estim
     return make_estimate(method, graph, found, covariances, variables=factors_of.variables)
 
 
-PAPER, BEST = "the paper's chain", "joint (the default)"
+PAPER = "the paper's chain"
+BEST = "joint (the default)"
 METHODS: dict[str, Callable[[PoseGraph], Estimate]] = {
     PAPER: chain,
     "EKF of poses": partial(ekf, method="smooth"),

@@ -17,13 +17,14 @@ import time
 import numpy as np
 
 from coloc_graph.errors import RobotError
-from coloc_graph.robot_io.link import CoordinatorLink
-from coloc_graph.robot_io.robot_link import RobotLink
-from coloc_graph.robot_io.wire import Halt, Sample
+from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
+from coloc_graph.robot_io.link.messages import Halt, Sample
+from coloc_graph.robot_io.link.robot_link import RobotLink
 from coloc_graph.simulation import reference_team
 
 #: Samples a second, as a PS3 Eye has them, of so many markers.
-RATE, MARKERS = 100.0, 4
+RATE = 100.0
+MARKERS = 4
 
 
 def robot(connect: str) -> None:

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from distributed import LocalCluster
 
-from coloc_graph.many_runs import places_of, runs_in, solve_runs
+from coloc_graph.results.executors import workers
+from coloc_graph.results.many_runs import places_of, runs_in, solve_runs
 from coloc_graph.simulation import simulate
-from coloc_graph.workers import workers
 
 
 def seconds(folder: Path, out: Path, executors: Callable[[], AbstractContextManager[Executor]]) -> float:

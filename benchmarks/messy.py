@@ -20,13 +20,14 @@ from monte_carlo import over_seeds
 from scipy.stats import chi2
 
 from coloc_graph.frontend import FrontendOptions, measure_pair
-from coloc_graph.lie import se3_inverse
+from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.run import open_run, read_truth
 from coloc_graph.simulation import simulate
 
 #: An error beyond this, and beyond 3 cm [m] or 1 deg [rad], is a false pose.
 IMPROBABLE = float(chi2.ppf(1 - 1e-6, 6))
-FAR, TURNED = 0.03, np.deg2rad(1.0)
+FAR = 0.03
+TURNED = np.deg2rad(1.0)
 
 
 def step(seed: int, *, messy: bool) -> dict[str, object]:

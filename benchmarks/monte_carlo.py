@@ -14,12 +14,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from coloc_graph.evaluation import Accuracy, align, evaluate
-from coloc_graph.pipeline import Solution, SolveOptions, solve
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.pipeline.batch import Solution, SolveOptions, solve
 from coloc_graph.run import Detections, OdometrySample, Planes
 from coloc_graph.simulation import EPOCH, World, build_world, observe, scenario
 from coloc_graph.simulation.wheels import odometry
 from coloc_graph.simulation.world import stream
-from coloc_graph.trajectory import Trajectory
 
 T = TypeVar("T")
 

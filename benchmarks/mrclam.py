@@ -20,12 +20,12 @@ from msgspec.structs import replace
 
 from coloc_graph.backend.planar import filter_forward
 from coloc_graph.backend.planar.estimate import trajectory
-from coloc_graph.driving import DriveOptions, solve_drive
 from coloc_graph.evaluation import align, evaluate
 from coloc_graph.exchange.mrclam import import_mrclam
 from coloc_graph.frontend.keyframes import keyframes_of
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.pipeline.ranging import DriveOptions, solve_drive
 from coloc_graph.run import Run, open_run, read_truth
-from coloc_graph.trajectory import Trajectory
 
 
 def uncalibrated(run: Run) -> Run:

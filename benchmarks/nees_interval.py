@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from coloc_graph.evaluation import effective_poses
-from coloc_graph.pipeline import SolveOptions
+from coloc_graph.pipeline.batch import SolveOptions
 from coloc_graph.simulation import Imperfections, build_world, scenario
 
 Array = NDArray[np.float64]

@@ -22,8 +22,8 @@ import numpy as np
 from coloc_graph.evaluation import Accuracy
 from coloc_graph.online.coordinator import Coordinator
 from coloc_graph.online.mission import MissionOptions
-from coloc_graph.pipeline import SolveOptions, solve
-from coloc_graph.results import assess
+from coloc_graph.pipeline.batch import SolveOptions, solve
+from coloc_graph.results.writer import assess
 from coloc_graph.run import open_run
 from coloc_graph.simulation.simulated_team import SimulatedTeam, field_team, free_address
 

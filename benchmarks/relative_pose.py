@@ -20,8 +20,10 @@ import numpy as np
 from monte_carlo import anees_interval, over_seeds, simulated
 from scipy.stats import chi2
 
-from coloc_graph.frontend import PointPairs, fit_homography, most_likely_pose, plane_from_mount, relative_pose
-from coloc_graph.lie import se3_inverse
+from coloc_graph.frontend import PointPairs, fit_homography, plane_from_mount
+from coloc_graph.frontend.homography import eq2_pose as relative_pose
+from coloc_graph.frontend.homography import ml_pose as most_likely_pose
+from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.measurements import HomographyMeasurement, RelativePose
 from coloc_graph.simulation.world import World
 

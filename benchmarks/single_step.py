@@ -15,7 +15,7 @@ import numpy as np
 from monte_carlo import MemoryRun, over_seeds, simulated
 
 from coloc_graph.frontend import FrontendOptions, fit_homography, measure_pair
-from coloc_graph.frontend.decomposition import decompose_with_normal
+from coloc_graph.frontend.homography.decomposition import decompose_with_normal
 from coloc_graph.frontend.stance_tracks import stance_plane
 
 BASELINES = (0.6, 0.8, 1.0, 1.2)

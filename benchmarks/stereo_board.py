@@ -24,10 +24,10 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from coloc_graph import pipeline
 from coloc_graph.exchange.tracks import import_tracks
 from coloc_graph.frontend import FrontendOptions, PairMeasurement
-from coloc_graph.lie import se3, se3_inverse, so3_log
+from coloc_graph.geometry.lie import se3, se3_inverse, so3_log
+from coloc_graph.pipeline import batch as pipeline
 from coloc_graph.run import Run, open_run
 from coloc_graph.team import Camera, Mount, Robot, Team, write_team
 
@@ -37,8 +37,10 @@ BOARD = (9, 6)  # inner corners
 SQUARE = 0.02423  # [m]
 PAIRS = 29
 CAMERAS = ("left", "right")
-TARGET_DEG, TARGET_PERCENT = 0.21, 1.8  # medians of eq. (2), criterion transfer, over all pairs
-JOINT_DEG, JOINT_PERCENT = 0.05, 0.5  # one pose from all pairs
+TARGET_DEG = 0.21  # medians of eq. (2), criterion transfer, over all pairs
+TARGET_PERCENT = 1.8
+JOINT_DEG = 0.05  # one pose from all pairs
+JOINT_PERCENT = 0.5
 FIRST_SIGMA = 0.25  # [px], until the corners have said their own
 DEFAULT_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "stereo_board"
 

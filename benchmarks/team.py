@@ -26,15 +26,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `coloc` does, before nu
 import numpy as np
 from monte_carlo import MemoryRun, anees_interval, over_seeds, truth_of
 
-from coloc_graph import stance_solver
 from coloc_graph.backend import Estimate, joint
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.evaluation import align, nees_of
 from coloc_graph.frontend import StanceTracks, Track
-from coloc_graph.frontend.bodies import markers_of_movers
-from coloc_graph.frontend.detection import Blobs
+from coloc_graph.frontend.images.detection import Blobs
 from coloc_graph.frontend.stance_tracks import stance_plane
-from coloc_graph.pipeline import SolveOptions, solve
+from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers
+from coloc_graph.pipeline import incremental as stance_solver
+from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.simulation import Imperfections, reference_team
 from coloc_graph.simulation.blinking import with_codes
 from coloc_graph.simulation.scenarios import team_of

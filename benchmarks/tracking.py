@@ -21,15 +21,15 @@ import numpy as np
 from monte_carlo import over_seeds
 from scipy.optimize import linear_sum_assignment
 
-from coloc_graph.common_view import View
-from coloc_graph.frontend.blinking import BlinkCodes
-from coloc_graph.frontend.detection import Blobs, Detector
-from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
-from coloc_graph.lie import floor_pose
+from coloc_graph.frontend.images.detection import Blobs, Detector
+from coloc_graph.frontend.tracks.blink_codes import BlinkCodes
+from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.simulation.blinking import blinking, with_codes
 from coloc_graph.simulation.crowd import Faults, Seen, crowd
 from coloc_graph.simulation.rig import reference_team
 from coloc_graph.simulation.scenarios import single_step
+from coloc_graph.team.shared_view import View
 
 
 def views() -> list[View]:

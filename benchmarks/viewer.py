@@ -12,9 +12,9 @@ import time
 
 import numpy as np
 
-from coloc_graph.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.run import Stance
-from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer import Edges, Scene, Viewer
 from coloc_graph.viewer.scene import layer_of
 

@@ -23,7 +23,7 @@
 # %%
 from IPython.display import SVG, display
 
-from coloc_graph.experiments import fig4
+from coloc_graph.experiments import single_step_results as fig4
 from coloc_graph.report import figure_svg
 
 cells = [(baseline, theta) for baseline in (0.6, 1.2) for theta in (0.0, 20.0, 40.0)]

@@ -20,7 +20,7 @@
 # %%
 from IPython.display import SVG, display
 
-from coloc_graph.experiments import table1
+from coloc_graph.experiments import multi_step_results as table1
 from coloc_graph.report import figure_svg
 
 result = table1(runs=2, seed=0)

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from coloc_graph.pipeline import METHODS, SolveOptions, solve
-from coloc_graph.results import write_result
+from coloc_graph.pipeline.batch import METHODS, SolveOptions, solve
+from coloc_graph.results.writer import write_result
 from coloc_graph.run import RunWriter, open_run, read_true_team, read_truth
 from coloc_graph.simulation import simulate
 

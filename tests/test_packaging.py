@@ -94,7 +94,7 @@ def test_a_users_own_backend_folder_does_not_get_in_the_way(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('this is the user\\'s own')")
     script = (
-        "import sys; sys.path.insert(0, '.'); import coloc_graph.backend, coloc_graph.frontend, coloc_graph.pipeline; "
+        "import sys; sys.path.insert(0, '.'); import coloc_graph.backend, coloc_graph.frontend; "
         "assert 'backend' not in sys.modules; print(coloc_graph.backend.__name__)"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)

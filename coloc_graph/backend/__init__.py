@@ -11,14 +11,28 @@ require_gtsam()
 from coloc_graph.backend.batch import joint, smooth  # noqa: E402
 from coloc_graph.backend.calibration import Calibration, loosened  # noqa: E402
 from coloc_graph.backend.chain import chain  # noqa: E402  after the check, so that its sentence is what one sees
-from coloc_graph.backend.diagnosis import Loose, diagnose  # noqa: E402
-from coloc_graph.backend.estimate import Bump, Estimate, Refusal, StanceEstimate  # noqa: E402
+from coloc_graph.backend.diagnosis import DisconnectedComponent, diagnose  # noqa: E402
+from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate  # noqa: E402
 from coloc_graph.backend.estimator import Estimator  # noqa: E402
 from coloc_graph.backend.factors import Method  # noqa: E402
 from coloc_graph.backend.graph import PoseGraph, StayPut  # noqa: E402
 from coloc_graph.backend.replay import replay  # noqa: E402
 
 __all__ = [
-    "Bump", "Calibration", "Estimate", "Estimator", "Loose", "Method", "PoseGraph", "Refusal", "StanceEstimate",
-    "StayPut", "chain", "diagnose", "joint", "loosened", "replay", "smooth",
+    "Bump",
+    "Calibration",
+    "DisconnectedComponent",
+    "Estimate",
+    "Estimator",
+    "Method",
+    "PoseGraph",
+    "Rejection",
+    "StanceEstimate",
+    "StayPut",
+    "chain",
+    "diagnose",
+    "joint",
+    "loosened",
+    "replay",
+    "smooth",
 ]  # fmt: skip

@@ -10,12 +10,12 @@ import gtsam
 import numpy as np
 from scipy.special import chdtri
 
-from coloc_graph.backend.consistency import LEAST_CHANCE, UNCHECKED, Agreement, innovation
-from coloc_graph.backend.estimate import Bump, Estimate, Refusal, make_estimate
+from coloc_graph.backend.chi2_test import LEAST_CHANCE, UNCHECKED, Agreement, innovation
+from coloc_graph.backend.estimate import Bump, Estimate, Rejection, make_estimate
 from coloc_graph.backend.factors import Method, calibrations_in, require_rigs
-from coloc_graph.backend.fit import ALL_TESTED, Fit, fit_graph
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.landmarks import ALWAYS, OnMap
+from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
 from coloc_graph.backend.solver import lm_parameters, with_stack
 from coloc_graph.measurements import RelativePose, Sighting
 from coloc_graph.team import Slip
@@ -59,7 +59,7 @@ def joint(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None =
 
 def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Values | None) -> Estimate:
     fit = fit_graph(method, graph, start)
-    refused: tuple[Refusal, ...] = ()
+    refused: tuple[Rejection, ...] = ()
     bumped: tuple[Bump, ...] = ()
     suspects = _suspects(fit) if refuse else None
     if suspects is not None:
@@ -128,7 +128,7 @@ def _scale(tested: Iterable[Agreement]) -> float:
     return max(1.0, float(np.median(ratios))) if ratios else 1.0
 
 
-def _find_wrong(method: Method, graph: PoseGraph, near: Near | None) -> tuple[tuple[Refusal, ...], Fit]:
+def _find_wrong(method: Method, graph: PoseGraph, near: Near | None) -> tuple[tuple[Rejection, ...], Fit]:
     """The measurements that all others contradict, and the fit of these."""
     # poses alone for a start: GTSAM's optimiser copies its factors, which those that are Python cannot be
     doubted = {} if near else _outliers(fit_graph("smooth", graph))
@@ -148,7 +148,7 @@ def _find_wrong(method: Method, graph: PoseGraph, near: Near | None) -> tuple[tu
         if worst is not None and refusing:
             doubted[id(fit.links[worst])] = fit.links[worst]
     refused = tuple(
-        Refusal(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
+        Rejection(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
         for link in (*graph.measurements, *graph.on_map)
         if id(link) in doubted
         for off in [_innovation(fit, link).sigmas]

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.lie import hat, rotation_x, rotation_y, rotation_z, sl3_vee
+from coloc_graph.geometry.lie import hat, rotation_x, rotation_y, rotation_z, sl3_vee
 from coloc_graph.team import R_BODY_OPTICAL, Markers, Mount
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from coloc_graph.measurements import Node
 
 
 @dataclass(frozen=True)
-class Loose:
+class DisconnectedComponent:
     """Nodes that hang together and by nothing on the reference, in the order of the stances, and the `remedy`."""
 
     nodes: tuple[Node, ...]
@@ -22,7 +22,7 @@ class Loose:
         return f"{robots} at {when}: not tied to the reference; {self.remedy}"
 
 
-def diagnose(graph: PoseGraph) -> tuple[Loose, ...]:
+def diagnose(graph: PoseGraph) -> tuple[DisconnectedComponent, ...]:
     """The parts of a graph that nothing ties to the reference, each with what would tie it; () where all is tied."""
     tied = {graph.reference_key, *(step.to for step in spanning_tree(graph, graph.links))}
     neighbours: dict[int, list[int]] = defaultdict(list)
@@ -39,7 +39,7 @@ def diagnose(graph: PoseGraph) -> tuple[Loose, ...]:
         if key not in part:
             _mark(key, len(parts), neighbours, part)
         parts[part[key]].append(node)
-    return tuple(Loose(tuple(nodes), _remedy(graph, nodes, tied)) for nodes in parts.values())
+    return tuple(DisconnectedComponent(tuple(nodes), _remedy(graph, nodes, tied)) for nodes in parts.values())
 
 
 def _mark(start: int, number: int, neighbours: dict[int, list[int]], part: dict[int, int]) -> None:

@@ -9,20 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.calibration import Calibration, Variables
-from coloc_graph.backend.consistency import UNCHECKED, Agreement
+from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.graph import PoseGraph, StayPut
 from coloc_graph.backend.landmarks import MAP, OnMap, Placed
-from coloc_graph.backend.posterior import Posterior
+from coloc_graph.backend.marginals import Posterior
 from coloc_graph.errors import EstimationError
+from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Measurement, Node
-from coloc_graph.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Refusal:
+class Rejection:
     """A measurement, or a place on the map, that was left out, and why, in words."""
 
     measurement: Measurement | OnMap
@@ -72,7 +72,7 @@ class Estimate:
     chi2: float = 0.0
     dof: int = 0
     iterations: int = 0
-    refused: tuple[Refusal, ...] = ()
+    refused: tuple[Rejection, ...] = ()
     bumped: tuple[Bump, ...] = ()
     calibration: Calibration = field(default_factory=Calibration)
     landmarks: Mapping[str, Placed] = field(default_factory=dict)
@@ -169,7 +169,7 @@ class StanceEstimate:
     poses: Mapping[str, gtsam.Pose3]
     covariances: Mapping[str, Array]
     untied: tuple[str, ...] = ()
-    refused: tuple[Refusal, ...] = ()
+    refused: tuple[Rejection, ...] = ()
     agreement: Agreement = UNCHECKED
     residuals: tuple[float, ...] = ()
     landmarks: Mapping[str, Placed] = field(default_factory=dict)
@@ -185,7 +185,7 @@ def make_estimate(
     chi2: float = 0.0,
     dof: int = 0,
     iterations: int = 0,
-    refused: tuple[Refusal, ...] = (),
+    refused: tuple[Rejection, ...] = (),
     bumped: tuple[Bump, ...] = (),
 ) -> Estimate:
     """An estimate of values, and of their covariances by key."""

@@ -12,22 +12,22 @@ from coloc_graph.backend import checkpoint
 from coloc_graph.backend.batch import find_bumps, joint, smooth
 from coloc_graph.backend.calibration import Variables
 from coloc_graph.backend.checkpoint import Early
-from coloc_graph.backend.consistency import UNCHECKED, Agreement
-from coloc_graph.backend.entering import Entering, Sorter
-from coloc_graph.backend.estimate import Bump, Estimate, Refusal, StanceEstimate
+from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
+from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate
 from coloc_graph.backend.factors import Factors, Method, require_rigs
 from coloc_graph.backend.graph import (
     Link,
-    Places,
     PoseGraph,
+    PoseKeys,
     require_ends,
     require_instant,
     require_reference,
     require_robots,
     slips_of,
 )
+from coloc_graph.backend.insertion import InsertionPlan, InsertionPlanner
+from coloc_graph.backend.isam2_graph import Isam2Graph, rebuilt
 from coloc_graph.backend.landmarks import Placed, landmarks_of, map_of, of_seen
-from coloc_graph.backend.live_graph import LiveGraph, rebuilt
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError, MeasurementError
 from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
@@ -37,9 +37,9 @@ from coloc_graph.team import Floor, Landmark, Robot, Slip, Team
 Array = NDArray[np.float64]
 
 
-def _refusal(link: Link, off: Agreement) -> Refusal:
+def _refusal(link: Link, off: Agreement) -> Rejection:
     assert isinstance(link, RelativePose | Sighting)
-    return Refusal(link, f"contradicted by the other measurements ({off.sigmas:.0f} sigmas)")
+    return Rejection(link, f"contradicted by the other measurements ({off.sigmas:.0f} sigmas)")
 
 
 class Estimator:
@@ -67,15 +67,15 @@ class Estimator:
             raise EstimationError(f"the reference robot {reference} is not one of {', '.join(self.robots)}")
         if self.rigs:
             require_rigs(self.robots, self.rigs)
-        self._places = Places(self.robots, self.slips, self.landmarks)
+        self._places = PoseKeys(self.robots, self.slips, self.landmarks)
         self._stances: dict[int, Stance] = {}
         self._log: list[Measurement] = []  # everything that ever came, the refused too
-        self._refused: dict[int, Refusal] = {}  # by the measurement's identity
+        self._refused: dict[int, Rejection] = {}  # by the measurement's identity
         self._newly: set[int] = set()  # those refused since the last stance came, it included
         self._early: dict[int, Early] = {}
         self._loose: list[Link] = []  # what nothing ties to the reference
         self._instants: dict[Node, float] = {}  # when moving robots were sighted
-        self._live = LiveGraph(self._new_factors())
+        self._live = Isam2Graph(self._new_factors())
 
     @classmethod
     def of(cls, team: Team, method: Method = "joint") -> "Estimator":
@@ -102,7 +102,7 @@ class Estimator:
         return tuple(self._log)
 
     @property
-    def refused(self) -> tuple[Refusal, ...]:
+    def refused(self) -> tuple[Rejection, ...]:
         """What all other measurements contradict."""
         return tuple(self._refused.values())
 
@@ -292,7 +292,7 @@ class Estimator:
             raise InputError(f"{path}: is a damaged checkpoint ({error}); solve the run again") from error
         estimator._log = list(saved.measurements)
         for number, reason in saved.refused.items():
-            estimator._refused[id(saved.measurements[number])] = Refusal(saved.measurements[number], reason)
+            estimator._refused[id(saved.measurements[number])] = Rejection(saved.measurements[number], reason)
         estimator._early = {one.stance.index: one for one in saved.early}
         if saved.stances:
             estimator._rebuild()
@@ -351,12 +351,12 @@ class Estimator:
                 require_instant(measured, self._instants.get(node, instants.setdefault(node, measured.time)))
         return instants
 
-    def _entering(self, links: list[Link]) -> Entering:
+    def _entering(self, links: list[Link]) -> InsertionPlan:
         reference = self._places.key((self.reference, next(iter(self._stances))))
         live = self._live
-        return Sorter(live.factors_of, self._keys, live.tied, reference, live.pose, live.errors).sort(links)
+        return InsertionPlanner(live.factors_of, self._keys, live.tied, reference, live.pose, live.errors).sort(links)
 
-    def _update(self, entering: Entering) -> tuple[tuple[Refusal, ...], Agreement]:
+    def _update(self, entering: InsertionPlan) -> tuple[tuple[Rejection, ...], Agreement]:
         """Put poses and links into the graph, without those that all others contradict; all of it or nothing."""
         try:
             outcome = self._live.enter(entering)
@@ -384,7 +384,7 @@ class Estimator:
                 return key
         raise EstimationError(f"robot {robot} has no pose{'' if stance is None else f' at stance {stance}'}")
 
-    def _at(self, stance: Stance, refused: tuple[Refusal, ...], agreement: Agreement) -> StanceEstimate:
+    def _at(self, stance: Stance, refused: tuple[Rejection, ...], agreement: Agreement) -> StanceEstimate:
         keys = {robot: self._places.key((robot, stance.index)) for robot in self.robots}
         tied = {robot: key for robot, key in keys.items() if key in self._live.tied}
         return StanceEstimate(

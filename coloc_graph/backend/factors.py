@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.at_once import AtOnce, SeenFactor
+from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors
 from coloc_graph.backend.calibration import Variables, is_calibration
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.homography_factor import homography_factor, markers_factor, related, sighted
@@ -153,7 +153,7 @@ class Factors:
 
     def of_graph(
         self, graph: PoseGraph, keys: Iterable[int]
-    ) -> tuple[gtsam.NonlinearFactorGraph, tuple[Link, ...], AtOnce]:
+    ) -> tuple[gtsam.NonlinearFactorGraph, tuple[Link, ...], BatchedFactors]:
         """The factors over these keys, and the links among them; the links' factors come last, in that order. With what
         evaluates all at once that are in Python."""
         wanted = set(keys)
@@ -174,7 +174,7 @@ class Factors:
             factors.add(self.calibration_prior(key))
         for factor in made:
             factors.add(factor)
-        return factors, tuple(links), AtOnce([one.seen for one in made if isinstance(one, SeenFactor)])
+        return factors, tuple(links), BatchedFactors([one.seen for one in made if isinstance(one, BatchedFactor)])
 
     def nominal(self, key: int) -> Array:
         """Where the search for a calibration variable starts: as stated."""

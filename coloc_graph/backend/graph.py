@@ -49,7 +49,7 @@ class StayPut:
 Link = Measurement | StayPut | OnMap
 
 
-class Places:
+class PoseKeys:
     """Which variable each robot's pose at each stance is: stance after stance, by counting its moves.
 
     `landmarks`, and the map, never move: each is one variable, at every stance.
@@ -176,9 +176,9 @@ class PoseGraph:
         _require_one_instant(self.measurements, self.by_index)
 
     @cached_property
-    def places(self) -> Places:
+    def places(self) -> PoseKeys:
         """Which variable each node is."""
-        places = Places(self.robots, self.slips, self.landmarks)
+        places = PoseKeys(self.robots, self.slips, self.landmarks)
         for before, stance in zip((None, *self.stances), self.stances, strict=False):
             places.accept(places.after(before, stance))
         return places
@@ -199,7 +199,7 @@ class PoseGraph:
         nodes: list[Node] = []
         there: set[str] = set()
         for before, stance in zip((None, *self.stances), self.stances, strict=False):
-            held = [r for r in stance.anchors if before and r in there and Places.stays(r, before, stance)]
+            held = [r for r in stance.anchors if before and r in there and PoseKeys.stays(r, before, stance)]
             at = dict.fromkeys([*stance.observers, *named[stance.index], *held])
             there = set(at)
             nodes += [(robot, stance.index) for robot in at]
@@ -315,7 +315,7 @@ def require_robots(stance: Stance, robots: tuple[str, ...]) -> None:
             )
 
 
-def require_ends(measured: Measurement, places: Places, stances: Mapping[int, Stance]) -> None:
+def require_ends(measured: Measurement, places: PoseKeys, stances: Mapping[int, Stance]) -> None:
     """Raise `MeasurementError` where a measurement relates what is not there, or a robot to itself."""
     for robot, index in measured.ends:
         if (robot, index) not in places:

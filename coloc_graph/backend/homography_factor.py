@@ -10,11 +10,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.at_once import Seen, SeenFactor
+from coloc_graph.backend.batched_factors import BatchedFactor, Seen
 from coloc_graph.backend.calibration import Variables, sigmas_of_plane
 from coloc_graph.backend.camera_model import MarkersModel
 from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
-from coloc_graph.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import RelativePose, Sighting
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 MOST_STEPS = 8
 
 
-def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, on_floor: bool) -> SeenFactor:
+def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, on_floor: bool) -> BatchedFactor:
     """The factor of a homography, and of the spans seen with it, on poses i and j, their mounts, the movers' markers
     and the clocks; of a plane that was stated, on the poses and that plane."""
     assert link.homography is not None and link.plane is not None
@@ -31,7 +31,7 @@ def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, 
     if not link.plane.normal_from_mount:
         plane = StatedPlaneModel(link.homography, link.plane.N / link.plane.d, rig_i.mount, rig_j.mount)
         key = variables.plane(link.robot_i, link.stance, sigmas_of_plane(link))
-        return SeenFactor(Seen(plane, (i, j), (key,), (3,)))
+        return BatchedFactor(Seen(plane, (i, j), (key,), (3,)))
     measured = link.homography
     markers = {robot: rig for robot in link.movers if (rig := variables.rigs[robot].markers) is not None}
     about, tilt_sigma = variables.anchor(link.robot_i)
@@ -43,7 +43,7 @@ def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, 
         *map(variables.markers, model.movers),
         clocks,
     )
-    return SeenFactor(Seen(model, (i, j), keys, (3, 3, *[2] * len(model.movers), 1)))
+    return BatchedFactor(Seen(model, (i, j), keys, (3, 3, *[2] * len(model.movers), 1)))
 
 
 def related(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[[int], Array]) -> gtsam.Pose3:
@@ -69,10 +69,10 @@ def related(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[
     return T_i_j
 
 
-def markers_factor(link: Sighting, i: int, j: int, variables: Variables) -> SeenFactor:
+def markers_factor(link: Sighting, i: int, j: int, variables: Variables) -> BatchedFactor:
     """The factor of sighted markers on the poses of observer and seen, the observer's mount and the markers."""
     keys = variables.mount(link.observer), variables.markers(link.seen)
-    return SeenFactor(Seen(_markers_model(link, variables), (i, j), keys, (3, 2)))
+    return BatchedFactor(Seen(_markers_model(link, variables), (i, j), keys, (3, 2)))
 
 
 def sighted(link: Sighting, variables: Variables, errors: Callable[[int], Array]) -> gtsam.Pose3:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.camera_model import HATS, Mounts, SeenPlanes, see
-from coloc_graph.backend.spans import SpanModel, Spans
-from coloc_graph.lie import hat, se3_inverse, sl3_adjoint, sl3_log, sl3_log_derivative, sl3_vee
+from coloc_graph.backend.span_factor import SpanModel, Spans
+from coloc_graph.geometry.lie import hat, se3_inverse, sl3_adjoint, sl3_log, sl3_log_derivative, sl3_vee
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan
 from coloc_graph.team import Markers, Mount
 

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Node
 from coloc_graph.team import Landmark, Team
 

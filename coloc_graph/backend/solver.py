@@ -20,22 +20,26 @@ DEEP = 3000
 STACK = 1 << 30
 
 #: A search that goes on for longer is not going to end. With less error than this there is none to begin.
-MOST_ITERATIONS, NOTHING_TO_GAIN = 500, 1e-9
+MOST_ITERATIONS = 500
+NOTHING_TO_GAIN = 1e-9
 
 #: Over more poses than this each iteration gains a little for hundreds of them, since GTSAM's between-factors leave
 #: the derivative of the logarithm out: there the search ends where one gains less than `NOISE` a pose in half chi2,
 #: of which a pose has about 3.
-LONG, NOISE = 2000, 1e-5
+LONG = 2000
+NOISE = 1e-5
 
 #: A pose of ours is linearised anew where it has turned by more than this [rad], or shifted by that [m]: never. Errors
 #: of linearisation come from turns; a far pose shifts by centimetres whenever the heading of an early one changes by
 #: 1e-4 rad, and with GTSAM's single threshold of 0.01 the whole chain is then redone at every step (with turns of
 #: 0.01 from stance 2,600 on).
-TURNED, SHIFTED = 0.03, 1e9
+TURNED = 0.03
+SHIFTED = 1e9
 #: Where mounts are calibrated, also where it has tilted by this [rad]: a homography's residual grows with the square of
 #: a tilt times that of distance over height, and half a milliradian is then a fifth of its noise. And where it has
 #: turned by a sixth as much as otherwise: a sighting's pixels tell a tenth of a millimetre.
-TILTED, AIMED = 5e-4, 5e-3
+TILTED = 5e-4
+AIMED = 5e-3
 #: A calibration variable is linearised anew where it has changed by more than this [m, rad, relative, s].
 CALIBRATED = 3e-4
 

@@ -17,7 +17,8 @@ from coloc_graph.errors import EstimationError
 Array = NDArray[np.float64]
 #: Steps at most; a step that lowers the sum of squares by less than this part of it is the last: the next would move
 #: no parameter by a thousandth of its sigma.
-STEPS, STILL = 60, 1e-11
+STEPS = 60
+STILL = 1e-11
 #: Damping to begin with: valleys are shallow (a focal length is a part in a million of the curvature), starts are good.
 DAMPING = 1e-9
 UNDETERMINED = "the images do not determine the camera; take more, with the board tilted and in all parts of the image"

@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 #: Numbers of lens coefficients that are tried: none, k1 k2 p1 p2, k3 too, and the rational ones too.
 LENSES = (0, 4, 5, 8)
 #: So many images are the least; and of those of which sigmas are made, so many parts at most.
-LEAST_IMAGES, MOST_PARTS = 6, 40
+LEAST_IMAGES = 6
+MOST_PARTS = 40
 #: An image whose corners are off by so many times what is usual shows another board, or one that moved or is bent.
 OUTLIER = 3.0
 #: Of more than this part of the images refused, it is not clear which ones are right.

@@ -19,7 +19,8 @@ Image = NDArray[np.uint8]
 KINDS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 #: A corner is sought in a window of this part of the way to its neighbour, at most so many pixels to each side: a
 #: larger one sees the neighbour's edges (11 px on squares of 13 px: 0.58 px RMS instead of 0.16).
-WINDOW, LARGEST_WINDOW = 0.45, 12
+WINDOW = 0.45
+LARGEST_WINDOW = 12
 #: JPEG's blocks and the sensor's noise are smoothed by so many pixels first.
 SMOOTHING = 0.7
 #: Fewer corners of a ChArUco board than this say too little about its pose.

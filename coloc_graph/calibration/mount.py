@@ -20,7 +20,7 @@ from coloc_graph.calibration.corners import View
 from coloc_graph.calibration.fusion import Said, disagreement, fuse, fuse_scaled
 from coloc_graph.calibration.residuals import noise_and_shared
 from coloc_graph.errors import DegenerateGeometry, InputError
-from coloc_graph.lie import so3_exp
+from coloc_graph.geometry.lie import so3_exp
 from coloc_graph.team import R_BODY_OPTICAL, Camera, Floor, Mount
 
 Array = NDArray[np.float64]
@@ -28,7 +28,8 @@ Array = NDArray[np.float64]
 #: An image contradicts the others where chance would do so in one of so many calibrations.
 CHANCE = 1e-3
 #: A board that is so near to the others [m, deg] is on the floor, as flat as floors are; sigmas make up for it.
-NEAR_HEIGHT, NEAR_DEG = 0.003, 0.3
+NEAR_HEIGHT = 0.003
+NEAR_DEG = 0.3
 #: Where all images together disagree by more than such a chance, their own errors count as larger.
 DISAGREE = 1e-2
 #: Images whose corners are off by so many times what is usual show another board, or one that is not flat.

@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 
 from coloc_graph.errors import TeamError
+from coloc_graph.run.atomic_file import write_whole
 from coloc_graph.team import Camera, Mount, Team, read_team
-from coloc_graph.whole_file import write_whole
 
 #: What a calibration says of a camera, and of a mount; the rest is the robot's own.
 CAMERA_FIELDS = ("width", "height", "fx", "fy", "cx", "cy", "distortion", "noise_px", "bias_px")

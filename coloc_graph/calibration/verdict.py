@@ -15,11 +15,14 @@ REGIONS = (
     ("left", "middle", "right"),
     ("lower left", "bottom", "lower right"),
 )
-CELLS, COVERED = 4, 0.2
+CELLS = 4
+COVERED = 0.2
 #: At least so many boards tilted by so much [deg] give the focal length.
-TILTED, TILT = 3, 20.0
+TILTED = 3
+TILT = 20.0
 #: A focal length is uncertain where it is known no better than by this part, a ray where by so many pixels.
-FOCAL, RAY = 0.01, 1.0
+FOCAL = 0.01
+RAY = 1.0
 #: Corners of a sharp board are found to less than this [px].
 SHARP = 1.0
 #: Sigmas that stand on fewer places are uncertain themselves, by a quarter and more.

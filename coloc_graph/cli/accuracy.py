@@ -9,7 +9,7 @@ from coloc_graph.evaluation import Accuracy, Alignment, RobotAccuracy
 
 if TYPE_CHECKING:
     from coloc_graph.backend import Calibration
-    from coloc_graph.trajectory import Trajectory
+    from coloc_graph.geometry.trajectory import Trajectory
 
 #: What was made to agree, in words.
 ALIGNED: dict[Alignment, str] = {
@@ -143,7 +143,7 @@ def print_last_poses(trajectories: "Mapping[str, Trajectory]") -> None:
     """Per robot the length of its path, and its last pose in the world with one sigma."""
     import numpy as np
 
-    from coloc_graph.lie import yaw
+    from coloc_graph.geometry.lie import yaw
 
     rows = []
     for robot, trajectory in trajectories.items():

@@ -17,7 +17,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.cli.printing import print_json, warn
     from coloc_graph.errors import InputError
     from coloc_graph.exchange.camera_info import read_camera_info, write_camera_info
-    from coloc_graph.whole_file import require_writable
+    from coloc_graph.run.atomic_file import require_writable
 
     robot = robot_of(args)
     for path, what in ((args.camera_info, "a YAML file"), (args.out_team, "a team.toml")):

@@ -15,8 +15,8 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.calibration.summary import read_covariance, summarise_mount
     from coloc_graph.cli.printing import print_json, warn
     from coloc_graph.errors import InputError
+    from coloc_graph.run.atomic_file import require_writable
     from coloc_graph.team import read_team
-    from coloc_graph.whole_file import require_writable
 
     robot = robot_of(args)
     if robot is None:

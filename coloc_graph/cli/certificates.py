@@ -20,7 +20,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 
 def run(args: argparse.Namespace) -> int:
     """Make them, and say what goes where."""
-    from coloc_graph.robot_io.certificates import make_certificates
+    from coloc_graph.robot_io.link.certificates import make_certificates
     from coloc_graph.team import read_team
 
     team = read_team(args.team)

@@ -56,8 +56,8 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.online.coordinator import Coordinator
     from coloc_graph.online.mission import MissionOptions
-    from coloc_graph.online.phases import Phase, as_dot
-    from coloc_graph.robot_io.link_config import tls_of
+    from coloc_graph.online.mission_states import Phase, as_dot
+    from coloc_graph.robot_io.link.zenoh_config import tls_of
     from coloc_graph.team import read_team
 
     if args.draw:

@@ -27,9 +27,9 @@ def run(args: argparse.Namespace) -> int:
 
     from coloc_graph.cli.accuracy import print_accuracy, print_promised
     from coloc_graph.cli.printing import progress, warn
-    from coloc_graph.pipeline import solve
+    from coloc_graph.pipeline.batch import solve
     from coloc_graph.report import hero_figure
-    from coloc_graph.results import assess, require_place, write_result
+    from coloc_graph.results.writer import assess, require_place, write_result
     from coloc_graph.run import open_run
     from coloc_graph.simulation import simulate
 
@@ -75,7 +75,7 @@ def online(args: argparse.Namespace) -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.online.coordinator import Coordinator
     from coloc_graph.online.mission import MissionOptions
-    from coloc_graph.online.phases import Phase
+    from coloc_graph.online.mission_states import Phase
     from coloc_graph.simulation.simulated_team import SimulatedTeam, field_team, free_address
 
     out = Path(args.out) / "online"

@@ -4,7 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from coloc_graph.comparison import Comparison
+    from coloc_graph.results.comparison import Comparison
 
 #: As in coloc_graph.evaluation, which is too heavy for --help.
 ALIGNMENTS = ("reference", "team", "robot", "none")
@@ -86,8 +86,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _comparison(args: argparse.Namespace) -> "Comparison":
     """What the arguments say is compared with what."""
-    from coloc_graph import comparison
     from coloc_graph.errors import InputError
+    from coloc_graph.results import comparison
 
     if bool(args.dir) == bool(args.estimate):
         raise InputError("what is compared is not said; give the folder of a result, or --estimate with TUM files")

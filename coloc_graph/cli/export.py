@@ -20,7 +20,7 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from coloc_graph.errors import InputError
-    from coloc_graph.results import read_result, team_of
+    from coloc_graph.results.writer import read_result, team_of
 
     result, out = read_result(args.result), Path(args.out)
     if out.exists():

@@ -19,7 +19,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 def run(args: argparse.Namespace) -> int:
     """Look and print."""
     from coloc_graph.cli.printing import counted, print_json, print_table
-    from coloc_graph.inspection import inspect, landmarks_seen
+    from coloc_graph.pipeline.inspection import inspect, landmarks_seen
     from coloc_graph.run import open_run, read_truth
     from coloc_graph.run.schemas import topic_of
 

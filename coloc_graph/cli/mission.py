@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from coloc_graph.online.mission import Heard
-    from coloc_graph.stance_solver import EnteredStance
+    from coloc_graph.pipeline.incremental import EnteredStance
     from coloc_graph.team import Team
 
 
@@ -44,8 +44,8 @@ def report(folder: Path, truth_path: Path | None = None) -> None:
     """Solve the record of a mission as it was solved on the way, write the result beside it, and print it."""
     from coloc_graph.cli.accuracy import print_accuracy, print_calibration, print_last_poses, print_promised
     from coloc_graph.cli.printing import warn
-    from coloc_graph.pipeline import SolveOptions, solve
-    from coloc_graph.results import assess, write_result
+    from coloc_graph.pipeline.batch import SolveOptions, solve
+    from coloc_graph.results.writer import assess, write_result
     from coloc_graph.run import open_run
 
     solution = solve(open_run(folder / "run.mcap"), SolveOptions(incremental=True))

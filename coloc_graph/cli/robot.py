@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     """Run it until a signal comes."""
     from coloc_graph.cli.running import until_signal
     from coloc_graph.online.robot import RobotProgram
-    from coloc_graph.robot_io.link_config import tls_of
+    from coloc_graph.robot_io.link.zenoh_config import tls_of
     from coloc_graph.team import read_team
 
     with until_signal() as stop:

@@ -11,7 +11,7 @@ from coloc_graph.cli.printing import counted, print_json, progress, warn
 
 if TYPE_CHECKING:
     from coloc_graph.evaluation import Accuracy
-    from coloc_graph.pipeline import EnteredStance, Solution, SolveOptions
+    from coloc_graph.pipeline.batch import EnteredStance, Solution, SolveOptions
     from coloc_graph.run import Run
 
 
@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.cli.solve_many import solve_folder
     from coloc_graph.cli.view import announce, show
     from coloc_graph.errors import InputError
-    from coloc_graph.pipeline import SolveOptions
-    from coloc_graph.results import require_place
+    from coloc_graph.pipeline.batch import SolveOptions
+    from coloc_graph.results.writer import require_place
     from coloc_graph.run import open_run
 
     options = SolveOptions(
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
 def _earlier_result_named(out: str) -> Iterator[None]:
     """An error says that an earlier result is still there, so that nobody takes it for the new one."""
     from coloc_graph.errors import ColocError
-    from coloc_graph.results import holds_result
+    from coloc_graph.results.writer import holds_result
 
     try:
         yield
@@ -135,8 +135,8 @@ def _solved(
     entered: "Callable[[EnteredStance], None] | None" = None,
 ) -> "Solution":
     """Solve, write, print."""
-    from coloc_graph.pipeline import solve
-    from coloc_graph.results import summarise, write_result
+    from coloc_graph.pipeline.batch import solve
+    from coloc_graph.results.writer import summarise, write_result
 
     with _earlier_result_named(args.out):
         with progress("stances measured") as report:

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 from coloc_graph.cli.printing import counted, print_json, print_table, progress, warn
 
 if TYPE_CHECKING:
-    from coloc_graph.drive_results import DriveAssessment
-    from coloc_graph.driving import DriveSolution
+    from coloc_graph.pipeline.ranging import DriveSolution
+    from coloc_graph.results.ranging import DriveAssessment
     from coloc_graph.run import Run
 
 
 def solve_one_drive(args: argparse.Namespace, run: "Run") -> None:
     """Solve, write, print."""
-    from coloc_graph.drive_results import summarise_drive, write_drive_result
-    from coloc_graph.driving import DriveOptions, solve_drive
+    from coloc_graph.pipeline.ranging import DriveOptions, solve_drive
+    from coloc_graph.results.ranging import summarise_drive, write_drive_result
 
     options = DriveOptions(incremental=args.incremental, between_robots=not args.without_robots)
     with progress("seconds of the run done") as report:

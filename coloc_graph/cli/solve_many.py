@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from coloc_graph.cli.printing import counted, print_json, print_table
 
 if TYPE_CHECKING:
-    from coloc_graph.many_runs import Outcome
-    from coloc_graph.pipeline import SolveOptions
+    from coloc_graph.pipeline.batch import SolveOptions
+    from coloc_graph.results.many_runs import Outcome
 
 
 def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
@@ -17,8 +17,8 @@ def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
     from functools import partial
 
     from coloc_graph.errors import InputError
-    from coloc_graph.many_runs import places_of, runs_in, solve_runs
-    from coloc_graph.workers import workers
+    from coloc_graph.results.executors import workers
+    from coloc_graph.results.many_runs import places_of, runs_in, solve_runs
 
     if args.view:
         raise InputError("--view shows one run; solve the folder without it, and view one of its results")

@@ -21,8 +21,8 @@ from coloc_graph.evaluation.pose_errors import (
     spread,
 )
 from coloc_graph.evaluation.truth import left_out, with_truth
-from coloc_graph.lie import yaw
-from coloc_graph.trajectory import Trajectory
+from coloc_graph.geometry.lie import yaw
+from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.evaluation.truth import LONGEST_TRUTH_GAP, true_poses, with_truth
-from coloc_graph.lie import closest_rotation, floor_pose, se3, se3_inverse, yaw
-from coloc_graph.trajectory import Trajectory
+from coloc_graph.geometry.lie import closest_rotation, floor_pose, se3, se3_inverse, yaw
+from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

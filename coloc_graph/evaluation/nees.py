@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.evaluation.truth import with_truth
-from coloc_graph.lie import floor_pose, se3_inverse, se3_log, yaw
-from coloc_graph.trajectory import Trajectory
+from coloc_graph.geometry.lie import floor_pose, se3_inverse, se3_log, yaw
+from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 #: Tangent components of a pose on the floor, and of one that is free.
-PLANAR, FREE = [2, 3, 4], [0, 1, 2, 3, 4, 5]
+PLANAR = [2, 3, 4]
+FREE = [0, 1, 2, 3, 4, 5]
 #: A pose that is known better than this defines the world; its error says nothing [m, rad].
 DEFINED = 1e-5
 

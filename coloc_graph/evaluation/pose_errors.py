@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.lie import se3, so3_log
+from coloc_graph.geometry.lie import se3, so3_log
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.lie import so3_exp, so3_log
-from coloc_graph.trajectory import Trajectory
+from coloc_graph.geometry.lie import so3_exp, so3_log
+from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

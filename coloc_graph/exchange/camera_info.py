@@ -14,8 +14,8 @@ import yaml
 from msgspec.structs import replace
 
 from coloc_graph.errors import InputError
+from coloc_graph.run.atomic_file import write_whole
 from coloc_graph.team import Camera
-from coloc_graph.whole_file import write_whole
 
 #: Distortion models of ROS that are OpenCV's, and how many coefficients they may have here.
 MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}

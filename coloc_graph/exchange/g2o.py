@@ -22,7 +22,7 @@ from coloc_graph.backend import Estimate, StayPut
 from coloc_graph.backend.factors import GAUGE_SIGMA, link_covariance
 from coloc_graph.backend.landmarks import MAP
 from coloc_graph.errors import InputError
-from coloc_graph.lie import quaternion
+from coloc_graph.geometry.lie import quaternion
 from coloc_graph.measurements import Node
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.exchange.dat_table import DatTable, read_dat
-from coloc_graph.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.run import OdometrySample, Ranges, RunWriter, whole_run
 from coloc_graph.team import Floor, Landmark, Ranging, Robot, Team, Wheels
 
@@ -43,7 +43,9 @@ RANGING = Ranging(
 WHEELS = Wheels(delay=0.1, scale_sigma=0.1, turn_scale_sigma=0.1, delay_sigma=0.1)
 #: Noise of the way: along and across it [m per root of a metre, of a second], and of the heading [rad per root of a
 #: radian, of a metre, of a second]. It is what errors add up to in ten seconds: they last, and a step alone has less.
-ALONG, ACROSS, TURN = (0.08, 0.004), (0.012, 0.002), (0.1, 0.08, 0.006)
+ALONG = (0.08, 0.004)
+ACROSS = (0.012, 0.002)
+TURN = (0.1, 0.08, 0.006)
 #: Commands that stay the same are kept so often [s].
 KEPT_EVERY = 0.2
 #: Truth is kept so often [s]: motion capture's 100 a second would be most of the run.

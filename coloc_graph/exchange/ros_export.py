@@ -14,18 +14,20 @@ from numpy.typing import NDArray
 from coloc_graph.errors import BagError, InputError
 from coloc_graph.exchange.ros_bag import NOT_INSTALLED, POSE, POSE_WITH_COVARIANCE, TF
 from coloc_graph.exchange.ros_poses import ros_covariance
-from coloc_graph.lie import quaternion
+from coloc_graph.geometry.lie import quaternion
+from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.run.schemas import to_ns
 from coloc_graph.team import Team
-from coloc_graph.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 Array = NDArray[np.float64]
 
-PATH, TRANSFORM = "nav_msgs/msg/Path", "geometry_msgs/msg/TransformStamped"
-WORLD, TF_STATIC = "world", "/tf_static"
+PATH = "nav_msgs/msg/Path"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+WORLD = "world"
+TF_STATIC = "/tf_static"
 #: The metadata that ROS 2 Humble and all later ones read.
 VERSION: Literal[8] = 8
 #: No limit, as ROS 2 writes it: the nanoseconds of 63 bits.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.errors import BagError
 from coloc_graph.exchange.ros_map import OdometrySigmas
-from coloc_graph.lie import se3
+from coloc_graph.geometry.lie import se3
 
 Array = NDArray[np.float64]
 

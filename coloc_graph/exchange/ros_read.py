@@ -24,7 +24,7 @@ from coloc_graph.exchange.ros_map import RosMap
 from coloc_graph.exchange.ros_order import Order, order_of
 from coloc_graph.exchange.ros_poses import T_of, planar_covariance
 from coloc_graph.exchange.ros_tf import Frames
-from coloc_graph.lie import yaw
+from coloc_graph.geometry.lie import yaw
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.lie import se3, se3_inverse, so3_exp, so3_log
+from coloc_graph.geometry.lie import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]
 

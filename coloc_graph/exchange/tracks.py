@@ -17,7 +17,8 @@ from coloc_graph.team import Team, read_team
 Array = NDArray[np.float64]
 
 TRACKS_HEADER = ("stance", "time", "robot", "marker", "u", "v")
-PLANES_HEADER, PLANES_SIGMAS = ("stance", "robot", "nx", "ny", "nz", "d"), ("normal_sigma_deg", "d_sigma")
+PLANES_HEADER = ("stance", "robot", "nx", "ny", "nz", "d")
+PLANES_SIGMAS = ("normal_sigma_deg", "d_sigma")
 MOVES_HEADER = ("stance", "robot")
 
 #: A run counts nanoseconds in 63 bits; later times are milliseconds or nanoseconds given as seconds [s].

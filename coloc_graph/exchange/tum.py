@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.lie import quaternion
-from coloc_graph.trajectory import Trajectory
+from coloc_graph.geometry.lie import quaternion
+from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -5,11 +5,11 @@ eq. (2) as the paper computes it, and our estimate, side by side.
 Both depths go the same road: a run is simulated to a file, opened, and measured by the front end.
 """
 
-from coloc_graph.experiments.fig4 import Fig4, fig4
 from coloc_graph.experiments.fig5 import Fig5, fig5
+from coloc_graph.experiments.multi_step_results import Table1, table1
 from coloc_graph.experiments.output import Experiment, require_place, save
 from coloc_graph.experiments.single_step import CELLS, Cell, measure_cells
-from coloc_graph.experiments.table1 import Table1, table1
+from coloc_graph.experiments.single_step_results import Fig4, fig4
 from coloc_graph.experiments.table2 import Table2, table2
 
 __all__ = [

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from coloc_graph.experiments.fig4 import estimates_json
 from coloc_graph.experiments.pool import Progress
 from coloc_graph.experiments.single_step import CELLS, Cell, Estimates, measure_cells
+from coloc_graph.experiments.single_step_results import estimates_json
 from coloc_graph.simulation.world import Depth
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend import Method
 from coloc_graph.errors import EstimationError
-from coloc_graph.pipeline import SolveOptions, solve
-from coloc_graph.results import assess
+from coloc_graph.pipeline.batch import SolveOptions, solve
+from coloc_graph.results.writer import assess
 from coloc_graph.run import open_run
 from coloc_graph.simulation import simulate
 from coloc_graph.simulation.world import Depth

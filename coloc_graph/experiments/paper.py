@@ -6,7 +6,10 @@ from dataclasses import dataclass
 BASELINES = (0.6, 0.8, 1.0, 1.2)
 ANGLES = (0.0, 10.0, 20.0, 30.0, 40.0)
 #: Fig. 4: points recorded in each cell, points drawn in each run, runs a cell, width of a bin [cm].
-RECORDED, DRAWN, RUNS, BIN_CM = 250, 50, 500, 0.5
+RECORDED = 250
+DRAWN = 50
+RUNS = 500
+BIN_CM = 0.5
 
 #: Fig. 4: mean error [cm] of the one cell (l [m], theta [deg]) whose mean the text gives.
 FIG4_MEAN_CM = {(0.6, 0.0): 0.5}

@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar, get_args
 
 from coloc_graph.errors import InputError
+from coloc_graph.results.executors import workers
 from coloc_graph.simulation.world import Depth
-from coloc_graph.workers import workers
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -7,9 +7,14 @@ from matplotlib.figure import Figure
 from coloc_graph.report.drawing import COLOURS, INK, styled
 
 #: Eq. (2) and ours: a colour each (Okabe and Ito) and a marker each, so that colour is never the only difference.
-EQ2, OURS, PAPER = COLOURS[1], COLOURS[0], INK
-EQ2_MARKER, OURS_MARKER, PAPER_MARKER = "s", "o", "_"
-EQ2_LABEL, OURS_LABEL = "eq. (2)", "ours"
+EQ2 = COLOURS[1]
+OURS = COLOURS[0]
+PAPER = INK
+EQ2_MARKER = "s"
+OURS_MARKER = "o"
+PAPER_MARKER = "_"
+EQ2_LABEL = "eq. (2)"
+OURS_LABEL = "ours"
 
 DEPTHS = {"tracks": "marker centres with 0.3 px noise", "images": "rendered images"}
 

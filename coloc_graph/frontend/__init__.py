@@ -3,19 +3,24 @@
 `measure_pair` is the whole road for two observers in one stance; its steps are modules of their own.
 """
 
-from coloc_graph.frontend.clock_offset import ClockFit, ClockOffset
-from coloc_graph.frontend.correspondence import Correspondences, correspond, pair_by_time
-from coloc_graph.frontend.decomposition import choose_by_normal, decompose_svd, decompose_with_normal, metric_scale
-from coloc_graph.frontend.detection import Blobs, Detector, Threshold, detect_hue, detect_leds, detector_for
-from coloc_graph.frontend.homography import HomographyFit, fit_homography
+from coloc_graph.frontend.homography.decomposition import (
+    choose_by_normal,
+    decompose_svd,
+    decompose_with_normal,
+    metric_scale,
+)
+from coloc_graph.frontend.homography.eq2_pose import relative_pose
+from coloc_graph.frontend.homography.fit import HomographyFit, fit_homography
+from coloc_graph.frontend.homography.ml_pose import most_likely_pose
+from coloc_graph.frontend.homography.plane import distance_from_span, on_plane, plane_from_mount
+from coloc_graph.frontend.homography.refinement import PointPairs, least_squares, refine
+from coloc_graph.frontend.images.detection import Blobs, Detector, Threshold, detect_hue, detect_leds, detector_for
 from coloc_graph.frontend.landmarks import Doubt, SeenLandmarks, in_words, sight_landmarks
-from coloc_graph.frontend.most_likely_pose import most_likely_pose
-from coloc_graph.frontend.plane import distance_from_span, on_plane, plane_from_mount
-from coloc_graph.frontend.refinement import PointPairs, least_squares, refine
-from coloc_graph.frontend.relative_pose import relative_pose
-from coloc_graph.frontend.shared_clock import share_clock_offsets
+from coloc_graph.frontend.odometry import WheelTrack
+from coloc_graph.frontend.pairing.clock_fusion import share_clock_offsets
+from coloc_graph.frontend.pairing.clock_offset import ClockFit, ClockOffset
+from coloc_graph.frontend.pairing.correspondence import Correspondences, correspond, pair_by_time
 from coloc_graph.frontend.sighting import sight
-from coloc_graph.frontend.sightings import sight_movers, sight_standing
 from coloc_graph.frontend.stance import (
     FrontendOptions,
     PairMeasurement,
@@ -24,9 +29,9 @@ from coloc_graph.frontend.stance import (
     measure_pair,
     measured_pairs,
 )
+from coloc_graph.frontend.stance_sightings import sight_movers, sight_standing
 from coloc_graph.frontend.stance_tracks import StanceTracks
-from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
-from coloc_graph.frontend.wheels import WheelTrack
+from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
 
 __all__ = [
     "Blobs",

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.keyframes import LONGEST_STEP, Drive, RangeBearings, Steps
+from coloc_graph.measurements import LONGEST_STEP, Drive, RangeBearings, Steps
 from coloc_graph.run import OdometrySample, Ranges, Run
 from coloc_graph.team import Ranging, Wheels
 
@@ -20,7 +20,8 @@ READ_AT_ONCE = 10.0
 #: Odometry with a gap longer than this says nothing there [s].
 LONGEST_GAP = 5.0
 #: A delay that is not known is looked for so far on either side [its sigmas], in steps of so much [s].
-DELAYS_SIGMAS, DELAY_STEP = 4.0, 0.05
+DELAYS_SIGMAS = 4.0
+DELAY_STEP = 0.05
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend.detection import Detector, Pixels, detector_for
-from coloc_graph.frontend.plane import on_plane, plane_from_mount
+from coloc_graph.frontend.homography.plane import on_plane, plane_from_mount
+from coloc_graph.frontend.images.apriltags import find_tags
+from coloc_graph.frontend.images.detection import Detector, Pixels, detector_for
 from coloc_graph.frontend.sighting import Marked, at_rest, sight
-from coloc_graph.frontend.tags import find_tags
-from coloc_graph.frontend.tracking import DOUBTFUL, Track
-from coloc_graph.lie import se3_inverse
+from coloc_graph.frontend.tracks.tracking import DOUBTFUL, Track
+from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.measurements import Sighting
 from coloc_graph.run import Image, Recorded, Stance
 from coloc_graph.team import Camera, Floor, Landmark, Mount, Robot, Team
@@ -26,7 +26,9 @@ EVERY = 2.0
 TAG_BIAS_PX = 0.05
 #: A marker that stands is seen no further than this from where it is seen mostly [sigma, px], at this share of the
 #: instants at least.
-STILL_SIGMAS, STILL_PX, MOSTLY = 5.0, 0.5, 0.6
+STILL_SIGMAS = 5.0
+STILL_PX = 0.5
+MOSTLY = 0.6
 #: Two markers are as far apart as a landmark's, to this share of it.
 SPAN_TOLERANCE = 0.35
 #: A bar of two lights that is seen so much along itself [rad] does not say which light is which.

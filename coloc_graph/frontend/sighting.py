@@ -7,12 +7,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.frontend.bodies import couple_of
-from coloc_graph.frontend.correspondence import pair_by_time
-from coloc_graph.frontend.relative_pose import mounted, turned_normal
-from coloc_graph.frontend.tracking import Track
-from coloc_graph.frontend.wheels import WheelTrack
-from coloc_graph.lie import across, floor_pose, so3_exp
+from coloc_graph.frontend.homography.eq2_pose import mounted, turned_normal
+from coloc_graph.frontend.odometry import WheelTrack
+from coloc_graph.frontend.pairing.correspondence import pair_by_time
+from coloc_graph.frontend.tracks.marker_pairs import couple_of
+from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.geometry.lie import across, floor_pose, so3_exp
 from coloc_graph.measurements import Plane, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.team import Markers, Robot

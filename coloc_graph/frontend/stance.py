@@ -9,28 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend.bodies import couple_of, span_samples
-from coloc_graph.frontend.clock_offset import (
+from coloc_graph.frontend.homography.eq2_pose import relative_pose
+from coloc_graph.frontend.homography.fit import HomographyFit, fit_homography, persisting, shared_error
+from coloc_graph.frontend.homography.fit_checks import require_agreement, require_determined
+from coloc_graph.frontend.homography.marker_span import marker_spans
+from coloc_graph.frontend.homography.ml_pose import most_likely_pose
+from coloc_graph.frontend.homography.plane import distance_from_span
+from coloc_graph.frontend.homography.refinement import Criterion
+from coloc_graph.frontend.landmarks import SeenLandmarks
+from coloc_graph.frontend.pairing.clock_offset import (
     ClockOffset,
     find_offset,
     fit_at_offset,
     require_searchable,
 )
-from coloc_graph.frontend.correspondence import PAIRING_WINDOW, Correspondences, correspond, correspond_roughly
-from coloc_graph.frontend.fit_checks import require_agreement, require_determined
-from coloc_graph.frontend.homography import HomographyFit, fit_homography, persisting, shared_error
-from coloc_graph.frontend.interpolation import LONGEST_GAP
-from coloc_graph.frontend.landmarks import SeenLandmarks
-from coloc_graph.frontend.most_likely_pose import most_likely_pose
-from coloc_graph.frontend.paired_tracks import PairedTracks
-from coloc_graph.frontend.plane import distance_from_span
-from coloc_graph.frontend.refinement import Criterion
-from coloc_graph.frontend.relative_pose import relative_pose
-from coloc_graph.frontend.shared_pixels import Pair, pairs_of, share
-from coloc_graph.frontend.spans import marker_spans
+from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW, Correspondences, correspond, correspond_roughly
+from coloc_graph.frontend.pairing.floor_checks import of_some_span, on_one_floor, require_on_floor
+from coloc_graph.frontend.pairing.observer_pairs import Pair, pairs_of, share
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
-from coloc_graph.frontend.standing import of_some_span, on_one_floor, require_on_floor
-from coloc_graph.frontend.tracking import Track, TrackerOptions
+from coloc_graph.frontend.tracks.interpolation import LONGEST_GAP
+from coloc_graph.frontend.tracks.marker_pairs import couple_of, span_samples
+from coloc_graph.frontend.tracks.paired_tracks import PairedTracks
+from coloc_graph.frontend.tracks.tracking import Track, TrackerOptions
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose
 from coloc_graph.run import Recorded, Stance
 from coloc_graph.team import Camera, Markers

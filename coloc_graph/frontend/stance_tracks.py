@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry, InputError
-from coloc_graph.frontend.blinking import BlinkCodes
-from coloc_graph.frontend.bodies import markers_of_movers, of_named
-from coloc_graph.frontend.detection import Blobs, detector_for
+from coloc_graph.frontend.homography.plane import plane_from_mount
+from coloc_graph.frontend.images.detection import Blobs, detector_for
 from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks
-from coloc_graph.frontend.plane import plane_from_mount
-from coloc_graph.frontend.tracking import MarkerTracker, Track, TrackerOptions
+from coloc_graph.frontend.tracks.blink_codes import BlinkCodes
+from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers, of_named
+from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.measurements import Plane
 from coloc_graph.run import Detections, Flag, Recorded, Stance
 from coloc_graph.team import Markers

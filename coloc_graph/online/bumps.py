@@ -5,9 +5,9 @@ from collections.abc import Iterable, Iterator
 
 from coloc_graph.backend import Bump
 from coloc_graph.online.formation import Planar
-from coloc_graph.online.roster import Roster
-from coloc_graph.online.watch import InView
-from coloc_graph.online.whereabouts import compose
+from coloc_graph.online.pose_tracker import compose
+from coloc_graph.online.robot_registry import Roster
+from coloc_graph.online.visibility import InView
 
 
 def pushed(roster: Roster, bumps: Iterable[Bump]) -> Iterator[tuple[str, str]]:

@@ -16,33 +16,39 @@ from typing import Self
 import numpy as np
 
 from coloc_graph.errors import ColocError, InputError, RobotError
-from coloc_graph.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Sighting
 from coloc_graph.online.bumps import displaced, pushed
+from coloc_graph.online.commands import Orders
+from coloc_graph.online.estimation_worker import Measuring
 from coloc_graph.online.formation import STAGGER, Course, Formation, Planar
-from coloc_graph.online.measuring import Measuring
 from coloc_graph.online.mission import Heard, MissionOptions, in_world
-from coloc_graph.online.orders import Orders
-from coloc_graph.online.phases import Change, Phase, Phases
+from coloc_graph.online.mission_states import Change, Phase, Phases
 from coloc_graph.online.record import Record, continued
-from coloc_graph.online.roster import Member, Roster
-from coloc_graph.online.watch import InView, Precision
-from coloc_graph.robot_io.link import CoordinatorLink
-from coloc_graph.robot_io.link_config import Tls
-from coloc_graph.robot_io.wire import Body, Capture, EndCapture, Event, Halt, Recover, Sample, Status, Wheels
+from coloc_graph.online.robot_registry import Member, Roster
+from coloc_graph.online.visibility import InView, Precision
+from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
+from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
+from coloc_graph.robot_io.link.messages import Body, Capture, EndCapture, Event, Halt, Recover, Sample, Status, Wheels
+from coloc_graph.robot_io.link.zenoh_config import Tls
 from coloc_graph.run import Detections, Run, Stance
 from coloc_graph.run.schemas import to_ns, to_seconds
-from coloc_graph.stance_solver import EnteredStance, StanceSolver
 from coloc_graph.team import Team
 
 log = logging.getLogger(__name__)
 
 #: How often is looked what is to be done, while all wait for the estimate too, and how often a stance's precision [s].
-TICK, SOON, JUDGED = 0.03, 0.004, 0.7
+TICK = 0.03
+SOON = 0.004
+JUDGED = 0.7
 #: Before a stance begins, all have stood for this long [s]; it ends so much after what was seen last in it.
-SETTLED, MARGIN = 0.25, 0.02
+SETTLED = 0.25
+MARGIN = 0.02
 #: How long things may take at most [s]: a drive, to find the mover, to get the last images, to be mended.
-DRIVE_TIME, LOOK_TIME, COLLECT_TIME, HOLD_TIME = 40.0, 4.0, 30.0, 120.0
+DRIVE_TIME = 40.0
+LOOK_TIME = 4.0
+COLLECT_TIME = 30.0
+HOLD_TIME = 120.0
 #: Each image moves where the mover is thought to be by this share towards where it is seen.
 FOLLOWED = 0.1
 #: The mover may be out of a view for so long before it turns back [s].

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.common_view import View, places_in_view
 from coloc_graph.errors import InputError
+from coloc_graph.team.shared_view import View, places_in_view
 
 Array = NDArray[np.float64]
 
@@ -16,11 +16,13 @@ Array = NDArray[np.float64]
 Planar = tuple[float, float, float]
 
 #: The paper's formation: neighbours so far apart [m], their cameras turned towards each other by so much [rad].
-APART, BETWEEN = 0.8, math.radians(34.0)
+APART = 0.8
+BETWEEN = math.radians(34.0)
 #: The front observer stands so far ahead of the next [m]; one that leaps goes twice as far.
 STAGGER = 0.185
 #: Where the mover drives, ahead of the front observer [m]; it keeps clear of whoever leaps to the front.
-NEAR, FAR = 0.65, 1.9
+NEAR = 0.65
+FAR = 1.9
 #: Markers stay this far from the border of the images [px].
 MARGIN = 12.0
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.online.formation import STAGGER, Course, Formation, Planar
-from coloc_graph.online.whereabouts import compose, inverse
-from coloc_graph.stance_solver import SolveOptions
+from coloc_graph.online.pose_tracker import compose, inverse
+from coloc_graph.pipeline.incremental import SolveOptions
 from coloc_graph.team import Team
 
 

@@ -6,11 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 #: Nearer than this a place is reached [m], and a heading [rad].
-NEAR, ALIGNED = 0.01, 0.02
+NEAR = 0.01
+ALIGNED = 0.02
 #: It sets off when it heads at the place to within this [rad].
 SET_OFF = 0.06
 #: How hard it slows down before a place [1/s] and steers [1/s], the least that still moves [m/s], [rad/s].
-BRAKE, STEER, LEAST_SPEED, LEAST_TURN = 2.0, 2.5, 0.02, 0.08
+BRAKE = 2.0
+STEER = 2.5
+LEAST_SPEED = 0.02
+LEAST_TURN = 0.08
 
 
 @dataclass(frozen=True)

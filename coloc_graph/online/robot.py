@@ -13,17 +13,15 @@ from typing import Self
 
 from coloc_graph.errors import CameraError, ColocError, InputError, RobotError
 from coloc_graph.frontend import detector_for
-from coloc_graph.online.ledger import Counted, Ledger, way_since
+from coloc_graph.online.encoder_log import Counted, Ledger, way_since
 from coloc_graph.online.motion import Follower
-from coloc_graph.online.odometry_join import JoinedOdometry
+from coloc_graph.online.odometry_restart import JoinedOdometry
+from coloc_graph.online.pose_tracker import compose
 from coloc_graph.online.record import Record
-from coloc_graph.online.whereabouts import compose
-from coloc_graph.robot_io.camera import open_camera
-from coloc_graph.robot_io.camera_source import CameraSource, Frame, clock_ahead
-from coloc_graph.robot_io.create import Create
-from coloc_graph.robot_io.link_config import Tls
-from coloc_graph.robot_io.robot_link import RobotLink
-from coloc_graph.robot_io.wire import (
+from coloc_graph.robot_io.camera.open import open_camera
+from coloc_graph.robot_io.camera.source import CameraSource, Frame, clock_ahead
+from coloc_graph.robot_io.create.driver import Create
+from coloc_graph.robot_io.link.messages import (
     Body,
     Capture,
     Drive,
@@ -35,6 +33,8 @@ from coloc_graph.robot_io.wire import (
     Status,
     Wheels,
 )
+from coloc_graph.robot_io.link.robot_link import RobotLink
+from coloc_graph.robot_io.link.zenoh_config import Tls
 from coloc_graph.run import Detections, OdometrySample
 from coloc_graph.run.schemas import to_seconds
 from coloc_graph.team import Team
@@ -42,11 +42,13 @@ from coloc_graph.team import Team
 log = logging.getLogger(__name__)
 
 #: Control of the motion, and word of how it is [s].
-CONTROL, REPORT = 0.04, 0.1
+CONTROL = 0.04
+REPORT = 0.1
 #: Without a word from the coordinator for this long it stops [s]; wheels take up to 0.25 s more to stand.
 LEASE = 0.18
 #: So long a camera may be without an image [s]; a lost one, or lost wheels, are opened again so often [s].
-NO_IMAGE, REOPEN = 1.0, 1.0
+NO_IMAGE = 1.0
+REOPEN = 1.0
 
 
 class RobotProgram:

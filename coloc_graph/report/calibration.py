@@ -16,11 +16,12 @@ from coloc_graph.calibration.summary import SUMMARY, summarise_camera
 from coloc_graph.calibration.verdict import REGIONS, cell_counts, uncovered, verdict
 from coloc_graph.errors import InputError
 from coloc_graph.report.drawing import BAD, COLOURS, GREY, INK, PALE, styled
-from coloc_graph.whole_file import write_whole
+from coloc_graph.run.atomic_file import write_whole
 
 Array = NDArray[np.float64]
 
-COVERAGE, RESIDUALS = "coverage.png", "residuals.png"
+COVERAGE = "coverage.png"
+RESIDUALS = "residuals.png"
 #: Cells along the longer side of the image, where corners are counted.
 CELLS = 24
 #: Of more images than this, bars have no names.

@@ -16,9 +16,9 @@ from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from coloc_graph.errors import InputError
 from coloc_graph.evaluation import Accuracy, Alignment
-from coloc_graph.lie import yaw
+from coloc_graph.geometry.lie import yaw
+from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.report.drawing import COLOURS, GREY, INK, MARKERS, Array, Truth, styled, world_covariances
-from coloc_graph.trajectory import Trajectory
 
 _WIDTH = 9.0  # [in]
 #: The figures; there is no last one where nobody went far enough.

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.backend import Estimate
 from coloc_graph.errors import InputError
-from coloc_graph.lie import yaw
-from coloc_graph.trajectory import Trajectory
+from coloc_graph.geometry.lie import yaw
+from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Truth = Mapping[str, NDArray[np.float64]]
@@ -24,7 +24,10 @@ Truth = Mapping[str, NDArray[np.float64]]
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 #: A marker a robot, so that colour is never the only difference.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-INK, GREY, PALE, BAD = "#24292f", "#6e7781", "#d8dee4", "#D55E00"
+INK = "#24292f"
+GREY = "#6e7781"
+PALE = "#d8dee4"
+BAD = "#D55E00"
 #: Radius of the ellipse that holds 95 % of a planar Gaussian, in standard deviations.
 K_95 = float(np.sqrt(5.991464547107979))
 #: At most so many ellipses, ticks or rings a robot; more would be a smear.

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from coloc_graph._version import __version__
-from coloc_graph.driving import DriveSolution
 from coloc_graph.evaluation import Accuracy
+from coloc_graph.pipeline.ranging import DriveSolution
 from coloc_graph.report.accuracy import accuracy_section
 from coloc_graph.report.comparison import Drawing, comparison_drawings
 from coloc_graph.report.drawing import COLOURS, GREY, INK, K_95, ellipse_points, styled

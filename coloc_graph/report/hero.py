@@ -11,7 +11,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, ConnectionPatch, FancyArrowPatch, Rectangle, Wedge
 
 from coloc_graph.backend import Estimate
-from coloc_graph.lie import floor_pose, yaw
+from coloc_graph.geometry.lie import floor_pose, yaw
+from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Odometry
 from coloc_graph.report.drawing import (
     GREY,
@@ -31,12 +32,12 @@ from coloc_graph.report.drawing import (
     trajectories_of,
     truth_of,
 )
-from coloc_graph.trajectory import Trajectory
 
 #: Radius of a robot as drawn [m]: the paper's iRobot Create.
 BODY_RADIUS = 0.16
 #: Room about the poses [m]: ahead of them, their cameras look.
-_BEFORE, _AHEAD = np.array([0.35, 0.3]), np.array([0.75, 0.3])
+_BEFORE = np.array([0.35, 0.3])
+_AHEAD = np.array([0.75, 0.3])
 _FLOOR = "#f4f6f8"
 _TRUTH: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (4, 3))}
 

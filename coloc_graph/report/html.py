@@ -12,7 +12,7 @@ from coloc_graph._version import __version__
 from coloc_graph.evaluation import Accuracy, RobotAccuracy
 from coloc_graph.exchange.landmarks import LandmarkRow, landmark_rows, map_row
 from coloc_graph.frontend import PairMeasurement
-from coloc_graph.pipeline import Solution
+from coloc_graph.pipeline.batch import Solution
 from coloc_graph.report.accuracy import accuracy_section
 from coloc_graph.report.drawing import Truth, position_sigmas, trajectories_of
 from coloc_graph.report.page import DASH, document, figure_card, many, number, table, warnings_section

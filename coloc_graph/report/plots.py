@@ -18,7 +18,8 @@ from matplotlib.ticker import MaxNLocator
 from scipy.stats import chi2
 
 from coloc_graph.backend import Estimate
-from coloc_graph.lie import se3_inverse, yaw
+from coloc_graph.geometry.lie import se3_inverse, yaw
+from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import HomographyMeasurement
 from coloc_graph.report.drawing import (
     BAD,
@@ -44,7 +45,6 @@ from coloc_graph.report.drawing import (
     trajectories_of,
     truth_of,
 )
-from coloc_graph.trajectory import Trajectory
 
 _WIDTH = 9.0  # [in]
 

@@ -4,9 +4,9 @@
 `open_camera` opens cameras; docs/cameras.md.
 """
 
-from coloc_graph.robot_io.camera import open_camera
-from coloc_graph.robot_io.camera_source import CameraSource, Frame
-from coloc_graph.robot_io.create import Create
-from coloc_graph.robot_io.create_state import CreateState
+from coloc_graph.robot_io.camera.open import open_camera
+from coloc_graph.robot_io.camera.source import CameraSource, Frame
+from coloc_graph.robot_io.create.driver import Create
+from coloc_graph.robot_io.create.state import CreateState
 
 __all__ = ["CameraSource", "Create", "CreateState", "Frame", "open_camera"]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import RunError
-from coloc_graph.lie import quaternion
+from coloc_graph.geometry.lie import quaternion
 from coloc_graph.run import schemas
 from coloc_graph.run.messages import (
     Detections,

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from coloc_graph.errors import RunError
+from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.run import decode, schemas
 from coloc_graph.run.encode import check_robots, check_targets
 from coloc_graph.run.index import Index, build_index
 from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Planes, Ranges, Stance
 from coloc_graph.run.topics import Item, decoded, read_topic, time_span
 from coloc_graph.team import Team
-from coloc_graph.trajectory import Trajectory
 
 #: A run's id is made of at most so many bytes.
 MAX_IDENTIFYING = 1 << 20

@@ -6,15 +6,19 @@ from numpy.typing import NDArray
 
 from coloc_graph.calibration.board import Board, charuco_board
 from coloc_graph.calibration.corners import View, Views
-from coloc_graph.lie import rotation_x, rotation_y, rotation_z, se3
+from coloc_graph.geometry.lie import rotation_x, rotation_y, rotation_z, se3
 from coloc_graph.team import Camera, Floor, Mount
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 #: Of a board's picture: pixels a square, white margin in squares. Rays a pixel of an image, along each axis.
-PER_SQUARE, MARGIN, RAYS = 40, 1, 2
-PAPER, INK, SURROUNDINGS = 220.0, 25.0, 110.0
+PER_SQUARE = 40
+MARGIN = 1
+RAYS = 2
+PAPER = 220.0
+INK = 25.0
+SURROUNDINGS = 110.0
 
 
 def held_poses(

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coloc_graph.common_view import View
 from coloc_graph.run.messages import Detections, Flag
 from coloc_graph.simulation.blinking import Blinking
 from coloc_graph.simulation.paths import SPEED, TURN_RATE, Array, wrap
+from coloc_graph.team.shared_view import View
 
 #: Robots keep so far from each other, middle to middle [m], and step so often [s].
-ROOM, STEP = 0.42, 0.02
+ROOM = 0.42
+STEP = 0.02
 #: Two lights nearer to each other than this are detected as one [px].
 MERGING = 4.0
 

@@ -7,20 +7,25 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from coloc_graph.common_view import View
-from coloc_graph.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.simulation.paths import tilt_rotation
 from coloc_graph.simulation.scenarios import CourseScenario, Pose, Scenario
 from coloc_graph.team import Landmark, Markers, Tag, Team
+from coloc_graph.team.shared_view import View
 
 Array = NDArray[np.float64]
 
 #: Tracks: two coloured LEDs on a bar, so far apart and so high [m]. Images: a tag, so large and so high [m].
-BAR, HEIGHT, HUE_DEG, TAG = 0.4, 0.15, 120.0, 0.2
+BAR = 0.4
+HEIGHT = 0.15
+HUE_DEG = 120.0
+TAG = 0.2
 #: Who surveys them knows where they stand to so much [m, deg].
-SURVEYED, SURVEYED_DEG = 0.005, 0.5
+SURVEYED = 0.005
+SURVEYED_DEG = 0.5
 #: A landmark is recorded from no further than this [m], and from no more than so far aside of the way it faces [rad].
-FARTHEST, ASIDE = 3.0, math.radians(70.0)
+FARTHEST = 3.0
+ASIDE = math.radians(70.0)
 
 
 def with_landmarks(team: Team, scenario: Scenario, *, tags: bool) -> Team:

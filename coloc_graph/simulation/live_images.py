@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.robot_io.camera_world import ANSWER, HEADER, LONGEST_LINE
+from coloc_graph.robot_io.camera.simulated import ANSWER, HEADER, LONGEST_LINE
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.rendering import Field, Sensor
 from coloc_graph.simulation.scenery import RobotInView, Scenery, backdrop, draw
@@ -26,7 +26,8 @@ from coloc_graph.team import Team
 AFTER = 0.005
 
 #: So many images' noise is drawn, and from one image to the next it is taken so much further on.
-NOISE, LEAP = 5, 104_729
+NOISE = 5
+LEAP = 104_729
 
 log = logging.getLogger(__name__)
 

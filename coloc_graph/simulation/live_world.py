@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import ColocError, InputError
-from coloc_graph.robot_io.create_emulator import CreateEmulator
-from coloc_graph.robot_io.create_physics import Physics
+from coloc_graph.robot_io.create.emulator import CreateEmulator
+from coloc_graph.robot_io.create.physics import Physics
 from coloc_graph.run import whole_run
 from coloc_graph.simulation.live_images import ImageServer, LiveCamera
 from coloc_graph.simulation.paths import Array
@@ -38,7 +38,8 @@ from coloc_graph.simulation.world import stream
 from coloc_graph.team import Team, read_team
 
 #: True poses are kept so often [1/s], and taken from the wheels so often [s], which remember a few minutes.
-TRUTH_RATE, TRUTH_TAKEN = 20.0, 1.0
+TRUTH_RATE = 20.0
+TRUTH_TAKEN = 1.0
 #: Bright things are there so far ahead of the robots' start [m].
 LENGTH = 10.0
 #: The observers look at a place so far ahead [m], over which the mover stands.

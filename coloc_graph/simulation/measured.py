@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.lie import floor_pose, se3_exp, se3_inverse
+from coloc_graph.geometry.lie import floor_pose, se3_exp, se3_inverse
 from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
 from coloc_graph.run.messages import Stance
 from coloc_graph.simulation.paths import tilt_rotation
@@ -18,9 +18,11 @@ Array = NDArray[np.float64]
 #: Deviations of a relative pose in GTSAM's tangent [rad, m], as eq. (2) and better have them at l = 0.8 m.
 RELATIVE = (4e-3, 4e-3, 3e-3, 5e-3, 5e-3, 4e-3)
 #: Of odometry over a step and of a sighting: heading [rad], x, y [m].
-WHEELS, SEEN = (0.01, 0.01, 0.01), (0.02, 0.008, 0.008)
+WHEELS = (0.01, 0.01, 0.01)
+SEEN = (0.02, 0.008, 0.008)
 #: Robots stand so far apart across [m], and move so far ahead [m].
-APART, STEP = 0.6, 0.45
+APART = 0.6
+STEP = 0.45
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coloc_graph.lie import se3_inverse
+from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.run.messages import Image
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.rendering import Field, Sensor, add_spots, expose, fill, spots
@@ -15,17 +15,26 @@ from coloc_graph.simulation.world import Capture, World, stream
 from coloc_graph.team import Camera
 
 #: Light of the mains comes and goes so often [Hz], and so much of it does.
-MAINS, FLICKER = 100.0, 0.35
+MAINS = 100.0
+FLICKER = 0.35
 #: Lamps, windows and specks are so many times brighter than in an orderly world, at most this [grey levels].
-BRIGHTER, BRIGHTEST = 3.0, 400.0
+BRIGHTER = 3.0
+BRIGHTEST = 400.0
 #: What the floor mirrors of an LED, relative to it.
 MIRRORED = 0.6
 #: A person: the width of a leg and of the body, where the body begins [m], the step [m], pace [m/s], grey level; and a
 #: bright strip at each ankle, its height and radius [m].
-LEG, BODY, HIP, STRIDE, PACE, DARK = 0.16, 0.45, 0.8, 0.6, 1.2, 9.0
-ANKLE, STRIP = 0.12, 0.015
+LEG = 0.16
+BODY = 0.45
+HIP = 0.8
+STRIDE = 0.6
+PACE = 1.2
+DARK = 9.0
+ANKLE = 0.12
+STRIP = 0.015
 #: How high the person is, and how bright the strips are.
-TALL, SHINING = 1.8, 220.0
+TALL = 1.8
+SHINING = 220.0
 
 
 @dataclass(frozen=True)

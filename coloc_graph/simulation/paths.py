@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coloc_graph.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose
 
 Array = NDArray[np.float64]
 

@@ -13,11 +13,14 @@ from coloc_graph.errors import InputError
 Pose = tuple[float, float, float]
 
 #: A team's robots stand in lanes so far apart, one behind the other so far [m].
-LANE, ROW = 0.8, 0.45
+LANE = 0.8
+ROW = 0.45
 
 #: Round a course the pair comes so much further with each leap, its corners are as wide, and so far aside is its
 #: outer wall [m].
-LEAP, CORNER, WALL = 0.25, 1.2, 0.95
+LEAP = 0.25
+CORNER = 1.2
+WALL = 0.95
 
 #: Half the angle between the pair's cameras in the multi-step experiments.
 HALF_ANGLE = math.radians(17.0)

@@ -19,10 +19,14 @@ from coloc_graph.team import Camera
 
 #: An LED is a disc of this radius [m]; a body is a dark cylinder, radius and height [m], at a grey level.
 LED_RADIUS = 0.005
-BODY_RADIUS, BODY_HEIGHT, BODY_LEVEL = 0.17, 0.12, 6.0
+BODY_RADIUS = 0.17
+BODY_HEIGHT = 0.12
+BODY_LEVEL = 6.0
 
 #: An LED's mirror image in the floor: its level relative to the LED's, its radius and blur relative to it.
-MIRROR_LEVEL, MIRROR_RADIUS, MIRROR_BLUR = 0.28, 2.0, 2.0
+MIRROR_LEVEL = 0.28
+MIRROR_RADIUS = 2.0
+MIRROR_BLUR = 2.0
 
 #: Height of the ceiling's lamps above the floor [m].
 CEILING = 2.6

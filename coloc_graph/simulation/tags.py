@@ -6,16 +6,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.lie import se3_inverse
+from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.simulation.rendering import Field
 from coloc_graph.team import Camera, Tag
 
 Array = NDArray[np.float64]
 
 #: Grey levels of a tag's black and white as they are lit, and how wide its white margin is [its side].
-BLACK, WHITE, MARGIN = 12.0, 110.0, 0.2
+BLACK = 12.0
+WHITE = 110.0
+MARGIN = 0.2
 #: A pixel is the mean of so many samples across; the lens blurs by so much [px].
-SAMPLES, BLUR = 4, 0.8
+SAMPLES = 4
+BLUR = 0.8
 #: A tag is drawn where its rim is off the image by no more than this [px].
 REACH = 40.0
 

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 
-from coloc_graph.common_view import View
 from coloc_graph.errors import InputError
 from coloc_graph.run.messages import Stance
 from coloc_graph.simulation.crowd import STEP, wander
@@ -13,9 +12,12 @@ from coloc_graph.simulation.rig import Imperfections, reference_team, stated_tea
 from coloc_graph.simulation.scenarios import TeamScenario
 from coloc_graph.simulation.world import EPOCH, REST, Capture, World, stamp, standing_pose, stream
 from coloc_graph.team import IMAGES_A_BIT, Team
+from coloc_graph.team.shared_view import View
 
 #: Movers wander so far ahead of the foremost row, from and to, and to either side of their lanes [m]; for so long [s].
-AHEAD, ASIDE, WANDERING = (0.7, 2.1), 0.7, 20.0
+AHEAD = (0.7, 2.1)
+ASIDE = 0.7
+WANDERING = 20.0
 #: Of the poses of their ways each so manieth is kept.
 COARSE = 5
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.common_view import View, places_in_view
 from coloc_graph.errors import InputError
 from coloc_graph.simulation.paths import SPEED, Array, Leg, drive, stop_and_go, travel, wrap
 from coloc_graph.simulation.scenarios import Box
+from coloc_graph.team.shared_view import View, places_in_view
 
 #: Half the straight stretch on which a pose is passed [m]: a late capture sees the marker move evenly.
 RUN_IN = 0.03
@@ -18,10 +18,13 @@ BURST_SPACING = 0.05
 LONGEST_BURST = 5
 
 #: Robots and their images stay this far [px] from the border: tracks; images, where a spot has a size.
-TRACK_MARGIN, IMAGE_MARGIN = 1.0, 8.0
+TRACK_MARGIN = 1.0
+IMAGE_MARGIN = 8.0
 
 #: Depths at which images are taken, from the pair's middle [m]; a short stance is less deep, to be wide.
-NEAR, FAR, FAR_IN_HASTE = 0.45, 2.2, 1.5
+NEAR = 0.45
+FAR = 2.2
+FAR_IN_HASTE = 1.5
 
 
 @dataclass(frozen=True, eq=False)

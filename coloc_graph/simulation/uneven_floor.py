@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coloc_graph.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.simulation.paths import FLOOR_GRAIN, Array, tilt_rotation
 
 #: Waves that make up the slope along one axis: enough for it to be normally distributed.

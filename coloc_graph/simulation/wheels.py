@@ -15,7 +15,8 @@ RATE = 10.0
 ALONG = 0.01
 TURNED = 0.01
 VEER = 0.005
-FLOOR_METRES, FLOOR_RADIANS = 2e-5, 1e-4
+FLOOR_METRES = 2e-5
+FLOOR_RADIANS = 1e-4
 
 
 @dataclass(frozen=True, eq=False)

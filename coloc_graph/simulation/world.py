@@ -8,9 +8,8 @@ import numpy as np
 from msgspec.structs import replace as with_fields
 from numpy.typing import ArrayLike, NDArray
 
-from coloc_graph.common_view import View
 from coloc_graph.errors import InputError
-from coloc_graph.lie import floor_pose, rotation_z
+from coloc_graph.geometry.lie import floor_pose, rotation_z
 from coloc_graph.run.messages import Stance
 from coloc_graph.simulation.landmarks import drawn, in_view, standing_landmarks, unsurveyed, with_landmarks
 from coloc_graph.simulation.paths import Array, Path, PathBuilder, drive, tilt_rotation
@@ -18,6 +17,7 @@ from coloc_graph.simulation.rig import IMAGE_BIAS, MILD_LENS, Imperfections, ref
 from coloc_graph.simulation.scenarios import Pose, Scenario
 from coloc_graph.simulation.tours import LONGEST_BURST, Tour, patrol, scatter
 from coloc_graph.team import Team
+from coloc_graph.team.shared_view import View
 
 #: When every simulated run begins [UTC s].
 EPOCH = 1_700_000_000.0

@@ -7,7 +7,8 @@ import msgspec
 from coloc_graph.team.checks import require_finite
 
 #: A bit is at least, and at most, so long [s]: what is off for longer is lost, and images are at least two a bit.
-SHORTEST, LONGEST = 0.02, 0.25
+SHORTEST = 0.02
+LONGEST = 0.25
 #: So many images at least must a camera take in a bit.
 IMAGES_A_BIT = 2
 #: A code is at most so long.

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.lie import rotation_x, rotation_y, rotation_z
+from coloc_graph.geometry.lie import rotation_x, rotation_y, rotation_z
 from coloc_graph.team.checks import require_finite, require_not_negative
 
 Array = NDArray[np.float64]

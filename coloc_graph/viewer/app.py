@@ -27,7 +27,8 @@ from coloc_graph.viewer.server import start_server, stop_server, url_of
 from coloc_graph.viewer.worker import Failure, Worker
 
 #: Frames are at least this far apart, so that the server comes to send them; what rests is shown whole after [s].
-BETWEEN_FRAMES, UNTIL_REST = 0.03, 0.35
+BETWEEN_FRAMES = 0.03
+UNTIL_REST = 0.35
 #: Live stances are put together at most this often [s].
 BETWEEN_GROWTHS = 0.25
 #: Plots are pushed whole, and this often at most while time moves [s].

@@ -10,15 +10,16 @@ import numpy as np
 
 from coloc_graph.errors import InputError
 from coloc_graph.evaluation import Alignment
-from coloc_graph.results import LANDMARKS, Result
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.results.writer import LANDMARKS, Result
 from coloc_graph.run import Run, Stance
-from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.scene import Array, Landmarks, Scene, layer_of
 from coloc_graph.viewer.ties import links_of, wheels_of
 from coloc_graph.viewer.truth import true_layers
 
 #: How long a moment is at least [s], and how many there are at most.
-MOMENT, MOST = 1.0, 2000
+MOMENT = 1.0
+MOST = 2000
 
 
 def scene_of_drive(result: Result, run: Run) -> Scene:

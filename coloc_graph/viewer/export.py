@@ -17,11 +17,16 @@ from coloc_graph.viewer.server import start_server, stop_server
 
 #: A stance takes so long, in a long run less, for all to take no more than so long; the last one is held; it moves in
 #: steps of so long [s].
-STANCE_SECONDS, MOST_SECONDS, HELD_SECONDS, STEP_SECONDS = 1.0, 60.0, 3.0, 0.1
+STANCE_SECONDS = 1.0
+MOST_SECONDS = 60.0
+HELD_SECONDS = 3.0
+STEP_SECONDS = 0.1
 #: So many stances are played at most; of no more than so many each has its images and its robots' trails in each step.
-MOST_STANCES, IN_FULL = 240, 80
+MOST_STANCES = 240
+IN_FULL = 80
 #: The stance is written so high over the team [m], or at such a share of the distance it is seen from: over the names.
-CAPTION_HEIGHT, CAPTION_SHARE = 0.9, 0.1
+CAPTION_HEIGHT = 0.9
+CAPTION_SHARE = 0.1
 
 
 def page_of(scene: Scene, state: ViewState) -> str:

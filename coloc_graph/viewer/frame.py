@@ -22,11 +22,16 @@ from coloc_graph.viewer.prepared import (
 from coloc_graph.viewer.scene import TRUE, Array, Edges, Index, Landmarks, Layer, Links, Mask, Scene
 
 #: So many poses are drawn at most: while time moves, and once it rests.
-MOVING, RESTING = 1_800, 9_000
+MOVING = 1_800
+RESTING = 9_000
 #: Heights [m] over the floor: ellipses, rings, wedges, trajectories.
-Z_ELLIPSE, Z_RING, Z_WEDGE, Z_WAY = 0.004, 0.006, 0.008, 0.010
+Z_ELLIPSE = 0.004
+Z_RING = 0.006
+Z_WEDGE = 0.008
+Z_WAY = 0.010
 #: Dashes and gaps of what is refused, and of what is chained, are so long [m]; so many at most.
-DASH, MOST_DASHES = 0.06, 4_000
+DASH = 0.06
+MOST_DASHES = 4_000
 WEDGE_REACH = 0.3
 ROBOT_REACH = 0.2
 

@@ -6,26 +6,36 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from coloc_graph.lie import quaternion
-from coloc_graph.viewer import bodies, palette, still
+from coloc_graph.geometry.lie import quaternion
+from coloc_graph.viewer import meshes as bodies
+from coloc_graph.viewer import palette, still
 from coloc_graph.viewer.frame import NO_LINES, Batch, Frame, Lines, ViewState
 from coloc_graph.viewer.motion import extent
 from coloc_graph.viewer.prepared import about_z
 from coloc_graph.viewer.scene import TRUE, Scene
 
 #: Room about the data [m], and the largest floor that has lines every half metre.
-MARGIN, FINE = 2.0, 60.0
+MARGIN = 2.0
+FINE = 60.0
 #: How large a frustum is drawn [m].
 FRUSTUM = 0.14
 #: Robots are as large as they are from up to so far [m], and larger from farther away; so many times at most.
-NEAR, LARGEST = 25.0, 64.0
+NEAR = 25.0
+LARGEST = 64.0
 #: Of teams that are larger nobody's name is written; robots that are drawn larger than this have one label for all.
-MOST_NAMES, APART = 16, 8.0
+MOST_NAMES = 16
+APART = 8.0
 #: The camera at the beginning: its vertical field of view and how steeply it looks down [rad], what it is taken to be
 #: wide for its height, and the share of the picture that the data fill. Robots are so tall [m].
-FOV, PITCH, ASPECT, FILLED, TALL = float(np.radians(40)), float(np.radians(40)), 1.3, 0.85, 0.6
+FOV = float(np.radians(40))
+PITCH = float(np.radians(40))
+ASPECT = 1.3
+FILLED = 0.85
+TALL = 0.6
 #: Widths of trajectories [px].
-ESTIMATE_PX, OTHER_PX, TRUTH_PX = 5.0, 2.0, 1.3
+ESTIMATE_PX = 5.0
+OTHER_PX = 2.0
+TRUTH_PX = 1.3
 
 Image = NDArray[np.uint8]
 

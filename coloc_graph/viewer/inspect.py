@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend import PairMeasurement, measure_pair
-from coloc_graph.frontend.decomposition import choose_by_normal, decompose_svd
-from coloc_graph.frontend.homography import INLIER_GATE
-from coloc_graph.frontend.plane import on_plane
-from coloc_graph.frontend.refinement import squared_residuals
+from coloc_graph.frontend.homography.decomposition import choose_by_normal, decompose_svd
+from coloc_graph.frontend.homography.fit import INLIER_GATE
+from coloc_graph.frontend.homography.plane import on_plane
+from coloc_graph.frontend.homography.refinement import squared_residuals
 from coloc_graph.frontend.stance_tracks import stance_plane
-from coloc_graph.frontend.tracking import Track
-from coloc_graph.lie import floor_pose, so3_log
+from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.geometry.lie import floor_pose, so3_log
 from coloc_graph.run import Run
 from coloc_graph.team import Camera, Team
 from coloc_graph.viewer import palette

@@ -9,9 +9,9 @@ from coloc_graph.backend import StanceEstimate
 from coloc_graph.backend.landmarks import Placed
 from coloc_graph.exchange.landmarks import row_of
 from coloc_graph.frontend import PairMeasurement
+from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Measurement, RelativePose, Sighting
 from coloc_graph.run import Stance
-from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.scene import Array, Scene, layer_of
 from coloc_graph.viewer.sources import as_edges, stayed
 from coloc_graph.viewer.still import landmarks_in, sighted_in

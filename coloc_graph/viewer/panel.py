@@ -17,7 +17,8 @@ from coloc_graph.viewer.scene import TRUE, Scene
 
 NOBODY = "nobody"
 HELP = "Click an edge or a robot. Space plays, arrow keys step."
-WIDTH, INSPECTOR_WIDTH = 330, 480
+WIDTH = 330
+INSPECTOR_WIDTH = 480
 
 #: A slider is left to whoever moves it for so long; keys that move it while it has the focus do nothing else [s].
 HANDS_OFF = 0.25

@@ -11,7 +11,9 @@ from coloc_graph.viewer.scene import Array, Edges, Index, Layer, Links, Mask
 Float32 = NDArray[np.float32]
 
 #: Heights [m] over the floor of edges, of sightings, and of odometry.
-Z_EDGE, Z_SIGHTING, Z_ODOMETRY = 0.13, 0.15, 0.05
+Z_EDGE = 0.13
+Z_SIGHTING = 0.15
+Z_ODOMETRY = 0.05
 
 
 class Doubts:

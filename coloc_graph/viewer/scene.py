@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.frontend import FrontendOptions, WheelTrack
-from coloc_graph.lie import yaw
+from coloc_graph.geometry.lie import yaw
+from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.report.drawing import world_covariances
 from coloc_graph.run import Run, Stance
 from coloc_graph.team import Team
-from coloc_graph.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

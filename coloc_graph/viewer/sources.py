@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from coloc_graph.backend import Estimate, Method, chain, smooth
-from coloc_graph.backend.graph import Places
+from coloc_graph.backend.graph import PoseKeys
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.exchange.landmarks import landmark_rows, read_landmarks
 from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions
 from coloc_graph.measurements import RelativePose
-from coloc_graph.pipeline import Progress, Solution, SolveOptions, solve
-from coloc_graph.results import LANDMARKS, read_result
+from coloc_graph.pipeline.batch import Progress, Solution, SolveOptions, solve
+from coloc_graph.results.writer import LANDMARKS, read_result
 from coloc_graph.run import Run, Stance, open_run
 from coloc_graph.team import read_team
 from coloc_graph.viewer.drive import scene_of_drive
@@ -240,7 +240,7 @@ def _anchored(stances: Sequence[Stance], bumped: Sequence[Sequence[object]]) -> 
         (robot, after.index)
         for before, after in itertools.pairwise(stances)
         for robot in after.anchors
-        if Places.stays(robot, before, after) and (robot, after.index) not in moved
+        if PoseKeys.stays(robot, before, after) and (robot, after.index) not in moved
     ]
 
 

@@ -9,13 +9,19 @@ from coloc_graph.exchange.landmarks import LandmarkRow
 from coloc_graph.measurements import Sighting
 from coloc_graph.run import Stance
 from coloc_graph.team import Landmark, Team
-from coloc_graph.viewer.bodies import LED, LED_RADIUS, cylinder, painted
+from coloc_graph.viewer.meshes import LED, LED_RADIUS, cylinder, painted
 from coloc_graph.viewer.scene import NO_LANDMARKS, Landmarks
 from coloc_graph.viewer.ties import links_of
 
 #: A post, its foot and a tag's board: radius and thickness [m]; and what the post of a bare point is tall [m].
-POST, FOOT, BOARD, TALL = 0.012, 0.07, 0.012, 0.2
-_STEEL, _AMBER, _WHITE, _BLACK = (120, 126, 134), (214, 160, 30), (244, 244, 244), (24, 26, 30)
+POST = 0.012
+FOOT = 0.07
+BOARD = 0.012
+TALL = 0.2
+_STEEL = (120, 126, 134)
+_AMBER = (214, 160, 30)
+_WHITE = (244, 244, 244)
+_BLACK = (24, 26, 30)
 
 
 def landmarks_in(

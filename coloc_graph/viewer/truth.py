@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from coloc_graph.errors import InputError
 from coloc_graph.evaluation import Alignment, align, left_out, with_truth
+from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.run import Run, Stance, read_truth
-from coloc_graph.trajectory import Trajectory
 from coloc_graph.viewer.scene import TRUE, Layer, layer_of
 
 

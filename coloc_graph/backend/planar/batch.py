@@ -12,7 +12,7 @@ from coloc_graph.backend.planar.filter import Filtered, Models, filter_forward
 from coloc_graph.backend.planar.slices import Slices, slices_of
 from coloc_graph.backend.planar.summary import DOUBTED, Found, measured_off, summed_up
 from coloc_graph.errors import EstimationError
-from coloc_graph.keyframes import Drive
+from coloc_graph.measurements import Drive
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
@@ -20,7 +20,8 @@ Index = NDArray[np.int64]
 
 #: The search ends where a step gains less than this much of half chi2 a pose, of which one has about 3.
 ENOUGH = 1e-4
-MOST_ITERATIONS, MOST_HALVINGS = 40, 6
+MOST_ITERATIONS = 40
+MOST_HALVINGS = 6
 #: Where the fit has left less than this of residuals, they say nothing of noise.
 LEAST_LEFT = 0.3
 #: Noise is not taken for less, or more, than so many times what is stated.

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.keyframes import Drive
-from coloc_graph.lie import floor_pose
-from coloc_graph.trajectory import Trajectory
+from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.measurements import Drive
 
 Array = NDArray[np.float64]
 

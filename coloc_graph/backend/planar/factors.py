@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from coloc_graph.backend.planar.estimate import Errors
 from coloc_graph.backend.planar.filter import Models
 from coloc_graph.backend.planar.model import RANGING, WHEELS, wrapped
-from coloc_graph.keyframes import Drive
+from coloc_graph.measurements import Drive
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

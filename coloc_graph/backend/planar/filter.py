@@ -23,7 +23,7 @@ from coloc_graph.backend.planar.model import (
     wrapped,
 )
 from coloc_graph.backend.planar.placing import Placing
-from coloc_graph.keyframes import Drive
+from coloc_graph.measurements import Drive
 from coloc_graph.team import Ranging, Team, Wheels
 
 Array = NDArray[np.float64]
@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 #: A measurement further off than this (chi2 of two numbers, chance 1e-4) is left out.
 GATE = 18.4
 #: A robot that was just placed is known to this [m, m, rad]; a landmark, before it is measured, to this [m].
-PLACED, ANYWHERE = (0.15, 0.15, 0.1), 30.0
+PLACED = (0.15, 0.15, 0.1)
+ANYWHERE = 30.0
 
 
 @dataclass(eq=False)

@@ -16,15 +16,16 @@ from coloc_graph.backend.planar.filter import Filter
 from coloc_graph.backend.planar.model import compose
 from coloc_graph.backend.planar.slices import Slices, Summary, slices_of
 from coloc_graph.backend.planar.summary import Found, summed_up
-from coloc_graph.keyframes import Drive
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.measurements import Drive
 from coloc_graph.team import Team
-from coloc_graph.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 #: Poses this far back are still corrected [s], and what came in meanwhile is taken in so often [s].
-LAG, EVERY = 40.0, 1.0
+LAG = 40.0
+EVERY = 1.0
 #: Slices leave so many at a time: each time, covariances of all are worked out.
 LEAVING = 4
 #: Until so long after the first keyframe none leaves [s]: wheels and sensors are being calibrated, and what has left

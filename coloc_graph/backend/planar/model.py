@@ -11,14 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.keyframes import Steps
+from coloc_graph.measurements import Steps
 from coloc_graph.team import Ranging, Wheels
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
 
 #: How many errors wheels have, and a sensor.
-WHEELS, RANGING = 3, 7
+WHEELS = 3
+RANGING = 7
 #: Less of a turn than this in a step is none [rad].
 STRAIGHT = 1e-6
 #: A depth is at least this part of the distance: what is beside a camera is not seen by it.

@@ -11,7 +11,10 @@ from coloc_graph.backend.planar.model import Pose
 Array = NDArray[np.float64]
 
 #: So many points must agree, this far apart [m], to so much [m]; and this part of all.
-LEAST, APART, NEAR, MOST_OF = 4, 0.5, 0.3, 0.7
+LEAST = 4
+APART = 0.5
+NEAR = 0.3
+MOST_OF = 0.7
 #: The newest so many are looked at.
 NEWEST = 24
 

@@ -14,7 +14,7 @@ from scipy.linalg import lapack
 
 from coloc_graph.backend.planar.factors import DriveFactors, Rows
 from coloc_graph.errors import EstimationError
-from coloc_graph.keyframes import LONGEST_STEP
+from coloc_graph.measurements import LONGEST_STEP
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -1,0 +1,114 @@
+"""Which links can enter a graph that is there already, in which order, and where the poses they bring start."""
+
+from collections.abc import Callable, Mapping, Set
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.backend.factors import Factors
+from coloc_graph.backend.graph import Link
+from coloc_graph.measurements import Odometry, RelativePose, Sighting
+
+Array = NDArray[np.float64]
+
+#: What is no further than this from where it is expected [m, rad], or than so many sigmas of the wheels that expect it
+#: there, is taken in at once and tested then.
+NEAR = 0.05
+SIGMAS = 6.0
+
+#: A link and the keys of its ends.
+Tie = tuple[Link, int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class InsertionPlan:
+    """What one call puts into the graph: where new poses `start`, the `ties` that hold them, measurements that are
+    `near` what these say and are tested when all is in, those that are `far` and are tested before they enter, and
+    what is `loose` still."""
+
+    start: dict[int, gtsam.Pose3]
+    ties: list[Tie]
+    near: list[Tie]
+    far: list[Tie]
+    loose: list[Link]
+
+
+class InsertionPlanner:
+    """Sorts links by what is `tied` to the reference; `ends` gives their keys, `known` the poses of tied keys, and
+    `errors` what calibration variables are thought to be."""
+
+    def __init__(
+        self,
+        factors: Factors,
+        ends: Callable[[Link], tuple[int, int]],
+        tied: Set[int],
+        reference: int,
+        known: Callable[[int], gtsam.Pose3],
+        errors: Callable[[int], Array],
+    ) -> None:
+        self._factors, self._ends, self._tied, self._reference, self._known = factors, ends, tied, reference, known
+        self._errors = errors
+
+    def sort(self, links: list[Link]) -> InsertionPlan:
+        """What hangs on the poses that are tied, what does not yet, and where new poses start."""
+        start: dict[int, gtsam.Pose3] = {}
+        if not self._tied:
+            start[self._reference] = gtsam.Pose3()
+        ties: list[Tie] = []
+        near: list[Tie] = []
+        far: list[Tie] = []
+        rough: dict[int, float] = {}  # started by wheels alone, with their sigma
+        # wheels first: they are seldom wrong by much, so that what they predict can refuse a wrong homography
+        left = sorted(links, key=lambda link: isinstance(link, RelativePose | Sighting))
+        while left:
+            still: list[Link] = []
+            for link in left:
+                i, j = self._ends(link)
+                has_i, has_j = (key in self._tied or key in start for key in (i, j))
+                is_new = i not in self._tied or j not in self._tied
+                T_i_j = self._factors.expected(link, i, j, self._errors) if is_new else link.T_i_j
+                tested = isinstance(link, RelativePose | Sighting)
+                if i == j:
+                    continue
+                if not has_i and not has_j:
+                    still.append(link)
+                elif has_i and has_j and tested:
+                    # a pose that starts where a homography says is not moved by it, nor linearised anew
+                    is_near = self._refine(T_i_j, i, j, start, rough)
+                    (near if is_near else far).append((link, i, j))
+                else:
+                    if not has_j:
+                        start[j] = self._factors.start(self._pose_of(i, start).compose(T_i_j))
+                    elif not has_i:
+                        start[i] = self._factors.start(self._pose_of(j, start).compose(T_i_j.inverse()))
+                    if isinstance(link, Odometry):
+                        sigma = float(np.sqrt(np.diagonal(link.covariance).max()))
+                        rough |= {key: sigma for key, had in ((i, has_i), (j, has_j)) if not had}
+                    ties.append((link, i, j))
+            if len(still) == len(left):
+                break
+            left = still
+        return InsertionPlan(start, ties, near, far, left)
+
+    def _refine(
+        self, T_i_j: gtsam.Pose3, i: int, j: int, start: dict[int, gtsam.Pose3], rough: dict[int, float]
+    ) -> bool:
+        """Whether a measurement is near what is expected; a new pose that wheels alone placed then starts by it."""
+        T_world_i, T_world_j = self._pose_of(i, start), self._pose_of(j, start)
+        off = T_world_i.between(T_world_j).between(T_i_j)
+        near = max(NEAR, SIGMAS * max(rough.get(i, 0.0), rough.get(j, 0.0)))
+        if np.abs(off.translation()).max() > near or abs(off.rotation().yaw()) > near:
+            return False
+        if j in rough:
+            start[j] = self._factors.start(T_world_i.compose(T_i_j))
+        elif i in rough:
+            start[i] = self._factors.start(T_world_j.compose(T_i_j.inverse()))
+        for key in (i, j):
+            rough.pop(key, None)
+        return True
+
+    def _pose_of(self, key: int, start: Mapping[int, gtsam.Pose3]) -> gtsam.Pose3:
+        pose = start.get(key)
+        return self._known(key) if pose is None else pose

@@ -1,0 +1,162 @@
+"""Known spans of markers on a plane: a measurement of the plane's tilts and distance, and where its scale comes from.
+
+Of n instants three sums count, those that tell most about two tilts and the distance; which these are is decided at a
+plane that is nearly right, and then stays, so that the residual is a function of the plane alone.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.geometry.lie import across
+from coloc_graph.measurements import MarkerSpan
+
+Array = NDArray[np.float64]
+
+#: Rays that meet the plane at less than this sine, or than so many sigmas of its normal, say nothing of it.
+GRAZING = 0.02
+SIGMAS = 3.0
+#: A normal that is known to this much tells noise in a length from its own error [rad].
+KNOWN = 5e-3
+#: So many instants at least make a span.
+FEWEST = 4
+
+
+def spans_on_plane(x_i: Array, n: Array) -> tuple[Array, Array, Array, Array]:
+    """Distances (..., k) [m] on planes n . X = 1 (n = N / d, (..., 3) [1/m]) of pairs of rays (x, y, 1), `x_i`
+    (..., k, 2, 2).
+
+    With their derivatives by n (..., k, 3), the rays' ends X (..., k, 2, 3), and unit vectors (..., k, 3) from first to
+    second. Rays that do not meet the plane are taken to meet it far away.
+    """
+    n = n[..., None, None, :]
+    nearest = 1e-3 * np.sqrt((n * n).sum(-1))
+    depth = 1 / np.maximum(x_i[..., 0] * n[..., 0] + x_i[..., 1] * n[..., 1] + n[..., 2], nearest)
+    X = np.empty((*x_i.shape[:-1], 3))
+    X[..., :2] = x_i * depth[..., None]
+    X[..., 2] = depth
+    arm = X[..., 1, :] - X[..., 0, :]
+    lengths = np.sqrt(np.einsum("...a,...a->...", arm, arm))
+    u = arm / lengths[..., None]
+    # dX/dn = -X X^T
+    along = np.einsum("...ma,...a->...m", X, u)
+    return lengths, along[..., :1] * X[..., 0, :] - along[..., 1:] * X[..., 1, :], X, u
+
+
+def _by_rays(X: Array, u: Array, n: Array) -> Array:
+    """How the distances change with x_i, (k, 2, 2)."""
+    along = X @ u[:, :, None]
+    by_x = X[..., 2:] * (u[:, None, :2] - along * n[:2])
+    return np.asarray(by_x * np.array([-1.0, 1.0])[:, None])
+
+
+def _lengthening(X: Array, u: Array, n: Array, covariance: Array) -> Array:
+    """What noise adds to the distances (k,), since across their line it makes each longer: (tr S - u^T S u) / 2 length,
+    with S the covariance of the line from one marker to the other."""
+    J = X[..., 2, None, None] * (np.eye(3)[:, :2] - X[..., None] * n[:2])
+    S = (J @ covariance @ J.mT).sum(axis=1)
+    arm = np.sqrt(((X[:, 1] - X[:, 0]) ** 2).sum(-1))
+    return np.asarray((S[:, 0, 0] + S[:, 1, 1] + S[:, 2, 2] - ((S @ u[..., None])[..., 0] * u).sum(axis=1)) / (2 * arm))
+
+
+@dataclass(frozen=True, eq=False)
+class SpanModel:
+    """The spans of one mover as a residual (3,) of covariance 1: a function of the plane, the span and the homography.
+
+    `weights` (3, k) @ (lengths - `noise` - span) + `by_h` (3, 8) @ h, at the k instants whose rays are clear of the
+    horizon. `noise` (k,) is what noise adds to each length, `length` [m] the span as stated.
+    """
+
+    mover: str
+    length: float
+    x_i: Array
+    noise: Array
+    weights: Array
+    by_h: Array
+
+    @classmethod
+    def near(
+        cls, spans: Sequence[MarkerSpan], n: Array, normal_sigma: float, lengths: Sequence[float]
+    ) -> tuple["SpanModel", ...]:
+        """Those of spans of these `lengths` [m] about the plane n . X = 1 in camera i, whose normal is known to so much
+        [rad], as far as they say anything of it."""
+        N = n / np.linalg.norm(n)
+        some, clear = [], []
+        for span, length in zip(spans, lengths, strict=True):
+            sine = (span.x_i @ N[:2] + N[2]) / np.sqrt(1 + (span.x_i**2).sum(-1))
+            which = (sine > max(GRAZING, SIGMAS * normal_sigma)).all(axis=1)
+            if which.sum() >= FEWEST:
+                some.append((span, length))
+                clear.append(which)
+        if not some:
+            return ()
+        # the instants of all of them, one after the other, and each one's by itself, filled up with nothing
+        x_i, covariance, by_h, shared = (
+            np.concatenate([getattr(span, name)[which] for (span, _), which in zip(some, clear, strict=True)])
+            for name in ("x_i", "covariance", "by_h", "shared")
+        )
+        count = [int(which.sum()) for which in clear]
+        own = np.arange(max(count)) < np.array(count)[:, None]
+
+        def apart(each: Array) -> Array:
+            """(k, ...) of all instants as (s, k, ...) of each span."""
+            out = np.zeros((*own.shape, *each.shape[1:]))
+            out[own] = each
+            return out
+
+        found, by_n, X, u = spans_on_plane(x_i, n)
+        by_x = _by_rays(X, u, n)
+        if normal_sigma < KNOWN:
+            # weigh each length at the nearest rays that have it right: noise that makes a length longer would make
+            # its weight smaller, which over hundreds of instants is a bias of a tenth of a sigma
+            off = found - np.repeat([length for _, length in some], count)
+            by_noise = (covariance @ by_x[..., None])[..., 0]
+            variance = (by_x * by_noise).sum(axis=(1, 2))
+            _, by_n, X, u = spans_on_plane(x_i - by_noise * (off / variance)[:, None, None], n)
+            by_x = _by_rays(X, u, n)
+        sigma = np.sqrt((by_x * (covariance @ by_x[..., None])[..., 0]).sum(axis=(1, 2)))
+        J = (by_n @ np.stack([*across(N), N], axis=1)) / sigma[:, None]
+        weights = np.linalg.qr(apart(J))[0].mT / np.where(own, apart(sigma), 1.0)[:, None]
+        # what all rays to one marker share, and is no noise that averages out
+        each = apart((by_x[:, :, None] @ shared)[:, :, 0].reshape(len(x_i), -1))
+        root = weights @ each
+        weights = np.linalg.solve(np.linalg.cholesky(np.eye(3) + root @ root.mT), weights)
+        by_h = weights @ apart((by_x[:, :, None] @ by_h)[:, :, 0].sum(axis=1))
+        noise = _lengthening(X, u, n, covariance)
+        ends = np.cumsum(count)
+        return tuple(
+            cls(span.mover, length, x_i[end - k : end], noise[end - k : end], weights[at, :, :k], by_h[at])
+            for at, ((span, length), k, end) in enumerate(zip(some, count, ends, strict=True))
+        )
+
+    def weighing(self, share: float) -> "SpanModel":
+        """The same with a part of the information, where other pairs have the rest of it."""
+        root = math.sqrt(share)
+        return self if share == 1 else replace(self, weights=root * self.weights, by_h=root * self.by_h)
+
+
+class Spans:
+    """As many spans of three rows each, evaluated at once; instants that some have fewer of weigh nothing."""
+
+    rows = 3
+
+    def __init__(self, models: Sequence[SpanModel]) -> None:
+        shape = len(models), max(len(one.x_i) for one in models)
+        self._x_i, self._noise = np.zeros((*shape, 2, 2)), np.zeros(shape)
+        self._weights: Array = np.zeros((len(models), self.rows, shape[1]))
+        for at, one in enumerate(models):
+            k = len(one.x_i)
+            self._x_i[at, :k], self._noise[at, :k], self._weights[at, :, :k] = one.x_i, one.noise, one.weights
+            self._x_i[at, k:] = one.x_i[0]
+        self._length: Array = np.array([one.length for one in models])
+        self._by_longer = -self._length[:, None] * self._weights.sum(axis=2)
+
+    def at(self, n: Array, longer: Array) -> tuple[Array, Array, Array]:
+        """The residuals (s, 3) but for h, and their derivatives by the planes n (s, 3, 3) and by how much `longer` (s,)
+        the spans are than stated, relative (s, 3)."""
+        lengths, by_n, _, _ = spans_on_plane(self._x_i, n)
+        off = lengths - self._noise - (self._length * (1 + longer))[:, None]
+        return (self._weights @ off[..., None])[..., 0], self._weights @ by_n, self._by_longer

@@ -1,0 +1,147 @@
+"""From a homography measurement to the pose of observer j in observer i, with a 6x6 covariance."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.frontend.homography.decomposition import (
+    choose_by_normal,
+    decompose_svd,
+    decompose_with_normal,
+    metric_scale,
+)
+from coloc_graph.geometry.lie import (
+    across,
+    rotation_x,
+    rotation_y,
+    rotation_z,
+    se3,
+    se3_inverse,
+    sl3_exp,
+    so3_exp,
+    so3_log,
+)
+from coloc_graph.measurements import HomographyMeasurement, Plane, RelativePose
+from coloc_graph.team import R_BODY_OPTICAL, Mount
+
+Array = NDArray[np.float64]
+
+# The unknowns of a relative pose, in this order: the homography's h (8), the normal's rotation about two
+# axes across it (2), the distance (1), and of each mount height, tilt, roll (3 + 3).
+_H = slice(0, 8)
+_NORMAL = slice(8, 10)
+_D = 10
+_MOUNT_I = slice(11, 14)
+_MOUNT_J = slice(14, 17)
+
+#: A baseline that is certainly shorter than this share of the plane's distance is none.
+SHORT_BASELINE = 0.2
+
+
+def relative_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount, plane: Plane) -> RelativePose:
+    """Eq. (2) on a homography measurement, both SVD solutions beside it, and a first-order covariance.
+
+    `plane` is that of the markers in camera i. The covariance carries the homography's information, what is
+    uncertain of the plane, and the tolerances of both mounts. Raises `DegenerateGeometry` where there is no
+    baseline between the cameras.
+    """
+    start = eq2_pose(measurement, mount_i, mount_j, plane)
+    H = metric_scale(measurement.H_j_i)
+    root = _root_covariance(measurement, mount_i, mount_j, plane)
+    # central differences along each column of the root, all decompositions in one call
+    scale = 0.1
+    T_i_j, _ = _poses(
+        np.concatenate([np.zeros((1, len(root))), scale * root.T, -scale * root.T]), H, mount_i, mount_j, plane
+    )
+    off = se3_inverse(T_i_j[0]) @ T_i_j[1:]
+    xi = np.concatenate([so3_log(off[:, :3, :3]), off[:, :3, 3]], axis=1)
+    columns = (xi[: len(root.T)] - xi[len(root.T) :]) / (2 * scale)
+    covariance = columns.T @ columns
+    return replace(start, covariance=(covariance + covariance.T) / 2)
+
+
+def eq2_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount, plane: Plane) -> RelativePose:
+    """The same without a covariance (NaN)."""
+    H = metric_scale(measurement.H_j_i)
+    _require_baseline(measurement, H)
+    _, _, N_both = decompose_svd(H)
+    which, normal_error = choose_by_normal(N_both, plane.N)
+    T_i_j, T_ci_cj = _poses(np.zeros((1, 17)), H, mount_i, mount_j, plane)
+    return RelativePose(
+        stance=measurement.stance,
+        robot_i=measurement.robot_i,
+        robot_j=measurement.robot_j,
+        T_i_j=gtsam.Pose3(T_i_j[0]),
+        covariance=np.full((6, 6), np.nan),
+        T_ci_cj=gtsam.Pose3(T_ci_cj[0]),
+        solution=int(which),
+        normal_error=float(normal_error),
+    )
+
+
+def _require_baseline(measurement: HomographyMeasurement, H: Array) -> None:
+    """H of a pure rotation is a rotation: v2 and with it eq. (2) are then undetermined."""
+    s = np.linalg.svd(H, compute_uv=False)
+    baseline = s[0] - s[2]  # in units of the plane's distance d
+    noise = 3 * np.sqrt(np.linalg.eigvalsh(np.linalg.inv(measurement.information)).max())
+    if baseline >= noise:
+        return
+    pair = f"the homography between {measurement.robot_i} and {measurement.robot_j}"
+    if baseline + noise < SHORT_BASELINE:
+        raise DegenerateGeometry(
+            f"{pair} is that of a pure rotation, so "
+            "that there is no baseline to measure: place the two observers further apart"
+        )
+    raise DegenerateGeometry(
+        f"{pair}, made of {measurement.points} points, is too noisy to tell a baseline (it seems "
+        f"{baseline:.2g} of the camera's distance from the marker plane long, give or take {noise:.2g}): record more "
+        "points, spread over the plane, detect them better, or place the observers further apart"
+    )
+
+
+def _root_covariance(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount, plane: Plane) -> Array:
+    """A square root (17, 17) of the unknowns' covariance."""
+    root = np.zeros((17, 17))
+    root[_H, _H] = np.linalg.inv(np.linalg.cholesky(measurement.information)).T
+    root[_NORMAL, _NORMAL] = plane.normal_sigma * np.eye(2)
+    root[_D, _D] = plane.d_sigma
+    for block, mount in ((_MOUNT_I, mount_i), (_MOUNT_J, mount_j)):
+        tilts = np.deg2rad([mount.tilt_sigma_deg, mount.roll_sigma_deg])
+        root[block, block] = np.diag([mount.height_sigma, *tilts])
+    return root
+
+
+def _poses(unknowns: Array, H: Array, mount_i: Mount, mount_j: Mount, plane: Plane) -> tuple[Array, Array]:
+    """T_i_j and T_ci_cj, (m, 4, 4) each, for errors (m, 17) of the unknowns."""
+    T_bi_ci, T_bj_cj = mounted(mount_i, unknowns[:, _MOUNT_I]), mounted(mount_j, unknowns[:, _MOUNT_J])
+    N = turned_normal(plane, mount_i, T_bi_ci)
+    sides = across(plane.N)
+    N = (so3_exp(unknowns[:, _NORMAL] @ sides) @ N[..., None])[..., 0]
+    d = plane.d + unknowns[:, _D] + (unknowns[:, _MOUNT_I][:, 0] if plane.d_from_mount else 0.0)
+    R_cj_ci, t_cj_ci = decompose_with_normal(H @ sl3_exp(unknowns[:, _H]), N, d)
+    T_ci_cj = se3_inverse(se3(R_cj_ci, t_cj_ci))
+    return T_bi_ci @ T_ci_cj @ se3_inverse(T_bj_cj), T_ci_cj
+
+
+def turned_normal(plane: Plane, mount: Mount, T_body_camera: Array) -> Array:
+    """The plane's normal (m, 3) in cameras that sit on the body as `T_body_camera` (m, 4, 4), not as thought.
+
+    Where the normal was computed from the mount, the body's vertical is what stays.
+    """
+    if not plane.normal_from_mount:
+        return np.broadcast_to(plane.N, (len(T_body_camera), 3))
+    return np.asarray(T_body_camera[:, :3, :3].mT @ mount.R_body_camera @ plane.N)
+
+
+def mounted(mount: Mount, errors: Array) -> Array:
+    """T_body_camera (m, 4, 4) for errors (m, 3) of height, tilt, roll."""
+    R_tilt = rotation_y(np.deg2rad(mount.tilt_deg) + errors[:, 1])
+    R_roll = rotation_x(np.deg2rad(mount.roll_deg) + errors[:, 2])
+    T = se3(
+        rotation_z(np.deg2rad(mount.yaw_deg)) @ R_tilt @ (R_roll @ R_BODY_OPTICAL), (mount.x, mount.y, mount.height)
+    )
+    T[:, 2, 3] += errors[:, 0]
+    return T

@@ -1,0 +1,1 @@
+"""Markers in images: blobs, sub-pixel centroids with covariances, AprilTags."""

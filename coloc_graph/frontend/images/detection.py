@@ -1,0 +1,336 @@
+"""Markers in images: white LEDs by brightness, coloured markers by hue, as candidates and as measured blobs.
+
+A candidate is what a tracker needs, quickly: roughly where, and the pixels around. A blob is what a measurement
+needs: the sub-pixel centre with its covariance, and what is doubtful about it. Candidates become blobs many at
+a time.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.frontend.images.centroid import at_points, axes, measure_first
+from coloc_graph.run.messages import Flag
+from coloc_graph.team import Camera, Markers
+
+Array = NDArray[np.float64]
+Pixels = NDArray[np.uint8]
+#: A rectangle of an image (u0, v0, u1, v1), u1 and v1 not included.
+Box = tuple[int, int, int, int]
+
+#: How far around a box is looked at [px]: more than the radius of the largest blob, and its margin.
+BORDER = 20
+#: How far around a box is looked at first [px].
+RIM = 4
+#: A box of at most so many pixels may hold one spot and nothing else.
+LONE = 400
+#: Pixels between a candidate and the border of its window.
+MARGIN = 3
+#: Windows come in these sizes [px], so that many are measured at once.
+SIZES = (11, 15, 21, 31, 45, 63)
+SIZE_FOR = [next(size for size in SIZES if size >= wanted) for wanted in range(SIZES[-1] + 1)]
+#: Windows are measured with larger ones while they are no more pixels than this then.
+FEW = 1 << 16
+#: Blobs that fit into a window of this size [px] are measured together where one lies in another's.
+TOGETHER = 31
+#: Larger ones [px] are lamps, for which there is no time.
+LED = 14
+#: A blob's peak is at least this many times the noise around it.
+LEAST_CONTRAST = 4.0
+#: Two spots touch where it is darker between them than this part of the darker one.
+DIP = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Blobs:
+    """Blobs of one image: `uv` (n, 2) [px], `covariance` (n, 2, 2) [px^2], `flags`, `peak`, `area` (n,)."""
+
+    uv: Array
+    covariance: Array
+    flags: NDArray[np.uint8]
+    peak: Array
+    area: Array
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    def __getitem__(self, which: NDArray[np.bool_]) -> "Blobs":
+        return Blobs(*(getattr(self, name)[which] for name in ("uv", "covariance", "flags", "peak", "area")))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Candidate:
+    """A blob as it was found: roughly its centre `uv` [px], and the `window` of light around it.
+
+    `corner` is the pixel (u, v) of the window's first element; `box` (left, top, width, height) [px in the
+    window] is what the blob covers above `level` [grey levels], `others` what other blobs there do. `touched` says that
+    one of these is too large to be measured with it.
+    """
+
+    uv: tuple[float, float]
+    area: int
+    window: NDArray[np.uint8] | NDArray[np.float32]
+    corner: tuple[int, int]
+    box: tuple[int, int, int, int]
+    level: float
+    clipped: bool
+    others: tuple[tuple[int, int, int, int], ...] = ()
+    touched: bool = False
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """What counts as a blob: so many grey levels above the background, so many pixels above that."""
+
+    levels: float = 35.0
+    min_area: int = 2
+    max_area: int = 1000
+    saturation: int = 250
+    elongation: float = 2.5  # longer than this many times its width: blurred
+    shot_gain: float = 0.1  # variance in grey levels^2 that one grey level of light adds
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Finds markers by brightness, or by hue where `hue_deg` is given (a grey image holds no hue, and no blob)."""
+
+    threshold: Threshold = field(default_factory=Threshold)
+    hue_deg: float | None = None
+    tolerance_deg: float = 18.0
+
+    def __call__(self, image: Pixels, box: Box | None = None) -> Blobs:
+        """The blobs (..., with their centres in the box, where one is given) of an image."""
+        blobs, real = self.measure(self.find(image, box))
+        if box is not None:
+            u, v = blobs.uv.T
+            real &= (u >= box[0] - 0.5) & (v >= box[1] - 0.5) & (u < box[2] - 0.5) & (v < box[3] - 0.5)
+        return blobs[real]
+
+    def light(self, part: Pixels) -> NDArray[np.uint8] | NDArray[np.float32]:
+        """What of a part of an image is a marker's light, (h, w) [grey levels]."""
+        if self.hue_deg is None:
+            return part if part.ndim == 2 else np.asarray(part.max(axis=2))
+        if part.ndim == 2:
+            return np.zeros(part.shape, np.uint8)
+        hsv = cv2.cvtColor(np.ascontiguousarray(part), cv2.COLOR_BGR2HSV).astype(np.float32)
+        off = np.abs((2 * hsv[..., 0] - self.hue_deg + 180) % 360 - 180)
+        # chroma is linear in the light, and noise in a dark pixel, whose hue is random, has little of it
+        chroma = hsv[..., 1] * hsv[..., 2] / 255
+        return np.where(off <= self.tolerance_deg, chroma, 0.0).astype(np.float32)
+
+    def find(self, image: Pixels, box: Box | None = None) -> list[Candidate]:
+        """Candidates in an image, or those whose centre lies in a box (a pixel more at its border)."""
+        u0, v0 = (max(box[0] - BORDER, 0), max(box[1] - BORDER, 0)) if box else (0, 0)
+        light = self.light(image[v0 : box[3] + BORDER, u0 : box[2] + BORDER] if box else image)
+        t = self.threshold
+        if box is None:
+            area = (0, 0, light.shape[1], light.shape[0])
+        else:  # the box and a rim; what is cut by the rim is looked at again with all that is around
+            left, top = max(box[0] - RIM - u0, 0), max(box[1] - RIM - v0, 0)
+            area = (left, top, min(box[2] + RIM - u0, light.shape[1]), min(box[3] + RIM - v0, light.shape[0]))
+        part = light[area[1] : area[3], area[0] : area[2]]
+        # some fifty pixels tell the median to a grey level, and a small list is sorted faster than an array
+        coarse = max(1, min(part.shape) // 6)
+        few = sorted(part[::coarse, ::coarse].ravel().tolist())
+        level = float(few[len(few) // 2]) + t.levels
+        blobs = _components(part, level)
+        if box is not None and any(_cut_off(blob, area, light.shape) for blob, _ in blobs):
+            area = (0, 0, light.shape[1], light.shape[0])
+            blobs = _components(light, level)
+        found = []
+        everything: list[tuple[list[int], list[float]]] | None = None
+        for (left, top, width, height, pixels), (x, y) in blobs:
+            left, top = left + area[0], top + area[1]
+            u, v = x + area[0] + u0, y + area[1] + v0
+            inside = box is None or (box[0] - 1 <= u < box[2] + 1 and box[1] - 1 <= v < box[3] + 1)
+            if inside and t.min_area <= pixels <= t.max_area:
+                clipped = left + u0 <= 0 or top + v0 <= 0
+                clipped |= left + u0 + width >= image.shape[1] or top + v0 + height >= image.shape[0]
+                own = (left, top, width, height)
+                window = _window(own, light.shape)
+                # any other light there?
+                around = light[window[1] : window[3], window[0] : window[2]]
+                group = [own]
+                touched = False
+                if max(width, height) <= LED and np.count_nonzero(around > level) > pixels:
+                    if everything is None:
+                        everything = _components(light, level)
+                    group, touched = _together(own, [tuple(blob) for blob, _ in everything], light.shape)
+                found.append(_cut(light, group, (u0, v0), (u, v), pixels, level, clipped, touched))
+        return found
+
+    def measure(self, candidates: Sequence[Candidate]) -> tuple[Blobs, NDArray[np.bool_]]:
+        """One blob a candidate, and which of them are real: the others (noise, a bright edge) mean nothing."""
+        n = len(candidates)
+        uv, covariance = np.zeros((n, 2)), np.zeros((n, 2, 2))
+        flags, peak, real = np.zeros(n, np.uint8), np.zeros(n), np.zeros(n, bool)
+        for rows in _alike([max(one.window.shape) for one in candidates]):
+            own = [candidates[row] for row in rows]
+            uv[rows], covariance[rows], flags[rows], peak[rows], real[rows] = self._measure(own)
+        return Blobs(uv, covariance, flags, peak, np.array([one.area for one in candidates], float)), real
+
+    def _measure(self, candidates: list[Candidate]) -> tuple[Array, Array, NDArray[np.uint8], Array, NDArray[np.bool_]]:
+        t = self.threshold
+        light, size = _padded([one.window for one in candidates])
+        boxes = np.array([box for one in candidates for box in (one.box, *one.others)])
+        counts = np.array([1 + len(one.others) for one in candidates])
+        window, first = np.repeat(np.arange(len(candidates)), counts), np.cumsum(counts) - counts
+        level = np.array([one.level for one in candidates])[:, None, None]
+        each = _in_boxes(light.shape, boxes) & (light > level)[window]
+        inner = each[first]
+        spots, touching = measure_first(light, size, each, window, t.levels, t.shot_gain)
+        peak = np.where(inner, spots.signal, 0.0).max(axis=(1, 2))
+        n = np.arange(len(candidates))
+        pixel = np.clip(np.rint(spots.centre), 0, size - 1).astype(int)
+        # a window that slid off its candidate found no spot there
+        on_it = inner[n, pixel[:, 1], pixel[:, 0]]
+        real = spots.found & on_it & (peak >= LEAST_CONTRAST * spots.noise)
+
+        short, long, along = axes(spots.shape)
+        # a spot, drawn out or not, has one hump along its long axis; two that touch have a dip between two
+        steps = np.linspace(-1.25, 1.25, 11)
+        points = spots.centre + steps[:, None, None] * (long[:, None] * along)
+        humps = at_points(spots.signal, np.tile(n, len(steps)), points.reshape(-1, 2), size).reshape(len(steps), -1)
+        dip = humps[3:8].min(axis=0) < DIP * np.minimum(humps[:5].max(axis=0), humps[6:].max(axis=0))
+        flags = np.zeros(len(candidates), np.uint8)
+        flags[(inner & (light >= t.saturation)).any(axis=(1, 2))] |= np.uint8(Flag.SATURATED)
+        flags[np.array([one.clipped for one in candidates])] |= np.uint8(Flag.CLIPPED)
+        flags[long > t.elongation * short] |= np.uint8(Flag.BLURRED)
+        touching |= np.array([one.touched for one in candidates])
+        flags[touching | ((long > 1.4 * short) & dip)] |= np.uint8(Flag.MERGED)
+        corners = np.array([one.corner for one in candidates], float)
+        return spots.centre + corners, spots.covariance, flags, peak, real
+
+
+def _components(light: NDArray[np.uint8] | NDArray[np.float32], level: float) -> list[tuple[list[int], list[float]]]:
+    """Connected pixels above a level: (left, top, width, height, pixels) and roughly the centre of each."""
+    above = cv2.threshold(light, level, 255, cv2.THRESH_BINARY)[1]
+    if above.dtype != np.uint8:
+        above = above.astype(np.uint8)
+    left, top, width, height = cv2.boundingRect(above)
+    if not width:
+        return []
+    if max(width, height) <= 1.5 * min(width, height) + 1 and width * height <= LONE:
+        # most patches hold one compact spot, which needs no labels: two apart would leave the box half empty
+        pixels = cv2.countNonZero(above)
+        if pixels >= 0.6 * width * height:
+            return [([left, top, width, height, pixels], [left + (width - 1) / 2, top + (height - 1) / 2])]
+    _, _, stats, centres = cv2.connectedComponentsWithStats(above, connectivity=8, ltype=cv2.CV_16U)
+    return list(zip(stats[1:].tolist(), centres[1:].tolist(), strict=True))
+
+
+def _cut_off(blob: list[int], area: Box, shape: tuple[int, ...]) -> bool:
+    """Whether a blob ends at the border of the area searched, where the light (h, w) goes on."""
+    left, top, width, height, _ = blob
+    return (
+        (left == 0 and area[0] > 0)
+        or (top == 0 and area[1] > 0)
+        or (left + width == area[2] - area[0] and area[2] < shape[1])
+        or (top + height == area[3] - area[1] and area[3] < shape[0])
+    )
+
+
+def _window(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> Box:
+    """The window of the least size that holds a box with a margin, moved to lie in the light (h, w)."""
+    left, top, width, height = box
+    wanted = max(width, height) + 2 * MARGIN
+    size = SIZE_FOR[wanted] if wanted < len(SIZE_FOR) else wanted
+    x = max(min(left + (width - size) // 2, shape[1] - size), 0)
+    y = max(min(top + (height - size) // 2, shape[0] - size), 0)
+    return x, y, x + size, y + size
+
+
+def _around(boxes: Sequence[tuple[int, int, int, int]]) -> tuple[int, int, int, int]:
+    """The box around boxes (left, top, width, height)."""
+    left, top = min(box[0] for box in boxes), min(box[1] for box in boxes)
+    return left, top, max(box[0] + box[2] for box in boxes) - left, max(box[1] + box[3] for box in boxes) - top
+
+
+def _together(
+    own: tuple[int, int, int, int], blobs: Sequence[tuple[int, ...]], shape: tuple[int, ...]
+) -> tuple[list[tuple[int, int, int, int]], bool]:
+    """The boxes of a blob and of all others (left, top, width, height, pixels) that must be measured with it, since
+    they lie in its window, or in that of all of them; or its own, and True, where that is too much."""
+    group = [own]
+    while True:
+        window = _window(_around(group), shape)
+        if window[2] - window[0] > TOGETHER or max(max(box[2:]) for box in group) > LED:
+            return [own], True
+        more = [
+            blob
+            for blob in blobs
+            if blob[0] < window[2]
+            and blob[1] < window[3]
+            and blob[0] + blob[2] > window[0]
+            and blob[1] + blob[3] > window[1]
+            and blob[:4] not in group
+        ]
+        if not more:
+            return group, False
+        group += [(blob[0], blob[1], blob[2], blob[3]) for blob in more]
+
+
+def _cut(
+    light: NDArray[np.uint8] | NDArray[np.float32],
+    group: Sequence[tuple[int, int, int, int]],
+    origin: tuple[int, int],
+    uv: tuple[float, float],
+    area: int,
+    level: float,
+    clipped: bool,
+    touched: bool,
+) -> Candidate:
+    """A candidate with its window, which holds all boxes of a group, the first of which is its own."""
+    x, y, end_x, end_y = _window(_around(group), light.shape)
+    box, *others = ((left - x, top - y, width, height) for left, top, width, height in group)
+    window = light[y:end_y, x:end_x].copy()
+    corner = (x + origin[0], y + origin[1])
+    return Candidate(uv, area, window, corner, box, level, clipped, tuple(others), touched)
+
+
+def _alike(sizes: Sequence[int]) -> list[list[int]]:
+    """Which windows of so many pixels a side are measured together, those that are few as if they were larger."""
+    order = sorted(range(len(sizes)), key=sizes.__getitem__)
+    together: list[list[int]] = []
+    for size, rows in groupby(order, key=sizes.__getitem__):
+        if not together or len(together[-1]) * size**2 > FEW:
+            together.append([])
+        together[-1] += rows
+    return together
+
+
+def _padded(windows: Sequence[NDArray[np.uint8] | NDArray[np.float32]]) -> tuple[Array, NDArray[np.int64]]:
+    """Windows of several sizes in one array (n, h, w), and their sizes (n, 2) [px: u, v]."""
+    shapes = np.array([window.shape for window in windows])
+    light = np.zeros((len(windows), *shapes.max(axis=0)))
+    for row, window in zip(light, windows, strict=True):
+        row[: window.shape[0], : window.shape[1]] = window
+    return light, shapes[:, ::-1]
+
+
+def _in_boxes(shape: tuple[int, ...], boxes: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which pixels (m, h, w) of windows lie in boxes (m, 4)."""
+    left, top, width, height = boxes.T[..., None]
+    x, y = np.arange(shape[2]), np.arange(shape[1])
+    in_x, in_y = (x >= left) & (x < left + width), (y >= top) & (y < top + height)
+    return np.asarray(in_y[..., :, None] & in_x[..., None, :])
+
+
+def detector_for(markers: Markers | None, camera: Camera | None = None) -> Detector:
+    """The detector of a kind of marker in a camera: by brightness, or by hue where the markers have one."""
+    threshold = Threshold(shot_gain=camera.shot_gain) if camera is not None else Threshold()
+    return Detector(threshold, markers.hue_deg if markers is not None else None)
+
+
+def detect_leds(image: Pixels, box: Box | None = None, threshold: Threshold | None = None) -> Blobs:
+    """Bright blobs in a grey (or BGR) image, optionally only in a box of it."""
+    return Detector(threshold or Threshold())(image, box)
+
+
+def detect_hue(image: Pixels, box: Box | None = None, *, hue_deg: float, threshold: Threshold | None = None) -> Blobs:
+    """Blobs of one hue (degrees, HSV) in a BGR image: pixels whose hue is near it and that are not pale."""
+    return Detector(threshold or Threshold(), hue_deg)(image, box)

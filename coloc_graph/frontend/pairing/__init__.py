@@ -1,0 +1,1 @@
+"""Correspondences between two cameras: time, identity, clock offset, and checks on them."""

@@ -1,0 +1,53 @@
+"""One offset of two clocks for all stances of a run: clocks drift slowly, and one stance alone may not tell."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+
+from coloc_graph.frontend.pairing.clock_offset import DISAGREEMENT, ClockOffset, fuse
+from coloc_graph.frontend.stance import LEAST_OBSERVED, NOT_OBSERVABLE, PairMeasurement
+
+
+def share_clock_offsets(
+    measurements: Sequence[PairMeasurement], clock_sigma: float, before: Sequence[PairMeasurement] = ()
+) -> tuple[tuple[PairMeasurement, ...], list[str]]:
+    """Measurements made once more with the offset that all stances of a pair know together, and warnings.
+
+    `clock_sigma` [s] is how well the clocks are said to agree; where it is 0 nothing changes. A pair's offset is
+    the weighted mean of what its stances and the prior know, and its uncertainty is in each homography's information.
+    What was measured `before` has its say in it, and is not measured again.
+    """
+    if clock_sigma == 0:
+        return tuple(measurements), []
+    evidence: dict[tuple[str, str], list[ClockOffset]] = defaultdict(list)
+    for one in (*before, *measurements):
+        pair, known = _in_order(one, one.offset_evidence)
+        evidence[pair] += [known] if known is not None else []
+    warnings: list[str] = []
+    fused: dict[tuple[str, str], ClockOffset] = {}
+    for pair, known_by_stances in evidence.items():
+        fused[pair], chance = fuse(known_by_stances, ClockOffset(0.0, clock_sigma))
+        if chance < DISAGREEMENT:
+            values = [1e3 * one.value for one in known_by_stances]
+            warnings.append(
+                f"the stances disagree on the offset of the clocks of {pair[0]} and {pair[1]} ({min(values):.1f} to "
+                f"{max(values):.1f} ms): the clocks drift or were set during the run: synchronise them, "
+                "or split the run"
+            )
+        if fused[pair].sigma > LEAST_OBSERVED * clock_sigma:
+            warnings.append(f"{pair[0]} and {pair[1]}: {NOT_OBSERVABLE}")
+    shared = []
+    for one in measurements:
+        pair, _ = _in_order(one, None)
+        offset = fused[pair] if pair == (one.homography.robot_i, one.homography.robot_j) else fused[pair].reversed()
+        again = one if one.at_offset is None else one.at_offset(offset)
+        shared.append(replace(again, offset_evidence=one.offset_evidence, at_offset=None))
+    return tuple(shared), warnings
+
+
+def _in_order(one: PairMeasurement, offset: ClockOffset | None) -> tuple[tuple[str, str], ClockOffset | None]:
+    """The pair's names in alphabetical order, and the offset of the second's clock from the first's."""
+    i, j = one.homography.robot_i, one.homography.robot_j
+    if i < j:
+        return (i, j), offset
+    return (j, i), offset and offset.reversed()

@@ -1,0 +1,315 @@
+"""The offset between two cameras' clocks as the ninth parameter of their homography.
+
+A marker that camera i sees at t by its clock is seen by camera j at t + offset by j's: offset = clock_j - clock_i.
+Tracks of j are interpolated at i's instants plus the offset; how fast they move there is the offset's Jacobian.
+
+Samples bring noise to that speed, and a speed that is nothing but noise would pass for knowledge of the offset. So
+the equations are solved with a smoothed speed as instrument, what noise alone contributes to them is drawn and taken
+off, and the offset counts as observed only where more is left than noise can make. A motion whose shift in time is a
+homography itself (a straight line or an arc at constant speed) leaves nothing: the offset then stays at its prior,
+and the homography's covariance says what that means for it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.stats import chi2 as chi2_distribution
+
+from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.frontend.homography.fit import (
+    INLIER_GATE,
+    MEDIAN_CHI2,
+    MINIMUM_POINTS,
+    WIDEST_SCALE,
+    HomographyFit,
+    fit_homography,
+)
+from coloc_graph.frontend.homography.refinement import Criterion, PointPairs, squared_residuals
+from coloc_graph.frontend.pairing.correspondence import Correspondences
+from coloc_graph.frontend.tracks.paired_tracks import PairedTracks, Shifted
+from coloc_graph.geometry.lie import SL3_BASIS, sl3_exp
+
+Array = NDArray[np.float64]
+Used = NDArray[np.bool_]
+
+#: Clocks that agree no better than this are not searched for their offset [s].
+WORST_CLOCKS = 0.25
+#: How far from its prior an offset is searched, in sigmas, and in how many places at most.
+SEARCH_SIGMAS = 4.0
+SEARCH_PLACES = 41
+#: How many standard deviations of what noise makes the information on the offset has to exceed.
+NOISE_SIGMAS = 4.0
+#: Chance below which stances that disagree on the offset are said to.
+DISAGREEMENT = 1e-3
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """What is known of clock_j - clock_i: `value` and its standard deviation `sigma` [s]."""
+
+    value: float
+    sigma: float
+
+    def reversed(self) -> "ClockOffset":
+        """clock_i - clock_j."""
+        return ClockOffset(-self.value, self.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class ClockFit:
+    """A homography fitted together with the offset of the clocks.
+
+    `fit.information` is that of H alone, with the offset's uncertainty in it; `information` (9, 9) that of H and
+    the offset [s]; H changes by `by_offset` (8,) where the offset grows by 1 s. `found` has camera j's points at the
+    instants of camera i's. `offset` is what is known of it.
+    """
+
+    fit: HomographyFit
+    found: Correspondences
+    information: Array
+    offset: ClockOffset
+    by_offset: Array
+
+
+def find_offset(
+    tracks: "PairedTracks", start: Correspondences, prior: ClockOffset
+) -> tuple[ClockOffset, ClockOffset | None]:
+    """The offset by maximum likelihood, from a search over the prior: with the prior, and what the tracks alone say
+    (None: nothing).
+
+    `start` are correspondences whose covariances allow for the prior's sigma. Raises `DegenerateGeometry` where
+    the clocks may differ by more than is searched, or the points do not determine a homography.
+    """
+    require_searchable(prior)
+    guess, H = _search(tracks, fit_homography(start.pairs).H, prior)
+    evidence = _evidence(tracks, H, guess, prior)
+    return _combined(prior, evidence), evidence
+
+
+def require_searchable(prior: ClockOffset) -> None:
+    """Raises `DegenerateGeometry` where clocks may differ by more than is searched."""
+    if prior.sigma > WORST_CLOCKS:
+        raise DegenerateGeometry(
+            f"the clocks are said to agree to {prior.sigma:g} s only, and offsets are searched for up to a sigma of "
+            f"{WORST_CLOCKS:g} s: synchronise the clocks"
+        )
+
+
+def fit_at_offset(
+    tracks: "PairedTracks",
+    offset: ClockOffset,
+    criterion: Criterion = "reprojection",
+) -> ClockFit:
+    """H with the offset at a value known to its sigma, which H's information then contains."""
+    at = tracks.at(offset.value)
+    valid = np.flatnonzero(at.interpolated.valid)
+    found = tracks.correspondences(at, valid)
+    fit = fit_homography(found.pairs, criterion)
+    kept = valid[fit.inliers]
+    system = _System(tracks, at, fit.H, kept)
+    H, chi2, iterations = fit.H, fit.chi2, fit.iterations
+    if criterion == "reprojection":
+        # the robust fit takes points for independent; points between the same samples are not
+        for iterations in range(1, 11):
+            step = np.asarray(np.linalg.solve(system.by_H, system.score_H), float)
+            H = H @ sl3_exp(step)
+            system = _System(tracks, at, H, kept, system.moved(step))
+            if step @ system.by_H @ step < 1e-12:
+                break
+        chi2 = system.chi2
+        information = system.by_H * _scale(chi2, fit.dof)
+        by_offset = np.asarray(np.linalg.solve(system.by_H, system.by_H_offset), float)
+    else:
+        information = fit.information
+        A, v = system.A.reshape(-1, 8), system.slope.ravel()
+        by_offset = np.asarray(np.linalg.lstsq(A, v, rcond=None)[0], float)
+    squared = squared_residuals(H, found.pairs)
+    own = np.linalg.inv(information)
+    marginal = np.asarray(np.linalg.inv(own + offset.sigma**2 * np.outer(by_offset, by_offset)), float)
+    joint = np.zeros((9, 9))
+    joint[:8, :8] = information
+    joint[:8, 8] = joint[8, :8] = -information @ by_offset
+    joint[8, 8] = by_offset @ information @ by_offset + 1 / offset.sigma**2
+    whole = HomographyFit(H, marginal, fit.inliers, squared, chi2, fit.dof, iterations)
+    return ClockFit(whole, found, joint, offset, by_offset)
+
+
+def fuse(evidence: Sequence[ClockOffset], prior: ClockOffset) -> tuple[ClockOffset, float]:
+    """One offset from what several stances know of it, and how likely they disagree as much by chance.
+
+    Where they disagree beyond chance the sigma is as much larger as they do (never smaller).
+    """
+    if not evidence:
+        return prior, 1.0
+    values, weights = np.array([e.value for e in evidence]), np.array([e.sigma**-2 for e in evidence])
+    mean = float(weights @ values / weights.sum())
+    chi2, dof = float(weights @ (values - mean) ** 2), len(evidence) - 1
+    chance = float(chi2_distribution.sf(chi2, dof)) if dof else 1.0
+    spread = max(1.0, chi2 / dof) if dof and chance < 0.05 else 1.0
+    return _combined(prior, ClockOffset(mean, float(np.sqrt(spread / weights.sum())))), chance
+
+
+def _combined(prior: ClockOffset, evidence: ClockOffset | None) -> ClockOffset:
+    if evidence is None:
+        return prior
+    a, b = prior.sigma**-2, evidence.sigma**-2
+    return ClockOffset((a * prior.value + b * evidence.value) / (a + b), float((a + b) ** -0.5))
+
+
+def _parts(H: Array, z: Array) -> tuple[Array, Array, Array]:
+    """pi(H z) (n, 2), its derivative by z (n, 2, 2), and by the coordinates of H on the right (n, 2, 8)."""
+    z1 = np.concatenate([z, np.ones((len(z), 1))], axis=1)
+    Y = z1 @ H.T
+    w = 1 / Y[:, 2]
+    p = Y[:, :2] * w[:, None]
+    J = np.zeros((len(z), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = w
+    J[:, :, 2] = -p * w[:, None]
+    by_h = ((J @ H)[..., None] * z1[:, None, None, :]).reshape(len(z), 2, 9) @ SL3_BASIS.reshape(8, 9).T
+    return p, J @ H[:, :2], by_h
+
+
+class _System:
+    """The equations of H and the offset, linearised at k points `which` and their true places z (k, 2) in image i.
+
+    Residual = A h - speed * offset, with a covariance in which points that share samples are correlated.
+    """
+
+    def __init__(
+        self, tracks: PairedTracks, at: Shifted, H: Array, which: NDArray[np.int64], z: Array | None = None
+    ) -> None:
+        self._z = tracks.x_i[which] if z is None else z
+        p, self._by_z, self.A = _parts(H, self._z)
+        self._r_i, self._C_i = tracks.x_i[which] - self._z, tracks.covariance_i[which]
+        self.residual = (at.x[which] - p - (self._by_z @ self._r_i[..., None])[..., 0]).ravel()
+        from_i = self._by_z @ self._C_i @ self._by_z.swapaxes(1, 2)
+        band = tracks.noise_j(at, which)
+        band[0] += from_i[:, [0, 1], [0, 1]].ravel()
+        band[1, ::2] += from_i[:, 1, 0]
+        self._factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
+        self.slope = at.slope[which]
+        flat = self.A.reshape(-1, 8)
+        self._weighted = self._solve(np.column_stack([flat, self.residual, self.slope.ravel()]))
+        self.by_H = flat.T @ self._weighted[:, :8]
+        self.score_H = flat.T @ self._weighted[:, 8]
+        self.by_H_offset = flat.T @ self._weighted[:, 9]
+        self.chi2 = float(self.residual @ self._weighted[:, 8])
+
+    def _solve(self, right: Array) -> Array:
+        return np.asarray(cho_solve_banded((self._factor, True), right, check_finite=False))
+
+    def moved(self, step: Array, offset: float = 0.0, speed: Array | None = None) -> Array:
+        """The points' places z (k, 2) once H and the offset have taken a step."""
+        left = self.residual - self.A.reshape(-1, 8) @ step
+        if speed is not None:
+            left = left + offset * speed.ravel()
+        back = self._by_z.swapaxes(1, 2) @ self._solve(left).reshape(-1, 2, 1)
+        return np.asarray(self._z + self._r_i + (self._C_i @ back)[..., 0])
+
+    def offset_equation(self, speed: Array, drawn: tuple[Array, Array, Array]) -> tuple[float, float, float, float]:
+        """With H eliminated: the offset's score and information, the score's variance, and the standard deviation
+        of the information that noise makes. What noise makes of the first two on average is taken off."""
+        flat = self.A.reshape(-1, 8)
+        instrument = self.slope.ravel()
+        gain = np.linalg.solve(self.by_H, self.by_H_offset)
+        across = self._weighted[:, 9] - self._weighted[:, :8] @ gain
+        position, derivative, slope = drawn
+        weighted = self._solve(slope)
+        projected = weighted - self._weighted[:, :8] @ np.linalg.solve(self.by_H, flat.T @ weighted)
+        made = (projected * derivative).sum(axis=0)
+        information = float(across @ speed.ravel() - made.mean())
+        score = float(-(across @ self.residual) + (projected * position).sum(axis=0).mean())
+        return score, information, float(instrument @ across), float(made.std())
+
+
+def _scale(chi2: float, dof: int) -> float:
+    """What the information is multiplied by where residuals are larger than the noise explains."""
+    return dof / chi2 if chi2 > dof + 3 * np.sqrt(2 * dof) else 1.0
+
+
+def _gated(squared: Array, valid: Used, among: Used) -> Used:
+    """Points within the gate, which widens with the typical residual of those that agree so far."""
+    agree = among & valid
+    scale = np.median(squared[agree]) / MEDIAN_CHI2 if agree.any() else 1.0
+    return np.asarray(valid & (squared < INLIER_GATE * np.clip(scale, 1.0, WIDEST_SCALE)))
+
+
+def _evidence(
+    tracks: PairedTracks, H: Array, offset: float, prior: ClockOffset, rounds: int = 15
+) -> ClockOffset | None:
+    """What the tracks alone say of the offset; None where it is no more than noise says."""
+    used = np.ones(len(tracks), bool)
+    z_all, draws = tracks.x_i.copy(), tracks.draws()
+    for round_ in range(rounds):
+        at = tracks.at(offset)
+        if round_ < rounds // 2:
+            squared = squared_residuals(H, tracks.pairs(at, np.arange(len(tracks))))
+            used = _gated(squared, at.interpolated.valid, used)
+        which = np.flatnonzero(used)
+        if len(which) < MINIMUM_POINTS:
+            return None
+        system = _System(tracks, at, H, which, z_all[which])
+        speed = tracks.speed(at, which)
+        score, information, variance, fluctuation = system.offset_equation(speed, tracks.drawn(at, which, draws))
+        if information <= NOISE_SIGMAS * fluctuation:
+            return None
+        step = float(np.clip(score / information, -prior.sigma, prior.sigma))
+        h = np.asarray(np.linalg.solve(system.by_H, system.score_H + system.by_H_offset * step), float)
+        z_all[which] = system.moved(h, step, speed)
+        H, offset = H @ sl3_exp(h), offset + step
+        if abs(offset - prior.value) > 1.5 * SEARCH_SIGMAS * prior.sigma:
+            return None
+        sigma = float(np.sqrt(variance) / information)
+        if abs(step) < 1e-3 * sigma and round_ >= 2:
+            break
+    sigma /= np.sqrt(_scale(system.chi2, 2 * len(which) - 9))
+    return ClockOffset(offset, sigma)
+
+
+def _search(tracks: PairedTracks, H: Array, prior: ClockOffset) -> tuple[float, Array]:
+    """The offset within the prior's reach at which one homography explains most, and that homography."""
+    at = tracks.at(prior.value)
+    sigma = tracks.pairs(at, np.arange(len(tracks))).sigma
+    valid = at.interpolated.valid
+    fastest = float(np.quantile(np.hypot(*at.slope[valid].T), 0.9)) if valid.any() else 0.0
+    reach = SEARCH_SIGMAS * prior.sigma
+    # half a step must not take a point further than the gate is wide
+    places = int(np.clip(2 * np.ceil(reach * fastest / (4 * sigma)) + 1, 3, SEARCH_PLACES))
+    offsets = prior.value + np.linspace(-reach, reach, places)
+    candidates = []
+    for offset in offsets:
+        at = tracks.at(float(offset))
+        which = np.flatnonzero(at.interpolated.valid)
+        if len(which) >= MINIMUM_POINTS:
+            refined, cost = _robust(H, tracks.pairs(at, which))
+            candidates.append((float(offset), len(which), cost, refined))
+    if not candidates:
+        raise DegenerateGeometry(
+            "no track of one observer goes on while the other sees the marker: record at 10 or more images a second, "
+            "and check the clocks"
+        )
+    most = max(n for _, n, _, _ in candidates)
+    enough = [c for c in candidates if c[1] >= max(MINIMUM_POINTS, most // 3)]
+    best = min(enough, key=lambda c: most * c[2] + ((c[0] - prior.value) / prior.sigma) ** 2)
+    return best[0], best[3]
+
+
+def _robust(H: Array, pairs: PointPairs) -> tuple[Array, float]:
+    """H and its mean cost, which grows no more once a point is beyond the gate (Geman and McClure's)."""
+    for gate in (2500.0, 400.0, 80.0, INLIER_GATE, INLIER_GATE):
+        p, by_z, A = _parts(H, pairs.x_i)
+        S = pairs.covariance_j + by_z @ pairs.covariance_i @ by_z.swapaxes(1, 2)
+        residual = pairs.x_j - p
+        weighted = np.linalg.solve(S, np.concatenate([A, residual[..., None]], axis=2))
+        squared = np.einsum("nk,nk->n", residual, weighted[..., 8])
+        w = (gate / (gate + squared)) ** 2
+        normal = np.einsum("n,nka,nkb->ab", w, A, weighted[..., :8])
+        step, *_ = np.linalg.lstsq(normal, np.einsum("n,nka,nk->a", w, A, weighted[..., 8]), rcond=1e-14)
+        if not np.abs(step).max() < 1.0:
+            break
+        H = H @ sl3_exp(step)
+    squared = squared_residuals(H, pairs)
+    return H, float((squared * INLIER_GATE / (squared + INLIER_GATE)).mean())

@@ -1,0 +1,74 @@
+"""Which pairs of observers are measured, and what several of them measure of the same pixels, which counts once."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from coloc_graph.frontend.pairing.correspondence import Correspondences, pair_each_by_time
+from coloc_graph.frontend.tracks.tracking import Track
+
+#: Of many observers each is measured with so many others at least: those with which it has most in common.
+PARTNERS = 4
+
+Pair = tuple[str, str]
+
+
+def pairs_of(observers: Sequence[str], tracks: Mapping[str, Sequence[Track]], window: float) -> list[Pair]:
+    """The pairs of observers that are measured: all, or of many those that have most samples in common."""
+    every = list(itertools.combinations(observers, 2))
+    if len(observers) <= PARTNERS + 1:
+        return every
+    series, of = [], []
+    for number, (i, j) in enumerate(every):
+        for a, b in itertools.product(tracks[i], tracks[j]):
+            if a.marker == b.marker or not (a.marker and b.marker):
+                series.append((a.times, b.times))
+                of.append(number)
+    which, _ = pair_each_by_time(series, window)
+    counts = np.bincount(np.array(of, np.int64)[which], minlength=len(every))
+    common = dict(zip(every, counts.tolist(), strict=True))
+    best: set[Pair] = set()
+    for one in observers:
+        own = sorted((pair for pair in every if one in pair), key=lambda pair: -common[pair])
+        best.update(own[:PARTNERS])
+    return [pair for pair in every if pair in best]
+
+
+def share(
+    found: Correspondences,
+    pair: Pair,
+    pairs: Sequence[Pair],
+    tracks: Mapping[str, Sequence[Track]],
+    window: float,
+) -> float:
+    """The part of a pair's information that is its own, of all `pairs` that are measured.
+
+    A point that n observers see is in up to n (n - 1) / 2 homographies, each made of two images' noise. What is known
+    of it altogether is the sum of all of them times 2 / n: sum_i |x_i - mean|^2 = sum_{i<j} |x_i - x_j|^2 / n; of
+    m of them, n - 1 images' worth. Markers without names may be any.
+    """
+    if len(pairs) < 2:
+        return 1.0
+    names = [*pair, *(name for name in tracks if name not in pair)]
+    seen = np.zeros((len(names), len(found)), bool)
+    seen[:2] = True
+    series, of = [], []
+    for number in np.unique(found.markers):
+        own = np.flatnonzero(found.markers == number)
+        marker, times = tracks[pair[0]][number].marker, found.times[own]
+        for there, name in zip(seen[2:], names[2:], strict=True):
+            for track in tracks[name]:
+                if track.marker == marker or not (track.marker and marker):
+                    series.append((times, track.times))
+                    of.append((there, own))
+    which, indices = pair_each_by_time(series, window)
+    ends = np.searchsorted(which, np.arange(len(series) + 1))
+    for (there, own), begin, end in zip(of, ends[:-1], ends[1:], strict=True):
+        there[own[indices[begin:end, 0]]] = True
+    measured = np.zeros((len(names), len(names)))
+    places = {name: place for place, name in enumerate(names)}
+    for i, j in pairs:
+        measured[places[i], places[j]] = 1.0
+    among = ((measured @ seen) * seen).sum(axis=0)
+    return float(np.minimum(1.0, (seen.sum(axis=0) - 1) / np.maximum(among, 1.0)).mean())

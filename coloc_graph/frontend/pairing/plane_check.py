@@ -1,0 +1,66 @@
+"""Whether what a camera saw of the movers can lie on the marker plane that is said to be there."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.frontend.homography.plane import on_plane
+from coloc_graph.frontend.pairing.correspondence import Correspondences
+from coloc_graph.frontend.stance_tracks import stance_plane
+from coloc_graph.measurements import Plane
+from coloc_graph.run import Recorded, Stance
+from coloc_graph.team import Camera
+
+#: No LED is made out further away than this [m].
+FARTHEST = 20.0
+#: The share by which the markers' span may look wrong: a tilt that is off by a degree makes 15 % at 2 m.
+SPAN_TOLERANCE = 0.30
+
+
+def implausible(run: Recorded, stance: Stance, robot: str, found: Correspondences) -> str | None:
+    """Why the marker plane of an observer contradicts what it saw (`uv_i` of `found`), in words; None where not.
+
+    Seen on the plane, the markers must be in front of the camera and near, and the two of a mover their known
+    span apart.
+    """
+    camera = run.team[robot].camera
+    try:
+        plane = stance_plane(run, stance, robot)
+    except DegenerateGeometry:
+        return None  # said elsewhere
+    stated = stance.index in run.planes and robot in run.planes[stance.index].planes
+    remedy = "correct the stated plane (metres?)" if stated else "correct heights, tilt or units (metres?) in the team"
+    distance = np.linalg.norm(on_plane(camera.normalise(found.uv_i), plane), axis=1)
+    if not np.isfinite(distance).mean() > 0.5:
+        return f"{robot} saw the markers above the horizon of the marker plane: {remedy}"
+    if np.nanmedian(distance) > FARTHEST:
+        return f"on the marker plane the markers would be {np.nanmedian(distance):.0f} m away from {robot}: {remedy}"
+    span = _known_span(run, stance)
+    seen = _seen_span(found, camera, plane)
+    if span is not None and seen is not None and abs(seen[0] - span) > SPAN_TOLERANCE * span + seen[1]:
+        return (
+            f"on the marker plane of {robot} the two markers would be {seen[0]:.2f} m apart, and the team says "
+            f"{span:.2f} m: {remedy}, or the markers' positions"
+        )
+    return None
+
+
+def _known_span(run: Recorded, stance: Stance) -> float | None:
+    """The distance between the two markers that move [m]; None where not just two do."""
+    carried = [markers for name in stance.movers if (markers := run.team[name].markers) is not None]
+    return carried[0].span if len(carried) == 1 and len(carried[0].positions) == 2 else None
+
+
+def _seen_span(found: Correspondences, camera: Camera, plane: Plane) -> tuple[float, float] | None:
+    """Distance on the plane of the points that are seen two at once [m], median and scatter; None where hardly any."""
+    order: NDArray[np.int64] = np.argsort(found.times, kind="stable")
+    _, first, count = np.unique(found.times[order], return_index=True, return_counts=True)
+    a = order[first[count == 2]]
+    b = order[first[count == 2] + 1]
+    x = camera.normalise(found.uv_i)
+    apart = np.linalg.norm(on_plane(x[a], plane) - on_plane(x[b], plane), axis=1)
+    apart = apart[np.isfinite(apart)]
+    if len(apart) < 3:
+        return None
+    middle = np.median(apart)
+    return float(middle), float(1.4826 * np.median(np.abs(apart - middle)))

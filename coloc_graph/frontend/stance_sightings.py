@@ -1,0 +1,77 @@
+"""Which robots saw which others in a stance: those that moved, and those that stood."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.frontend.homography.plane import plane_from_mount
+from coloc_graph.frontend.odometry import WheelTrack
+from coloc_graph.frontend.sighting import at_rest, sight
+from coloc_graph.frontend.stance import PairMeasurement
+from coloc_graph.frontend.stance_tracks import stance_plane
+from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.measurements import Sighting
+from coloc_graph.run import Recorded, Stance
+
+
+def sight_movers(
+    run: Recorded, stance: Stance, measured: Iterable[PairMeasurement], wheels: Mapping[str, WheelTrack]
+) -> list[Sighting]:
+    """Where the moving robots were in a stance, by the observer that saw each best; nothing without a floor.
+
+    `measured` are all pairs of the stance. A robot whose markers cannot be told apart, or are never seen at once, is
+    not in the list; tracks without names are followed where one robot moves alone, or has a colour of its own.
+    """
+    if run.team.floor is None or stance.index in run.planes:
+        return []
+    tracks: dict[str, list[Track]] = {}
+    for one in measured:
+        if one.tracks is not None:
+            for observer, seen in zip((one.homography.robot_i, one.homography.robot_j), one.tracks, strict=True):
+                tracks.setdefault(observer, seen)
+    best: dict[str, Sighting] = {}
+    for observer, seen in tracks.items():
+        try:
+            plane = stance_plane(run, stance, observer)
+        except DegenerateGeometry:  # a camera below the markers, which the homography's refusal names
+            continue
+        for mover in stance.movers:
+            named = len(stance.movers) == 1 or any(track.marker for track in seen)
+            own = seen if named else [track for track in seen if track.mover == mover]
+            sighting = sight(stance, run.team[observer], run.team[mover], own, plane, wheels.get(mover))
+            before = best.get(mover)
+            if sighting is not None and (before is None or np.trace(sighting.covariance) < np.trace(before.covariance)):
+                best[mover] = sighting
+    return list(best.values())
+
+
+def sight_standing(
+    run: Recorded, stance: Stance, measured: Iterable[PairMeasurement], before: Stance | None
+) -> list[Sighting]:
+    """Where robots that stand saw others that stand, whose markers have names; nothing without a floor.
+
+    A stance is told by what came since the one `before`: two that have stood since then see no more of each other than
+    they did.
+    """
+    if run.team.floor is None or stance.index in run.planes:
+        return []
+    stayed = {name for name in stance.anchors if before is not None and name in before.observers}
+    tracks: dict[str, list[Track]] = {}
+    for one in measured:
+        for observer, seen in zip((one.homography.robot_i, one.homography.robot_j), one.standing, strict=True):
+            tracks.setdefault(observer, seen)
+    made = []
+    for observer, standing in tracks.items():
+        still = [at_rest(track, stance.start) for track in standing]
+        for name in dict.fromkeys(track.marker[: track.marker.rfind("/")] for track in standing):
+            markers = run.team[name].markers
+            if markers is None or (observer in stayed and name in stayed):
+                continue
+            try:
+                plane = plane_from_mount(run.team[observer].mount, markers, run.team.floor)
+            except DegenerateGeometry:  # a camera below these markers
+                continue
+            sighting = sight(stance, run.team[observer], run.team[name], still, plane)
+            made += [] if sighting is None else [sighting]
+    return made

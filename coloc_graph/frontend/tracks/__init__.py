@@ -1,0 +1,1 @@
+"""Marker tracks in one camera: tracking, blink codes, marker pairs, interpolation."""

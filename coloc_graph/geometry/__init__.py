@@ -1,0 +1,1 @@
+"""Lie groups and trajectories, with numpy alone."""

@@ -1,0 +1,260 @@
+"""One stance after the other: measured when it is over, and entered; on a logged run as on a team in the field."""
+
+import time
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import get_args
+
+from coloc_graph.backend import Estimator, Method, StanceEstimate, loosened
+from coloc_graph.backend.graph import PoseKeys, slips_of
+from coloc_graph.backend.landmarks import landmarks_of
+from coloc_graph.errors import ColocError, InputError
+from coloc_graph.frontend import (
+    Doubt,
+    FrontendOptions,
+    PairMeasurement,
+    Scale,
+    StanceTracks,
+    WheelTrack,
+    measure_pair,
+    measured_pairs,
+    share_clock_offsets,
+    sight_landmarks,
+    sight_movers,
+    sight_standing,
+)
+from coloc_graph.measurements import Measurement, Odometry, Sighting
+from coloc_graph.run import OdometrySample, Recorded, Stance
+from coloc_graph.team import Robot, Team
+
+METHODS: tuple[Method, ...] = get_args(Method)
+
+#: Where the scale comes from the markers' span alone, the heights of cameras are known no better than this [m].
+UNKNOWN_HEIGHT = 0.1
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """Everything that a result depends on besides the run.
+
+    `chain` is the paper: homographies by least squares in one image, eq. (2), composition. `smooth` takes
+    maximum-likelihood homographies and relative poses into a pose graph, with `odometry` and where the movers are
+    seen. `joint` takes the homographies themselves, and calibrates mounts, markers and clocks along with the poses.
+    `incremental` measures and enters stance by stance, as a team in the field would.
+    """
+
+    method: Method = "joint"
+    frontend: FrontendOptions | None = None
+    odometry: bool = True
+    incremental: bool = False
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InputError(f"there is no method `{self.method}`; choose one of {', '.join(METHODS)}")
+        if self.incremental and self.method == "chain":
+            raise InputError("a chain is composed, and never incremental: leave out `incremental`, or use joint")
+
+    def resolved(self) -> "SolveOptions":
+        """With the front end that belongs to the method, where none is chosen."""
+        if self.frontend is not None:
+            return self
+        paper = FrontendOptions(criterion="transfer", pose="eq2")
+        return replace(self, frontend=paper if self.method == "chain" else FrontendOptions())
+
+    @property
+    def by_span(self) -> bool:
+        """Whether the scale comes from the markers' span alone."""
+        return self.frontend is not None and self.frontend.scale == "span"
+
+    def rigs(self, team: Team) -> dict[str, Robot]:
+        """The robots that a joint estimate calibrates; none of another method."""
+        if self.method != "joint":
+            return {}
+        rigs = {robot.name: robot for robot in team.robots}
+        return dict(loosened(rigs, UNKNOWN_HEIGHT)) if self.by_span else rigs
+
+
+def measure_stance(
+    run: Recorded, stance: Stance, options: SolveOptions, tracks: StanceTracks | None = None
+) -> Iterator[PairMeasurement]:
+    """What each pair of observers measured in a stance, one after the other, but for the offset of their clocks, which
+    all stances know together: `share_clock_offsets`."""
+    frontend = options.resolved().frontend
+    assert frontend is not None
+    # a joint estimate takes the scale from the spans by itself, and the heights for a start
+    scale: Scale = "heights" if options.method == "joint" else frontend.scale
+    tracks = tracks or StanceTracks(run, stance, frontend.tracker)
+    pairs = measured_pairs(tracks, stance.end)
+    for pair in pairs:
+        yield measure_pair(run, stance, *pair, replace(frontend, scale=scale), tracks, pairs, alone=False)
+
+
+class OdometryAndSightings:
+    """Where the movers were seen, and what the wheels say of each robot's way from one pose to its next.
+
+    Takes the stances in their order; needs of the odometry what is between two poses, no more.
+    """
+
+    def __init__(self, team: Team, *, odometry: bool = True) -> None:
+        self.team, self._odometry = team, odometry
+        self._places = PoseKeys(team.names, slips_of(team))
+        self._sighted: set[tuple[str, str]] = set()  # landmarks, by who has stayed where it saw them
+        #: Landmarks that were seen and are not used.
+        self.doubts: list[Doubt] = []
+        self._before: Stance | None = None
+        self._there: set[str] = set()
+        self._last: dict[str, tuple[int, float]] = {}  # each robot's last pose: its stance, its time
+        self._samples: dict[str, list[OdometrySample]] = {robot: [] for robot in team.names}  # from there on
+        self._earlier: (
+            tuple[Stance | None, set[str], dict[str, tuple[int, float]], set[tuple[str, str]], list[Doubt]] | None
+        ) = None
+
+    def withdraw(self) -> None:
+        """Forget the last stance; once, until another has come."""
+        assert self._before is not None and self._earlier is not None
+        self._places.forget(self._earlier[0], self._before)
+        self._before, self._there, self._last, self._sighted, self.doubts = self._earlier
+        self._samples = {robot: [] for robot in self.team.names}  # they are read again
+        self._earlier = None
+
+    def of_stance(self, run: Recorded, stance: Stance, measured: Sequence[PairMeasurement]) -> list[Measurement]:
+        """Those of a stance, whose pairs are all `measured`."""
+        wheels = {robot: self._wheels(run, robot, stance) for robot in self.team.names}
+        sightings = sight_movers(run, stance, measured, wheels)
+        sightings += sight_standing(run, stance, measured, self._before)
+        earlier = self._before, self._there, dict(self._last), self._sighted, list(self.doubts)
+        sightings += self._of_landmarks(run, stance, measured)
+        self._earlier = earlier
+        return [*sightings, *self._ways(stance, measured, sightings, wheels)]
+
+    def _of_landmarks(self, run: Recorded, stance: Stance, measured: Sequence[PairMeasurement]) -> list[Sighting]:
+        """The landmarks that observers saw: who has stayed sees no more of one than when it came."""
+        before = self._before
+        here = {r for r in stance.observers if before is not None and r not in self._places.slips
+                and PoseKeys.stays(r, before, stance)}  # fmt: skip
+        self._sighted = {one for one in self._sighted if one[0] in here}
+        seen = (
+            (robot, what)
+            for one in measured
+            for robot, what in zip((one.homography.robot_i, one.homography.robot_j), one.landmarks, strict=True)
+        )
+        made, doubts = sight_landmarks(run, stance, seen, self._sighted)
+        self._sighted |= {(one.observer, one.seen) for one in made}
+        self.doubts += doubts
+        return made
+
+    def _wheels(self, run: Recorded, robot: str, stance: Stance) -> WheelTrack:
+        samples = self._samples[robot]
+        known = samples[-1].time if samples else None
+        samples += [one for one in run.odometry(robot, known, stance.end) if known is None or one.time > known]
+        if robot in self._last:
+            begun = bisect_right(samples, self._last[robot][1], key=lambda one: one.time)
+            del samples[: max(begun - 1, 0)]
+        return WheelTrack(robot, samples)
+
+    def _ways(
+        self,
+        stance: Stance,
+        measured: Sequence[PairMeasurement],
+        sightings: Sequence[Sighting],
+        wheels: Mapping[str, WheelTrack],
+    ) -> list[Odometry]:
+        before = self._before
+        self._places.accept(self._places.after(before, stance))
+        held = [r for r in stance.anchors if before and r in self._there and PoseKeys.stays(r, before, stance)]
+        posed = [robot for m in measured if m.relative_pose for robot, _ in m.relative_pose.ends]
+        posed += [robot for s in sightings for robot, _ in s.ends if robot in self._samples]  # landmarks have no wheels
+        self._there = {*stance.observers, *posed, *held}
+        self._before = stance
+        times = {s.seen: s.time for s in sightings if s.seen in stance.movers}
+        ways: list[Odometry] = []
+        for robot in sorted(self._there):
+            last, time_now = self._last.get(robot), times.get(robot, stance.start)
+            self._last[robot] = stance.index, time_now
+            if not self._odometry or last is None or self._key(robot, last[0]) == self._key(robot, stance.index):
+                continue
+            way = wheels[robot].between(last[0], stance.index, last[1], time_now, self.team.clock_sigma)
+            ways += [] if way is None else [way]
+        return ways
+
+    def _key(self, robot: str, stance: int) -> int:
+        return self._places.key((robot, stance))
+
+
+@dataclass(frozen=True, eq=False)
+class EnteredStance:
+    """A stance that is in, where its robots stand by what was known then, and what was measured in it and on the way
+    to it; `pairs` are all that were looked at, the unusable too."""
+
+    stance: Stance
+    estimate: StanceEstimate
+    measurements: tuple[Measurement, ...]
+    pairs: tuple[PairMeasurement, ...]
+
+
+class StanceSolver:
+    """Measures each stance when it is over, and enters it into an estimator."""
+
+    def __init__(self, team: Team, options: SolveOptions | None = None) -> None:
+        self.options = (options or SolveOptions()).resolved()
+        self.team = team
+        rigs = self.options.rigs(team) or None
+        self.estimator = Estimator(team.reference, team.names, team.floor, slips_of(team), rigs, landmarks_of(team))
+        #: All pairs of all stances; those that are unusable too.
+        self.measured: tuple[PairMeasurement, ...] = ()
+        #: What is to be said of clocks.
+        self.warnings: list[str] = []
+        #: How long the front end and the estimator took, stance by stance [s].
+        self.seconds: list[tuple[float, float]] = []
+        self._motions = OdometryAndSightings(team, odometry=self.options.odometry)
+        self._measuring = 0.0
+
+    def measure(
+        self, run: Recorded, stance: Stance, pairs: Iterable[PairMeasurement] | None = None
+    ) -> tuple[PairMeasurement, ...]:
+        """What the pairs of a stance measure, by what is known so far of their clocks; `pairs` come from
+        `measure_stance`, here or elsewhere."""
+        started = time.perf_counter()
+        alone = list(measure_stance(run, stance, self.options) if pairs is None else pairs)
+        shared, self.warnings = share_clock_offsets(alone, self.team.clock_sigma, self.measured)
+        self._measuring = time.perf_counter() - started
+        return shared
+
+    def enter(
+        self, run: Recorded, stance: Stance, measured: tuple[PairMeasurement, ...] | None = None
+    ) -> EnteredStance:
+        """Enter a stance with what was measured in it, by `measure`.
+
+        A stance without an anchor raises `MeasurementError`, but for the first.
+        """
+        shared = self.measure(run, stance) if measured is None else measured
+        started = time.perf_counter()
+        motions = [] if self.team.floor is None else self._motions.of_stance(run, stance, shared)
+        made = (*(m.relative_pose for m in shared if m.relative_pose is not None), *motions)
+        entering = time.perf_counter()
+        before = next(reversed(self.estimator.stances), None)
+        # before the first nobody can have stayed, whatever it says
+        here = stance if before else replace(stance, anchors=())
+        try:
+            said = self.estimator.add(here, made, after=before.index if before else None)
+        except ColocError:
+            if self.team.floor is not None:
+                self._motions.withdraw()
+            raise
+        self.seconds.append((self._measuring + entering - started, time.perf_counter() - entering))
+        self.measured += shared
+        return EnteredStance(here, said, made, shared)
+
+    @property
+    def doubts(self) -> list[Doubt]:
+        """Landmarks that were seen and are not used."""
+        return self._motions.doubts
+
+    def withdraw(self) -> None:
+        """Take the last stance out again, as if it had never come; `EstimationError` where it is the first."""
+        index = self.estimator.withdraw().index
+        if self.team.floor is not None:
+            self._motions.withdraw()
+        self.measured = tuple(one for one in self.measured if one.homography.stance != index)
+        self.seconds.pop()

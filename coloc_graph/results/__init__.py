@@ -1,0 +1,1 @@
+"""Results on disk: writing, reading, comparing, and solving many runs."""

@@ -1,0 +1,1 @@
+"""Cameras: V4L2, video files, and a simulated world."""

@@ -1,0 +1,1 @@
+"""iRobot Create: driver, odometry, watchdog process, and an emulator."""

@@ -1,0 +1,309 @@
+"""The wheels of a robot: `Create`, a driver for the iRobot Create 1 and 2 whose motion ends by itself.
+
+The robot has no watchdog: it goes on with the last command. The driver is the watchdog instead (docs/wheels.md).
+"""
+
+import contextlib
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Collection
+from typing import Self
+
+from coloc_graph.errors import InputError, RobotError
+from coloc_graph.robot_io.create import protocol as oi
+from coloc_graph.robot_io.create.exit_hooks import guard, release
+from coloc_graph.robot_io.create.feed import SensorFeed
+from coloc_graph.robot_io.create.line import LEAVE, CreateLine
+from coloc_graph.robot_io.create.odometry import WHEELS
+from coloc_graph.robot_io.create.protocol import Mode, Packet
+from coloc_graph.robot_io.create.state import HAZARDS, CreateState
+from coloc_graph.run.messages import OdometrySample
+
+#: How long a drive command holds by default, and at most [s].
+LEASE = 0.2
+LONGEST_LEASE = 0.5
+#: Without a frame for this long [s], a moving robot is stopped and a standing one does not set off.
+STALE = 0.3
+#: How often what must end is looked for, and a stop that the robot has not taken is sent again [s].
+WATCH = 0.01
+REPEAT = 0.05
+#: How often a Create 1 is asked for way and turn [s].
+DELTA_PERIOD = 0.5
+
+log = logging.getLogger(__name__)
+
+
+class Create:
+    """One robot's wheels on a serial port; a context manager, at whose end the wheels stand still.
+
+    `model` is 1 or 2, or None to find out. `max_speed` [m/s] and `max_turn` [rad/s] bound every command. `stop_on`
+    is a choice of "bump", "cliff", "wheel_drop", "charger". `full` asks for full mode, in which the robot does not
+    stop by itself at a cliff, a dropped wheel or the charger. `robot` names the odometry's samples, one of which
+    comes every `odometry_period` [s] while it moves; their times are `epoch` [s] ahead of the monotonic clock, by
+    default UTC as it is when the line opens.
+
+    Methods raise `RobotError` where the robot does not answer, is lost, or was stopped for a reason that still
+    holds; `recover` says that it may go on. Source: iRobot Create Open Interface specification.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        model: int | None = None,
+        *,
+        robot: str = "",
+        max_speed: float = 0.5,
+        max_turn: float = 2.0,
+        stop_on: Collection[str] = ("wheel_drop", "cliff"),
+        full: bool = False,
+        odometry_period: float = 0.05,
+        epoch: float | None = None,
+    ) -> None:
+        if model not in (None, *WHEELS):
+            raise InputError(f"there is no Create {model}: the model is 1, 2 or None to find out")
+        if isinstance(stop_on, str) or set(stop_on) - set(HAZARDS):
+            raise InputError(f"stop_on is a list of {', '.join(HAZARDS)}, not {stop_on}")
+        if not (max_speed > 0 and max_turn > 0):
+            raise InputError(f"limits are above 0, not {max_speed} m/s and {max_turn} rad/s")
+        self.port, self.max_speed, self.max_turn, self._epoch = port, max_speed, max_turn, epoch
+        self._asked_model, self._stop_on = model, frozenset(stop_on)
+        self._mode, self._robot, self._period = Mode.FULL if full else Mode.SAFE, robot, odometry_period
+        self._line: CreateLine | None = None
+        self._feed = SensorFeed(2, robot, odometry_period, epoch)
+
+    def open(self) -> Self:
+        """Find the robot, have it stream and enter its mode. `RobotError` if it does not answer within a second a baud.
+
+        A robot that does not enter its mode, because it charges or a wheel hangs, can be read, not driven.
+        """
+        if self._line is not None:
+            raise RobotError(f"the Create on {self.port} is open already: close it first")
+        line = CreateLine(self.port, self._asked_model)
+        self.model = line.model
+        self._ended = threading.Event()
+        self._fault: str | None = None
+        self._armed = self._ask = False
+        self._halted_at, self._halts, self._blames = 0.0, object(), object()  # new ones with each stop, each fault
+        self._deadline: float | None = None
+        self._commanded, self._hazards = (0, 0), set[str]()
+        self._feed = SensorFeed(line.model, self._robot, self._period, self._epoch)
+        self._last_ask = time.monotonic()
+        self._threads = [
+            threading.Thread(target=self._alive, args=(work, line), name=f"{name} of {self.port}", daemon=True)
+            for name, work in (("reader", self._read), ("watchdog", self._watch))
+        ]
+        self._line = line
+        try:
+            guard(self)
+            for thread in self._threads:
+                thread.start()
+            line.send(self._enter_mode + oi.HALT)
+            if not self._wait(lambda: self._armed, 1.0):
+                self._halt(f"it did not enter {self._mode.name.lower()} mode{self._feed.because}")
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __enter__(self) -> Self:
+        return self.open() if self._line is None else self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the wheels, leave the robot passive, let go of the port. Never raises."""
+        line = self._line
+        if line is None:
+            return
+        self._halt(None)
+        self._wait(lambda: not self._feed.told_to_move, 0.3)
+        self._ended.set()
+        with contextlib.suppress(RobotError):
+            line.send(LEAVE)
+        for thread in self._threads:
+            if thread.is_alive() and thread is not threading.current_thread():
+                thread.join(timeout=1.0)
+        line.close()
+        self._line = None
+        release(self)
+
+    def drive(self, v: float, w: float, lease: float = LEASE) -> tuple[float, float]:
+        """Drive ahead at `v` [m/s] while turning at `w` [rad/s], for `lease` [s] at most: renew it before.
+
+        What is beyond the limits is slowed down so that the curve stays the same; returned is (v, w) as sent, in
+        whole mm/s of each wheel. `InputError` for arguments that are no motion, `RobotError` if it must not drive.
+        """
+        if not (math.isfinite(v) and math.isfinite(w)):
+            raise InputError(f"drive({v}, {w}) is no motion: give finite m/s and rad/s")
+        if not 0 < lease <= LONGEST_LEASE:
+            raise InputError(f"a lease is above 0 and at most {LONGEST_LEASE} s, not {lease} s: renew it instead")
+        halts, line = self._halts if self._line else None, self._may_drive()
+        half = WHEELS[self.model].base / 2
+        wheel = (abs(v) + abs(w) * half) * 1e3 / oi.MAX_WHEEL_SPEED
+        slower = max(1.0, abs(v) / self.max_speed, abs(w) / self.max_turn, wheel)
+        left, right = (round((v + side * w * half) / slower * 1e3) for side in (-1, 1))
+        self._ask |= (left, right) != self._commanded
+        self._commanded, self._deadline = (left, right), time.monotonic() + lease
+        try:
+            line.send(oi.drive_direct(right, left))
+        except RobotError as error:
+            self._halt(str(error))
+            raise
+        if self._halts is not halts:  # stopped while this was under way: the stop has the last word
+            self._halt(None)
+            self._may_drive()
+        return (left + right) / 2e3, (right - left) * 1e-3 / (2 * half)
+
+    def stop(self) -> None:
+        """Stop the wheels now. `RobotError` if it could not be told."""
+        self._halt(None)
+        if self._line is None or self._line.lost:
+            self._may_drive()
+
+    def emergency_stop(self, reason: str) -> None:
+        """Stop the wheels now and do not drive again before `recover`; never raises."""
+        if self._line is not None:
+            self._halt(reason)
+
+    def recover(self, timeout: float = 1.0) -> None:
+        """After a stop with a reason, or after the robot left its mode: it may be driven again.
+
+        `RobotError` if it does not enter its mode within `timeout` [s] or the line is lost. A hazard that is still
+        there (a cliff to back away from) does not stop it again, a new one does.
+        """
+        line = self._line
+        if line is None or line.lost:
+            line = self._may_drive()
+        self._halt(None)
+        blames, state = self._blames, self._feed.state
+        asleep = self._feed.age > STALE or state is None or state.mode == Mode.OFF
+        self._armed = False
+        line.send((bytes([oi.START]) if asleep else b"") + self._enter_mode + oi.HALT + oi.stream(line.layouts[0]))
+        since = time.monotonic() + 2 * oi.STREAM_PERIOD
+        if not self._wait(lambda: self._armed and self._feed.last > since, timeout):
+            why = f"it did not go back to {self._mode.name.lower()} mode{self._feed.because}"
+            self._halt(why)
+            raise RobotError(f"the Create on {self.port} cannot go on, {why}: put it right and try again")
+        self._fault = None
+        if self._blames is not blames:
+            self._fault = "it was stopped again while it recovered"
+            self._may_drive()
+
+    @property
+    def state(self) -> CreateState:
+        """The newest sensor data."""
+        if self._line is None or self._feed.state is None:
+            raise RobotError(f"the Create on {self.port} has sent no sensor data yet: open it first")
+        return self._feed.state
+
+    @property
+    def odometry(self) -> OdometrySample:
+        """The newest sample; `take_odometry` gives all of them."""
+        if self._line is None or self._feed.sample is None:
+            raise RobotError(f"the Create on {self.port} has no odometry yet: open it, and wait for the first sample")
+        return self._feed.sample
+
+    def take_odometry(self) -> list[OdometrySample]:
+        """All samples since this was last called (the newest 20 000), each with its increment's covariance."""
+        return self._feed.take_samples()
+
+    @property
+    def moving(self) -> bool:
+        """Whether a drive command holds, or the robot still says that it has one."""
+        return self._line is not None and (self._deadline is not None or self._feed.told_to_move)
+
+    @property
+    def fault(self) -> str | None:
+        """Why it does not drive, None where it does."""
+        return self._fault if self._line else "it is not open"
+
+    @property
+    def lost(self) -> bool:
+        """Whether its line is lost, or it is not open: open it anew."""
+        return self._line is None or self._line.lost is not None
+
+    @property
+    def frames(self) -> tuple[int, int]:
+        """Frames of the stream since it was opened: sound, damaged."""
+        return (self._line.decoder.good, self._line.decoder.bad) if self._line else (0, 0)
+
+    @property
+    def _enter_mode(self) -> bytes:
+        return bytes([oi.FULL if self._mode == Mode.FULL else oi.SAFE])
+
+    def _may_drive(self) -> CreateLine:
+        """The line. `RobotError` where it must not be driven."""
+        if self._line is None:
+            raise RobotError(f"the Create on {self.port} is not open: open it, best as a context manager")
+        why, remedy = self._fault, "put it right and call recover()"
+        if self._line.lost:
+            why, remedy = f"its line is lost ({self._line.lost})", "check the cable, close it and open it again"
+        elif why is None and self._feed.age > STALE:
+            why = f"no sensor data came for {STALE} s"
+        if why is not None:
+            raise RobotError(f"the Create on {self.port} does not drive, {why}: {remedy}")
+        return self._line
+
+    def _halt(self, fault: str | None) -> None:
+        """Stop the wheels and remember why; never raises."""
+        self._halts, self._blames = object(), object() if fault else self._blames
+        new, self._fault = bool(fault and not self._fault), self._fault or fault
+        self._deadline, self._commanded, self._halted_at = None, (0, 0), time.monotonic()
+        if self._line is not None:
+            with contextlib.suppress(RobotError):
+                self._line.send(oi.HALT)
+        if new:
+            log.warning("Create on %s stops: %s", self.port, fault)
+
+    def _wait(self, met: Callable[[], bool], timeout: float) -> bool:
+        return self._feed.wait(met, lambda: self._line is None or self._line.lost is not None, timeout)
+
+    def _alive(self, work: Callable[[CreateLine], None], line: CreateLine) -> None:
+        """A thread that does not die without a word, or with the wheels turning."""
+        try:
+            work(line)
+        except BaseException as error:
+            if not self._ended.is_set():
+                self._halt(str(error) if isinstance(error, RobotError) else f"its driver failed ({error!r})")
+                if line.lost and work == self._read:
+                    line.stop_when_back(self._ended)
+
+    def _read(self, line: CreateLine) -> None:
+        """The reader thread: frames as they come, and what they tell to stop for."""
+        while not self._ended.is_set():
+            for values in line.read():
+                if line.model == 1 and Packet.DISTANCE in values:
+                    line.send(oi.stream(line.layouts[0]))
+                state = self._feed.take(values)
+                if state is not None:
+                    self._judge(state)
+                self._feed.notify()
+            if line.model == 1 and (self._ask or time.monotonic() - self._last_ask > DELTA_PERIOD):
+                self._ask, self._last_ask = False, time.monotonic()
+                line.send(oi.stream(line.layouts[1]))
+
+    def _judge(self, state: CreateState) -> None:
+        """Stop where the robot left its mode, or met what it is to stop on."""
+        hazards = state.hazards()
+        new = [said for name, said in hazards.items() if name in self._stop_on and name not in self._hazards]
+        left_mode = self._armed and state.mode != self._mode and not self._ended.is_set()
+        self._armed, self._hazards = state.mode == self._mode, set(hazards)
+        if left_mode:
+            self._halt(f"it left {self._mode.name.lower()} mode for {state.mode.name.lower()}{self._feed.because}")
+        elif new:
+            self._halt(f"it met {' and '.join(new)}")
+
+    def _watch(self, line: CreateLine) -> None:
+        """The watchdog thread: ends a motion when nothing else does, and sees to it that a stop is taken."""
+        while not self._ended.wait(WATCH):
+            line.beat()
+            now, deadline = time.monotonic(), self._deadline
+            if deadline is not None and now >= deadline:
+                self._halt(None)
+            elif deadline is not None and self._feed.age > STALE:
+                self._halt(f"no sensor data came for {STALE} s")
+            elif deadline is None and self._feed.told_to_move and now - self._halted_at > REPEAT and not line.lost:
+                self._halt(None)

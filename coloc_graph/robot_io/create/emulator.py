@@ -1,0 +1,319 @@
+"""A Create 1 or 2 that is not there: it speaks the Open Interface on a pseudo-terminal, and its wheels have physics.
+
+    python -m coloc_graph.robot_io.create.emulator --model 2      prints the port to open
+
+Like the real one it has no watchdog: the last drive command goes on, also when nobody holds the port any more.
+"""
+
+import argparse
+import contextlib
+import os
+import select
+import struct
+import termios
+import threading
+import time
+import tty
+from collections.abc import Callable, Collection
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coloc_graph.robot_io.create import protocol as oi
+from coloc_graph.robot_io.create.odometry import WHEELS
+from coloc_graph.robot_io.create.physics import Body, Physics
+from coloc_graph.robot_io.create.protocol import Mode, Packet
+from coloc_graph.robot_io.create.state import CLIFFS, DROPS
+
+_BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
+
+
+class CreateEmulator:
+    """An emulated robot; a context manager. `port` is what a driver opens.
+
+    `encoders` are the counts (left, right) at the start. `mute` holds back everything it would send; `corruption`
+    is the share of the bytes it sends that are changed or lost. `received` keeps all bytes that came.
+    """
+
+    def __init__(
+        self,
+        model: int = 2,
+        physics: Physics | None = None,
+        *,
+        encoders: tuple[int, int] = (0, 0),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.model, self._clock, self._encoders = model, clock, encoders
+        self._body = Body(model, physics or Physics(), clock())
+        self.mode = Mode.OFF
+        self.mute = False
+        self.corruption = 0.0
+        self.received = bytearray()
+        self._cliffs, self._drops, self._docked = set[str](), set[str](), False
+        self._asked_at = [0.0, 0.0]
+        self._listed: tuple[int, ...] = ()
+        self._streaming, self._next_frame, self._pending = False, 0.0, b""
+        self._rng = np.random.default_rng(self._body.physics.seed + 1)
+        self._lock = threading.RLock()
+        self._wired = self._ended = False
+        self.plug_in()
+        self._thread = threading.Thread(target=self._run, name=f"emulated Create {model}", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End it, the line first."""
+        self.hang_up()
+        self._ended = True
+        self._thread.join(timeout=2.0)
+
+    def hang_up(self) -> None:
+        """The line breaks; the robot goes on as it was told last."""
+        with self._lock:
+            if self._wired:
+                self._wired = False
+                os.close(self._slave)
+                os.close(self._master)
+
+    def plug_in(self) -> None:
+        """A line, and with it a new `port`, as at the start or after `hang_up`."""
+        with self._lock:
+            self.hang_up()
+            self._master, self._slave = os.openpty()  # the far end stays open here: a driver may come and go
+            tty.setraw(self._slave)
+            os.set_blocking(self._master, False)
+            self.port, self._wired = os.ttyname(self._slave), True
+
+    @property
+    def wired(self) -> bool:
+        """Whether its line is plugged in."""
+        with self._lock:
+            return self._wired
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """Where it truly is: x [m], y [m], yaw [rad]."""
+        with self._lock:
+            return np.array([self._body.x, self._body.y, self._body.yaw])
+
+    @property
+    def speeds(self) -> tuple[float, float]:
+        """How fast the left and the right wheel truly turn [m/s]."""
+        with self._lock:
+            return self._body.speeds[0], self._body.speeds[1]
+
+    @property
+    def still_since(self) -> float | None:
+        """The instant [s, by its clock] since which both wheels have stood still; None while one turns."""
+        with self._lock:
+            return self._body.still_since
+
+    def trace(self) -> NDArray[np.float64]:
+        """The truth over the last minutes (n, 6): time [s, by its clock], x, y [m], yaw [rad], left, right [m/s]."""
+        with self._lock:
+            return np.array(self._body.trace)
+
+    def poses_at(self, times: ArrayLike) -> NDArray[np.float64]:
+        """Where it truly was at instants (n,) of the last minutes [s, by its clock]: (n, 3), yaw unwrapped.
+
+        What it does in the last step of its physics is not known yet.
+        """
+        with self._lock:
+            self._body.advance(self._clock())
+            return self._body.poses_at(times)
+
+    def push(self, dx: float, dy: float, dyaw: float) -> None:
+        """Somebody bumps into it: it moves by so much in the world [m], [rad], and its encoders count nothing."""
+        with self._lock:
+            self._body.push(dx, dy, dyaw)
+
+    def cliff(self, where: str, there: bool = True) -> None:
+        """A cliff under "left", "front left", "front right" or "right"."""
+        with self._lock:
+            _mark(self._cliffs, CLIFFS.values(), where, there)
+
+    def wheel_drop(self, where: str, there: bool = True) -> None:
+        """The "left" or "right" wheel, or the "caster" (Create 1), hangs in the air."""
+        with self._lock:
+            _mark(self._drops, DROPS.values(), where, there)
+
+    def dock(self, there: bool = True) -> None:
+        """On the charger, or off it."""
+        with self._lock:
+            self._docked = there
+
+    def restart(self) -> None:
+        """A flat battery or its button: it forgets mode, stream and speed."""
+        with self._lock:
+            self.mode, self._streaming, self._body.wanted = Mode.OFF, False, (0.0, 0.0)
+
+    def _run(self) -> None:
+        while not self._ended:
+            with self._lock:
+                wired, master = self._wired, self._master
+            try:
+                if wired and select.select([master], [], [], self._body.physics.step)[0]:
+                    self._receive()
+                elif not wired:
+                    time.sleep(self._body.physics.step)
+            except (OSError, ValueError):  # hung up in between
+                continue
+            with self._lock:
+                self._tick()
+
+    def _tick(self) -> None:
+        """Physics up to now, what the robot does by itself, and a frame if one is due."""
+        now = self._clock()
+        self._body.advance(now)
+        forward = max(self._body.wanted) > 0
+        if self.mode == Mode.SAFE and (self._drops or self._docked or (self._cliffs and forward)):
+            self.mode, self._body.wanted = Mode.PASSIVE, (0.0, 0.0)
+        if self._streaming and now >= self._next_frame:
+            late = now - self._next_frame
+            self._next_frame += oi.STREAM_PERIOD * (1 + late // oi.STREAM_PERIOD)
+            values = {i: self._value(i) for i in self._listed}
+            self._send(oi.encode_frame(values, header_counts=self.model == 2))
+
+    def _receive(self) -> None:
+        with self._lock:
+            if not self._wired:
+                return
+            data = os.read(self._master, 4096)
+            if not self._same_baud():
+                return  # noise to its ears
+            self.received += data
+            self._body.advance(self._clock())
+            self._pending += data
+            while True:
+                command, self._pending = oi.split_command(self._pending)
+                if command is None:
+                    break
+                self._obey(command)
+
+    def _same_baud(self) -> bool:
+        return _BAUDS.get(termios.tcgetattr(self._slave)[4]) == WHEELS[self.model].baud
+
+    def _obey(self, command: bytes) -> None:
+        op = command[0]
+        if op == oi.START:
+            self._enter(Mode.PASSIVE)
+        elif op in (oi.RESET, oi.STOP_INTERFACE) and self.model == 2:
+            self._enter(Mode.OFF)
+            self._streaming = False
+        elif self.mode == Mode.OFF:
+            return
+        elif op == oi.POWER and self.model == 2:
+            self._enter(Mode.PASSIVE)
+        elif op in (oi.SAFE, oi.FULL):
+            self.mode = Mode.SAFE if op == oi.SAFE else Mode.FULL
+        elif op == oi.DRIVE_DIRECT and self.mode >= Mode.SAFE:
+            right, left = struct.unpack(">hh", command[1:])
+            self._drive(left, right)
+        elif op == oi.DRIVE and self.mode >= Mode.SAFE:
+            speed, radius = struct.unpack(">hh", command[1:])
+            self._drive(*_of_radius(speed, radius, WHEELS[self.model].base * 1e3))
+        elif op in (oi.SENSORS, oi.QUERY_LIST):
+            asked = self._known(command[1:] if op == oi.SENSORS else command[2:])
+            self._send(b"".join(oi.encode_value(i, self._value(i)) for i in asked))
+        elif op == oi.STREAM:
+            self._listed = self._known(command[2:])
+            self._streaming, self._next_frame = bool(self._listed), self._clock()
+        elif op == oi.PAUSE_RESUME:
+            self._streaming = bool(command[1]) and bool(self._listed)
+
+    def _enter(self, mode: Mode) -> None:
+        self.mode, self._body.wanted = mode, (0.0, 0.0)
+
+    def _known(self, packets: bytes) -> tuple[int, ...]:
+        known = [i for i in packets if i in oi.PACKETS or i in oi.GROUPS]
+        return tuple(i for i in oi.expand(known) if i <= oi.LAST_PACKET[self.model])
+
+    def _drive(self, left: int, right: int) -> None:
+        top = oi.MAX_WHEEL_SPEED
+        self._body.wanted = (max(-top, min(top, left)) / 1e3, max(-top, min(top, right)) / 1e3)
+
+    def _value(self, packet: int) -> int:
+        body = self._body
+        if packet == Packet.BUMPS_DROPS:
+            bumps = body.bump_left * oi.BumpDrop.BUMP_LEFT | body.bump_right * oi.BumpDrop.BUMP_RIGHT
+            return int(bumps | sum(bit for bit, where in DROPS.items() if where in self._drops))
+        if packet in CLIFFS:
+            return int(CLIFFS[Packet(packet)] in self._cliffs)
+        if packet in (Packet.LEFT_TICKS, Packet.RIGHT_TICKS):
+            i = packet - Packet.LEFT_TICKS
+            return self._encoders[i] + int(body.counted[i] // WHEELS[2].metres)
+        if packet in (Packet.DISTANCE, Packet.ANGLE):
+            # whole units since it was last asked; the remainder is lost, as on the real one
+            left, right = body.counted
+            i = packet - Packet.DISTANCE
+            counted = ((left + right) / 2 * 1e3, np.degrees((right - left) / body.base))[i]
+            whole = int(counted - self._asked_at[i])
+            self._asked_at[i] = counted
+            return whole
+        rest: dict[int, int] = {
+            Packet.MODE: int(self.mode),
+            Packet.CHARGERS: 2 * self._docked,
+            Packet.CHARGING_STATE: 2 * self._docked,
+            Packet.VOLTAGE: 15_400,
+            Packet.CHARGE: 2_100,
+            Packet.CAPACITY: 2_696,
+            Packet.REQUESTED_LEFT: round(body.wanted[0] * 1e3),
+            Packet.REQUESTED_RIGHT: round(body.wanted[1] * 1e3),
+            38: len(self._listed),
+        }
+        return rest.get(packet, 0)
+
+    def _send(self, data: bytes) -> None:
+        if self.mute or not self._wired:
+            return
+        if not self._same_baud():
+            data = bytes(b ^ 0xA5 for b in data)
+        if self.corruption:
+            changed = self._rng.random(len(data)) < self.corruption
+            noise = self._rng.integers(0, 257, len(data))
+            data = bytes(int(n) if c else b for b, c, n in zip(data, changed, noise, strict=True) if not c or n < 256)
+        with contextlib.suppress(OSError):  # nobody reads: lost, as on a wire
+            os.write(self._master, data)
+
+
+def _mark(marked: set[str], known: Collection[str], where: str, there: bool) -> None:
+    if where not in known:
+        raise ValueError(f'"{where}" is none of {", ".join(known)}')
+    (marked.add if there else marked.discard)(where)
+
+
+def _of_radius(speed: int, radius: int, base: float) -> tuple[int, int]:
+    """Wheel speeds (left, right) [mm/s] of the drive command 137: radius [mm], -1 and 1 spin, 0x8000 is straight."""
+    if radius in (-0x8000, 0x7FFF):
+        return speed, speed
+    if abs(radius) == 1:
+        return -speed * radius, speed * radius
+    share = base / 2 / radius if radius else 0.0
+    return round(speed * (1 - share)), round(speed * (1 + share))
+
+
+def main() -> None:
+    """Play with an emulated robot: print its port, then where it stands, until Ctrl-C."""
+    parser = argparse.ArgumentParser(description="An emulated iRobot Create on a pseudo-terminal.")
+    parser.add_argument("--model", type=int, choices=(1, 2), default=2, help="Create 1 or 2 (default 2)")
+    parser.add_argument("--seed", type=int, default=0, help="of slip and encoder noise")
+    options = parser.parse_args()
+    with CreateEmulator(options.model, Physics(seed=options.seed)) as robot, contextlib.suppress(KeyboardInterrupt):
+        print(robot.port, flush=True)
+        before = None
+        while True:
+            time.sleep(1.0)
+            line = "x {:.3f} m  y {:.3f} m  yaw {:.3f} rad".format(*robot.pose) + f"  {robot.mode.name.lower()}"
+            if line != before:
+                print(line, flush=True)
+            before = line
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""What a Create's frames amount to: the newest state, and odometry; `SensorFeed`."""
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+
+from coloc_graph.robot_io.create.odometry import DeltaWay, EncoderWay, Odometer
+from coloc_graph.robot_io.create.state import CreateState, read_state
+from coloc_graph.run.messages import OdometrySample
+
+
+class SensorFeed:
+    """Made of frames by one thread with `take`, read by others. Times are UTC, the monotonic clock's steps."""
+
+    def __init__(self, model: int, robot: str, period: float, epoch: float | None = None) -> None:
+        self.state: CreateState | None = None
+        self.sample: OdometrySample | None = None
+        #: When the newest frame came [s, monotonic].
+        self.last = time.monotonic()
+        self._epoch = time.time() - self.last if epoch is None else epoch
+        # a Create 1 tells its way seldom, and each time all of it
+        self._odometer = Odometer(robot, period) if model == 2 else Odometer(robot, period, math.inf)
+        self._way = EncoderWay() if model == 2 else DeltaWay()
+        self._samples: deque[OdometrySample] = deque(maxlen=20_000)
+        self._fresh = threading.Condition()
+
+    def take(self, values: Mapping[int, int]) -> CreateState | None:
+        """The state in a frame that has just come; None where it is damaged with a checksum that fits by chance."""
+        now = time.monotonic()
+        try:
+            state = read_state(values, self._epoch + now)
+        except ValueError:
+            return None
+        step = self._way.step(values, now - self.last)
+        samples = self._odometer.add(state.time, *step) if step is not None else []
+        with self._fresh:
+            self.state, self.last = state, now
+            if samples:
+                self.sample = samples[-1]
+                self._samples += samples
+        return state
+
+    def notify(self) -> None:
+        """What came of the frame is settled: wake those who wait."""
+        with self._fresh:
+            self._fresh.notify_all()
+
+    def take_samples(self) -> list[OdometrySample]:
+        """The samples since this was last called."""
+        with self._fresh:
+            taken = list(self._samples)
+            self._samples.clear()
+        return taken
+
+    def wait(self, met: Callable[[], bool], given_up: Callable[[], bool], timeout: float) -> bool:
+        """Whether a frame that comes within `timeout` [s] makes it so."""
+        until = time.monotonic() + timeout
+        with self._fresh:
+            while not met():
+                left = until - time.monotonic()
+                if left <= 0 or given_up():
+                    return False
+                self._fresh.wait(min(left, 0.05))
+        return True
+
+    @property
+    def age(self) -> float:
+        """Of the newest frame [s]."""
+        return time.monotonic() - self.last
+
+    @property
+    def told_to_move(self) -> bool:
+        """Whether the robot says that it has a speed to keep."""
+        return self.state is not None and any(self.state.requested)
+
+    @property
+    def because(self) -> str:
+        """The hazards that are there, as the end of a sentence."""
+        if self.state is None or self.age > 0.3:
+            return " because no sensor data come"
+        why = " and ".join(self.state.hazards().values())
+        return f" because of {why}" if why else ""

@@ -1,0 +1,139 @@
+"""The body of an emulated Create: two wheels with inertia, slip and noisy encoders, walls, and what can befall it."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from math import atan2, cos, hypot, pi, sin
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coloc_graph.robot_io.create.odometry import ENCODER, SLIP, WHEELS
+
+Array = NDArray[np.float64]
+
+#: Radius of the body [m].
+RADIUS = 0.17
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A rectangle in the world [m] that nothing goes through."""
+
+    x_low: float
+    y_low: float
+    x_high: float
+    y_high: float
+
+
+@dataclass(frozen=True)
+class Physics:
+    """How the emulated body behaves.
+
+    `acceleration` of a wheel [m/s^2]; `slip` and `encoder` are sigmas [m] after a metre rolled, growing with the
+    root of the way; `step` [s]; `seed` of all noise.
+    """
+
+    acceleration: float = 2.0
+    slip: float = SLIP
+    encoder: float = ENCODER
+    step: float = 0.0025
+    seed: int = 0
+    walls: Sequence[Wall] = ()
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass
+class Body:
+    """The true state; `advance` moves it on. Wheels are (left, right).
+
+    `trace` holds the last minutes as (time, x, y, yaw, left speed, right speed), one row a step.
+    """
+
+    model: int
+    physics: Physics
+    time: float
+    wanted: tuple[float, float] = (0.0, 0.0)
+    bump_left: bool = False
+    bump_right: bool = False
+    trace: deque[tuple[float, ...]] = field(default_factory=lambda: deque(maxlen=100_000))
+
+    def __post_init__(self) -> None:
+        self.base = WHEELS[self.model].base
+        self.x, self.y, self.yaw = self.physics.start
+        self.speeds = [0.0, 0.0]
+        #: What the encoders have counted since the start [m].
+        self.counted = [0.0, 0.0]
+        #: Since when both wheels have been still, None while one turns [s].
+        self.still_since: float | None = self.time
+        self._rng = np.random.default_rng(self.physics.seed)
+        self._noise: list[float] = []
+        self._pushes = 0
+        self._record()
+
+    def advance(self, to: float) -> None:
+        """On to the instant `to` in whole steps."""
+        while self.time + self.physics.step <= to:
+            self._step(self.physics.step)
+
+    def poses_at(self, times: ArrayLike) -> Array:
+        """Where it was at instants (n,) [s] of the last minutes: x, y [m], yaw [rad, unwrapped], (n, 3)."""
+        times = np.asarray(times, float)
+        back = int((self.time - times.min(initial=self.time)) / self.physics.step) + self._pushes + 2
+        rows = np.array(list(islice(reversed(self.trace), back)))[::-1]
+        columns = rows[:, 1], rows[:, 2], np.unwrap(rows[:, 3])
+        return np.stack([np.interp(times, rows[:, 0], column) for column in columns], axis=1)
+
+    def push(self, dx: float, dy: float, dyaw: float) -> None:
+        """Move it at once by so much in the world [m], [rad]: no wheel turns, no encoder counts."""
+        self.x, self.y, self.yaw = self.x + dx, self.y + dy, (self.yaw + dyaw + pi) % (2 * pi) - pi
+        self._pushes += 1
+        self._record()
+
+    def _step(self, dt: float) -> None:
+        self.time += dt
+        if not any(self.speeds) and not any(self.wanted):
+            if self.still_since is None:
+                self.still_since = self.time - dt
+            self._record()
+            return
+        self.still_since = None
+        reach = self.physics.acceleration * dt
+        ground = [0.0, 0.0]
+        for i in (0, 1):
+            before = self.speeds[i]
+            self.speeds[i] += max(-reach, min(reach, self.wanted[i] - before))
+            rolled = (before + self.speeds[i]) / 2 * dt
+            root = abs(rolled) ** 0.5
+            self.counted[i] += rolled + self.physics.encoder * root * self._normal()
+            ground[i] = rolled + self.physics.slip * root * self._normal()
+        forward, turned = (ground[0] + ground[1]) / 2, (ground[1] - ground[0]) / self.base
+        middle = self.yaw + turned / 2
+        self.yaw = (self.yaw + turned + pi) % (2 * pi) - pi
+        self._move(self.x + forward * cos(middle), self.y + forward * sin(middle))
+        self._record()
+
+    def _normal(self) -> float:
+        if not self._noise:
+            self._noise = self._rng.standard_normal(1000).tolist()
+        return self._noise.pop()
+
+    def _move(self, x: float, y: float) -> None:
+        """Unless a wall is in the way; then the wheels slip where it stands, and the bumper is pressed."""
+        self.bump_left = self.bump_right = blocked = False
+        for wall in self.physics.walls:
+            dx = min(max(x, wall.x_low), wall.x_high) - x
+            dy = min(max(y, wall.y_low), wall.y_high) - y
+            if hypot(dx, dy) >= RADIUS:
+                continue
+            nearer = hypot(dx, dy) < hypot(dx + x - self.x, dy + y - self.y)
+            bearing = (atan2(dy, dx) - self.yaw + pi) % (2 * pi) - pi
+            self.bump_left |= -0.3 < bearing < pi / 2
+            self.bump_right |= -pi / 2 < bearing < 0.3
+            blocked |= nearer
+        if not blocked:
+            self.x, self.y = x, y
+
+    def _record(self) -> None:
+        self.trace.append((self.time, self.x, self.y, self.yaw, *self.speeds))

@@ -1,0 +1,80 @@
+"""What a Create's sensors say, in words and SI units: `CreateState`."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from coloc_graph.robot_io.create.protocol import BumpDrop, Mode, Packet
+
+#: Where cliffs, dropped wheels and bumps may be.
+CLIFFS = {
+    Packet.CLIFF_LEFT: "left",
+    Packet.CLIFF_FRONT_LEFT: "front left",
+    Packet.CLIFF_FRONT_RIGHT: "front right",
+    Packet.CLIFF_RIGHT: "right",
+}
+DROPS = {BumpDrop.DROP_LEFT: "left", BumpDrop.DROP_RIGHT: "right", BumpDrop.DROP_CASTER: "caster"}
+_BUMPS = {BumpDrop.BUMP_LEFT: "left", BumpDrop.BUMP_RIGHT: "right"}
+
+#: What the driver streams from each model; a Create 1 is asked for `DELTAS` only now and then.
+DELTAS = (Packet.DISTANCE, Packet.ANGLE)
+_COMMON = (
+    Packet.BUMPS_DROPS, *CLIFFS, Packet.CHARGERS, Packet.MODE, Packet.CHARGING_STATE, Packet.VOLTAGE, Packet.CHARGE,
+    Packet.CAPACITY, Packet.REQUESTED_LEFT, Packet.REQUESTED_RIGHT,
+)  # fmt: skip
+STREAMED: dict[int, tuple[Packet, ...]] = {1: _COMMON, 2: (*_COMMON, Packet.LEFT_TICKS, Packet.RIGHT_TICKS)}
+
+#: What a driver may be told to stop on.
+HAZARDS = ("bump", "cliff", "wheel_drop", "charger")
+
+
+@dataclass(frozen=True)
+class CreateState:
+    """One frame of the stream.
+
+    `time` [UTC s]; `bumps`, `cliffs` and `wheel_drops` name where ("left", "front right", "caster"); `charger` is
+    "home base", "internal" or None; `voltage` [V]; `charge` and `capacity` of the battery [Ah]; `requested` are the
+    speeds (left, right) that the robot last took [m/s]; `ticks` its encoder counts (left, right), None on a Create 1.
+    """
+
+    time: float
+    mode: Mode
+    bumps: frozenset[str]
+    cliffs: frozenset[str]
+    wheel_drops: frozenset[str]
+    charger: str | None
+    charging: bool
+    voltage: float
+    charge: float
+    capacity: float
+    requested: tuple[float, float]
+    ticks: tuple[int, int] | None
+
+    def hazards(self) -> dict[str, str]:
+        """Those of `HAZARDS` that are there, each with its words."""
+        words = {
+            "bump": self.bumps and f"a bump on the {' and '.join(sorted(self.bumps))}",
+            "cliff": self.cliffs and f"a cliff at the {' and '.join(sorted(self.cliffs))}",
+            "wheel_drop": self.wheel_drops and f"a dropped wheel ({' and '.join(sorted(self.wheel_drops))})",
+            "charger": self.charger and f"the charger ({self.charger})",
+        }
+        return {name: str(said) for name, said in words.items() if said}
+
+
+def read_state(values: Mapping[int, int], time: float) -> CreateState:
+    """The state in the packets of one frame that came at `time` [UTC s]. `ValueError` for a mode that is none."""
+    bits, chargers = values[Packet.BUMPS_DROPS], values[Packet.CHARGERS]
+    ticks = (values[Packet.LEFT_TICKS], values[Packet.RIGHT_TICKS]) if Packet.LEFT_TICKS in values else None
+    return CreateState(
+        time,
+        Mode(values[Packet.MODE]),
+        frozenset(where for bit, where in _BUMPS.items() if bits & bit),
+        frozenset(where for packet, where in CLIFFS.items() if values[packet]),
+        frozenset(where for bit, where in DROPS.items() if bits & bit),
+        "home base" if chargers & 2 else "internal" if chargers & 1 else None,
+        values[Packet.CHARGING_STATE] in (1, 2, 3),
+        values[Packet.VOLTAGE] * 1e-3,
+        values[Packet.CHARGE] * 1e-3,
+        values[Packet.CAPACITY] * 1e-3,
+        (values[Packet.REQUESTED_LEFT] * 1e-3, values[Packet.REQUESTED_RIGHT] * 1e-3),
+        ticks,
+    )

@@ -1,0 +1,1 @@
+"""The link between robots and coordinator, on zenoh: messages, ordering, clocks, certificates."""

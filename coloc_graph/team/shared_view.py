@@ -1,0 +1,58 @@
+"""What cameras at rest see of the floor: `View`, and the places where a robot's markers are in all of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from coloc_graph.geometry.lie import se3_inverse
+from coloc_graph.team import Camera
+
+Array = NDArray[np.float64]
+
+#: Places are looked for so far apart, and so far to either side [m].
+GRID = 0.05
+WIDE = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera at rest in the world."""
+
+    camera: Camera
+    T_world_camera: Array
+
+    def project(self, points_world: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+        """Pixels (..., 2) of points (..., 3) [m] in the world, and which of them the image contains."""
+        T_camera_world = se3_inverse(self.T_world_camera)
+        return self.camera.project(np.asarray(points_world, float) @ T_camera_world[:3, :3].T + T_camera_world[:3, 3])
+
+    def sees(self, points_world: ArrayLike, margin: float) -> NDArray[np.bool_]:
+        """Which points (..., 3) [m] lie in the image, `margin` [px] from its border."""
+        uv, inside = self.project(points_world)
+        size = np.array([self.camera.width, self.camera.height])
+        with np.errstate(invalid="ignore"):
+            return np.asarray(inside & (uv >= margin - 0.5).all(-1) & (uv <= size - 0.5 - margin).all(-1))
+
+
+def places_in_view(
+    views: Sequence[View],
+    p_markers: Array,
+    middle: tuple[float, float],
+    ahead: tuple[float, float],
+    margin: float,
+    heading: float = 0.0,
+) -> Array:
+    """Places (n, 2) [m] of a body where all cameras see all its markers (m, 3) at any yaw.
+
+    They lie on a grid, `ahead` [m] from and to of the `middle` along the `heading` [rad], row by row.
+    """
+    x, y = np.meshgrid(np.arange(ahead[0], ahead[1] + 1e-9, GRID), np.arange(-WIDE, WIDE + 1e-9, GRID), indexing="ij")
+    c, s = np.cos(heading), np.sin(heading)
+    xy = np.column_stack([c * x.ravel() - s * y.ravel() + middle[0], s * x.ravel() + c * y.ravel() + middle[1]])
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    rim = np.hypot(*p_markers[:, :2].T).max() * np.column_stack([np.cos(angles), np.sin(angles)])
+    points = np.concatenate([xy[:, None] + rim, np.full((len(xy), len(rim), 1), p_markers[0, 2])], axis=-1)
+    seen = np.all([view.sees(points, margin).all(axis=1) for view in views], axis=0)
+    return np.asarray(xy[seen])

@@ -1,0 +1,163 @@
+"""Pose graphs of other people, and ours for them: g2o in and out, dot, the export command."""
+
+import html
+import shutil
+import subprocess
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from teams import graph_of_team, team_of
+
+from coloc_graph.backend import PoseGraph, smooth
+from coloc_graph.backend.solver import optimise
+from coloc_graph.cli import main
+from coloc_graph.errors import InputError
+from coloc_graph.exchange.dot import to_dot
+from coloc_graph.exchange.g2o import read_g2o, write_g2o
+from coloc_graph.exchange.tum import read_tum
+from coloc_graph.team import Slip
+
+DATA = Path(__file__).parents[3] / "shared" / "data" / "pose_graphs"
+
+
+@pytest.mark.parametrize("floor", [True, False])
+def test_a_graph_goes_out_and_comes_back_with_its_stay_puts(tmp_path, floor):
+    team = team_of(5, 8) if floor else team_of(5, 8, floor=None)
+    estimate = smooth(graph_of_team(team))
+    write_g2o(estimate, tmp_path / "graph.g2o")
+    read = read_g2o(tmp_path / "graph.g2o")
+    at = {node: key for key, nodes in read.names.items() for node in nodes}
+    assert set(at) == set(estimate.graph.nodes)
+    for node, key in at.items():
+        assert np.abs(read.values.atPose3(key).matrix() - estimate.pose(*node).matrix()).max() < 1e-15
+    assert read.stay_puts == estimate.graph.stay_puts
+    for stay in read.stay_puts:
+        assert at[stay.ends[0]] == at[stay.ends[1]]
+    assert read.fixed == (at["A", 0],)
+    assert read.factors.size() == 1 + len(estimate.graph.measurements)
+    if not floor:  # whose priors g2o has no word for
+        assert 2 * read.factors.error(read.values) == pytest.approx(estimate.chi2, rel=1e-6)
+        values, _ = optimise(read.factors, read.values)
+        for node, key in at.items():
+            assert values.atPose3(key).equals(estimate.pose(*node), 1e-6)
+
+
+def test_refused_measurements_are_not_written(tmp_path):
+    team = team_of(6, 8, seed=1, wrong=0.1)
+    estimate = smooth(graph_of_team(team))
+    assert estimate.refused
+    write_g2o(estimate, tmp_path / "graph.g2o")
+    edges = [line for line in (tmp_path / "graph.g2o").read_text().splitlines() if line.startswith("EDGE")]
+    assert len(edges) == len(estimate.graph.measurements) - len(estimate.refused)
+
+
+V2 = "VERTEX_SE2 {} 0 0 0"
+V3 = "VERTEX_SE3:QUAT {} 0 0 0 0 0 0 1"
+E2 = "EDGE_SE2 {} {} 1 0 0 1 0 0 1 0 1"
+E3 = "EDGE_SE3:QUAT {} {} 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ([V2.format(0), V2.format(0)], "line 2: vertex 0 is there twice"),
+        ([V3.format(0), E3.format(0, 7)], "line 2: vertex 7 is not there"),
+        ([V2.format(0), "FIX 3"], "line 2: vertex 3 is not there"),
+        ([V2.format(0), V3.format(1)], "mixes SE2 and SE3"),
+        ([V3.format(0), V3.format(1), E2.format(0, 1)], "mixes SE2 and SE3"),
+        ([V2.format(0), "VERTEX_XY 1 0 0"], "line 2: `VERTEX_XY` is not read"),
+        (["VERTEX_SE2 0 0 0"], r"line 1: `VERTEX_SE2` has 3 numbers; 4"),
+        (["VERTEX_SE2 0 0 0 nan"], "all finite"),
+        (["VERTEX_SE2 0 0 0 zero"], "holds what is no number"),
+        (["VERTEX_SE2 0.5 0 0 0"], "0.5 is no id"),
+        (["VERTEX_SE2 -1 0 0 0"], "-1 is no id"),
+        (["VERTEX_SE3:QUAT 0 0 0 0 0 0 0 2"], "not of unit length"),
+        ([V2.format(0), V2.format(1), "EDGE_SE2 0 1 1 0 0 1 0 0 -1 0 1"], "line 3: .*not positive definite"),
+        ([], "holds no vertex"),
+    ],
+)
+def test_a_bad_g2o_is_named_by_its_line(tmp_path, lines, words):
+    path = tmp_path / "bad.g2o"
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(InputError, match=words) as refusal:
+        read_g2o(path)
+    assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_a_g2o_that_is_not_there_is_one_sentence(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_g2o(tmp_path / "none.g2o")
+
+
+def test_a_planar_graph_is_solved(tmp_path):
+    path = tmp_path / "square.g2o"
+    turn = f"EDGE_SE2 {{}} {{}} 1 0 {np.pi / 2} 1 0 0 1 0 1"
+    near = ("0 0 0", "0.8 0.1 1.4", "1.2 0.9 3.0", "0.1 1.1 -1.5")
+    edges = [turn.format(k, (k + 1) % 4) for k in range(4)]
+    path.write_text("\n".join([*(f"VERTEX_SE2 {k} {at}" for k, at in enumerate(near)), *edges]))
+    read = read_g2o(path)
+    values, _ = optimise(read.factors, read.values)
+    corners = [values.atPose2(k).translation() for k in range(4)]
+    np.testing.assert_allclose(corners, [[0, 0], [1, 0], [1, 1], [0, 1]], atol=1e-6)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the pose graphs of others are not beside this checkout")
+@pytest.mark.parametrize(("name", "solid"), [("sphere2500.g2o", True), ("input_M3500_g2o.g2o", False)])
+def test_other_peoples_graphs_reach_the_error_that_gtsams_own_lm_reaches(name, solid):
+    read = read_g2o(DATA / name)
+    values, _ = optimise(read.factors, read.values)
+    theirs, start = gtsam.readG2o(str(DATA / name), solid)
+    theirs.push_back(_first(read.factors))
+    error = theirs.error(gtsam.LevenbergMarquardtOptimizer(theirs, start).optimize())
+    assert theirs.error(values) == pytest.approx(error, rel=1e-6)
+
+
+def _first(factors):
+    one = gtsam.NonlinearFactorGraph()
+    one.add(factors.at(0))
+    return one
+
+
+def test_dot_shows_places_and_who_stayed_put():
+    team = team_of(4, 6)
+    slips = {"C": Slip(sigma=0.01, sigma_deg=1)}
+    graph = PoseGraph("A", team.robots, team.stances, team.measurements, team.floor, slips)
+    text = to_dot(graph)
+    assert text.startswith("graph poses {") and text.rstrip().endswith("}")
+    exact = [s for s in graph.stay_puts if s.slip is None]
+    for stay in exact:
+        assert f"{stay.robot}@{stay.before} = {stay.robot}@{stay.after}" in text
+    assert text.count('label="stay put", style=dashed') == sum(s.slip is not None for s in graph.stay_puts) > 0
+    assert text.count('label="H ') == len(graph.relative_poses)
+
+
+@pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
+def test_graphviz_draws_it():
+    text = to_dot(graph_of_team(team_of(4, 6)))
+    drawn = subprocess.run(["dot", "-Tsvg"], input=text, capture_output=True, text=True, timeout=60, check=True)
+    assert "B@0 = B@1" in html.unescape(drawn.stdout).replace("\xa0", " ")
+
+
+def test_a_result_is_exported(result, tmp_path, capsys):
+    for form in ("g2o", "dot", "tum"):
+        assert main(["export", form, str(result), "--out", str(tmp_path / form)]) == 0
+    assert read_g2o(tmp_path / "g2o").values.size() == 17
+    assert "graph poses {" in (tmp_path / "dot").read_text()
+    assert len(read_tum(tmp_path / "tum" / "C.tum")) == 8
+    capsys.readouterr()
+    assert main(["export", "g2o", str(result), "--out", str(tmp_path / "g2o")]) == 2
+    assert "exists; give another path" in capsys.readouterr().err
+    assert main(["export", "g2o", str(tmp_path), "--out", str(tmp_path / "x")]) == 2
+    assert "is not a result" in capsys.readouterr().err
+
+
+def test_solve_incrementally_says_what_a_stance_costs(short, tmp_path, capsys):
+    assert main(["solve", str(short), "--out", str(tmp_path / "a"), "--incremental"]) == 0
+    assert "a stance entered in" in capsys.readouterr().out
+    assert main(["solve", str(short), "--out", str(tmp_path / "b")]) == 0
+    a, b = (read_tum(tmp_path / way / "trajectories" / "B.tum") for way in "ab")
+    np.testing.assert_allclose(a.T_world_body, b.T_world_body, atol=1e-6)
+    assert main(["solve", str(short), "--out", str(tmp_path / "c"), "--incremental", "--method", "chain"]) == 2
+    assert "never incremental" in capsys.readouterr().err

@@ -1,0 +1,82 @@
+"""Which tracks of two cameras are the same markers: right, or said to be ambiguous."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from crowd_scene import FACTS, lockstep, movers, right, seen_by_both
+
+from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.frontend import correspond
+from coloc_graph.frontend.pairing.association import SURE, associate
+from coloc_graph.frontend.pairing.correspondence import Candidates
+
+
+def found(both, **options):
+    return associate(Candidates(both[0][0], both[1][0], FACTS.camera, FACTS.camera, **options))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_however_many_robots_move_each_marker_is_found_again(n, seed):
+    both = seen_by_both(movers(n, seed), seed)
+    one = found(both)
+    assert one.posterior > SURE
+    assert right(one, both)
+    assert len({both[0][1][a] for a, _ in one.chosen}) >= 2 * n - 1
+
+
+@pytest.mark.parametrize("hidden", [None, 0, 1])
+@pytest.mark.parametrize("seed", range(4))
+def test_robots_in_lock_step_are_ambiguous_and_not_guessed(seed, hidden):
+    both = seen_by_both(lockstep(seed), seed, hidden)
+    one = found(both)
+    assert one.posterior < SURE
+    assert one.rivals
+    assert one.posterior + sum(chance for _, chance in one.rivals) == pytest.approx(1.0)
+    assert one.posterior >= max(chance for _, chance in one.rivals)
+    with pytest.raises(DegenerateGeometry, match=r"ambiguous: \d pairings .* drive apart, or give markers names"):
+        correspond(both[0][0], both[1][0], FACTS.camera, FACTS.camera)
+
+
+def test_a_robot_that_only_one_camera_sees_is_left_out():
+    both = seen_by_both(movers(3, 5), 5, hidden=1)
+    one = found(both)
+    assert one.posterior > SURE
+    assert right(one, both)
+    assert not {0, 1} & {both[1][1][b] for _, b in one.chosen}
+
+
+def test_nothing_is_made_of_tracks_that_have_nothing_in_common():
+    here, there = seen_by_both(movers(1, 3), 3), seen_by_both(movers(1, 4), 4)
+    mixed = [here[0], there[1]]
+    one = found(mixed)
+    assert one is None or one.posterior < SURE or len(one.chosen) < 2
+
+
+def test_the_one_robot_that_moves_is_the_one_that_both_see():
+    both = seen_by_both(movers(1, 7), 7)
+    assert found(both, alone=True).posterior >= found(both).posterior
+
+
+def test_a_moment_that_agrees_among_much_that_does_not_is_no_pairing():
+    right_, other = seen_by_both(movers(1, 7), 7), seen_by_both(movers(1, 11), 11)
+    pieces = []
+    for (tracks, _), (strange, _) in zip(right_, (other[0], seen_by_both(movers(1, 12), 12)[1]), strict=True):
+        when = [slice(0, 16)] * len(tracks)
+        short = [
+            replace(t, times=t.times[w], uv=t.uv[w], covariance=t.covariance[w], peak=t.peak[w])
+            for t, w in zip(tracks[:2], when, strict=False)
+        ]
+        pieces.append((short + [replace(t, body=0) for t in strange], []))
+    assert found(pieces, alone=True) is None
+    assert found([(p[0][:2], []) for p in pieces], alone=True) is not None  # by itself it is one
+
+
+def test_bodies_are_robots():
+    both = seen_by_both(movers(4, 2), 2)
+    for tracks, lights in both:
+        robots = [{lights[n] // 2 for n, t in enumerate(tracks) if t.body == body} for body in {t.body for t in tracks}]
+        assert all(len(robot) == 1 for robot in robots)
+        assert len(robots) >= 4
+        assert np.min([t.body for t in tracks]) >= 0

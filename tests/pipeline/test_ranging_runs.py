@@ -1,0 +1,453 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mrclam_folder import DELAY, DEPTH, LANDMARKS, ROBOT_OFFSET, SCALE, TURN_SCALE, make
+from msgspec.structs import replace as with_fields
+
+from coloc_graph.backend.planar import IncrementalDrive, optimise_drive
+from coloc_graph.backend.planar.factors import DriveFactors, State
+from coloc_graph.backend.planar.filter import Models, filter_forward
+from coloc_graph.backend.planar.placing import Placing
+from coloc_graph.backend.planar.slices import Slices, Summary, slices_of
+from coloc_graph.cli import main
+from coloc_graph.errors import InputError, RunError
+from coloc_graph.exchange.mrclam import import_mrclam
+from coloc_graph.frontend.keyframes import keyframes_of
+from coloc_graph.pipeline.ranging import DriveOptions, calibrated, solve_drive
+from coloc_graph.results.ranging import assess_drive, write_drive_result
+from coloc_graph.run import OdometrySample, Ranges, open_run, whole_run
+from coloc_graph.team import Landmark, Ranging, Robot, Team
+from coloc_graph.viewer import scene_of_result
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("drives")
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    made = make(folder / "data", seed=1, seconds=40.0)
+    import_mrclam(made.path, folder / "run.mcap")
+    return open_run(folder / "run.mcap")
+
+
+@pytest.fixture(scope="module")
+def unmapped(folder, run):
+    import_mrclam(folder / "data", folder / "unmapped.mcap", map_known=False)
+    return open_run(folder / "unmapped.mcap")
+
+
+@pytest.fixture(scope="module")
+def batch(run):
+    return solve_drive(run)
+
+
+@pytest.fixture(scope="module")
+def incremental(run):
+    return solve_drive(run, DriveOptions(incremental=True))
+
+
+def rms(accuracy):
+    return max(row.translation.rmse for row in accuracy.robots)
+
+
+def test_robots_are_where_they_are_and_the_covariances_say_how_well(batch):
+    accuracy = assess_drive(batch).accuracy
+    assert rms(accuracy) < 0.05
+    assert 0.4 < accuracy.anees < 1.5
+    estimate = batch.estimate
+    assert 0.6 < estimate.chi2 / estimate.dof < 1.3
+    assert np.all((estimate.noise > 0.6) & (estimate.noise < 1.5))
+    assert not batch.warnings
+
+
+def test_wheels_that_are_not_as_they_say_are_found_out(run, batch):
+    for robot in run.team.names:
+        errors, C = batch.estimate.errors[robot].wheels
+        wheels = run.team[robot].wheels
+        true = np.array([SCALE - wheels.scale, TURN_SCALE - wheels.turn_scale, DELAY - wheels.delay])
+        assert np.all(np.abs(errors - true) < 4 * np.sqrt(np.diagonal(C)))
+        assert np.sqrt(C[2, 2]) < wheels.delay_sigma / 2
+    found = calibrated(run.team, batch.estimate)
+    stated, errors = run.team["R1"], batch.estimate.errors["R1"]
+    wheels, ranging = found["R1"].wheels, found["R1"].ranging
+    at = [wheels.scale - stated.wheels.scale, wheels.turn_scale - stated.wheels.turn_scale]
+    assert [*at, wheels.delay - stated.wheels.delay] == pytest.approx(errors.wheels[0].tolist())
+    at = [ranging.offset, ranging.scale - 1, np.deg2rad(ranging.bearing_offset_deg), ranging.x, ranging.y]
+    at += [ranging.depth - stated.ranging.depth, ranging.robot_offset]
+    assert at == pytest.approx(errors.ranging[0].tolist())
+    assert wheels.delay_sigma == pytest.approx(np.sqrt(errors.wheels[1][2, 2]))
+    assert ranging.range_sigma == pytest.approx(stated.ranging.range_sigma * batch.estimate.noise[0, 0])
+
+
+def test_each_robot_helps_the_others(run, batch):
+    alone = solve_drive(run, DriveOptions(between_robots=False))
+    assert len(alone.estimate.drive.measured) < len(batch.estimate.drive.measured)
+
+    def sigma(solution):
+        return np.mean([np.sqrt(t.covariances[:, 3, 3]).mean() for t in solution.estimate.trajectories.values()])
+
+    assert sigma(batch) < sigma(alone)
+
+
+def test_as_it_happens_it_is_nearly_as_good(batch, incremental):
+    of_batch, of_one = assess_drive(batch), assess_drive(incremental)
+    assert rms(of_one.accuracy) < 1.2 * rms(of_batch.accuracy)
+    assert rms(of_one.online) < 0.12
+    # nothing that comes later is in what was thought at the time
+    assert rms(of_one.online) > rms(of_one.accuracy)
+    assert set(incremental.online) == set(incremental.estimate.trajectories)
+    for robot, online in incremental.online.items():
+        assert np.isfinite(online.covariances).all()
+        smoothed = incremental.estimate.trajectories[robot]
+        assert len(smoothed) == len(batch.estimate.trajectories[robot])
+
+
+def test_without_a_map_robots_and_landmarks_are_found_up_to_where_the_map_lies(unmapped):
+    solution = solve_drive(unmapped)
+    assert not solution.estimate.on_map
+    start = solution.estimate.trajectories["R1"]
+    assert np.allclose(start.T_world_body[0], np.eye(4), atol=1e-3)
+    assert rms(assess_drive(solution).accuracy) < 0.06
+    found = np.array([one.position for one in solution.estimate.landmarks])
+    true = np.array([LANDMARKS[int(one.name[1:])] for one in solution.estimate.landmarks])
+    p, q = found - found.mean(axis=0), true - true.mean(axis=0)
+    angle = np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum())
+    c, s = np.cos(angle), np.sin(angle)
+    off = p @ np.array([[c, s], [-s, c]]) - q
+    sigmas = np.array([np.sqrt(np.trace(one.covariance)) for one in solution.estimate.landmarks])
+    assert np.all(np.hypot(*off.T) < 3 * sigmas)
+    assert np.median(np.hypot(*off.T)) < 0.1
+    known = calibrated(unmapped.team, solution.estimate).landmarks[0]
+    assert known.position == pytest.approx(tuple(solution.estimate.landmarks[0].position))
+
+
+def test_a_map_that_lies_elsewhere_moves_the_estimate_with_it_and_nothing_else(folder, batch):
+    made = make(folder / "moved", seed=1, seconds=40.0, turned=1.0, shifted=(5.0, -2.0))
+    import_mrclam(made.path, folder / "moved.mcap")
+    moved = solve_drive(open_run(folder / "moved.mcap"))
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]]
+    T[:2, 3] = 5.0, -2.0
+    for robot, trajectory in batch.estimate.trajectories.items():
+        off = moved.estimate.trajectories[robot].T_world_body - T @ trajectory.T_world_body
+        assert np.abs(off).max() < 0.01
+    assert moved.estimate.chi2 == pytest.approx(batch.estimate.chi2, rel=0.02)
+
+
+def test_what_was_read_wrong_is_doubted_and_moves_nothing(run, batch):
+    drive = batch.estimate.drive
+    target, robots = drive.measured.target.copy(), len(drive.robots)
+    landmarks = np.flatnonzero((target >= robots) & (drive.measured.share[:, 0] > 0.3))
+    wrong = landmarks[10::8]
+    target[wrong] = robots + (target[wrong] - robots + 3) % len(drive.landmarks)
+    estimate = optimise_drive(run.team, replace(drive, measured=replace(drive.measured, target=target)))
+    assert set(wrong) == set(np.flatnonzero(estimate.doubted))
+    for robot, trajectory in batch.estimate.trajectories.items():
+        off = estimate.trajectories[robot].positions - trajectory.positions
+        assert np.sqrt((off**2).sum(axis=1).mean()) < 0.02
+
+
+def test_the_filter_needs_no_first_poses(run):
+    drive = keyframes_of(run)
+    filtered = filter_forward(run.team, drive)
+    assert set(filtered.placed_at) == {0, 1, 2}
+    assert max(filtered.placed_at.values()) < 20
+    assert filtered.used.mean() > 0.9
+
+
+def test_that_a_range_is_a_depth_and_longer_to_robots_is_found_out(run, batch):
+    sigmas = []
+    for robot in run.team.names:
+        errors, C = batch.estimate.errors[robot].ranging
+        off = errors[5:] - (DEPTH - run.team[robot].ranging.depth, ROBOT_OFFSET)
+        sigmas.append(np.sqrt(np.diagonal(C)[5:]))
+        assert np.all(np.abs(off) < 4 * sigmas[-1])
+    assert np.max(sigmas, axis=0)[0] < 0.04
+    # one of them hardly sees another
+    assert np.min(sigmas, axis=0)[1] < 0.025
+
+
+@pytest.fixture(scope="module")
+def somewhere(unmapped):
+    """Factors without a map, and a state that is far from their optimum."""
+    drive = keyframes_of(unmapped)
+    factors = DriveFactors(drive, Models(unmapped.team, drive))
+    rng = np.random.default_rng(0)
+    shared = rng.normal(size=len(factors.free)) * 0.05
+    factors.landmarks(shared)[:] += 3 + rng.normal(size=(len(drive.landmarks), 2))
+    return factors, State(rng.normal(size=(len(factors), 3)), shared)
+
+
+def test_derivatives_are_those_of_the_residuals(somewhere):
+    factors, state = somewhere
+    of_robots, of_landmarks = (np.flatnonzero(factors.of_robot == of)[:3] for of in (True, False))
+    index = np.concatenate([of_robots, of_landmarks])
+    steps = np.array([3, factors.first[1] + 7])
+    for rows_at in (lambda at: factors.steps(at, steps), lambda at: factors.measured(at, index)):
+        J, columns = rows_at(state)
+        for n, k in np.ndindex(columns.shape):
+            ends = []
+            for step in (1e-6, -1e-6):
+                both = np.concatenate([state.poses.ravel(), state.shared])
+                both[columns[n, k]] += step
+                moved = State(both[: state.poses.size].reshape(-1, 3), both[state.poses.size :])
+                ends.append(rows_at(moved).residuals[n])
+            assert np.allclose((ends[0] - ends[1]) / 2e-6, J[n, :, k], atol=1e-5 * np.abs(J[n]).max())
+
+
+def dense(factors, slices, rows):
+    """The matrix and gradient of a problem over its own poses and what is shared, by the book."""
+    variables = np.concatenate(
+        [(3 * slices.poses[:, None] + np.arange(3)).ravel(), 3 * len(factors) + np.flatnonzero(factors.free)]
+    )
+    number = np.full(3 * len(factors) + len(factors.free), -1)
+    number[variables] = np.arange(len(variables))
+    A, b = [], []
+    for J, columns in rows:
+        for n in range(len(J)):
+            row = np.zeros((J.shape[1], len(variables) + 1))
+            row[:, number[columns[n]]] = J[n, :, :-1]
+            A.append(row[:, :-1])
+            b.append(J[n, :, -1])
+    A, b = np.concatenate(A), np.concatenate(b)
+    return A.T @ A, A.T @ b
+
+
+def test_second_by_second_it_is_the_same_as_all_at_once(somewhere):
+    factors, state = somewhere
+    slices_all = slices_of(factors)
+    poses = np.flatnonzero(slices_all < 12)
+    slices = Slices(factors, slices_all, poses)
+    inside = np.isin(np.arange(len(factors)), poses)
+    steps = np.flatnonzero(inside[:-1] & inside[1:] & (factors.robot[:-1] == factors.robot[1:]))
+    measured = np.flatnonzero(inside[factors.observer] & (inside[factors.seen] | ~factors.of_robot))
+    gauge = factors.gauge(state, int(poses[0]), state.poses[poses[0]] + 0.1)
+    rows = [factors.steps(state, steps), factors.measured(state, measured), gauge]
+    H, g = dense(factors, slices, rows)
+    weights, off = factors.before(state)
+    n = 3 * len(poses)
+    H[np.arange(n, len(H)), np.arange(n, len(H))] += weights
+    g[n:] += weights * off
+    C = np.linalg.inv(H)
+
+    flat = slices.problem(rows)
+    slices.add_known(flat, weights, off)
+    eliminated = slices.eliminate(flat)
+    shared, of_shared = slices.shared(flat)
+    expected = -C @ g
+    assert np.allclose(shared, expected[n:], rtol=1e-5, atol=1e-7)
+    assert np.allclose(slices.steps(eliminated, shared).ravel(), expected[:n], rtol=1e-5, atol=1e-6)
+    assert np.allclose(of_shared, C[n:, n:], rtol=1e-5, atol=1e-9)
+    for k, joint in slices.covariances(eliminated, of_shared):
+        at = np.r_[3 * slices.first[k] : 3 * slices.first[min(k + 2, slices.count)], n : len(C)]
+        assert np.allclose(joint, C[np.ix_(at, at)], rtol=1e-4, atol=1e-9)
+
+    # in two goes: what the first slices say of the rest is all they have to say
+    gone = slices_all < 5
+    near = Slices(factors, slices_all, np.flatnonzero(slices_all < 6))
+    is_early = [gone[steps] | gone[steps + 1], gone[factors.observer[measured]]]
+    is_early[1] |= gone[factors.seen[measured]] & factors.of_robot[measured]
+    flat = near.problem(
+        [factors.steps(state, steps[is_early[0]]), factors.measured(state, measured[is_early[1]]), gauge]
+    )
+    near.add_known(flat, weights, off)
+    near.eliminate(flat, near.count - 1)
+    left, information, gradient = near.remaining(flat)
+    at = np.concatenate([state.poses[left].ravel(), state.shared[factors.free]])
+    rest = Slices(factors, slices_all, poses[~gone[poses]])
+    flat = rest.problem([factors.steps(state, steps[~is_early[0]]), factors.measured(state, measured[~is_early[1]])])
+    rest.add_summary(flat, Summary(left, information, gradient + 0.0, at), at)
+    eliminated = rest.eliminate(flat)
+    again, _ = rest.shared(flat)
+    assert np.allclose(again, shared, rtol=1e-4, atol=1e-6)
+    assert np.allclose(rest.steps(eliminated, again), expected[3 * slices.first[5] : n].reshape(-1, 3), atol=1e-5)
+
+
+def test_what_has_left_the_window_is_not_forgotten(run, batch):
+    drive = keyframes_of(run)
+    one = IncrementalDrive(run.team, drive, lag=10.0, calibrating=12.0)
+    start = min(times[0] for times in drive.times)
+    for second in range(1, 42):
+        latest = one.advance(start + second)
+    assert set(latest.poses) == set(run.team.names)
+    estimate, _ = one.finish()
+    for robot in run.team.names:
+        # of wheels and sensors as much is known as in batch
+        for kind in ("wheels", "ranging"):
+            found, C = getattr(estimate.errors[robot], kind)
+            best, best_C = getattr(batch.estimate.errors[robot], kind)
+            assert np.all(np.abs(found - best) < 1.5 * np.sqrt(np.diagonal(best_C)))
+            assert np.allclose(np.sqrt(np.diagonal(C)), np.sqrt(np.diagonal(best_C)), rtol=0.3)
+        off = estimate.trajectories[robot].positions - batch.estimate.trajectories[robot].positions
+        assert len(off) == len(batch.estimate.trajectories[robot])
+        assert 1e-4 < np.sqrt((off**2).sum(axis=1).mean()) < 0.03
+
+
+def test_errors_that_last_count_by_how_long_they_do(run):
+    drive = keyframes_of(run)
+    m, memory = drive.measured, run.team["R1"].ranging.range_memory
+    pair = np.flatnonzero((m.robot == 0) & (m.target == m.target[m.robot == 0][0]))
+    assert m.share[pair[0]].tolist() == [1.0, 1.0]
+    gaps = np.diff(m.time[pair])
+    assert np.allclose(m.share[pair[1:], 0], np.tanh(gaps / (2 * memory)))
+
+
+def test_a_robot_is_placed_by_points_that_agree_and_not_by_those_that_do_not():
+    rng = np.random.default_rng(3)
+    local = rng.uniform(-2, 2, (8, 2))
+    c, s = np.cos(0.7), np.sin(0.7)
+    world = local @ np.array([[c, s], [-s, c]]) + (1.0, -2.0)
+    placing = Placing()
+    for n in range(3):
+        placing.add(tuple(local[n]), tuple(world[n]))
+    assert placing.place() is None  # too few to be sure
+    placing.add(tuple(local[3]), tuple(world[3] + 3.0))  # read wrong
+    for n in range(4, 8):
+        placing.add(tuple(local[n]), tuple(world[n]))
+    assert placing.place() == pytest.approx((1.0, -2.0, 0.7))
+
+
+def write(path, *, odometry=True, target="L", ranging=True, away=False):
+    sensor = Ranging(range_sigma=0.05, bearing_sigma_deg=0.5) if ranging else None
+    robots = tuple(Robot(name=name, ranging=sensor or Ranging(range_sigma=1, bearing_sigma_deg=1)) for name in "AB")
+    team = Team(reference="A", robots=robots, landmarks=(Landmark(name="L", position=(1.0, 0.0)),))
+    with whole_run(path, team) as writer:
+        for k in range(20):
+            if odometry:
+                writer.write(OdometrySample("A", 100.0 + k, np.array([0.1 * k, 0.0, 0.0]), np.eye(3) * 1e-4))
+            time = 100.0 + k + (1000.0 if away else 0.0)
+            writer.write(Ranges("A", time, (target,), np.array([1.0]), np.array([0.0])))
+    return path
+
+
+def test_a_run_without_odometry_says_so(tmp_path):
+    run = open_run(write(tmp_path / "run.mcap", odometry=False))
+    with pytest.raises(InputError, match="robot A measured ranges, and has no odometry"):
+        keyframes_of(run)
+
+
+def test_ranges_of_who_is_not_in_the_team_cannot_be_written(tmp_path):
+    with pytest.raises(RunError, match="name `X`, which is no other robot and no landmark"):
+        write(tmp_path / "run.mcap", target="X")
+    with pytest.raises(RunError, match="name `A`, which is no other"):
+        write(tmp_path / "run.mcap", target="A")
+    assert not list(tmp_path.iterdir())
+
+
+def test_ranges_where_there_is_no_odometry_are_left_out_and_counted(tmp_path):
+    run = open_run(write(tmp_path / "run.mcap", away=True))
+    with pytest.raises(InputError, match="no range was measured while there is odometry"):
+        keyframes_of(run)
+
+
+def test_one_landmark_alone_places_nobody(tmp_path, capsys):
+    path = write(tmp_path / "run.mcap")
+    assert main(["solve", str(path), "--out", str(tmp_path / "result")]) == 2
+    assert "no robot's measurements say where it is" in capsys.readouterr().err
+    assert not (tmp_path / "result").exists()
+
+
+def test_a_robot_needs_a_camera_or_a_sensor_of_ranges():
+    with pytest.raises(ValueError, match="no `camera` with its `mount`, and no `ranging`"):
+        Robot(name="A")
+    with pytest.raises(ValueError, match="`range_sigma` is 0"):
+        Ranging(range_sigma=0.0, bearing_sigma_deg=1.0)
+
+
+def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
+    out = tmp_path / "result"
+    assert main(["solve", str(run.path), "--out", str(out), "--incremental"]) == 0
+    printed = capsys.readouterr().out
+    assert "RMS position" in printed and "3 robots" not in printed
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["method"] == "incremental" and summary["world"] == "map"
+    assert summary["online_accuracy"]["ate_m"] > summary["accuracy"]["ate_m"] > 0
+    rows = (out / "measurements.csv").read_text().splitlines()
+    assert len(rows) == 1 + summary["measurements"]["used"] + summary["measurements"]["rejected"]
+    assert {one.name for one in out.iterdir()} == {
+        *("summary.json", "config.toml", "team.toml", "report.html", "landmarks.csv", "measurements.csv"),
+        *("trajectories", "online"),
+    }
+    report = (out / "report.html").read_text()
+    assert "the landmarks&#x27; map" in report or "the landmarks' map" in report
+    assert report.count("<svg") >= 2
+    assert main(["evaluate", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ate_m"] == pytest.approx(summary["accuracy"]["ate_m"])
+    assert main(["solve", str(run.path), "--out", str(out), "--method", "chain"]) == 2
+    capsys.readouterr()
+    for words in (["export", "g2o", str(out), "--out", str(tmp_path / "x.g2o")], ["view", str(run.path)]):
+        assert main(words) == 2
+        assert "of robots that drive, without stances" in capsys.readouterr().err
+    assert main(["export", "ros2", str(out), "--out", str(tmp_path / "x.mcap")]) == 0
+    landmarks = (out / "landmarks.csv").read_text().splitlines()
+    assert landmarks[0].startswith("name,x,y,x_sigma,y_sigma") and len(landmarks) == 1 + len(LANDMARKS)
+    assert main(["info", str(run.path)]) == 0
+    page = tmp_path / "page.html"
+    assert main(["view", str(out), "--export", str(page)]) == 0 and page.stat().st_size > 100_000
+    (out / "measurements.csv").write_text("\n".join([*rows[:9], "soon,R1,R2,1,0,1,1,0,0,no"]) + "\n")
+    assert main(["view", str(out), "--export", str(page)]) == 2
+    assert "measurements.csv is damaged" in capsys.readouterr().err
+
+
+def test_the_viewer_shows_where_each_was_and_what_it_measured(run, batch, tmp_path):
+    write_drive_result(batch, tmp_path / "result")
+    table = tmp_path / "result" / "measurements.csv"
+    head, *rows = table.read_text().splitlines()
+    doubted = np.arange(len(rows)) % 100 < 50
+    rows = [row.removesuffix("no") + "yes" if off else row for row, off in zip(rows, doubted, strict=True)]
+    table.write_text("\n".join([head, *rows]) + "\n")
+    scene = scene_of_result(tmp_path / "result")
+    estimated, true = scene.layers
+    truth = assess_drive(batch).true
+    trajectories = batch.estimate.trajectories
+    for number, robot in enumerate(scene.robots):
+        rows = estimated.rows[number]
+        at = np.searchsorted(trajectories[robot].times, estimated.times[number, rows] - 1e-5)
+        # the first of each second, as it is in the estimate; and the truth at that time
+        np.testing.assert_allclose(trajectories[robot].times[at], estimated.times[number, rows], atol=1e-5)
+        np.testing.assert_allclose(trajectories[robot].positions[at], estimated.xyz[number, rows], atol=1e-6)
+        second = np.floor(trajectories[robot].times - scene.starts[0] + 1e-9)
+        np.testing.assert_array_equal(at, np.unique(second, return_index=True)[1])
+        known = truth[robot][at]
+        there = np.isfinite(true.yaw[number, rows])
+        assert there.sum() > 20
+        np.testing.assert_allclose(true.xyz[number, rows][there], known[there][:, :3, 3], atol=1e-6)
+    links, seen = scene.sightings, scene.landmarks.sightings
+    assert len(scene.landmarks) == len(LANDMARKS) and len(links) > 10 and len(seen) > 20
+    m, names = batch.estimate.drive.measured, (*batch.estimate.drive.robots, *batch.estimate.drive.landmarks)
+    used = np.isfinite(batch.estimate.residuals[:, 0]) & ~doubted
+    told = {
+        (int(np.floor(m.time[n] - scene.starts[0] + 1e-9)), names[m.robot[n]], names[m.target[n]])
+        for n in np.flatnonzero(used)
+    }
+    shown = {(int(k), scene.robots[i], scene.robots[j]) for k, i, j in zip(links.rows_j, links.i, links.j, strict=True)}
+    shown |= {
+        (int(k), scene.robots[i], scene.landmarks.names[j]) for k, i, j in zip(seen.rows_j, seen.i, seen.j, strict=True)
+    }
+    assert shown == told
+    known = {one.name: one.position for one in batch.estimate.landmarks}
+    for name, place in zip(scene.landmarks.names, scene.landmarks.xy, strict=True):
+        np.testing.assert_allclose(place, known[name], atol=1e-6)
+
+
+def test_exact_wheels_and_sensors_are_no_variables(run):
+    exact = with_fields(
+        run.team,
+        robots=tuple(
+            with_fields(
+                robot,
+                wheels=with_fields(
+                    robot.wheels, scale=SCALE, delay=DELAY, scale_sigma=0.0, turn_scale_sigma=0.0, delay_sigma=0.0
+                ),
+                ranging=Ranging(range_sigma=0.05, bearing_sigma_deg=0.5),
+            )
+            for robot in run.team.robots
+        ),
+    )
+    estimate = optimise_drive(exact, keyframes_of(replace(run, team=exact)), calibrate_noise=False)
+    assert all(one.wheels is None and one.ranging is None for one in estimate.errors.values())
+    assert set(estimate.trajectories) == set(run.team.names)

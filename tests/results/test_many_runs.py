@@ -1,0 +1,143 @@
+"""A folder of runs: each solved by itself, resumed, and whatever one of them does to its process."""
+
+import json
+import os
+import shutil
+import signal
+from functools import partial
+from pathlib import Path
+
+import distributed
+import pytest
+
+from coloc_graph.cli import main
+from coloc_graph.errors import InputError
+from coloc_graph.pipeline.batch import SolveOptions
+from coloc_graph.results import many_runs
+from coloc_graph.results.executors import workers
+from coloc_graph.results.many_runs import places_of, runs_in, solve_runs
+from coloc_graph.run import open_run
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory, short, copied):
+    """Two runs, and one that is none."""
+    folder = tmp_path_factory.mktemp("runs")
+    (folder / "deep").mkdir(parents=True)
+    shutil.copy(short, folder / "a.mcap")
+    copied(short, folder / "deep" / "b.mcap", stances=open_run(short).stances[:2])
+    (folder / "bad.mcap").write_bytes(Path(short).read_bytes()[:2000])
+    return folder
+
+
+@pytest.fixture
+def folder(runs, tmp_path):
+    """A copy of these, to be spoiled."""
+    return Path(shutil.copytree(runs, tmp_path / "runs"))
+
+
+def kills_its_process_once(run, out, options):
+    """As `solve_one`, but for the run that kills the process it is in: the first time, or always."""
+    flag = Path(out).parent / "killed"
+    if run.stem == "a" and (out.parent.name == "always" or not flag.exists()):
+        flag.parent.mkdir(parents=True, exist_ok=True)
+        flag.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return solve_one(run, out, options)
+
+
+solve_one = many_runs.solve_one
+
+
+def solved(folder, out, executors, options=None):
+    runs = runs_in(folder)
+    heard = []
+    outcomes = solve_runs(runs, places_of(runs, folder, out), options, executors=executors, told=heard.append)
+    assert [one.run for one in outcomes] == runs
+    assert sorted(heard, key=lambda one: one.run) == sorted(outcomes, key=lambda one: one.run)
+    return {one.run.stem: one for one in outcomes}
+
+
+def test_a_folder_is_solved_and_a_bad_run_ends_none_of_the_others_and_what_is_there_stays(folder, tmp_path):
+    out, one = tmp_path / "out", partial(workers, 1)
+    first = solved(folder, out, partial(workers, 2))
+    assert first["a"].summary["stances"] and not first["a"].failed and not first["b"].failed
+    assert "bad.mcap" in first["bad"].failed and not (out / "bad").exists()
+    assert (out / "deep" / "b" / "summary.json").is_file()
+    again = solved(folder, out, one)
+    assert {name: one.resumed for name, one in again.items()} == {"a": True, "bad": False, "b": True}
+    assert again["a"].summary == first["a"].summary
+    # other options, another run, or a later one are solved anew
+    assert not solved(folder, out, one, SolveOptions(odometry=False))["a"].resumed
+    shutil.copy(folder / "deep" / "b.mcap", folder / "a.mcap")
+    later = solved(folder, out, one, SolveOptions(odometry=False))
+    assert not later["a"].resumed and later["b"].resumed
+
+
+def test_a_run_that_kills_its_process_is_tried_again_and_then_given_up(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(many_runs, "solve_one", kills_its_process_once)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    (folder / "bad.mcap").unlink()
+    once = solved(folder, tmp_path / "once", partial(workers, 1))
+    assert not once["a"].failed and not once["b"].failed
+    shutil.rmtree(folder / "deep")
+    always = solved(folder, tmp_path / "always", partial(workers, 1))
+    assert "the process that solved it ended" in always["a"].failed
+
+
+def test_a_cluster_goes_on_when_a_worker_is_killed(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(many_runs, "solve_one", kills_its_process_once)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        found = solved(folder, tmp_path / "out", partial(workers, cluster=cluster.scheduler_address))
+    assert not found["a"].failed and not found["b"].failed and found["bad"].failed
+    assert (tmp_path / "out" / "killed").exists()
+
+
+def test_the_command_prints_a_table_and_says_which_failed(folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["solve", str(folder), "--out", str(out), "--processes", "1"]) == 1
+    printed = capsys.readouterr()
+    assert "3 runs: 2 solved, 0 there already, 1 failed" in printed.out
+    assert printed.err.count(str(folder / "bad.mcap")) == 1
+    assert main(["solve", str(folder), "--out", str(out), "--processes", "1", "--json"]) == 1
+    states = [row["state"] for row in json.loads(capsys.readouterr().out)]
+    assert states == ["resumed", "failed", "resumed"]
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--view"], "--view shows one run"),
+        (["--processes", "0"], "give at least 1"),
+        (["--cluster", "tcp://127.0.0.1:1"], "no Dask scheduler at tcp://127.0.0.1:1"),
+    ],
+)
+def test_what_a_folder_cannot_have_is_one_sentence(folder, tmp_path, capsys, monkeypatch, more, words):
+    monkeypatch.setattr("coloc_graph.results.executors.PATIENCE", 0.5)
+    assert main(["solve", str(folder), "--out", str(tmp_path / "out"), *more]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_no_result_lies_in_another(folder, tmp_path, capsys):
+    (folder / "a").mkdir()
+    shutil.copy(folder / "a.mcap", folder / "a" / "c.mcap")
+    assert main(["solve", str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert "its result would lie in that of" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_run_that_has_become_bad_leaves_its_earlier_result_and_says_so(folder, tmp_path):
+    out, one = tmp_path / "out", partial(workers, 1)
+    solved(folder, out, one)
+    (folder / "a.mcap").write_bytes((folder / "bad.mcap").read_bytes())
+    again = solved(folder, out, one)["a"]
+    assert "still holds an earlier result" in again.failed and (out / "a" / "summary.json").is_file()
+
+
+def test_an_empty_folder_and_processes_for_one_run_are_one_sentence(tmp_path, short, capsys):
+    with pytest.raises(InputError, match=r"holds no run \(.mcap\)"):
+        runs_in(tmp_path)
+    assert main(["solve", str(short), "--out", str(tmp_path / "out"), "--processes", "2"]) == 2
+    assert "is not a folder of runs" in capsys.readouterr().err

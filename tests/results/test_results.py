@@ -1,0 +1,226 @@
+"""A result on disk: complete, reproducible, whole or not at all, and read back."""
+
+import csv
+import json
+import tomllib
+
+import msgspec
+import numpy as np
+import pytest
+
+from coloc_graph.errors import InputError
+from coloc_graph.pipeline.batch import solve
+from coloc_graph.results.writer import MEASUREMENT_COLUMNS, read_result, write_result
+from coloc_graph.run import open_run, run_id
+from coloc_graph.simulation import simulate
+from coloc_graph.team import Team
+
+FILES = {
+    "summary.json",
+    "trajectories/A.tum",
+    "trajectories/A.cov.csv",
+    "trajectories/B.tum",
+    "trajectories/B.cov.csv",
+    "trajectories/C.tum",
+    "trajectories/C.cov.csv",
+    "graph.dot",
+    "graph.g2o",
+    "measurements.csv",
+    "config.toml",
+    "report.html",
+}
+
+
+def contents(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_result_has_every_file_of_the_design(result):
+    assert set(contents(result)) == FILES
+    assert not list(result.parent.glob("result.*"))
+
+
+def test_the_summary_has_every_key_of_the_design(result):
+    summary = json.loads((result / "summary.json").read_text())
+    assert summary["method"] == "joint" and summary["robots"] == ["A", "B", "C"] and summary["stances"] == 8
+    assert summary["measurements"] == {"used": 8, "rejected": 0}
+    assert set(summary["seconds"]) == {"frontend", "backend", "total"}
+    assert all(seconds >= 0 for seconds in summary["seconds"].values())
+    accuracy = summary["accuracy"]
+    assert set(accuracy["length_error_percent"]) == {"A", "B", "C"}
+    for key in ("ate_m", "end_position_error_m", "heading_error_deg", "anees"):
+        assert isinstance(accuracy[key], float), key
+
+
+def test_a_summary_is_json_that_every_program_reads(result):
+    def refuse(word):
+        raise AssertionError(f"{word} is no JSON")
+
+    json.loads((result / "summary.json").read_text(), parse_constant=refuse)
+
+
+def test_measurements_are_one_row_a_homography(result, solutions):
+    with (result / "measurements.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == MEASUREMENT_COLUMNS
+    assert [(row["stance"], row["robot_i"], row["robot_j"]) for row in rows] == [
+        (str(s.index), *s.observers) for s in solutions["joint"].run.stances
+    ]
+    assert {row["usable"] for row in rows} == {"yes"}
+    for row, measured in zip(rows, solutions["joint"].measurements, strict=True):
+        assert int(row["inliers"]) == measured.homography.inliers <= int(row["points"])
+        distance = np.linalg.norm(measured.relative_pose.T_i_j.translation())
+        assert float(row["distance"]) == pytest.approx(distance)
+
+
+def test_the_config_says_everything_that_was_used(result, solutions):
+    config = tomllib.loads((result / "config.toml").read_text())
+    assert config["options"]["method"] == "joint"
+    assert config["options"]["frontend"]["criterion"] == "reprojection"
+    assert msgspec.convert(config["team"], Team) == solutions["joint"].run.team
+
+
+def test_the_same_input_gives_the_same_bytes_but_for_the_seconds(short, tmp_path):
+    for name in ("one", "two"):
+        write_result(solve(open_run(short)), tmp_path / name)
+    one, two = (contents(tmp_path / name) for name in ("one", "two"))
+    summaries = [json.loads(files.pop("summary.json")) for files in (one, two)]
+    assert one == two
+    for summary in summaries:
+        del summary["seconds"]
+    assert summaries[0] == summaries[1] and list(summaries[0]) == list(summaries[1])
+
+
+def test_a_result_reads_back(result, solutions, hallway):
+    read = read_result(result)
+    assert read.summary["method"] == "joint"
+    assert read.run_path.samefile(hallway)
+    for robot, trajectory in solutions["joint"].estimate.trajectories.items():
+        again = read.trajectories[robot]
+        for name in ("times", "stances", "covariances", "positions"):
+            assert np.array_equal(getattr(again, name), getattr(trajectory, name)), name
+
+
+def test_a_result_and_its_run_may_be_moved_together(short, short_solution, tmp_path):
+    (tmp_path / "here").mkdir()
+    moved_run = tmp_path / "here" / "run.mcap"
+    moved_run.write_bytes(short.read_bytes())
+    write_result(solve(open_run(moved_run)), tmp_path / "here" / "out")
+    (tmp_path / "here").rename(tmp_path / "there")
+    assert read_result(tmp_path / "there" / "out").run_path.samefile(tmp_path / "there" / "run.mcap")
+
+
+def test_an_earlier_result_is_replaced_whole(short_solution, solutions, tmp_path):
+    out = tmp_path / "out"
+    write_result(solutions["joint"], out)
+    (out / "trajectories" / "Z.tum").write_text("of an earlier team")
+    write_result(short_solution, out)
+    assert set(contents(out)) == FILES
+    assert json.loads((out / "summary.json").read_text())["stances"] == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_result_goes_to_an_empty_folder_a_deep_one_the_present_one_and_through_a_link(
+    short_solution, tmp_path, monkeypatch
+):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "present").mkdir()
+    (tmp_path / "target").mkdir()
+    (tmp_path / "link").symlink_to("target")
+    write_result(short_solution, tmp_path / "empty")
+    write_result(short_solution, tmp_path / "a" / "b" / "c")
+    write_result(short_solution, tmp_path / "link")
+    monkeypatch.chdir(tmp_path / "present")
+    write_result(short_solution, ".")
+    for name in ("empty", "a/b/c", "target", "present"):
+        assert set(contents(tmp_path / name)) == FILES, name
+    assert (tmp_path / "link").is_symlink()
+
+
+def test_a_folder_that_is_something_else_is_refused_and_stays_as_it_was(short_solution, tmp_path):
+    foreign = tmp_path / "thesis"
+    foreign.mkdir()
+    (foreign / "chapter.txt").write_text("years of work")
+    (tmp_path / "file").write_text("a file")
+    for place in (foreign, tmp_path / "file"):
+        with pytest.raises(InputError, match=f"{place.name} exists and is not a result; give another folder"):
+            write_result(short_solution, place)
+    with pytest.raises(InputError, match="file is not a folder"):
+        write_result(short_solution, tmp_path / "file" / "below")
+    assert contents(tmp_path) == {"thesis/chapter.txt": b"years of work", "file": b"a file"}
+
+
+def test_nothing_half_written_is_left_and_the_earlier_result_stands(short_solution, tmp_path, monkeypatch):
+    import coloc_graph.report
+
+    out = tmp_path / "out"
+    write_result(short_solution, out)
+    before = contents(tmp_path)
+
+    def full_disk(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(coloc_graph.report, "render_report", full_disk)
+    for place in (out, tmp_path / "new"):
+        with pytest.raises(OSError, match="No space left"):
+            write_result(short_solution, place)
+    assert contents(tmp_path) == before and [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_run_without_truth_has_no_accuracy(short, copied, tmp_path):
+    run = open_run(copied(short, tmp_path / "run.mcap"))
+    assert write_result(solve(run), tmp_path / "out") is None
+    assert "accuracy" not in json.loads((tmp_path / "out" / "summary.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("summary", "words"),
+    [
+        (None, r"is not a result: summary.json cannot be read \(No such file"),
+        ("{", "summary.json is damaged"),
+        ("[]", "summary.json is damaged"),
+        ("{}", r"summary.json is damaged \('robots'\); solve the run again"),
+        ('{"robots": ["A"], "run": "x.mcap"}', "A.tum: cannot be read"),
+        ('{"robots": 3, "run": "x.mcap"}', "summary.json is damaged"),
+    ],
+)
+def test_what_is_no_result_is_refused_in_words(tmp_path, summary, words):
+    if summary is not None:
+        (tmp_path / "summary.json").write_text(summary)
+    with pytest.raises(InputError, match=words) as refusal:
+        read_result(tmp_path)
+    assert str(tmp_path) in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_a_result_knows_its_run_by_content(short, hallway, short_solution, tmp_path):
+    write_result(short_solution, tmp_path / "out")
+    read = read_result(tmp_path / "out")
+    read.require_run(short)
+    copy, cut = tmp_path / "copy.mcap", tmp_path / "cut.mcap"
+    copy.write_bytes(short.read_bytes())
+    ends = [chunk.offset + chunk.length for chunk in open_run(short)._index.chunks]
+    cut.write_bytes(short.read_bytes()[: ends[1] + 100])
+    read.require_run(copy)
+    read.require_run(cut)
+    with pytest.raises(InputError, match=r"hallway.mcap is not the run that .*out was made of"):
+        read.require_run(hallway)
+    with pytest.raises(InputError, match=r"no longer at .*gone.mcap; give --run RUN"):
+        read.require_run(tmp_path / "gone.mcap")
+
+
+@pytest.mark.parametrize("scenario", ["single-step", "six-step", "hallway"])
+def test_runs_of_two_seeds_have_two_ids_and_one_of_the_same_seed_has_one(tmp_path, scenario):
+    ids = []
+    for name, seed in (("a", 0), ("b", 1), ("c", 0)):
+        shorter = {"stances": 4} if scenario == "hallway" else {}
+        simulate(scenario, tmp_path / name, seed=seed, points=20, **shorter)
+        ids.append(run_id(tmp_path / name))
+    assert ids[0] == ids[2] != ids[1]
+
+
+def test_a_result_of_a_version_without_ids_is_taken_as_it_is(short, hallway, short_solution, tmp_path):
+    write_result(short_solution, tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    del summary["run_id"]
+    (tmp_path / "out" / "summary.json").write_text(json.dumps(summary))
+    read_result(tmp_path / "out").require_run(hallway)
