@@ -1,6 +1,5 @@
 """An estimator on disk, as JSON: what it was given, from which it can be rebuilt. No pickle."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,6 +21,7 @@ from coloc_graph.measurements import (
     Sighting,
 )
 from coloc_graph.run import Stance
+from coloc_graph.run.atomic_file import write_whole
 from coloc_graph.team import Floor, Landmark, Robot, Slip
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -154,13 +154,8 @@ def write(saved: Checkpoint, path: Path) -> None:
         early=[_Early(one.stance, [_of(m) for m in one.measurements], one.after) for one in saved.early],
         landmarks=saved.landmarks,
     )
-    part = path.with_name(path.name + ".part")
     try:
-        with part.open("wb") as stream:
-            stream.write(msgspec.json.encode(file))
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(path)
+        write_whole(path, msgspec.json.encode(file), synchronise=True)
     except OSError as error:
         raise InputError(f"{path}: the checkpoint cannot be written ({error.strerror}); give another path") from error
 

@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from coloc_graph.cli.calibration_arguments import robot_of, say_written, seen_in
+from coloc_graph.cli.calibration_arguments import locked_outputs, robot_of, say_written, seen_in
 
 if TYPE_CHECKING:
     from coloc_graph.calibration import CameraCalibration
@@ -11,6 +11,11 @@ if TYPE_CHECKING:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate or read, write, print."""
+    with locked_outputs(args):
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from coloc_graph.calibration.team_file import write_camera

@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from coloc_graph.cli.calibration_arguments import robot_of, say_written, seen_in
+from coloc_graph.cli.calibration_arguments import locked_outputs, robot_of, say_written, seen_in
 
 if TYPE_CHECKING:
     from coloc_graph.calibration import MountCalibration
@@ -11,6 +11,11 @@ if TYPE_CHECKING:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate, write, print."""
+    with locked_outputs(args):
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
     from coloc_graph.calibration import calibrate_mount, write_mount
     from coloc_graph.calibration.summary import read_covariance, summarise_mount
     from coloc_graph.cli.printing import print_json, warn

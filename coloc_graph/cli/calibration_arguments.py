@@ -1,6 +1,7 @@
 """What `coloc calibrate camera` and `mount` share: whose camera, the boards in images, what was written."""
 
 import argparse
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -18,6 +19,19 @@ def robot_of(args: argparse.Namespace) -> "Robot | None":
     if args.out_team and not args.team:
         raise InputError("--out-team is a copy of a team; give it with --team and --robot")
     return read_team(args.team)[args.robot] if args.team else None
+
+
+def locked_outputs(args: argparse.Namespace) -> ExitStack:
+    """Lock all that the command writes, until the context ends; `InputError` if another command writes one of them."""
+    from pathlib import Path
+
+    from coloc_graph.run.output_lock import locked_output
+
+    with ExitStack() as locks:
+        for path in (getattr(args, "out", None), getattr(args, "camera_info", None), args.out_team or args.team):
+            if path and Path(path).absolute().parent.is_dir():
+                locks.enter_context(locked_output(path))
+        return locks.pop_all()
 
 
 def seen_in(args: argparse.Namespace) -> "tuple[Views, Board]":

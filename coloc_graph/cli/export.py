@@ -16,14 +16,16 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 
 def run(args: argparse.Namespace) -> int:
     """Copy what `solve` wrote, or make a bag of it, where nothing is yet."""
+    import os
     import shutil
     from pathlib import Path
 
     from coloc_graph.errors import InputError
     from coloc_graph.results.writer import read_result, team_of
+    from coloc_graph.run.atomic_file import write_whole
 
     result, out = read_result(args.result), Path(args.out)
-    if out.exists():
+    if os.path.lexists(out):
         raise InputError(f"{out} exists; give another path, or remove it")
     if args.format == "ros2":
         from coloc_graph.exchange.ros_export import write_ros2
@@ -43,6 +45,6 @@ def run(args: argparse.Namespace) -> int:
     if args.format == "tum":
         shutil.copytree(source, out)
     else:
-        shutil.copyfile(source, out)
+        write_whole(out, source.read_bytes())
     print(f"wrote {out}")
     return 0

@@ -137,8 +137,9 @@ def _solved(
     """Solve, write, print."""
     from coloc_graph.pipeline.batch import solve
     from coloc_graph.results.writer import summarise, write_result
+    from coloc_graph.run.output_lock import locked_output
 
-    with _earlier_result_named(args.out):
+    with _earlier_result_named(args.out), locked_output(args.out):
         with progress("stances measured") as report:
             solution = solve(run, options, report, entered)
         accuracy = write_result(solution, args.out)

@@ -15,11 +15,13 @@ def solve_one_drive(args: argparse.Namespace, run: "Run") -> None:
     """Solve, write, print."""
     from coloc_graph.pipeline.ranging import DriveOptions, solve_drive
     from coloc_graph.results.ranging import summarise_drive, write_drive_result
+    from coloc_graph.run.output_lock import locked_output
 
     options = DriveOptions(incremental=args.incremental, between_robots=not args.without_robots)
-    with progress("seconds of the run done") as report:
-        solution = solve_drive(run, options, report)
-    assessed = write_drive_result(solution, args.out)
+    with locked_output(args.out):
+        with progress("seconds of the run done") as report:
+            solution = solve_drive(run, options, report)
+        assessed = write_drive_result(solution, args.out)
     warn(solution.warnings)
     if args.json:
         print_json(summarise_drive(solution, assessed))

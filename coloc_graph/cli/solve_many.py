@@ -19,6 +19,7 @@ def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.results.executors import workers
     from coloc_graph.results.many_runs import places_of, runs_in, solve_runs
+    from coloc_graph.run.output_lock import locked_output
 
     if args.view:
         raise InputError("--view shows one run; solve the folder without it, and view one of its results")
@@ -34,7 +35,9 @@ def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
         named = what if what.startswith(str(outcome.run)) else f"{outcome.run}: {what}"
         print(f"{done} of {len(runs)}: {named}", file=sys.stderr, flush=True)
 
-    outcomes = solve_runs(runs, places, options, executors=partial(workers, processes, args.cluster), told=told)
+    executors = partial(workers, processes, args.cluster)
+    with locked_output(args.out):
+        outcomes = solve_runs(runs, places, options, executors=executors, told=told)
     failed = [one for one in outcomes if one.failed]
     if args.json:
         print_json([_as_json(one) for one in outcomes])

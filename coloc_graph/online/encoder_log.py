@@ -12,6 +12,7 @@ import msgspec
 
 from coloc_graph.online.formation import Planar
 from coloc_graph.robot_io.create.odometry import WHEELS, arc, ticks_between
+from coloc_graph.run.atomic_file import write_whole
 
 #: Nobody counted for less than such a way [m]: more is a robot that was carried, or began to count anew.
 FURTHEST = 5.0
@@ -46,9 +47,7 @@ class Ledger:
     def write(self, counted: Counted) -> None:
         """Write it, whole or not at all; a disk that refuses does not stop a robot."""
         with contextlib.suppress(OSError):
-            new = self._path.with_suffix(".new")
-            new.write_bytes(msgspec.json.encode(counted))
-            new.replace(self._path)
+            write_whole(self._path, msgspec.json.encode(counted))
 
 
 def way_since(counted: Counted, ticks: tuple[int, int]) -> tuple[Planar, tuple[float, float, float]] | None:

@@ -35,6 +35,7 @@ from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.batch import Solution, SolveOptions
 from coloc_graph.run import read_truth, run_id
+from coloc_graph.run.output_lock import locked_output
 from coloc_graph.team import Team, read_team, without_none, write_team
 
 SUMMARY = "summary.json"
@@ -122,22 +123,22 @@ def whole_result(out: str | Path) -> Iterator[Path]:
     """
     require_place(out)
     place = Path(out).resolve()  # "." has no name, and a link's target is what is replaced
-    place.parent.mkdir(parents=True, exist_ok=True)
-    # a folder of our own beside it, whose name nobody else has
-    work = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
-    part, old = work / "new", work / "old"
-    (part / "trajectories").mkdir(parents=True)
-    try:
-        yield part
-        if place.exists():
-            place.rename(old)
-        part.rename(place)
-    except BaseException:
-        if old.exists() and not place.exists():
-            old.rename(place)
-        raise
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+    with locked_output(place):
+        # a folder of our own beside it, whose name nobody else has
+        work = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
+        part, old = work / "new", work / "old"
+        (part / "trajectories").mkdir(parents=True)
+        try:
+            yield part
+            if place.exists():
+                place.rename(old)
+            part.rename(place)
+        except BaseException:
+            if old.exists() and not place.exists():
+                old.rename(place)
+            raise
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
 
 
 def write_summary(summary: dict[str, Any], run: Path, out: str | Path, part: Path) -> None:

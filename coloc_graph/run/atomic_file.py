@@ -1,37 +1,81 @@
-"""Files that are there whole or not at all."""
+"""Atomic writes: a file is there whole or not at all."""
 
 import os
-import tempfile
+import secrets
 from contextlib import suppress
 from pathlib import Path
 
 from coloc_graph.errors import InputError
 
+#: Bytes of the random part of a temporary name.
+_RANDOM_BYTES = 8
+
 
 def require_writable(path: str | Path, *, force: bool = False, what: str = "a file") -> None:
-    """Raise `InputError` where a file cannot be written at `path`, or is there already, unless with `force`."""
+    """Raise `InputError` if no file can be written at `path`, or if one is there and `force` is not given."""
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path} is a folder; give the path of {what}")
-    if path.exists() and not force:
+    if os.path.lexists(path) and not force:
         raise InputError(f"{path} exists; replace it with --force, or give another path")
     if not path.absolute().parent.is_dir():
-        raise InputError(f"{path} cannot be written, since its folder does not exist; make it, or give another path")
+        raise InputError(f"{path} cannot be written: its folder does not exist; create it, or give another path")
 
 
-def write_whole(path: Path, data: str | bytes) -> None:
-    """Write a file that is there whole or not at all; where there was one, it keeps its rights. A link stays one."""
+def open_part(path: Path) -> tuple[int, Path]:
+    """Create the temporary file of an output, beside it, under a name that nobody can foresee.
+
+    The file is new (`O_EXCL`) and no link is followed (`O_NOFOLLOW`); its rights are those that the system gives to new
+    files. It is called `NAME.<random>.part`, so that what a killed process wrote can be found.
+
+    Parameters
+    ----------
+    path
+        Output that the file is for.
+
+    Returns
+    -------
+    tuple
+        File descriptor, open for writing, and path of the temporary file.
+    """
+    part = path.with_name(f"{path.name}.{secrets.token_hex(_RANDOM_BYTES)}.part")
+    return os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666), part
+
+
+def parts_left(path: Path) -> list[Path]:
+    """Temporary files of an output (see `open_part`) that killed processes left beside it, by name."""
+    return sorted(one for one in path.parent.glob("*.part") if _is_part(one.name, path.name) and one.is_file())
+
+
+def _is_part(name: str, of: str) -> bool:
+    random = name.removeprefix(f"{of}.").removesuffix(".part")
+    return len(random) == 2 * _RANDOM_BYTES and f"{of}.{random}.part" == name and set(random) <= set("0123456789abcdef")
+
+
+def write_whole(path: Path, data: str | bytes, *, synchronise: bool = False) -> None:
+    """Write a file atomically; a file that is replaced keeps its rights, and a link stays a link.
+
+    Parameters
+    ----------
+    path
+        Output.
+    data
+        Content; text is written as UTF-8.
+    synchronise
+        Whether the content is on the disk, not only in the system's hands, before the file gets its name.
+    """
     path = path.resolve()
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}-", delete=False) as part:
-        try:
-            part.write(data.encode() if isinstance(data, str) else data)
-            part.close()
-            # such a file is its owner's alone, where others are as the system has it
-            mask = os.umask(0)
-            os.umask(mask)
-            Path(part.name).chmod(path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~mask)
-            Path(part.name).replace(path)
-        except BaseException:
-            with suppress(FileNotFoundError):
-                Path(part.name).unlink()
-            raise
+    file, part = open_part(path)
+    try:
+        with os.fdopen(file, "wb") as stream:
+            stream.write(data.encode() if isinstance(data, str) else data)
+            if synchronise:
+                stream.flush()
+                os.fsync(stream.fileno())
+        if path.exists():
+            part.chmod(path.stat().st_mode & 0o777)
+        part.replace(path)
+    except BaseException:
+        with suppress(FileNotFoundError):
+            part.unlink()
+        raise

@@ -1,11 +1,13 @@
 """`RunWriter` records a run as it happens, `whole_run` writes one that is there whole or not at all."""
 
+import os
+import stat
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import BinaryIO, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -13,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from coloc_graph.errors import RunError
 from coloc_graph.run import schemas
+from coloc_graph.run.atomic_file import open_part
 from coloc_graph.run.encode import (
     ImageFormat,
     Record,
@@ -23,20 +26,36 @@ from coloc_graph.run.encode import (
     encode_team,
 )
 from coloc_graph.run.messages import Planes, Ranges, Stance
+from coloc_graph.run.output_lock import OutputLock, locked_output
 from coloc_graph.team import Team
 
 CHUNK_SIZE = 128 * 1024
 
 
 class RunWriter:
-    """Writes a run to `path` as it happens; a context manager, which replaces a file that was there.
+    """Writer of a run while it happens; a context manager, which replaces a file that was there.
 
-    Messages are on their way to the disk (in the operating system's hands) at most `flush_every` seconds
-    after `write` returned, so that a killed process loses no more than that; None writes a chunk only when it
-    is full, and then the same input gives the same bytes. `image_format` is `jpeg` (quality 95, lossy),
-    `png` or `raw`. `write` may be called from several threads.
+    `write` may be called from several threads.
 
-    Raises RunError where a record cannot be read back as it was meant, and when the disk refuses.
+    Parameters
+    ----------
+    path
+        File to write. It is not touched while another writer writes it, and a link is not followed.
+    team
+        Robots of the run.
+    image_format
+        `jpeg` (quality 95, lossy), `png` or `raw`.
+    flush_every
+        Longest time between the return of `write` and the moment when the message is in the operating system's hands
+        [s]; a killed process loses no more than that. None writes a chunk only when it is full, and then the same input
+        gives the same bytes.
+
+    Raises
+    ------
+    RunError
+        If a record cannot be read back as it was meant, or if the disk refuses.
+    InputError
+        If another writer writes the file.
     """
 
     def __init__(
@@ -64,10 +83,15 @@ class RunWriter:
         self._failure: OSError | None = None
         self._lock = threading.Lock()
         self._stop = threading.Event()
+        self._output: OutputLock | None = None
         try:
-            self._file = self.path.open("wb")
+            self._file = self._open()
         except OSError as error:
+            self._release()
             raise self._refused(error) from error
+        except BaseException:
+            self._release()
+            raise
         self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE, compression=CompressionType.LZ4)
         try:
             self._on_disk(self._begin)
@@ -141,6 +165,21 @@ class RunWriter:
             if self._failure is not None:
                 raise self._refused(self._failure) from self._failure
 
+    def _open(self) -> BinaryIO:
+        """Lock the output, then open it: what is there is emptied only once nobody else writes it."""
+        if not self.path.exists() or self.path.is_file():  # a device is nobody's alone
+            self._output = OutputLock(self.path)
+        if self.path.is_symlink():
+            raise RunError(f"{self.path}: is a link; give the path of the file itself")
+        file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        if stat.S_ISREG(os.fstat(file).st_mode):
+            os.ftruncate(file, 0)
+        return os.fdopen(file, "wb")
+
+    def _release(self) -> None:
+        if self._output is not None:
+            self._output.release()
+
     def _add(self, topic: str, schema: str, time: float, data: bytes) -> None:
         ns = schemas.to_ns(time)
         with self._lock:
@@ -210,6 +249,7 @@ class RunWriter:
     def _close_file(self) -> None:
         with suppress(OSError):  # it flushes once more, and a disk that is full has said so before
             self._file.close()
+        self._release()
 
     def _on_disk(self, action: Callable[[], None]) -> None:
         try:
@@ -224,13 +264,31 @@ class RunWriter:
         )
 
 
+class _PartWriter(RunWriter):
+    """Writer of the temporary file of a run, which is open as `file`."""
+
+    def __init__(self, file: int, path: Path, team: Team, *, image_format: ImageFormat, flush_every: float | None):
+        self._descriptor = file
+        super().__init__(path, team, image_format=image_format, flush_every=flush_every)
+
+    def _open(self) -> BinaryIO:
+        return os.fdopen(self._descriptor, "wb")
+
+
 @contextmanager
 def whole_run(
     path: str | Path, team: Team, *, image_format: ImageFormat = "jpeg", flush_every: float | None = None
 ) -> Iterator[RunWriter]:
-    """A `RunWriter` whose file is at `path` only once it is whole: nothing is left of it after an exception.
+    """Yield a `RunWriter` whose file gets its name `path` once it is whole; nothing is left of it after an exception.
 
-    Until then it is beside it, as `path` + ".part". The same input gives the same bytes.
+    Until then it is beside it, as `NAME.<random>.part`. The same input gives the same bytes.
+
+    Raises
+    ------
+    RunError
+        If `path` is a folder, or its folder does not exist.
+    InputError
+        If another command writes `path`.
     """
     path = Path(path)
     if path.is_dir():
@@ -238,14 +296,17 @@ def whole_run(
     if not path.parent.is_dir():
         what = "is not a folder" if path.parent.exists() else "does not exist"
         raise RunError(f"{path}: cannot be written, since {path.parent} {what}; make the folder, or give another")
-    part = path.with_name(path.name + ".part")
-    writer = RunWriter(part, team, image_format=image_format, flush_every=flush_every)
-    try:
-        yield writer
-        writer.close()
-        part.replace(path)
-    except BaseException:
-        with suppress(RunError):
+    with locked_output(path):
+        file, part = open_part(path)
+        writer = None
+        try:
+            writer = _PartWriter(file, path, team, image_format=image_format, flush_every=flush_every)
+            yield writer
             writer.close()
-        part.unlink(missing_ok=True)
-        raise
+            part.replace(path)
+        except BaseException:
+            if writer is not None:
+                with suppress(RunError):
+                    writer.close()
+            part.unlink(missing_ok=True)
+            raise
