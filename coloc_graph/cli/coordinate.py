@@ -92,6 +92,6 @@ def run(args: argparse.Namespace) -> int:
         )
         with coordinator:
             phase = coordinator.run(stop)
-        if coordinator.stances:
-            report(out)
+    if coordinator.stances:
+        report(out, stopped=stop.is_set())
     return 0 if phase == Phase.DONE else 1

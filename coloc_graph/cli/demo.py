@@ -83,21 +83,24 @@ def online(args: argparse.Namespace) -> int:
         raise InputError(f"{out} is there already: remove it, or give another folder with --out")
     team, address = field_team(), free_address()
     options = MissionOptions(goals=((100.0, 0.0),), stances=args.stances, speed=0.4)
-    with until_signal() as stop, watched(team, args.port, browser=not args.no_browser) as told:
-        with SimulatedTeam(team, out / "field", connect=address, seed=args.seed) as field:
-            field.start()
-            began = time.monotonic()
-            coordinator = Coordinator(
-                team, out / "mission", options, listen=address, entered=told.entered, heard=told.heard
-            )
-            with coordinator:
-                phase = coordinator.run(stop)
-        if coordinator.stances == 0:
-            return 1
-        report(out / "mission", field.truth_path)
-        slowest = max(coordinator.latencies)
-        print(
-            f"{coordinator.stances} stances in {time.monotonic() - began:.0f} s; from the last image of a stance "
-            f"to its estimate at most {slowest:.2f} s; {field.truth_path} is the truth"
+    with (
+        until_signal() as stop,
+        watched(team, args.port, browser=not args.no_browser) as told,
+        SimulatedTeam(team, out / "field", connect=address, seed=args.seed) as field,
+    ):
+        field.start()
+        began = time.monotonic()
+        coordinator = Coordinator(
+            team, out / "mission", options, listen=address, entered=told.entered, heard=told.heard
         )
+        with coordinator:
+            phase = coordinator.run(stop)
+    if coordinator.stances == 0:
+        return 1
+    report(out / "mission", field.truth_path, stopped=stop.is_set())
+    slowest = max(coordinator.latencies)
+    print(
+        f"{coordinator.stances} stances in {time.monotonic() - began:.0f} s; from the last image of a stance "
+        f"to its estimate at most {slowest:.2f} s; {field.truth_path} is the truth"
+    )
     return 0 if phase == Phase.DONE else 1

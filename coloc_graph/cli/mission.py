@@ -1,5 +1,6 @@
 """A mission as it is seen: in the viewer while it goes on, as a result when it is over."""
 
+import logging
 import sys
 import webbrowser
 from collections.abc import Callable, Iterator
@@ -12,6 +13,9 @@ if TYPE_CHECKING:
     from coloc_graph.online.mission import Heard
     from coloc_graph.pipeline.incremental import EnteredStance
     from coloc_graph.team import Team
+
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,7 @@ def watched(team: "Team", port: int | None, *, browser: bool) -> Iterator[Told]:
     from coloc_graph.viewer import LivePoses, LiveStance, Scene, Viewer
 
     with Viewer(Scene(team.names, (), team=team, title="a mission"), port=port) as viewer:
-        print(f"the viewer is at {viewer.url}", file=sys.stderr, flush=True)
+        log.info("the viewer is at %s", viewer.url)
         if browser and sys.stdout.isatty():
             webbrowser.open(viewer.url)
         yield Told(
@@ -40,16 +44,22 @@ def watched(team: "Team", port: int | None, *, browser: bool) -> Iterator[Told]:
         )
 
 
-def report(folder: Path, truth_path: Path | None = None) -> None:
-    """Solve the record of a mission as it was solved on the way, write the result beside it, and print it."""
+def report(folder: Path, truth_path: Path | None = None, *, stopped: bool = False) -> None:
+    """Solve the record of a mission as it was solved on the way, write the result beside it, and print it.
+
+    After a mission that a signal `stopped` nothing is printed where nobody reads it: it must end by itself.
+    """
     from coloc_graph.cli.accuracy import print_accuracy, print_calibration, print_last_poses, print_promised
     from coloc_graph.cli.printing import warn
+    from coloc_graph.cli.running import output_is_read
     from coloc_graph.pipeline.batch import SolveOptions, solve
     from coloc_graph.results.writer import assess, write_result
     from coloc_graph.run import open_run
 
     solution = solve(open_run(folder / "run.mcap"), SolveOptions(incremental=True))
     write_result(solution, folder / "result")
+    if stopped and not output_is_read():
+        return
     warn(solution.warnings)
     assessed = None if truth_path is None else assess(solution, truth_path)
     if assessed is None:

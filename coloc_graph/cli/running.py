@@ -1,21 +1,52 @@
-"""What programs that run until they are stopped have in common: their log, and the end by a signal."""
+"""Signals and logging of programs that run until they are stopped."""
 
 import logging
+import select
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from coloc_graph.cli.nonblocking_log import NonBlockingHandler
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+READER_WAIT = 2.0  # time for whoever reads stdout and stderr to make room, after a signal [s]
+
 
 @contextmanager
 def until_signal() -> Iterator[threading.Event]:
-    """An event that SIGINT or SIGTERM sets; the log goes to stderr meanwhile."""
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    """An event that SIGINT, SIGTERM or SIGHUP sets; log messages go to stderr meanwhile, without ever waiting for it.
+
+    SIGHUP stays ignored where it was ignored before, as under nohup. SIGINT, which shells ignore for programs in the
+    background, is not.
+    """
     stop = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [n for n in SIGNALS if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in numbers}
+    root, handler = logging.getLogger(), NonBlockingHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
+    level = root.level
+    root.addHandler(handler)
+    root.setLevel(logging.INFO)
+    logging.captureWarnings(True)
     try:
         yield stop
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        logging.captureWarnings(False)
+        root.removeHandler(handler)
+        root.setLevel(level)
+        handler.close()
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
+
+
+def output_is_read() -> bool:
+    """Return whether stdout and stderr take a few lines within `READER_WAIT` without waiting for their reader."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            if not select.select([], [stream.fileno()], [], READER_WAIT)[1]:
+                return False
+        except (OSError, ValueError):  # no file behind it
+            continue
+    return True

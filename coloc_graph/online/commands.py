@@ -1,62 +1,80 @@
-"""What the coordinator tells robots to do, and its permission to move; `Orders`."""
+"""Commands to the robots, and their permission to move; `Commander`."""
 
 import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
-from coloc_graph.errors import RobotError
+from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.online.robot_registry import Roster
+from coloc_graph.robot_io.deadlines import PERMISSION_PERIOD
 from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
 from coloc_graph.robot_io.link.messages import Body, Drive, EndCapture, Halt
 
-#: The permission to move is renewed so often while the coordinator is at work, which may take so long [s].
-RENEWED = 0.05
-AT_WORK = 0.4
-#: How long a robot has to answer [s], and one that is only told to stop.
-ANSWER = 1.0
-STOP_ANSWER = 0.3
+ANSWER = 1.0  # time that a robot has to answer a command [s]
+STOP_ANSWER = 0.3  # the same when all robots are stopped [s]
 
 
-class Orders:
-    """Orders to the robots of a roster, at a `speed` [m/s]; they move only while `at_work` is called again and again.
+class Stopped(ColocError):
+    """The mission was told to stop while it waited for an answer."""
 
-    `note` is told of each robot that goes on after it stopped. Methods raise `RobotError` where a robot does not answer
-    in time, or refuses.
+
+class Commander:
+    """Commands to the robots of a roster; they move only while `renew` is called again and again.
+
+    It runs on the thread of the mission's main loop alone: when that hangs, permissions end. Waiting for an answer
+    renews them.
+
+    Parameters
+    ----------
+    link, roster
+        The link to the robots, and their states.
+    speed
+        Speed of drives [m/s].
+    on_drive_resumed
+        Called with the name of each robot that is sent on after it stopped on its way.
     """
 
-    def __init__(self, link: CoordinatorLink, roster: Roster, speed: float, note: Callable[[str], None]) -> None:
-        self._link, self._roster, self._speed, self._note = link, roster, speed, note
-        self._ways = time.time_ns() // 1_000_000  # no number twice, of whatever coordinator
-        self._until = 0.0
-        self._ended = threading.Event()
-        self._holder = threading.Thread(target=self._renew, name="permission to move", daemon=True)
-        self._holder.start()
+    def __init__(
+        self, link: CoordinatorLink, roster: Roster, speed: float, on_drive_resumed: Callable[[str], None]
+    ) -> None:
+        self._link, self._roster, self._speed, self._on_drive_resumed = link, roster, speed, on_drive_resumed
+        self._drives = time.time_ns() // 1_000_000  # drive numbers are unique across coordinators
+        self._renewed = -PERMISSION_PERIOD
+        self.stop = threading.Event()
 
-    def end(self) -> None:
-        """Renew no permission any more, and stop all robots."""
-        self._ended.set()
-        self._holder.join(1.0)
-        self.halt_all()
-
-    def at_work(self, seconds: float = AT_WORK) -> None:
-        """The coordinator is alive, and will say so again within some time [s]."""
-        self._until = time.monotonic() + seconds
+    def renew(self) -> None:
+        """Renew the robots' permission to move, unless that was done within `PERMISSION_PERIOD`."""
+        now = time.monotonic()
+        if now - self._renewed >= PERMISSION_PERIOD:
+            self._renewed = now
+            self._link.hold()
 
     def ask(self, name: str, body: Body) -> str:
-        """Ask a robot, which must answer and agree; what it says comes back."""
-        self.at_work(ANSWER + AT_WORK)
-        reply = self._link.ask(name, body, ANSWER)
-        self.at_work()
-        if not reply.ok:
-            raise RobotError(f"{name} refuses: {reply.text}")
-        return reply.text
+        """Have a robot carry out a command, and return its answer.
 
-    def ask_each(self, orders: Mapping[str, Body]) -> dict[str, str]:
-        """Ask several robots at once, and what each says."""
-        with ThreadPoolExecutor(len(orders), thread_name_prefix="orders") as threads:
-            return dict(zip(orders, threads.map(self.ask, orders.keys(), orders.values()), strict=True))
+        Raises
+        ------
+        RobotError
+            If it does not answer in time, or refuses.
+        Stopped
+            If the mission is told to stop meanwhile.
+        """
+        return self.ask_each({name: body})[name]
+
+    def ask_each(self, bodies: Mapping[str, Body]) -> dict[str, str]:
+        """Have several robots carry out a command each at the same time, and return their answers; see `ask`."""
+        answers = {}
+        for name, reply in self._link.ask_each(bodies, ANSWER, self._while_waiting).items():
+            if reply is None:
+                what = type(bodies[name]).__name__
+                raise RobotError(
+                    f"robot {name} has not answered `{what}` within {ANSWER:g} s: check its program and network"
+                )
+            if not reply.ok:
+                raise RobotError(f"{name} refuses: {reply.text}")
+            answers[name] = reply.text
+        return answers
 
     def drive(
         self, name: str, places: Iterable[Sequence[float]], yaw: float | None = None, *, backwards: bool = True
@@ -65,29 +83,27 @@ class Orders:
         member = self._roster[name]
         own = [member.whereabouts.in_odometry((float(x), float(y), 0.0))[:2] for x, y in places]
         last = None if yaw is None else member.whereabouts.in_odometry((0.0, 0.0, yaw))[2]
-        self._ways += 1
-        member.way = Drive(number=self._ways, places=own, yaw=last, speed=self._speed, backwards=backwards)
+        self._drives += 1
+        member.way = Drive(number=self._drives, places=own, yaw=last, speed=self._speed, backwards=backwards)
         member.arrived = member.stopped = False
         self.ask(name, member.way)
 
     def drive_on(self) -> None:
-        """Robots that stopped on their way, for want of a word in time, go on."""
+        """Send on the robots that stopped on their way because no permission came in time."""
         for name, member in self._roster.members.items():
             if member.stopped and not member.arrived and member.way is not None:
                 member.stopped = False
-                self._note(name)
+                self._on_drive_resumed(name)
                 self.ask(name, member.way)
 
     def halt_all(self) -> None:
-        """Stop all robots, as far as they hear it; those that do not stop by themselves."""
-        for name, member in self._roster.members.items():
-            if member.present:
-                for body in (Halt(), EndCapture()):
-                    with contextlib.suppress(RobotError):
-                        self._link.ask(name, body, STOP_ANSWER)
+        """Stop all robots that are present, and their cameras' captures; never raises for those that do not answer."""
+        present = [name for name, member in self._roster.members.items() if member.present]
+        for body in (Halt(), EndCapture()):
+            with contextlib.suppress(RobotError):
+                self._link.ask_each(dict.fromkeys(present, body), STOP_ANSWER)
 
-    def _renew(self) -> None:
-        """The thread that lets robots move as long as the coordinator is at work."""
-        while not self._ended.wait(RENEWED):
-            if time.monotonic() < self._until:
-                self._link.hold()
+    def _while_waiting(self) -> None:
+        if self.stop.is_set():
+            raise Stopped("the mission was told to stop")
+        self.renew()

@@ -19,12 +19,12 @@ from coloc_graph.errors import ColocError, InputError, RobotError
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Sighting
 from coloc_graph.online.bumps import displaced, pushed
-from coloc_graph.online.commands import Orders
+from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.estimation_worker import Measuring
 from coloc_graph.online.formation import STAGGER, Course, Formation, Planar
 from coloc_graph.online.mission import Heard, MissionOptions, in_world
+from coloc_graph.online.mission_folder import MissionFolder
 from coloc_graph.online.mission_states import Change, Phase, Phases
-from coloc_graph.online.record import Record, continued
 from coloc_graph.online.robot_registry import Member, Roster
 from coloc_graph.online.visibility import InView, Precision
 from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
@@ -91,22 +91,9 @@ class Coordinator:
         self.formation = Formation(Course(points), self.observers)
         self._inbox: queue.SimpleQueue[tuple[str, object]] = queue.SimpleQueue()
         self.solver = StanceSolver(team, self.options.solve)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        path = self.folder / "run.mcap"
-        before: Run | None = None
-        if path.exists() and not resume:
-            raise InputError(f"{path} is there already: go on with --resume, or give another folder with --out")
-        epoch = time.time_ns() - time.monotonic_ns()
         with contextlib.ExitStack() as undo:
-            if path.exists():
-                record, before = continued(path, team)
-                undo.enter_context(record)
-                epoch = max(epoch, to_ns(record.newest()) - time.monotonic_ns())  # time does not run backwards
-            else:
-                record = undo.enter_context(Record(path, team))
-            self.record = record
-            self._log = undo.enter_context((self.folder / "mission.jsonl").open("a", encoding="utf-8"))
-            self.phases = Phases(self._note_phase)
+            # the folder and the port are taken before anything of an earlier mission is touched
+            held = undo.enter_context(MissionFolder(folder, resume=resume))
             link = CoordinatorLink(
                 team,
                 listen=listen,
@@ -118,8 +105,15 @@ class Coordinator:
                 on_status=lambda name, one: self._inbox.put((name, one)),
                 on_presence=lambda name, there: self._inbox.put((name, there)),
             )
-            self.roster = Roster(record, starts, lambda name: link.clocks[name].to_coordinator, epoch)
             self.link = undo.enter_context(link)
+            record, self._before = held.open_record(team)
+            self.record = undo.enter_context(record)
+            epoch = time.time_ns() - time.monotonic_ns()
+            if self._before is not None:
+                epoch = max(epoch, to_ns(record.newest()) - time.monotonic_ns())  # time does not run backwards
+            self._log = undo.enter_context(held.log_path.open("a", encoding="utf-8"))
+            self.phases = Phases(self._note_phase)
+            self.roster = Roster(record, starts, lambda name: link.clocks[name].to_coordinator, epoch)
             self._close = undo.pop_all()
         self._tries = self._rounds = 0
         self._capturing = time.time_ns() // 1_000_000  # no number twice, of whatever coordinator
@@ -137,9 +131,9 @@ class Coordinator:
         self._ended_at = 0.0
         self._in: list[Stance] = []
         self._latencies: list[float] = []
-        if before is not None:
-            self._go_on(before)
-        self._orders = Orders(link, self.roster, self.options.speed, lambda name: self._note("drives on", robot=name))
+        self._commander = Commander(
+            link, self.roster, self.options.speed, lambda name: self._note("drives on", robot=name)
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -147,7 +141,7 @@ class Coordinator:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._orders.end()
+        self._commander.halt_all()
         self._measuring.end()
         self._close.__exit__(kind, error, trace)
 
@@ -174,6 +168,9 @@ class Coordinator:
             Phase.ESTIMATING: self._estimate,
             Phase.HOLDING: self._hold,
         }
+        self._commander.stop = stop
+        if self._before is not None:
+            self._go_on(self._before, stop)
         while self.phases.now in steps and not stop.is_set():
             self._listen()
             try:
@@ -182,17 +179,19 @@ class Coordinator:
                     steps[self.phases.now]()
                 else:
                     self._hold_on(trouble)
+            except Stopped:
+                break
             except ColocError as error:
                 self._hold_on(str(error))
             self._tell()
-        self._orders.halt_all()
+        self._commander.halt_all()
         return self.phases.now
 
     # what comes in
 
     def _listen(self) -> None:
         """Take in all that came, or wait a little for something."""
-        self._orders.at_work()
+        self._commander.renew()
         until = time.monotonic() + (SOON if self.phases.now in (Phase.COLLECTING, Phase.ESTIMATING) else TICK)
         while True:
             try:
@@ -200,6 +199,7 @@ class Coordinator:
             except queue.Empty:
                 return
             self._take(self.roster[name], one)
+            self._commander.renew()
             if time.monotonic() > until + 10 * TICK:
                 return
 
@@ -269,8 +269,8 @@ class Coordinator:
         for member in self.roster.members.values():
             member.arrived, member.way = True, None
         if self._plan is not None:
-            self._orders.drive(leaper, [to[:2]], to[2], backwards=False)
-        self._orders.drive(self.mover, self._patrol[:1])
+            self._commander.drive(leaper, [to[:2]], to[2], backwards=False)
+        self._commander.drive(self.mover, self._patrol[:1])
 
     def _next_leap(self, places: dict[str, Planar]) -> tuple[str, Planar]:
         """Who leaps, and where to: one that has left its place already, under an earlier coordinator, goes on."""
@@ -283,7 +283,7 @@ class Coordinator:
         return left[0], self.formation.place(left[0], front + STAGGER)
 
     def _place(self) -> None:
-        self._orders.drive_on()
+        self._commander.drive_on()
         if not all(member.arrived for member in self.roster.members.values()):
             if self._phase_lasted(DRIVE_TIME):
                 raise RobotError(
@@ -304,14 +304,14 @@ class Coordinator:
         self._capturing += 1
         for name in self.observers:
             self.roster[name].samples = 0
-            self._orders.ask(name, Capture(capture=self._capturing))
+            self._commander.ask(name, Capture(capture=self._capturing))
         self._enter(Phase.LOOKING)
 
     def _look(self) -> None:
         assert self._view is not None and self._stance is not None
         missing = self._view.missing()
         if not missing:
-            self._orders.drive(self.mover, self._patrol[1:])
+            self._commander.drive(self.mover, self._patrol[1:])
             self._enter(Phase.CAPTURING)
         elif self._phase_lasted(LOOK_TIME):
             self._note_bumped(displaced(self.roster, self._view, self._awaited))
@@ -334,12 +334,12 @@ class Coordinator:
         if not missing:
             self._out_since = None
             if self.phases.now == Phase.TURNING_BACK:
-                self._orders.drive(self.mover, self._patrol)
+                self._commander.drive(self.mover, self._patrol)
                 self._enter(Phase.CAPTURING)
         elif self._out_since is None:
             self._out_since = now
         elif now - self._out_since > OUT_OF_VIEW and self.phases.now == Phase.CAPTURING:
-            self._orders.drive(self.mover, self._patrol[-1:])
+            self._commander.drive(self.mover, self._patrol[-1:])
             self._enter(Phase.TURNING_BACK, f"{self.mover} left the view of {' and '.join(missing)}")
         elif now - self._out_since > DRIVE_TIME / 2:
             raise RobotError(f"{self.mover} did not come back into the view of {' and '.join(missing)}")
@@ -353,17 +353,17 @@ class Coordinator:
         if not self._measuring.judging and now - self._judged > JUDGED < left:  # what is measured last waits for none
             self._judged = now
             self._measuring.judge(replace(self._stance, end=self._last_image()))
-        self._orders.drive_on()
+        self._commander.drive_on()
         if self.roster[self.mover].arrived and self.phases.now == Phase.CAPTURING:
             self._rounds += 1
             order = self._patrol[::-1] if self._rounds % 2 else self._patrol
-            self._orders.drive(self.mover, order)
+            self._commander.drive(self.mover, order)
         if left < 0:
             self._end_capture(f"{self.options.longest:g} s are over")
 
     def _end_capture(self, why: str) -> None:
         orders: dict[str, Body] = {self.mover: Halt(), **dict.fromkeys(self.observers, EndCapture())}
-        said = self._orders.ask_each(orders)
+        said = self._commander.ask_each(orders)
         self._expected = {name: int(said[name] or 0) for name in self.observers}
         self._enter(Phase.COLLECTING, why)
 
@@ -446,7 +446,7 @@ class Coordinator:
             self._fail(f"{self._tries} attempts of stance {self._next_index()} went wrong, the last one: {why}")
             return
         self._enter(Phase.HOLDING, why)
-        self._orders.halt_all()
+        self._commander.halt_all()
 
     def _fail(self, why: str) -> None:
         self._enter(Phase.FAILED, why)
@@ -479,7 +479,7 @@ class Coordinator:
                 if fault and member.present and time.monotonic() - self._judged > 1.0:
                     self._judged = time.monotonic()
                     with contextlib.suppress(RobotError):
-                        self._orders.ask(name, Recover())
+                        self._commander.ask(name, Recover())
                 return why
             if not member.whereabouts.known:
                 return f"the wheels of {name} have said nothing yet"
@@ -550,10 +550,12 @@ class Coordinator:
                 note += f", {1e3 * found.place:.1f} mm, {math.degrees(found.heading):.2f} deg"
         self._heard(Heard(self.roster.utc(time.monotonic_ns()), T, note))
 
-    def _go_on(self, before: Run) -> None:
+    def _go_on(self, before: Run, stop: threading.Event) -> None:
         """Enter the stances of a run that ended, and find where the robots are."""
         self.roster.go_on()
         for stance in before.stances:
+            if stop.is_set():
+                return
             self._fix(self.solver.enter(before, stance))
             self._in.append(stance)
         self._note("resumed", stances=len(before.stances))

@@ -110,24 +110,40 @@ def _between(kept: Sequence[T], start: float | None, end: float | None) -> Seque
 
 
 def continued(path: str | Path, team: Team) -> tuple[Record, Run]:
-    """A record that goes on where another ended, perhaps without warning, with all that could be read of it.
+    """Begin a record with all that can be read of an earlier one, which may have been cut off, and return both.
 
-    The old run, which is kept beside it with a number, comes back too. `RunError` where it is of another team.
+    The earlier run is kept beside it with a number. At every moment `path` is a complete copy of what was there before.
+
+    Raises
+    ------
+    RunError
+        If the earlier run is of another team, or cannot be read; nothing is changed then.
     """
     path = Path(path)
-    if open_run(path).team != team:
+    before = open_run(path)
+    if before.team != team:
         raise RunError(f"{path}: is of another team, or of another description of it: begin in a new folder")
     number = next(n for n in range(1, 10_000) if not path.with_suffix(f".{n}.mcap").exists())
-    path.rename(path.with_suffix(f".{number}.mcap"))
-    old = open_run(path.with_suffix(f".{number}.mcap"))
-    record = Record(path, team)
-    for robot in team.names:
-        for detections in old.detections(robot):
-            record.take(detections)
-        for sample in old.odometry(robot):
-            record.take(sample)
-        for motion in old.motions(robot):
-            record.moves(robot, motion.time, motion.moving)
-    for stance in old.stances:
-        record.complete(stance)
-    return record, old
+    kept, new = path.with_suffix(f".{number}.mcap"), path.with_suffix(".new.mcap")
+    record = Record(new, team)
+    try:
+        for robot in team.names:
+            for detections in before.detections(robot):
+                record.take(detections)
+            for sample in before.odometry(robot):
+                record.take(sample)
+            for motion in before.motions(robot):
+                record.moves(robot, motion.time, motion.moving)
+        for stance in before.stances:
+            record.complete(stance)
+        try:
+            kept.hardlink_to(path)
+        except OSError:  # a file system without hard links
+            path.rename(kept)
+        new.rename(path)
+    except BaseException:
+        record.__exit__(None, None, None)
+        new.unlink(missing_ok=True)
+        raise
+    record.path = path
+    return record, open_run(kept)

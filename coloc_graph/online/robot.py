@@ -21,6 +21,7 @@ from coloc_graph.online.record import Record
 from coloc_graph.robot_io.camera.open import open_camera
 from coloc_graph.robot_io.camera.source import CameraSource, Frame, clock_ahead
 from coloc_graph.robot_io.create.driver import Create
+from coloc_graph.robot_io.deadlines import PERMISSION_LEASE
 from coloc_graph.robot_io.link.messages import (
     Body,
     Capture,
@@ -44,8 +45,6 @@ log = logging.getLogger(__name__)
 #: Control of the motion, and word of how it is [s].
 CONTROL = 0.04
 REPORT = 0.1
-#: Without a word from the coordinator for this long it stops [s]; wheels take up to 0.25 s more to stand.
-LEASE = 0.18
 #: So long a camera may be without an image [s]; a lost one, or lost wheels, are opened again so often [s].
 NO_IMAGE = 1.0
 REOPEN = 1.0
@@ -229,9 +228,9 @@ class RobotProgram:
                 self._still_since = self._clock()
             if self._follower is None:
                 return
-            if time.monotonic_ns() - self._link.last_heard > LEASE * 1e9:
+            if time.monotonic_ns() - self._link.last_heard > PERMISSION_LEASE * 1e9:
                 self._halt()
-                self._tell("stopped", f"no word from the coordinator for {LEASE} s")
+                self._tell("stopped", f"no permission from the coordinator for {PERMISSION_LEASE} s")
                 return
             try:
                 twist = self._follower.step(*self._pose)

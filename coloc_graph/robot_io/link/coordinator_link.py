@@ -4,11 +4,12 @@ What robots measure arrives whole and in order, also after a cut; commands are c
 """
 
 import contextlib
+import queue
 import threading
 import time
 import uuid
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -48,8 +49,9 @@ COMPARED = 0.1
 #: How often what is missing is asked for, and, of a kind of which nothing comes, whether there is something newer [s].
 RECOVERED = 0.2
 NEWER = 1.0
-#: A command is asked again so often until its deadline [s].
-AGAIN = 0.25
+AGAIN = 0.25  # a command is sent again after this time, until its deadline [s]
+NO_SESSION = 0.02  # the same where the robot's session is not known, or nobody answers its key [s]
+WAITING = 0.02  # while answers are awaited, the caller's `waiting` is called at least this often [s]
 
 
 class CoordinatorLink:
@@ -146,23 +148,60 @@ class CoordinatorLink:
                 with contextlib.suppress(zenoh.ZError):
                     self._holds[robot].put(encode(Hold(session=session, sent=self.clocks[robot].to_robot(now))))
 
-    def ask(self, robot: str, body: Body, timeout: float) -> Reply:
-        """Have a robot carry out a command, and its answer; `RobotError` where none comes in time [s].
+    def ask(self, robot: str, body: Body, timeout: float, waiting: Callable[[], None] = lambda: None) -> Reply:
+        """Have one robot carry out a command; `ask_each` for one robot. Raises `RobotError` if it does not answer."""
+        reply = self.ask_each({robot: body}, timeout, waiting)[robot]
+        if reply is None:
+            what = type(body).__name__
+            raise RobotError(
+                f"robot {robot} has not answered `{what}` within {timeout:g} s: check its program and network"
+            )
+        return reply
 
-        The command is asked again until then, and carried out once. The robot refuses it afterwards, except `Halt`
-        where nothing is known of its clock.
+    def ask_each(
+        self, bodies: Mapping[str, Body], timeout: float, waiting: Callable[[], None] = lambda: None
+    ) -> dict[str, Reply | None]:
+        """Have several robots carry out a command each, at the same time.
+
+        Each command is sent again until it is answered, and is carried out once. The robot refuses it afterwards,
+        except `Halt` where nothing is known of its clock.
+
+        Parameters
+        ----------
+        bodies
+            The command of each robot, by name.
+        timeout
+            Time to answer [s].
+        waiting
+            Called on this thread at least every `WAITING` s until all have answered. What it raises ends the wait.
+
+        Returns
+        -------
+        dict
+            The reply of each robot, None for one that did not answer in time.
         """
-        until = time.monotonic() + timeout
-        command: Command | None = None
-        while (left := until - time.monotonic()) > 0:
-            command = command or self._command(robot, body, left)
-            if command is not None:
-                reply = self._asked(robot, command, max(min(left, max(AGAIN, timeout / 3)), 0.01))
-                if reply is not None:
-                    return reply
-            time.sleep(0.02)
-        what = type(body).__name__
-        raise RobotError(f"robot {robot} has not answered `{what}` within {timeout:g} s: check its program and network")
+        until, came = time.monotonic() + timeout, queue.SimpleQueue[tuple[str, Reply | None]]()
+        commands: dict[str, Command] = {}
+        again = dict.fromkeys(bodies, 0.0)
+        replies: dict[str, Reply | None] = dict.fromkeys(bodies)
+        while (left := until - (now := time.monotonic())) > 0 and None in replies.values():
+            for robot, body in bodies.items():
+                if replies[robot] is None and now >= again[robot]:
+                    command = commands.get(robot) or self._command(robot, body, left)
+                    again[robot] = now + NO_SESSION
+                    if command is not None:
+                        commands[robot] = command
+                        wait = max(min(left, max(AGAIN, timeout / 3)), 0.01)
+                        again[robot] = now + wait
+                        self._send(robot, command, wait, came)
+            waiting()
+            with contextlib.suppress(queue.Empty):
+                robot, reply = came.get(timeout=max(min(left, WAITING), 0.001))
+                if reply is None:  # this query is over, and nobody answered it
+                    again[robot] = min(again[robot], time.monotonic() + NO_SESSION)
+                elif reply.id == commands[robot].id:
+                    replies[robot] = reply
+        return replies
 
     def _command(self, robot: str, body: Body, left: float) -> Command | None:
         """The command for the robot's session that runs now; None while that, or its clock, is not known."""
@@ -172,18 +211,26 @@ class CoordinatorLink:
         deadline = clock.to_robot(self._clock() + round(1e9 * left)) if clock.known else FARTHEST - 1
         return Command(id=uuid.uuid4().hex, session=session, deadline=deadline, body=body)
 
-    def _asked(self, robot: str, command: Command, timeout: float) -> Reply | None:
-        for one in self._session.zenoh.get(f"coloc/{robot}/command", payload=encode(command), timeout=timeout, **FIRST):
+    def _send(
+        self, robot: str, command: Command, timeout: float, came: "queue.SimpleQueue[tuple[str, Reply | None]]"
+    ) -> None:
+        """Send a command as a query; the robot's replies, and None at the query's end, are put into `came`."""
+
+        def take(one: zenoh.Reply) -> None:
             if one.ok is None:
-                continue
+                return
             try:
-                reply = decode(one.ok.payload.to_bytes(), Reply)
+                came.put((robot, decode(one.ok.payload.to_bytes(), Reply)))
             except WireError as error:
                 self._counter.refuse(error, f"an answer of {robot}")
-                continue
-            if reply.id == command.id:
-                return reply
-        return None
+
+        self._session.zenoh.get(
+            f"coloc/{robot}/command",
+            zenoh.handlers.Callback(take, lambda: came.put((robot, None)), indirect=False),
+            payload=encode(command),
+            timeout=timeout,
+            **FIRST,
+        )
 
     def _taker(self, type_: type[M], asked: bool = False) -> Callable[[zenoh.Sample], None]:
         """What takes messages of one kind from zenoh, and never raises into its threads.

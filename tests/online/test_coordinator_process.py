@@ -1,0 +1,195 @@
+"""A coordinator's process beside others, with nobody who reads its output, and with signals; robots are fake."""
+
+import fcntl
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from fake_robots import fake_team
+
+from coloc_graph.cli.nonblocking_log import CAPACITY, NonBlockingHandler
+from coloc_graph.errors import InputError
+from coloc_graph.online.mission_folder import MissionFolder
+from coloc_graph.run import open_run
+from coloc_graph.simulation.simulated_team import field_team, free_address
+from coloc_graph.team import write_team
+
+pytestmark = pytest.mark.realtime
+F_SETPIPE_SZ = 1031
+
+
+def full_pipe():
+    """Both ends of a pipe that takes no more."""
+    reader, writer = os.pipe()
+    fcntl.fcntl(writer, F_SETPIPE_SZ, 4096)
+    os.set_blocking(writer, False)
+    try:
+        while True:
+            os.write(writer, b"x" * 64)
+    except BlockingIOError:
+        os.set_blocking(writer, True)
+    return reader, writer
+
+
+def ignore_terminal():
+    """As a shell does for programs in the background, and nohup."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+
+class Mission:
+    """A coordinator's process for fake robots, whose output nobody reads."""
+
+    def __init__(self, folder):
+        self.folder, self.address = folder, free_address()
+        write_team(field_team(), folder / "team.toml")
+        self._pipe = full_pipe()
+        self.process = self.start(stdout=self._pipe[1], stderr=self._pipe[1], preexec_fn=ignore_terminal)
+
+    def start(self, *more, address=None, **options):
+        command = [sys.executable, "-m", "coloc_graph.cli", "coordinate", str(self.folder / "team.toml")]
+        command += ["--out", str(self.folder / "mission"), "--goal", "5,0", "--listen", address or self.address, *more]
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, **options)
+
+    def rows(self):
+        path = self.folder / "mission" / "mission.jsonl"
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+    def wait_for(self, phase, timeout=60.0):
+        until = time.monotonic() + timeout
+        while not any(row.get("phase") == phase for row in self.rows()):
+            assert time.monotonic() < until, self.rows()
+            time.sleep(0.05)
+
+    def end(self, number):
+        """Send a signal; time until the process has ended [s], and its exit code."""
+        began = time.monotonic()
+        self.process.send_signal(number)
+        code = self.process.wait(20.0)
+        return time.monotonic() - began, code
+
+    def close(self):
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        for end in self._pipe:
+            os.close(end)
+
+
+@pytest.fixture(scope="module")
+def mission(tmp_path_factory):
+    one = Mission(tmp_path_factory.mktemp("mission"))
+    with fake_team("ABC", one.address) as one.robots:
+        yield one
+    one.close()
+
+
+def test_a_mission_goes_on_while_nobody_reads_its_output(mission):
+    mission.wait_for("looking")
+
+
+@pytest.mark.parametrize("elsewhere", [False, True], ids=["same port", "other port"])
+def test_a_second_coordinator_of_the_same_folder_is_refused_and_changes_nothing(mission, elsewhere):
+    mission.wait_for("looking")
+    folder = mission.folder / "mission"
+    before = {path.name: path.stat().st_ino for path in folder.iterdir()}
+    second = mission.start(
+        "--resume", address=free_address() if elsewhere else None, stderr=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    out, err = second.communicate(timeout=30.0)
+    assert second.returncode == 2 and out == b"" and err.count(b"\n") == 1
+    assert b"another coordinator is at work in" in err
+    assert {path.name: path.stat().st_ino for path in folder.iterdir()} == before
+
+
+def test_a_taken_port_is_refused_before_a_record_is_touched(mission, tmp_path):
+    mission.wait_for("looking")
+    command = [sys.executable, "-m", "coloc_graph.cli", "coordinate", str(mission.folder / "team.toml")]
+    command += ["--listen", mission.address, "--out"]
+    earlier = tmp_path / "earlier"
+    earlier.mkdir()
+    (earlier / "run.mcap").write_bytes(b"a record")
+    for more in ([str(tmp_path / "new")], [str(earlier), "--resume"]):
+        done = subprocess.run([*command, *more], capture_output=True, timeout=30.0, check=False)
+        assert done.returncode == 2 and b"cannot be opened" in done.stderr and b"Traceback" not in done.stderr
+    assert not (tmp_path / "new").exists()
+    assert (earlier / "run.mcap").read_bytes() == b"a record" and not list(earlier.glob("run.*.mcap"))
+
+
+def test_a_signal_ends_a_mission_of_which_nobody_reads_the_output(mission):
+    mission.wait_for("looking")
+    seconds, code = mission.end(signal.SIGINT)  # ignored when it was started, as in the background
+    assert code == 1 and seconds < 8.0
+    run = open_run(mission.folder / "mission" / "run.mcap")
+    assert not run.warnings and sum(1 for _ in run.odometry("A")) > 10
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_mission_that_waits_for_its_robots(tmp_path, number):
+    one = Mission(tmp_path)
+    try:
+        until = time.monotonic() + 60
+        while not (tmp_path / "mission" / "mission.jsonl").exists():
+            assert time.monotonic() < until and one.process.poll() is None
+            time.sleep(0.05)
+        if number == signal.SIGHUP:  # under nohup it is not for us
+            one.process.send_signal(number)
+            time.sleep(0.5)
+            assert one.process.poll() is None
+            number = signal.SIGTERM
+        seconds, code = one.end(number)
+        assert code == 1 and seconds < 8.0
+    finally:
+        one.close()
+
+
+def test_log_messages_that_nobody_reads_are_dropped_counted_and_never_waited_for():
+    reader, writer = full_pipe()
+    handler = NonBlockingHandler(writer)
+    logger = logging.Logger("nobody reads it")
+    logger.addHandler(handler)
+    began = time.monotonic()
+    for n in range(CAPACITY + 100):
+        logger.warning("message %d", n)
+    assert time.monotonic() - began < 5.0
+    text = b""
+
+    def read():
+        nonlocal text
+        while data := os.read(reader, 1 << 16):
+            text += data
+
+    thread = threading.Thread(target=read)
+    thread.start()
+    until = time.monotonic() + 10.0
+    while b"were dropped" not in text and time.monotonic() < until:
+        time.sleep(0.01)
+    handler.close()
+    os.close(writer)
+    thread.join()
+    os.close(reader)
+    lines = text.lstrip(b"x").decode().splitlines()
+    kept = [line for line in lines if line.startswith("message")]
+    assert kept == [f"message {n}" for n in range(len(kept))]
+    assert int(lines[-1].split()[0]) == CAPACITY + 100 - len(kept) > 0
+
+
+def test_a_mission_folder_is_locked_and_given_back(tmp_path):
+    folder = tmp_path / "mission"
+    with MissionFolder(folder, resume=False), pytest.raises(InputError, match="another coordinator is at work"):
+        MissionFolder(folder, resume=True)
+    assert not folder.exists()  # nothing came to be in it
+    folder.mkdir()
+    (folder / "run.mcap").touch()
+    for _ in range(2):  # the lock is given back
+        with pytest.raises(InputError, match="--resume"):
+            MissionFolder(folder, resume=False)
+    with MissionFolder(folder, resume=True):
+        pass
+    assert (folder / "run.mcap").exists()
