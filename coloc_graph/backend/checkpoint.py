@@ -1,6 +1,7 @@
 """An estimator on disk, as JSON: what it was given, from which it can be rebuilt. No pickle."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,7 +27,7 @@ from coloc_graph.team import Floor, Landmark, Robot, Slip
 
 S = TypeVar("S", bound=msgspec.Struct)
 
-FORMAT = "coloc-graph-checkpoint-2"
+FORMAT = "coloc-graph-checkpoint-3"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,20 +40,36 @@ class Early:
 
 
 @dataclass(frozen=True, eq=False)
+class Base:
+    """Stances with their measurements that were optimised in batch; `rejected` are reasons by the number of the
+    measurement."""
+
+    stances: tuple[Stance, ...] = ()
+    measurements: tuple[Measurement, ...] = ()
+    rejected: Mapping[int, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """What one call put into the graph: a stance, or None where measurements came late, and its measurements."""
+
+    stance: Stance | None
+    measurements: tuple[Measurement, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """What an estimator is made of; `refused` are reasons by the number of the measurement, `early` are the
-    stances that wait."""
+    """What an estimator is made of: its `base`, what has come since in its order, and the stances that wait."""
 
     reference: str
     robots: tuple[str, ...]
     floor: Floor | None
     slips: dict[str, Slip]
     rigs: dict[str, Robot]
-    stances: tuple[Stance, ...]
-    measurements: tuple[Measurement, ...]
-    refused: dict[int, str]
-    early: tuple[Early, ...]
     landmarks: dict[str, Landmark]
+    base: Base
+    journal: tuple[Entry, ...]
+    early: tuple[Early, ...]
 
 
 class _Array(msgspec.Struct, forbid_unknown_fields=True):
@@ -125,6 +142,21 @@ class _Early(msgspec.Struct, forbid_unknown_fields=True):
     after: int
 
 
+class _Base(msgspec.Struct, forbid_unknown_fields=True):
+    stances: list[Stance]
+    measurements: list[_Measured]
+    rejected: dict[int, str]
+
+
+class _Entry(msgspec.Struct, forbid_unknown_fields=True):
+    stance: Stance | None
+    measurements: list[_Measured]
+
+
+class _Format(msgspec.Struct):
+    format: str
+
+
 class _File(msgspec.Struct, forbid_unknown_fields=True):
     format: str
     reference: str
@@ -132,11 +164,10 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     floor: Floor | None
     slips: dict[str, Slip]
     rigs: dict[str, Robot]
-    stances: list[Stance]
-    measurements: list[_Measured]
-    refused: dict[int, str]
+    landmarks: dict[str, Landmark]
+    base: _Base
+    journal: list[_Entry]
     early: list[_Early]
-    landmarks: dict[str, Landmark] = {}
 
 
 def write(saved: Checkpoint, path: Path) -> None:
@@ -148,11 +179,10 @@ def write(saved: Checkpoint, path: Path) -> None:
         floor=saved.floor,
         slips=saved.slips,
         rigs=saved.rigs,
-        stances=list(saved.stances),
-        measurements=[_of(one) for one in saved.measurements],
-        refused=saved.refused,
-        early=[_Early(one.stance, [_of(m) for m in one.measurements], one.after) for one in saved.early],
         landmarks=saved.landmarks,
+        base=_Base(list(saved.base.stances), _of_all(saved.base.measurements), dict(saved.base.rejected)),
+        journal=[_Entry(one.stance, _of_all(one.measurements)) for one in saved.journal],
+        early=[_Early(one.stance, _of_all(one.measurements), one.after) for one in saved.early],
     )
     try:
         write_whole(path, msgspec.json.encode(file), synchronise=True)
@@ -163,25 +193,26 @@ def write(saved: Checkpoint, path: Path) -> None:
 def read(path: Path) -> Checkpoint:
     """The checkpoint in a file; `InputError` where it is none."""
     try:
-        file = msgspec.json.decode(path.read_bytes(), type=_File)
-        if file.format != FORMAT:
+        content = path.read_bytes()
+        if msgspec.json.decode(content, type=_Format).format != FORMAT:
             raise InputError(f"{path}: is not a checkpoint of this version ({FORMAT}); solve the run again")
+        file = msgspec.json.decode(content, type=_File)
         saved = Checkpoint(
             reference=file.reference,
             robots=file.robots,
             floor=file.floor,
             slips=file.slips,
             rigs=file.rigs,
-            stances=tuple(file.stances),
-            measurements=tuple(_to(one) for one in file.measurements),
-            refused=file.refused,
-            early=tuple(Early(one.stance, tuple(map(_to, one.measurements)), one.after) for one in file.early),
             landmarks=file.landmarks,
+            base=Base(tuple(file.base.stances), _to_all(file.base.measurements), file.base.rejected),
+            journal=tuple(Entry(one.stance, _to_all(one.measurements)) for one in file.journal),
+            early=tuple(Early(one.stance, _to_all(one.measurements), one.after) for one in file.early),
         )
-        for taken in (saved.measurements, *(one.measurements for one in saved.early)):
-            require_valid(taken, saved.floor)
-        if not all(0 <= number < len(saved.measurements) for number in saved.refused):
-            raise ValueError("a measurement that is not there is refused")
+        later = (*(one.measurements for one in saved.journal), *(one.measurements for one in saved.early))
+        for measurements in (saved.base.measurements, *later):
+            require_valid(measurements, saved.floor)
+        if not all(0 <= number < len(saved.base.measurements) for number in saved.base.rejected):
+            raise ValueError("a measurement that is not there is rejected")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a checkpoint") from error
     except (msgspec.DecodeError, ValueError, EstimationError) as error:
@@ -202,6 +233,14 @@ def _of(measured: Measurement) -> _Measured:
         out.plane = None if measured.plane is None else _fields(measured.plane, _Plane)
         out.spans = [_fields(one, _Span) for one in measured.spans]
     return out
+
+
+def _of_all(measurements: Iterable[Measurement]) -> list[_Measured]:
+    return [_of(one) for one in measurements]
+
+
+def _to_all(measurements: Iterable[_Measured]) -> tuple[Measurement, ...]:
+    return tuple(_to(one) for one in measurements)
 
 
 def _fields(one: Any, kind: type[S]) -> S:

@@ -1,6 +1,7 @@
 """The estimate kept up to date while stances come in: ISAM2 with QR, and a log from which it can be rebuilt."""
 
-from collections.abc import Collection, Iterable, Mapping, Set
+from collections.abc import Collection, Iterable, Iterator, Mapping, Set
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from coloc_graph.backend import checkpoint
 from coloc_graph.backend.batch import find_bumps, joint, smooth
 from coloc_graph.backend.calibration import Variables
-from coloc_graph.backend.checkpoint import Early
+from coloc_graph.backend.checkpoint import Base, Early, Entry
 from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
 from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate
 from coloc_graph.backend.factors import Factors, Method, require_rigs
@@ -42,6 +43,13 @@ def _refusal(link: Link, off: Agreement) -> Rejection:
     return Rejection(link, f"contradicted by the other measurements ({off.sigmas:.0f} sigmas)")
 
 
+def _base(
+    stances: tuple[Stance, ...], measurements: tuple[Measurement, ...], rejected: Mapping[int, Rejection]
+) -> Base:
+    numbers = {id(one): number for number, one in enumerate(measurements)}
+    return Base(stances, measurements, {numbers[key]: one.reason for key, one in rejected.items()})
+
+
 class Estimator:
     """Localises a team while it moves: `add` a stance when it is over, and ask for poses at any time.
 
@@ -67,15 +75,52 @@ class Estimator:
             raise EstimationError(f"the reference robot {reference} is not one of {', '.join(self.robots)}")
         if self.rigs:
             require_rigs(self.robots, self.rigs)
+        self._early: dict[int, Early] = {}
+        self._begin(Base())
+
+    def _begin(self, base: Base) -> None:
+        """Hold the stances and measurements of `base`, optimised in batch, and nothing else."""
+        self._base, self._journal = base, list[Entry]()  # what came since, in its order
         self._places = PoseKeys(self.robots, self.slips, self.landmarks)
         self._stances: dict[int, Stance] = {}
-        self._log: list[Measurement] = []  # everything that ever came, the refused too
-        self._refused: dict[int, Rejection] = {}  # by the measurement's identity
-        self._newly: set[int] = set()  # those refused since the last stance came, it included
-        self._early: dict[int, Early] = {}
+        for before, stance in zip((None, *base.stances), base.stances, strict=False):
+            self._places.accept(self._places.after(before, stance))
+            self._stances[stance.index] = stance
+        self._log = list(base.measurements)  # everything that ever came, the rejected too
+        self._refused = {  # by the measurement's identity
+            id(self._log[number]): Rejection(self._log[number], why) for number, why in base.rejected.items()
+        }
+        self._newly: set[int] = set()  # those rejected since the last stance came, it included
         self._loose: list[Link] = []  # what nothing ties to the reference
-        self._instants: dict[Node, float] = {}  # when moving robots were sighted
+        self._instants = self._checked(self._log)  # when moving robots were sighted
         self._live = Isam2Graph(self._new_factors())
+        if base.stances:
+            kept = self.graph.without(one.measurement for one in self.refused)
+            self._live, links = rebuilt(kept, self.method)
+            inside = set(map(id, links))
+            self._loose = [one for one in kept.links if id(one) not in inside and len(set(self._keys(one))) == 2]
+
+    def _replay(self, base: Base, journal: Iterable[Entry]) -> None:
+        """Become what `base` and all that came since have made: the same numbers, since it is done in the same way.
+
+        ISAM2 linearises each pose where it was when it came, so that no batch gives the same numbers.
+        """
+        self._begin(base)
+        for entry in journal:
+            self._enter(entry.stance, entry.measurements)
+
+    @contextmanager
+    def _all_or_nothing(self) -> Iterator[None]:
+        """Leave the estimator as it was where what is done in here fails or is interrupted."""
+        base, journal, count, early = self._base, self._journal, len(self._journal), dict(self._early)
+        self._changed = False
+        try:
+            yield
+        except BaseException:
+            self._early = early
+            if self._changed:
+                self._replay(base, journal[:count])
+            raise
 
     @classmethod
     def of(cls, team: Team, method: Method = "joint") -> "Estimator":
@@ -188,12 +233,28 @@ class Estimator:
                 f"stance {stance.index} is said to follow stance {follows}, which stance {last} follows: number the "
                 "stances in the order of time"
             )
-        estimate = self._enter(stance, taken)
-        while early := self._next_early():
-            del self._early[early.stance.index]  # one that cannot enter is not tried again
-            later = self._enter(early.stance, early.measurements)
-            estimate = replace(later, refused=(*estimate.refused, *later.refused))
+        with self._all_or_nothing():
+            estimate = self._enter(stance, taken)
+            while early := self._next_early():
+                del self._early[early.stance.index]
+                later = self._enter_early(early)
+                estimate = replace(later, refused=(*estimate.refused, *later.refused))
         return estimate
+
+    def _enter_early(self, early: Early) -> StanceEstimate:
+        try:
+            return self._enter(early.stance, early.measurements)
+        except EstimationError as error:
+            index = early.stance.index
+            raise type(error)(
+                f"{error}; stance {index} waits for stance {early.after}: drop it by `discard({index})`, or correct it"
+            ) from error
+
+    def discard(self, index: int) -> None:
+        """Drop a stance that waits for an earlier one; `MeasurementError` where none of this number waits."""
+        if index not in self._early:
+            raise MeasurementError(f"stance {index} does not wait for another, so that it cannot be discarded")
+        del self._early[index]
 
     def _next_early(self) -> Early | None:
         last = next(reversed(self._stances))
@@ -204,7 +265,8 @@ class Estimator:
         if not self._stances:
             raise MeasurementError("there is no stance that a measurement could belong to: add one first")
         require_valid(measurements, self.floor)
-        return self._enter(None, measurements)
+        with self._all_or_nothing():
+            return self._enter(None, measurements)
 
     def revoke(self, measurement: Measurement) -> StanceEstimate:
         """Take a measurement out again, as if it had never come; the last stance's poses come back.
@@ -213,11 +275,8 @@ class Estimator:
         """
         if not any(one is measurement for one in self._log):
             raise EstimationError(f"the {measurement} is not in, so that it cannot be taken out")
-        try:
-            self._take_out({id(measurement)}, set(self._refused))
-        except Exception:
-            self._rebuild()
-            raise
+        with self._all_or_nothing():
+            self._take_out(self.stances, {id(measurement)}, set(self._refused))
         return self._at(next(reversed(self._stances.values())), self.refused, UNCHECKED)
 
     def withdraw(self) -> Stance:
@@ -225,42 +284,28 @@ class Estimator:
         come; it comes back. `EstimationError` where it is the first."""
         if len(self._stances) < 2:
             raise EstimationError("the first stance is where the world is, and cannot be taken out: begin anew")
-        before, stance = list(self._stances.values())[-2:]
+        *left, stance = self.stances
         gone = {id(one) for one in self._log if any(index == stance.index for _, index in one.ends)}
-        del self._stances[stance.index]
-        self._places.forget(before, stance)
-        try:
-            self._take_out(gone, self._newly)
-        except Exception:
-            self._places.accept(self._places.after(before, stance))
-            self._stances[stance.index] = stance
-            self._rebuild()
-            raise
-        self._instants = {node: at for node, at in self._instants.items() if node[1] != stance.index}
+        with self._all_or_nothing():
+            self._take_out(tuple(left), gone, self._newly)
         return stance
 
-    def _take_out(self, gone: Set[int], doubted: Set[int]) -> None:
-        """Take measurements out, by identity, and try again those of the refused that are `doubted`; an exception
-        spoils the graph."""
-        log, refused, loose = self._log, self._refused, self._loose
-        left = {key: one for key, one in refused.items() if key not in gone}
-        self._log = [one for one in log if id(one) not in gone]
-        self._refused = left
-        try:
-            self._rebuild()
-            again = [one.measurement for key, one in left.items() if key in doubted]
-            entering = self._entering([*self._loose, *again])
-            found = {id(one.measurement): one for one in self._update(entering)[0]}
-            self._refused = {key: one for key, one in left.items() if key not in doubted} | found
-        except Exception:
-            self._log, self._refused, self._loose = log, refused, loose
-            raise
-        self._newly = set()
-        self._loose = entering.loose
+    def _take_out(self, stances: tuple[Stance, ...], gone: Set[int], doubted: Set[int]) -> None:
+        """Keep these stances and all measurements but those `gone`, by identity; of the rejected, try those `doubted`
+        again."""
+        measurements = tuple(one for one in self._log if id(one) not in gone)
+        rejected = {key: one for key, one in self._refused.items() if key not in gone}
+        self._changed = True
+        self._begin(_base(stances, measurements, rejected))
+        again = [one.measurement for key, one in rejected.items() if key in doubted]
+        if again:
+            found = {id(one.measurement): one for one in self._update(self._entering([*self._loose, *again]))[0]}
+            left = {key: one for key, one in rejected.items() if key not in doubted} | found
+            # anew, so that nothing depends on the order in which they were tried
+            self._begin(_base(stances, measurements, left))
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint, whole or not at all, from which `resume` goes on."""
-        numbers = {id(one): number for number, one in enumerate(self._log)}
         checkpoint.write(
             checkpoint.Checkpoint(
                 reference=self.reference,
@@ -268,34 +313,27 @@ class Estimator:
                 floor=self.floor,
                 slips=self.slips,
                 rigs=self.rigs,
-                stances=self.stances,
-                measurements=self.measurements,
-                refused={numbers[key]: one.reason for key, one in self._refused.items()},
-                early=tuple(self._early.values()),
                 landmarks=self.landmarks,
+                base=self._base,
+                journal=tuple(self._journal),
+                early=tuple(self._early.values()),
             ),
             Path(path),
         )
 
     @classmethod
     def resume(cls, path: str | Path) -> "Estimator":
-        """The estimator of a checkpoint, as it was; `InputError` where the file is none."""
+        """The estimator of a checkpoint, as it was to the last bit; `InputError` where the file is none.
+
+        Everything enters again as it came, which takes as long as it took.
+        """
         saved = checkpoint.read(Path(path))
         estimator = cls(saved.reference, saved.robots, saved.floor, saved.slips, saved.rigs, saved.landmarks)
-        before = None
-        for stance in saved.stances:
-            estimator._places.accept(estimator._places.after(before, stance))
-            estimator._stances[stance.index] = before = stance
         try:
-            estimator._instants = estimator._checked(saved.measurements)
-        except MeasurementError as error:
+            estimator._replay(saved.base, saved.journal)
+        except EstimationError as error:
             raise InputError(f"{path}: is a damaged checkpoint ({error}); solve the run again") from error
-        estimator._log = list(saved.measurements)
-        for number, reason in saved.refused.items():
-            estimator._refused[id(saved.measurements[number])] = Rejection(saved.measurements[number], reason)
         estimator._early = {one.stance.index: one for one in saved.early}
-        if saved.stances:
-            estimator._rebuild()
         return estimator
 
     def _enter(self, stance: Stance | None, taken: tuple[Measurement, ...]) -> StanceEstimate:
@@ -310,12 +348,13 @@ class Estimator:
         try:
             instants = self._checked(taken)
             entering = self._entering(links)
-            refused, agreement = self._update(entering)
-        except Exception:
+        except BaseException:
             if stance is not None:
                 self._places.forget(before, stance)
                 del self._stances[stance.index]
             raise
+        refused, agreement = self._update(entering)
+        self._journal.append(Entry(stance, taken))
         self._log += taken
         self._instants |= instants
         self._refused |= {id(one.measurement): one for one in refused}
@@ -357,20 +396,13 @@ class Estimator:
         return InsertionPlanner(live.factors_of, self._keys, live.tied, reference, live.pose, live.errors).sort(links)
 
     def _update(self, entering: InsertionPlan) -> tuple[tuple[Rejection, ...], Agreement]:
-        """Put poses and links into the graph, without those that all others contradict; all of it or nothing."""
+        """Put poses and links into the graph, without those that all others contradict."""
+        self._changed = True
         try:
             outcome = self._live.enter(entering)
         except Exception as failure:
-            self._rebuild()
             raise EstimationError(f"the graph cannot take this in, and is as it was: {failure}") from failure
         return tuple(_refusal(link, off) for link, off in outcome.refused), outcome.agreement
-
-    def _rebuild(self) -> None:
-        """The graph anew from the log without what was refused: after a failure, a revocation, from a checkpoint."""
-        kept = self.graph.without(one.measurement for one in self.refused)
-        self._live, links = rebuilt(kept, self.method)
-        inside = set(map(id, links))
-        self._loose = [link for link in kept.links if id(link) not in inside and len(set(self._keys(link))) == 2]
 
     def _keys(self, link: Link) -> tuple[int, int]:
         i, j = map(self._places.key, link.ends)

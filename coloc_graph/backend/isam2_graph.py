@@ -80,8 +80,8 @@ class Isam2Graph:
         return float(np.sqrt(2 * factor.error(values) / self.factors_of.rows(tie[0], factor)))
 
     def values(self) -> gtsam.Values:
-        """Everything, with all changes carried out."""
-        return self.isam.calculateBestEstimate()
+        """Everything, where it is; to ask changes nothing."""
+        return self.isam.calculateEstimate()
 
     def enter(self, entering: InsertionPlan) -> Outcome:
         """Put poses and links in, without what all others contradict."""
