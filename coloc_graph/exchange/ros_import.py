@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,7 +79,17 @@ def import_ros(
 
         recording = read_recording(bag, the_map, told)
         team, warnings = with_cameras(bag, the_map, recording, team)
-        odometry = {robot.name: odometry_of(bag, robot, recording) for robot in the_map.robots if robot.odometry}
+        if recording.clocks.sigma > team.clock_sigma:
+            team = msgspec.structs.replace(team, clock_sigma=recording.clocks.sigma)
+            warnings.append(
+                f"{bag.path}: the observers' clocks may still differ by {1e3 * recording.clocks.sigma:.0f} ms (1 sigma): "
+                "the run's team states that as `clock_sigma`, and a solve finds the offset where the motion shows it"
+            )
+        odometry = {}
+        for robot in the_map.robots:
+            if robot.odometry:
+                odometry[robot.name], said = odometry_of(bag, robot, recording)
+                warnings += said
         truth = {robot.name: true for robot in the_map.robots if (true := truth_of(bag, robot, recording))}
         moves = movements_of(the_map, recording, odometry)
         stances = _stances(bag, map_path, the_map, team, recording, moves)

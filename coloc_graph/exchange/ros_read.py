@@ -20,6 +20,7 @@ from coloc_graph.exchange.ros_bag import (
     Bag,
     BagMessage,
 )
+from coloc_graph.exchange.ros_clocks import BagClocks, StampedTopic, bag_clocks
 from coloc_graph.exchange.ros_map import RosMap
 from coloc_graph.exchange.ros_order import Order, order_of
 from coloc_graph.exchange.ros_poses import T_of, planar_covariance
@@ -36,18 +37,19 @@ TYPES = {
     "truth": (POSE, POSE_WITH_COVARIANCE, ODOMETRY),
 }
 TF_TOPICS = {"/tf": False, "/tf_static": True}
-#: Stamps that are so far from when the bag received their messages are of another clock [s].
-FAR = 1.0
 #: So often is told how far reading is, in messages.
 TELL_EVERY = 100
 
 
 class Moment(NamedTuple):
-    """One sample of odometry: x, y [m], yaw [rad], their covariance (3, 3), and how far from upright it is [rad]."""
+    """One sample of odometry: x, y [m], yaw [rad] of the frame `frame` with their covariance (3, 3); `T_odom_frame`
+    (4, 4) is the same in space, `tilt` how far it is from upright [rad]."""
 
     pose: tuple[float, float, float]
     covariance: Array
     tilt: float
+    frame: str
+    T_odom_frame: Array
 
 
 class TruePose(NamedTuple):
@@ -70,10 +72,14 @@ class Recording:
     by_bag: frozenset[str]
     frames: Frames
     notes: tuple[str, ...]
+    clocks: BagClocks
 
     def time(self, bag: Bag, message: BagMessage) -> int:
-        """A message's time [ns]."""
-        return message.received if message.topic in self.by_bag else bag.stamp(message)
+        """Time of a message [ns], with the error of its robot's clock removed."""
+        if message.topic in self.by_bag:
+            return message.received
+        clock = self.clocks.clocks.get(message.topic)
+        return bag.stamp(message) - (clock.error(message.received) if clock is not None else 0)
 
 
 def require_topics(bag: Bag, the_map: RosMap) -> None:
@@ -109,8 +115,9 @@ def read_recording(bag: Bag, the_map: RosMap, told: Callable[[int], None]) -> Re
     kinds = {topic: kind for robot in the_map.robots for kind, topic in robot.topics.items()}
     wanted = set(kinds)
     frames = Frames()
-    if any(robot.truth_tf for robot in the_map.robots):
-        wanted |= {name for name in TF_TOPICS if _is_tf(bag, name)}
+    for name, static in TF_TOPICS.items():  # static transforms also say where odometry's frame is on a body
+        if _is_tf(bag, name) and (static or any(robot.truth_tf for robot in the_map.robots)):
+            wanted.add(name)
     stamps: dict[str, list[int]] = {topic: [] for topic in kinds}
     received: dict[str, list[int]] = {topic: [] for topic in kinds}
     values: dict[str, list[Any]] = {topic: [] for topic in kinds}
@@ -127,16 +134,30 @@ def read_recording(bag: Bag, the_map: RosMap, told: Callable[[int], None]) -> Re
     by_bag = {topic for topic in kinds if the_map.time == "bag" or not any(stamps[topic])}
     times = {topic: received[topic] if topic in by_bag else stamps[topic] for topic in kinds}
     _require_stamped(bag, times)
+    owner = {topic: robot.name for robot in the_map.robots for topic in robot.topics.values()}
+    clocks = bag_clocks(
+        {
+            topic: StampedTopic(
+                owner[topic], kind, np.array(stamps[topic], np.int64), np.array(received[topic], np.int64)
+            )
+            for topic, kind in kinds.items()
+            if topic not in by_bag and kind in ("image", "odometry")
+        }
+    )
+    for topic, clock in clocks.clocks.items():
+        times[topic] = [ns - clock.error(at) for ns, at in zip(stamps[topic], received[topic], strict=True)]
     orders = {topic: order_of(times[topic]) for topic in kinds}
     notes = [*_of_order(bag, orders)]
     if the_map.time == "header":
-        notes += _of_clocks(bag, stamps, received, by_bag)
+        notes += _unstamped(bag, by_bag)
+        notes += [f"{bag.path}: {sentence}" for sentence in clocks.sentences()]
     return Recording(
         orders=orders,
         values={topic: [every[k] for k in orders[topic].kept] for topic, every in values.items() if every},
         by_bag=frozenset(by_bag),
         frames=frames,
         notes=tuple(notes),
+        clocks=clocks,
     )
 
 
@@ -161,24 +182,11 @@ def _of_order(bag: Bag, orders: dict[str, Order]) -> Iterator[str]:
             )
 
 
-def _of_clocks(
-    bag: Bag, stamps: dict[str, list[int]], received: dict[str, list[int]], by_bag: set[str]
-) -> Iterator[str]:
+def _unstamped(bag: Bag, by_bag: set[str]) -> Iterator[str]:
     if by_bag:
         yield (
             f"{bag.path}: no message of {', '.join(sorted(by_bag))} has a time in its header; "
             "they are taken to be of when the bag received them"
-        )
-    off = {
-        topic: float(np.median(np.array(stamps[topic], np.int64) - np.array(received[topic], np.int64))) / 1e9
-        for topic in stamps
-        if topic not in by_bag
-    }
-    if off and max(off.values()) - min(off.values()) > FAR:
-        said = ", ".join(f"{topic} {seconds:+.1f} s" for topic, seconds in off.items())
-        yield (
-            f"{bag.path}: the headers' times are of different clocks, by how far they are from when the bag received "
-            f'them: {said}; set the clocks, or say `time = "bag"` in the map'
         )
 
 
@@ -186,7 +194,7 @@ def _odometry(bag: Bag, message: BagMessage) -> Moment:
     found = bag.decode(message)
     T = _pose(bag, message, found.pose.pose)
     (x, y, _), tilt = T[:3, 3].tolist(), float(np.arccos(np.clip(T[2, 2], -1, 1)))
-    return Moment((x, y, float(yaw(T))), planar_covariance(found), tilt)
+    return Moment((x, y, float(yaw(T))), planar_covariance(found), tilt, found.child_frame_id.lstrip("/"), T)
 
 
 def _truth(bag: Bag, message: BagMessage) -> TruePose:

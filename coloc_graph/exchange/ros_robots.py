@@ -1,5 +1,7 @@
 """What a ROS bag says of each robot, as a run has it: camera, odometry, true poses, movements; and what is odd."""
 
+import itertools
+import re
 from collections.abc import Mapping
 
 import msgspec
@@ -13,7 +15,9 @@ from coloc_graph.exchange.ros_map import RobotTopics, RosMap
 from coloc_graph.exchange.ros_poses import grown_increments, stated_increments
 from coloc_graph.exchange.ros_read import Recording
 from coloc_graph.exchange.stances import Movements, movements
+from coloc_graph.geometry.lie import yaw
 from coloc_graph.run import OdometrySample
+from coloc_graph.run.odometry_breaks import find_breaks, joined
 from coloc_graph.run.schemas import to_seconds
 from coloc_graph.team import Team
 
@@ -23,6 +27,8 @@ Array = NDArray[np.float64]
 STAMPED = 12
 #: Odometry on a floor is not tilted by more than this [deg].
 LEVEL = 5.0
+BREAKS_NAMED = 3  # jumps of one topic that are described one by one
+BODY_FRAME = re.compile(r"(^|[/_])(base(_link|_footprint)?|body|chassis|footprint)$")  # frames of the body itself
 #: Images that are taken so long before or after all odometry are told of [s].
 UNKNOWN = 1.0
 
@@ -56,21 +62,63 @@ def seconds(ns: NDArray[np.int64]) -> Array:
     return np.array([to_seconds(one) for one in ns.tolist()])
 
 
-def odometry_of(bag: Bag, robot: RobotTopics, recording: Recording) -> list[OdometrySample]:
-    """A robot's odometry; the covariances of its increments are as the map states them, or as those of its poses grow.
+def odometry_of(bag: Bag, robot: RobotTopics, recording: Recording) -> tuple[list[OdometrySample], list[str]]:
+    """Odometry of a robot's body, and sentences on what was mended in it.
 
-    Raises `BagError` where neither says anything.
+    The covariances of its increments are as the map states them, or as those of its poses grow. A jump that no wheel
+    can make is cut out: poses go on from before it, and the increment across it says next to nothing. Raises
+    `BagError` where neither map nor messages say how far odometry errs.
     """
     assert robot.odometry is not None
     values = recording.values[robot.odometry]
+    poses, said = _of_body(bag, robot, recording)
+    times = seconds(recording.orders[robot.odometry].ns)
+    breaks = find_breaks(times, poses)
+    said += [
+        f"{bag.path}: {robot.odometry} (`odometry` of {robot.name}) {one}; the jump is not taken for a movement, and "
+        "the poses go on from before it"
+        for one in breaks[:BREAKS_NAMED]
+    ]
+    if len(breaks) > BREAKS_NAMED:
+        said.append(f"{bag.path}: {robot.odometry} jumped {len(breaks) - BREAKS_NAMED} more times")
+    where = f"{bag.path}: {robot.odometry} (`odometry` of {robot.name})"
+    parts = []
+    for begin, end in itertools.pairwise([0, *(one.index for one in breaks), len(poses)]):
+        if robot.odometry_sigmas is not None:
+            parts.append(stated_increments(poses[begin:end], robot.odometry_sigmas))
+        else:
+            parts.append(grown_increments(poses[begin:end], [one.covariance for one in values[begin:end]], where))
+    increments = np.concatenate(parts)
+    for one in breaks:
+        increments[one.index] = np.diag(np.square(one.sigmas))
+    samples = zip(times.tolist(), joined(poses, breaks), increments, strict=True)
+    return [OdometrySample(robot.name, *one) for one in samples], said
+
+
+def _of_body(bag: Bag, robot: RobotTopics, recording: Recording) -> tuple[Array, list[str]]:
+    """Poses (n, 3) x, y, yaw of the body by odometry, whose own frame may be another's, and what is said of that."""
+    assert robot.odometry is not None
+    values = recording.values[robot.odometry]
+    frame = values[0].frame
     poses = np.array([one.pose for one in values])
-    if robot.odometry_sigmas is not None:
-        increments = stated_increments(poses, robot.odometry_sigmas)
-    else:
-        where = f"{bag.path}: {robot.odometry} (`odometry` of {robot.name})"
-        increments = grown_increments(poses, [one.covariance for one in values], where)
-    times = seconds(recording.orders[robot.odometry].ns).tolist()
-    return [OdometrySample(robot.name, *one) for one in zip(times, poses, increments, strict=True)]
+    if not frame or BODY_FRAME.search(frame):
+        return poses, []
+    prefix = frame.rpartition("/")[0]
+    bodies = [name for name in recording.frames.names if BODY_FRAME.search(name)]
+    bodies.sort(key=lambda name: name.rpartition("/")[0] != prefix)
+    for body in bodies:
+        T_frame_body = recording.frames.fixed(frame, body)
+        if T_frame_body is not None:
+            T = np.array([one.T_odom_frame for one in values]) @ T_frame_body
+            x, y = T_frame_body[:2, 3].tolist()
+            return np.column_stack([T[:, :2, 3], yaw(T)]), [
+                f"{bag.path}: {robot.odometry} is of the frame `{frame}`; it was moved to `{body}` by the static tf "
+                f"between them ({x:+.3f}, {y:+.3f} m)"
+            ]
+    return poses, [
+        f"{bag.path}: {robot.odometry} (`odometry` of {robot.name}) is of the frame `{frame}`, which may not be the "
+        "body's, and is taken for it; record /tf_static, which says where it is on the body, or odometry of base_link"
+    ]
 
 
 def truth_of(bag: Bag, robot: RobotTopics, recording: Recording) -> list[tuple[float, Array]]:

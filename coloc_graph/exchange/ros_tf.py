@@ -73,6 +73,18 @@ class Frames:
             ns = ns[(ns >= max(map(min, told))) & (ns <= min(map(max, told)))]
         return ns, se3_inverse(self._down(from_a, ns)) @ self._down(from_b, ns)
 
+    def fixed(self, a: str, b: str) -> Array | None:
+        """T_a_b (4, 4) of two frames that static transforms tie to each other; None where they do not."""
+        up_a, up_b = self._up(a), self._up(b)
+        common = next((frame for frame in up_b if frame in up_a), None)
+        if common is None:
+            return None
+        from_a, from_b = up_a[: up_a.index(common)], up_b[: up_b.index(common)]
+        if not all(self._edges[frame].static for frame in (*from_a, *from_b)):
+            return None
+        at = np.zeros(1, np.int64)
+        return np.asarray(se3_inverse(self._down(from_a, at)) @ self._down(from_b, at))[0]
+
     def _down(self, frames: list[str], ns: NDArray[np.int64]) -> Array:
         """The pose of the first of some frames in the parent of the last."""
         T = np.tile(np.eye(4), (len(ns), 1, 1))
