@@ -82,7 +82,7 @@ def import_ros(
         if recording.clocks.sigma > team.clock_sigma:
             team = msgspec.structs.replace(team, clock_sigma=recording.clocks.sigma)
             warnings.append(
-                f"{bag.path}: the observers' clocks may still differ by {1e3 * recording.clocks.sigma:.0f} ms (1 sigma): "
+                f"{bag.path}: observers' clocks may still differ by {1e3 * recording.clocks.sigma:.0f} ms (1 sigma): "
                 "the run's team states that as `clock_sigma`, and a solve finds the offset where the motion shows it"
             )
         odometry = {}

@@ -5,7 +5,6 @@ import json
 import re
 import shutil
 import struct
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -217,9 +216,8 @@ def test_covariances_that_do_not_grow_are_refused_and_the_remedy_is_named(bring_
 
 def driven(child="base_link", restart=None, n=60):
     """A robot that drives 2 cm a sample ahead, whose odometry is of the frame `child`, and may begin anew."""
-    kept = partial(odometry_of_frame, child)
-    return [kept("/A/odom", T0 + k * SECOND // 10, (0.02 * (k if restart is None or k < restart else k - restart), 0, 0))
-            for k in range(n)]  # fmt: skip
+    begun = [k if restart is None or k < restart else k - restart for k in range(n)]
+    return [odometry_of_frame(child, "/A/odom", T0 + k * SECOND // 10, (0.02 * x, 0, 0)) for k, x in enumerate(begun)]
 
 
 def odometry_of_frame(child, topic, ns, pose):
