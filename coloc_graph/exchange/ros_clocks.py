@@ -212,7 +212,7 @@ def _segment_offsets(topic: StampedTopic, steps: Nanoseconds) -> Array:
 
 def _jitter(topic: StampedTopic) -> float:
     """Scatter [s] of stamp minus reception, from one message to the next."""
-    return 1.4826 * float(np.median(np.abs(np.diff(topic.offsets)))) / np.sqrt(2)
+    return float(1.4826 * np.median(np.abs(np.diff(topic.offsets))) / np.sqrt(2))
 
 
 def _majority(offsets: Sequence[float]) -> float:

@@ -83,7 +83,8 @@ class Frames:
         if not all(self._edges[frame].static for frame in (*from_a, *from_b)):
             return None
         at = np.zeros(1, np.int64)
-        return np.asarray(se3_inverse(self._down(from_a, at)) @ self._down(from_b, at))[0]
+        found: Array = np.asarray(se3_inverse(self._down(from_a, at)) @ self._down(from_b, at), float)[0]
+        return found
 
     def _down(self, frames: list[str], ns: NDArray[np.int64]) -> Array:
         """The pose of the first of some frames in the parent of the last."""
