@@ -33,7 +33,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     )
     command.add_argument("--resume", action="store_true", help="go on with what is in --out")
     command.add_argument("--view", action="store_true", help="see it in the browser while it goes on")
-    command.add_argument("--port", type=int, default=8080, help="of --view (8080)")
+    command.add_argument("--port", type=int, help="port of --view (default: 8080, or the first free one after it)")
     command.add_argument("--no-browser", action="store_true", help="with --view, do not open a browser")
     command.add_argument("--draw", action="store_true", help="print the phases as a Graphviz drawing, and end")
     command.set_defaults(run=run)
@@ -77,8 +77,8 @@ def run(args: argparse.Namespace) -> int:
         clock_limit=args.clock_limit / 1e3,
     )
     out = Path(args.out)
-    port = args.port if args.view else None
-    with until_signal() as stop, watched(team, port, browser=not args.no_browser) as told:
+    viewer = watched(team, args.port, browser=not args.no_browser, view=args.view)
+    with until_signal() as stop, viewer as told:
         coordinator = Coordinator(
             team,
             out,

@@ -15,7 +15,9 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         action="store_true",
         help="three programs of robots on simulated wheels and cameras drive the hallway by themselves",
     )
-    command.add_argument("--port", type=int, default=8080, help="of the viewer, with --online (8080)")
+    command.add_argument(
+        "--port", type=int, help="port of the viewer, with --online (default: 8080 or the next free one)"
+    )
     command.set_defaults(run=lambda args: online(args) if args.online else run(args))
 
 

@@ -27,14 +27,16 @@ class Told:
 
 
 @contextmanager
-def watched(team: "Team", port: int | None, *, browser: bool) -> Iterator[Told]:
-    """A viewer that is fed while a mission goes on, at a `port`; no viewer without one."""
-    if port is None:
+def watched(team: "Team", port: int | None, *, browser: bool, view: bool = True) -> Iterator[Told]:
+    """Feed a viewer while a mission goes on; nobody hears of it where there is no `view`."""
+    if not view:
         yield Told()
         return
+    from coloc_graph.cli.view import take_port
     from coloc_graph.viewer import LivePoses, LiveStance, Scene, Viewer
 
-    with Viewer(Scene(team.names, (), team=team, title="a mission"), port=port) as viewer:
+    scene = Scene(team.names, (), team=team, title="a mission")
+    with take_port(port, say=log.info) as listener, Viewer(scene, listener=listener) as viewer:
         log.info("the viewer is at %s", viewer.url)
         if browser and sys.stdout.isatty():
             webbrowser.open(viewer.url)

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 from coloc_graph.cli.printing import counted, print_json, progress, warn
 
 if TYPE_CHECKING:
+    from socket import socket
+
     from coloc_graph.evaluation import Accuracy
     from coloc_graph.pipeline.batch import EnteredStance, Solution, SolveOptions
     from coloc_graph.run import Run
@@ -36,7 +38,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument(
         "--view", action="store_true", help="see it in the browser; with --incremental, while it is solved"
     )
-    command.add_argument("--port", type=int, default=8080, help="of --view (8080)")
+    command.add_argument("--port", type=int, help="port of --view (default: 8080, or the first free one after it)")
     command.add_argument("--no-browser", action="store_true", help="with --view, do not open a browser")
     command.add_argument("--without-odometry", action="store_true", help="leave out what the wheels say")
     command.add_argument("--without-robots", action="store_true", help="leave out what robots measured of each other")
@@ -48,6 +50,15 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 
 def run(args: argparse.Namespace) -> int:
     """Solve, write, print; with --view, show."""
+    from contextlib import nullcontext
+
+    from coloc_graph.cli.view import take_port
+
+    with take_port(args.port) if args.view else nullcontext() as listener:  # before the work, not after it
+        return _run(args, listener)
+
+
+def _run(args: argparse.Namespace, listener: "socket | None") -> int:
     from dataclasses import replace
 
     from coloc_graph.cli.solve_many import solve_folder
@@ -67,10 +78,6 @@ def run(args: argparse.Namespace) -> int:
     if args.processes is not None or args.cluster is not None:
         raise InputError(f"{args.run_path} is not a folder of runs; --processes and --cluster are for one")
     require_place(args.out)  # before the work, not after it
-    if args.view:
-        from coloc_graph.viewer.server import require_free
-
-        require_free("127.0.0.1", args.port)
     with _earlier_result_named(args.out):
         logged = open_run(args.run_path)
     if logged.has_ranges and not logged.stances:
@@ -85,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         if args.view:
             from coloc_graph.viewer import Viewer, scene_of_result
 
-            with Viewer(scene_of_result(args.out), port=args.port) as viewer:
+            with Viewer(scene_of_result(args.out), listener=listener) as viewer:
                 show(viewer, browser=not args.no_browser)
         return 0
     if args.without_robots:
@@ -98,10 +105,10 @@ def run(args: argparse.Namespace) -> int:
 
     if not args.incremental:
         solution = _solved(args, logged, options)
-        with Viewer(scene_of_solution(solution), port=args.port) as viewer:
+        with Viewer(scene_of_solution(solution), listener=listener) as viewer:
             show(viewer, browser=not args.no_browser)
         return 0
-    with Viewer(empty_scene(logged, options.method, options.frontend), port=args.port) as viewer:
+    with Viewer(empty_scene(logged, options.method, options.frontend), listener=listener) as viewer:
 
         def entered(one: "EnteredStance") -> None:
             viewer.publish(LiveStance(one.stance, one.estimate, one.measurements, one.pairs))

@@ -4,7 +4,10 @@ import argparse
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from coloc_graph.viewer import Viewer
+    from collections.abc import Callable
+    from socket import socket
+
+    from coloc_graph.viewer import Scene, Viewer
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -18,8 +21,8 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("path", metavar="RUN|DIR", help="a run (.mcap), or a result of `coloc solve`")
     command.add_argument("--run", dest="run_path", metavar="RUN", help="the run of a result, if it is no longer there")
     command.add_argument("--compare", metavar="DIR2", help="another result of the same run, beside the first")
-    command.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
-    command.add_argument("--port", type=int, default=8080)
+    command.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, this machine)")
+    command.add_argument("--port", type=int, help="port to listen on (default: 8080, or the first free one after it)")
     command.add_argument("--no-browser", action="store_true", help="do not open a browser")
     command.add_argument("--dark", action="store_true", help="dark colours")
     command.add_argument(
@@ -30,46 +33,81 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the scene, show it."""
+    """Make the scene, and show or write it."""
     from pathlib import Path
 
-    from coloc_graph.cli.printing import progress, warn
+    from coloc_graph.cli.printing import warn
     from coloc_graph.errors import InputError
-    from coloc_graph.run import open_run
-    from coloc_graph.viewer import Viewer, is_run, scene_of_result, scene_of_run, with_other
+    from coloc_graph.viewer import Viewer
+    from coloc_graph.viewer.access import is_loopback
     from coloc_graph.viewer.app import left_out
     from coloc_graph.viewer.browser import require_browser, write_png
-    from coloc_graph.viewer.server import is_loopback, require_free
 
     writes = bool(args.export or args.png)
-    port = 0 if writes else args.port
-    require_free(args.host, port)  # before the work, not after it
     for out in (args.export, args.png):
         if out and not Path(out).absolute().parent.is_dir():
-            raise InputError(f"{out} cannot be written, since there is no such folder; make it, or give another place")
+            raise InputError(f"{out} cannot be written: its folder does not exist; make it, or give another place")
     if args.png:
         require_browser()
+    host, port = ("127.0.0.1", 0) if writes else (args.host, args.port)
+    with take_port(port, host) as listener:  # before the work, not after it
+        scene = _scene(args)
+        warn(left_out(scene))
+        if not is_loopback(host):
+            warn([f"whoever knows the address of this viewer and reaches {host} can see and steer it, unencrypted"])
+        with Viewer(scene, host=host, dark=args.dark, listener=listener) as viewer:
+            if args.export:
+                viewer.export(args.export)
+                print(args.export)
+            if args.png:
+                write_png(viewer, args.png)
+                print(args.png)
+            if not writes:
+                show(viewer, browser=not args.no_browser)
+    return 0
+
+
+def _scene(args: argparse.Namespace) -> "Scene":
+    """Scene of the arguments."""
+    from coloc_graph.cli.printing import progress
+    from coloc_graph.run import open_run
+    from coloc_graph.viewer import is_run, scene_of_result, scene_of_run, with_other
+
     if is_run(args.path):
         with progress("stances measured") as report:
             scene = scene_of_run(open_run(args.path), report)
     else:
         scene = scene_of_result(args.path, args.run_path)
-    if args.compare:
-        scene = with_other(scene, args.compare)
-    warn(left_out(scene))
-    if not is_loopback(args.host) and not writes:
-        warn([f"whoever reaches {args.host} can see and steer this viewer: it has no password"])
-    with Viewer(scene, host="127.0.0.1" if writes else args.host, port=port, dark=args.dark) as viewer:
-        if args.export:
-            viewer.export(args.export)
-            print(args.export)
-        if args.png:
-            write_png(viewer, args.png)
-            print(args.png)
-        if writes:
-            return 0
-        show(viewer, browser=not args.no_browser)
-    return 0
+    return with_other(scene, args.compare) if args.compare else scene
+
+
+def take_port(port: int | None, host: str = "127.0.0.1", say: "Callable[[str], None] | None" = None) -> "socket":
+    """Listen on the port that was asked for, or else on the default one or the first free one after it.
+
+    Parameters
+    ----------
+    port
+        Port that was asked for, None for the default one.
+    host
+        Address to listen on.
+    say
+        Called with a sentence that names the port if it is not the default one; without it, stderr is used.
+
+    Raises
+    ------
+    InputError
+        If the port that was asked for is taken, or cannot be listened on.
+    """
+    import sys
+
+    from coloc_graph.viewer.server import DEFAULT_PORT, open_listener
+
+    listener = open_listener(host, port)
+    taken = listener.getsockname()[1]
+    if port is None and taken != DEFAULT_PORT:
+        sentence = f"port {DEFAULT_PORT} is taken: the viewer uses port {taken}"
+        say(sentence) if say else print(sentence, file=sys.stderr, flush=True)
+    return listener
 
 
 def show(viewer: "Viewer", *, browser: bool) -> None:

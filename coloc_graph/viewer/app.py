@@ -1,6 +1,7 @@
 """The viewer: a server, a panel, and one thread that computes what is shown and alone touches the handles."""
 
 import itertools
+import socket
 import threading
 import time
 import traceback
@@ -23,7 +24,7 @@ from coloc_graph.viewer.handles import MOST_NAMES, GraphView, Image, camera_on, 
 from coloc_graph.viewer.live import LivePoses, LiveScene, LiveStance
 from coloc_graph.viewer.panel import NOBODY, Panel, set_value
 from coloc_graph.viewer.scene import Scene
-from coloc_graph.viewer.server import start_server, stop_server, url_of
+from coloc_graph.viewer.server import open_listener, start_server, stop_server, url_of
 from coloc_graph.viewer.worker import Failure, Worker
 
 #: Frames are at least this far apart, so that the server comes to send them; what rests is shown whole after [s].
@@ -40,13 +41,38 @@ MOST_MEASURED = 100
 class Viewer:
     """Shows a scene to browsers until it is closed; a context manager.
 
-    Callbacks and `publish` only leave a note and wake the render thread. Raises `InputError` where it cannot listen.
+    Callbacks and `publish` only leave a note and wake the render thread.
+
+    Parameters
+    ----------
+    scene
+        The first scene that is shown.
+    host, port
+        Address to listen on; without a port the first free one from 8080 on.
+    dark
+        Dark colours.
+    listener
+        Socket that listens at `host` already, see `open_listener`; the viewer closes it.
+
+    Raises
+    ------
+    InputError
+        If it cannot listen there.
     """
 
-    def __init__(self, scene: Scene, *, host: str = "127.0.0.1", port: int = 8080, dark: bool = False) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        dark: bool = False,
+        listener: socket.socket | None = None,
+    ) -> None:
         self._scene = scene
-        self.server = start_server(host, port, scene.title or "coloc")
-        self.url = url_of(host, self.server.get_port())
+        listener = listener or open_listener(host, port)
+        self.server = start_server(host, listener, scene.title or "coloc")
+        self.url = url_of(host, self.server.get_port(), self.server.token)
         self._asked: deque[tuple[str, float]] = deque()
         self._news: deque[Scene | LiveStance] = deque()
         self._changed = threading.Condition()

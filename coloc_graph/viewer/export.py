@@ -13,7 +13,7 @@ from coloc_graph.viewer.frame import Frame, ViewState, frame_of, thinned_rows
 from coloc_graph.viewer.handles import GraphView, Image, camera_on, initial_camera, seen_size
 from coloc_graph.viewer.panel import legend
 from coloc_graph.viewer.scene import Scene
-from coloc_graph.viewer.server import start_server, stop_server
+from coloc_graph.viewer.server import open_listener, start_server, stop_server
 
 #: A stance takes so long, in a long run less, for all to take no more than so long; the last one is held; it moves in
 #: steps of so long [s].
@@ -40,7 +40,7 @@ def page_of(scene: Scene, state: ViewState) -> str:
     bare = replace(state, shown=frozenset(), ellipses=False, wedges=False, edges=False, stays=False)
     each = min(STANCE_SECONDS, MOST_SECONDS / max(len(rows), 1))
     steps = max(round(each / STEP_SECONDS), 2)
-    server = start_server("127.0.0.1", 0, scene.title)
+    server = start_server("127.0.0.1", open_listener(port=0), scene.title)
     try:
         view = GraphView(server, scene, state.dark)
         view.dress(scene, state.dark, state.aside)

@@ -4,7 +4,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -47,7 +46,6 @@ from coloc_graph.viewer.panel import HANDS_OFF, set_value
 from coloc_graph.viewer.plots import error_curves, residual_curves, with_cursor
 from coloc_graph.viewer.prepared import ellipse_axes
 from coloc_graph.viewer.scene import layer_of
-from coloc_graph.viewer.server import is_loopback, require_free, url_of
 
 COLOC = Path(sys.executable).with_name("coloc")
 
@@ -481,45 +479,6 @@ sys.exit(" ".join({"viser", "trimesh", "numpy", "gtsam", "matplotlib", "websocke
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_busy_port_and_a_host_that_is_none_are_told_at_once(tmp_path, capsys):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(InputError, match=f"port {port} of 127.0.0.1 is taken"):
-            require_free("127.0.0.1", port)
-        assert main(["view", str(tmp_path / "no.mcap"), "--port", str(port)]) == 2
-        assert capsys.readouterr().err.count("\n") == 1
-        with pytest.raises(InputError, match="taken"):
-            Viewer(Scene(("A",), ()), port=port)
-    with pytest.raises(InputError, match="not an address of this machine"):
-        require_free("192.0.2.1", 8080)  # set aside for documentation, RFC 5737
-    with pytest.raises(InputError, match="there is no port 70000"):
-        require_free("127.0.0.1", 70_000)
-
-
-@pytest.mark.parametrize(("host", "own"), [("127.0.0.1", True), ("localhost", True), ("::1", True), ("0.0.0.0", False)])
-def test_only_loopback_is_private(host, own):
-    assert is_loopback(host) is own
-    assert url_of("0.0.0.0", 80) == "http://127.0.0.1:80" and url_of("::1", 80) == "http://[::1]:80"
-
-
-def test_nobody_is_given_a_share_link():
-    with Viewer(Scene(("A",), ()), port=0) as viewer:
-        assert viewer.server.request_share_url() is None
-        assert viewer.server._share_tunnel is None
-        assert viewer.url.startswith("http://127.0.0.1:")
-
-
-def test_a_closed_viewer_leaves_its_port():
-    viewer = Viewer(Scene(("A",), ()), port=0)
-    port = viewer.server.get_port()
-    viewer.close()
-    viewer.close()
-    require_free("127.0.0.1", port)
-    assert not viewer._thread.is_alive()
-
-
 def started(arguments, **more):
     """A program as a user starts it: its output buffered, and Ctrl-C heard, which a shell's background job hands on."""
     buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
@@ -540,7 +499,7 @@ def test_ctrl_c_ends_it_without_a_word(command, result, short, tmp_path):
     process = started(arguments, stdout=subprocess.PIPE)
     try:
         said = next(line for line in process.stderr if "viewer" in line)
-        assert re.match(r"the viewer is at http://127\.0\.0\.1:\d+ \(Ctrl-C ends it\)", said)
+        assert re.match(r"the viewer is at http://127\.0\.0\.1:\d+/[\w-]{22} \(Ctrl-C ends it\)", said)
         solved = command == "view" or any("3 of 3 measurements used" in line for line in process.stdout)
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)

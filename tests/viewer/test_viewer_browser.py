@@ -2,11 +2,14 @@
 
 # ruff: noqa: F811  the fixtures' names are imported, and are arguments
 
+import http.server
+import threading
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import viser
 from browser import browser, client_of, page_of, pixel_of, place_of, until  # noqa: F401  fixtures
 
 from coloc_graph.backend import replay
@@ -134,6 +137,63 @@ def test_slider_click_and_keys(scene, page_of):
         assert until(lambda: page.get_by_text(title).first.is_visible())
         assert until(lambda: page.get_by_text("decomposition").first.is_visible())
         assert until(lambda: page.get_by_text("inliers").first.is_visible())
+
+
+OPEN_WEBSOCKET = """([url, protocol]) => new Promise(done => {
+    const socket = new WebSocket(url, [protocol]);
+    let bytes = 0;
+    socket.onmessage = event => { bytes += event.data.size ?? event.data.length; };
+    socket.onclose = () => done(["closed", bytes]);
+    socket.onopen = () => setTimeout(() => done(["open", bytes]), 2000);
+})"""
+FETCH = "url => fetch(url).then(answer => answer.status, error => String(error))"
+
+
+@pytest.fixture
+def foreign_page(browser):
+    """A page of another origin on this machine, as any web server or program may send one."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(b"<html><body>another page</body></html>")
+
+        def log_message(self, *_):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        context = browser.new_context()
+        page = context.new_page()
+        page.goto(f"http://127.0.0.1:{server.server_port}/")
+        yield page
+        context.close()
+        server.shutdown()
+
+
+def test_a_page_of_another_origin_is_refused_and_an_honest_one_goes_on(scene, page_of, foreign_page):
+    with Viewer(scene, port=0) as viewer:
+        honest = page_of(viewer.url, "/robots/A")
+        client_of(viewer)
+        protocol = f"viser-v{viser.__version__}"
+        root = viewer.url.removesuffix(f"/{viewer.server.token}")
+        for address in (root, viewer.url):  # even one that has learnt the token
+            socket = address.replace("http:", "ws:")
+            assert foreign_page.evaluate(OPEN_WEBSOCKET, [socket, protocol]) == ["closed", 0]
+            assert "Failed to fetch" in foreign_page.evaluate(FETCH, address)
+        assert len(viewer.server.get_clients()) == 1
+
+        # the same script in the viewer's own page gets the stream
+        state, size = honest.evaluate(OPEN_WEBSOCKET, [viewer.url.replace("http:", "ws:"), protocol])
+        assert state == "open" and size > 10_000
+        slider = honest.get_by_role("slider").first
+        slider.focus()
+        slider.press("Home")
+        assert until(lambda: viewer.frame.row == 0)
+        honest.reload()
+        assert until(lambda: honest.evaluate("() => window.__viserMutable?.nodeRefFromName?.['/robots/A'] != null"))
 
 
 def test_a_live_stance_appears_while_one_looks_at_an_old_one(short_solution, page_of):
