@@ -130,6 +130,8 @@ class RobotProgram:
         """Control the wheels and report, until `stop` is set."""
         report, reopened = 0.0, 0.0
         while not stop.wait(CONTROL):
+            if self._link.refused is not None:
+                raise RobotError(self._link.refused)
             self._roll()
             now = time.monotonic()
             if self._wheels is not None and self._wheels_lost and now - reopened > REOPEN:

@@ -18,9 +18,9 @@ from tcp_relay import Relay
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError, RobotError
 from coloc_graph.robot_io.link.certificates import make_certificates
-from coloc_graph.robot_io.link.coordinator_link import NEWER, CoordinatorLink
+from coloc_graph.robot_io.link.coordinator_link import NEWEST_PERIOD, RECOVERY_PERIOD, CoordinatorLink
 from coloc_graph.robot_io.link.messages import (
-    LARGEST,
+    MAX_MESSAGE_BYTES,
     Capture,
     Command,
     Drive,
@@ -35,7 +35,6 @@ from coloc_graph.robot_io.link.messages import (
     decode,
     encode,
 )
-from coloc_graph.robot_io.link.reordering import AT_ONCE, TRIES, InOrder
 from coloc_graph.robot_io.link.robot_link import RobotLink
 from coloc_graph.robot_io.link.zenoh_config import Tls, config_of, tls_of
 from coloc_graph.simulation import reference_team
@@ -151,7 +150,7 @@ def outsider(address, tls=None):
 
 def raw_ask(heard, name, data, timeout=2.0):
     """What a robot answers to bytes; None where nothing comes."""
-    for one in heard.link._session.zenoh.get(f"coloc/{name}/command", payload=data, timeout=timeout):
+    for one in heard.link._session.zenoh.get(f"coloc/{name}/command/first", payload=data, timeout=timeout):
         if one.ok is not None:
             return decode(one.ok.payload.to_bytes(), Reply)
     return None
@@ -228,7 +227,7 @@ def test_late_malformed_oversized_and_foreign_commands_are_refused_counted_and_l
     assert "another session" in raw_ask(heard, "A", encode(command(Halt(), session="before"))).text
     for _ in range(3):
         assert raw_ask(heard, "A", b"\xc1 no command", 0.3) is None
-    assert raw_ask(heard, "A", bytes(LARGEST + 1), 0.3) is None
+    assert raw_ask(heard, "A", bytes(MAX_MESSAGE_BYTES + 1), 0.3) is None
     assert until(lambda: robot.link.counts.oversized == 1)
     counts = robot.link.counts
     assert (counts.late, counts.replayed, counts.malformed, counts.taken) == (1, 1, 3, 0)
@@ -274,7 +273,7 @@ def test_what_robots_send_is_checked(pair, caplog):
         for key, data, what in (
             ("coloc/A/status", b"\x00", "malformed"),
             ("coloc/A/time", b"\x00", "malformed"),
-            ("coloc/A/status", bytes(LARGEST + 1), "oversized"),
+            ("coloc/A/status", bytes(MAX_MESSAGE_BYTES + 1), "oversized"),
             ("coloc/Z/status", b"", "foreign"),
             ("coloc/**", b"\x00", "foreign"),
         ):
@@ -282,43 +281,27 @@ def test_what_robots_send_is_checked(pair, caplog):
     robot.put_event("first")
     assert until(lambda: len(heard.events) == 1)
     again = encode(heard.events[0][1])
-    heard.link._taker(Event)(_Like("coloc/A/events", again))
+    heard.link._receiver(Event)(_Like("coloc/A/events", again))
     assert heard.link.counts.replayed == 1 and len(heard.events) == 1
     late = msgspec.structs.replace(heard.events[0][1], number=4)
-    heard.link._taker(Event)(_Like("coloc/A/events", encode(late)))
+    heard.link._receiver(Event)(_Like("coloc/A/events", encode(late)))
     assert until(lambda: heard.link.counts.missed == 3)  # it was asked for them, and has none
-    assert len(heard.events) == 2 and "3 Event of A are lost for good" in caplog.text
+    assert len(heard.events) == 2 and "3 Event messages of A are lost" in caplog.text
 
 
 def test_what_does_not_come_by_itself_is_asked_for(pair):
     heard, robot = pair
     robot.put_event("0")
     assert until(lambda: len(heard.events) == 1)
-    for one in heard.link._heard["A"][1]:
+    for one in heard.link._subscribers:
         one.undeclare()
     for number in range(1, 300):
         robot.put_event(str(number))
     assert until(lambda: len(heard.events) == 300)
     assert [int(one.text) for _, one in heard.events] == list(range(300))
     assert heard.link.counts.missed == 0
-    time.sleep(1.5 * NEWER)  # the newest is asked for again, and is no replay
+    time.sleep(1.5 * NEWEST_PERIOD)  # the newest is asked for again, and is no replay
     assert heard.link.counts.replayed == 0
-
-
-def test_numbers_are_put_in_order_and_asked_for():
-    order = InOrder(most=1000)
-    assert list(order.take(0, "0")) == ["0"] and order.missing() is None
-    assert list(order.take(2, "2")) == [] and list(order.take(600, "600")) == []
-    assert order.missing() == (1, 1)
-    assert list(order.take(1, "1")) == ["1", "2"]
-    assert order.missing() == (3, 2 + AT_ONCE)
-    assert list(order.take(2, "2")) == [] and list(order.take(600, "600")) == [] and order.again == 2
-    for _ in range(TRIES - 1):
-        assert list(order.asked(3, 2 + AT_ONCE)) == [] and order.lost == 0
-    assert list(order.asked(3, 2 + AT_ONCE)) == [] and order.lost == AT_ONCE
-    assert order.missing() == (3 + AT_ONCE, 2 + 2 * AT_ONCE)
-    small = InOrder(most=2)
-    assert [list(small.take(n, n)) for n in (5, 6, 7)] == [[], [], [5, 6, 7]] and small.lost == 5
 
 
 class _Deaf:
@@ -328,26 +311,112 @@ class _Deaf:
         pass
 
 
-def test_what_a_program_that_ended_took_with_it_is_counted_and_holds_nothing_back():
-    with Heard(free_port()) as heard:
-        take = heard.link._taker(Event)
-        for session, number in (("one", 0), ("one", 2), ("one", 3), ("two", 0)):
-            event = Event(session=session, number=number, stamp=1, kind="fault", text="")
-            take(_Like("coloc/A/events", encode(event)))
-        time.sleep(0.5)
-        assert [(one.session, one.number) for _, one in heard.events] == [("one", 0), ("two", 0)]
-        heard.link._sessions["A"] = "two"
-        assert until(lambda: len(heard.events) == 4)
-        assert [one.number for _, one in heard.events if one.session == "one"] == [0, 2, 3]
-        assert heard.link.counts.missed == 1
-
-
 class _Like:
     """What zenoh hands over, as far as it is looked at."""
 
     def __init__(self, key, data):
         self.key_expr, self.payload = key, self
         self.to_bytes = lambda: data
+
+
+def test_a_request_that_fails_is_no_answer(pair, monkeypatch):
+    """What is missing is lost when the robot answers that it has it no more, not when nothing is heard of it."""
+    heard, robot = pair
+    robot.put_event("0")
+    assert until(lambda: len(heard.events) == 1)
+    assert not heard.link._request("B", Event, "_sn=0..9")  # nobody is there to answer
+    assert not heard.link._request("A", Sample, "_sn=0..9")  # nothing was ever sent
+    assert heard.link._request("A", Event, "_sn=5..9") and heard.link._request("A", Event, "_max=1")
+    failing = [True]
+    request = heard.link._request
+    monkeypatch.setattr(heard.link, "_request", lambda *one: not failing[0] and request(*one))
+    gap = msgspec.structs.replace(heard.events[0][1], number=2)
+    heard.link._receiver(Event)(_Like("coloc/A/events", encode(gap)))
+    time.sleep(5 * RECOVERY_PERIOD)
+    assert len(heard.events) == 1 and heard.link.counts.missed == 0
+    failing[0] = False
+    assert until(lambda: len(heard.events) == 2) and heard.link.counts.missed == 1
+
+
+def test_a_reply_that_is_an_error_is_no_answer(pair):
+    heard, _ = pair
+
+    def fail(query):
+        query.reply_err(b"not now")
+
+    with outsider(heard.address) as other:
+        other.declare_queryable("coloc/C/events/@adv/pub/x/y/_", fail)
+        assert until(lambda: any(other.info.peers_zid()))
+        asked = [heard.link._request("C", Event, "_max=1") for _ in range(5) if time.sleep(0.1) is None]
+        assert asked == [False] * 5
+
+
+def test_restarts_of_one_robot_leave_another_robots_data_alone(pair):
+    heard, a = pair
+    for _ in range(40):
+        a.put_wheels()
+    assert until(lambda: len(heard.wheels) == 40)
+    for n in range(4):
+        with Robot("B", heard.address, session=f"run-{n}") as b:
+            b.put_event(str(n))
+            assert until(lambda n=n: sum(name == "B" for name, _ in heard.events) == n + 1), heard.presence
+            a.put_wheels()
+    with outsider(heard.address) as other:  # as a robot that makes up sessions, by the hundred
+        before = heard.link.counts.unknown
+        assert comes_to_count(heard, other, "coloc/B/events", encode(event_of("x", 1)), "unknown")
+        for n in range(300):
+            other.put("coloc/B/events", encode(event_of(f"made-up-{n}", 1)))
+        assert until(lambda: heard.link.counts.unknown >= before + 300)
+    a.put_wheels()
+    assert until(lambda: len(heard.wheels) == 45)
+    time.sleep(1.5 * NEWEST_PERIOD)
+    assert [one.number for _, one in heard.wheels] == list(range(45))
+    assert heard.link.counts.missed == 0 and heard.link.counts.replayed == 0
+
+
+def event_of(session, number):
+    return Event(session=session, number=number, stamp=1, kind="tick", text="")
+
+
+def test_a_second_program_of_the_same_name_is_refused_and_the_first_one_goes_on(pair, caplog):
+    heard, first = pair
+    with Robot("A", heard.address, session="second") as second:
+        second.put_event("of the second")
+        assert until(lambda: second.link.refused is not None)
+        assert second.link.refused == (
+            "another program runs as robot A already: end it first, or give this one its own name"
+        )
+        assert heard.link.counts.duplicate >= 1 and "refused a second program that runs as robot A" in caplog.text
+        for n in range(20):
+            assert heard.link.ask("A", Capture(capture=n), LONG).ok
+        heard.link.hold()
+        first.put_event("of the first")
+        assert until(lambda: first.link.last_heard > 0 and len(heard.events) == 1)
+        assert first.bodies == [Capture(capture=n) for n in range(20)] and second.bodies == []
+        assert second.link.last_heard == 0 and first.link.refused is None
+    assert heard.presence == [("A", True)]
+    first.link.close()
+    assert until(lambda: heard.presence[-1] == ("A", False))
+    with Robot("A", heard.address, session="third") as third:
+        assert until(lambda: heard.link._inboxes["A"].session == "third")
+        assert heard.link.ask("A", Capture(capture=99), LONG).ok and third.bodies == [Capture(capture=99)]
+        assert heard.presence[-1] == ("A", True) and third.link.refused is None
+        third.put_event("of the third")
+        assert until(lambda: len(heard.events) == 2)
+    assert [one.text for _, one in heard.events] == ["of the first", "of the third"]
+
+
+def test_a_command_to_a_program_that_was_restarted_meanwhile_is_refused(pair):
+    heard, robot = pair
+    robot._answer = lambda body: time.sleep(3.0) or "late"
+    replies = []
+    asking = threading.Thread(target=lambda: replies.append(heard.link.ask("A", Halt(), LONG)))
+    asking.start()
+    assert until(lambda: robot.bodies)
+    robot.link._session.zenoh.close()
+    with Robot("A", heard.address, session="second") as second:
+        asking.join()
+        assert not replies[0].ok and "restarted meanwhile" in replies[0].text and second.bodies == []
 
 
 # clocks
@@ -371,15 +440,13 @@ def test_clocks_are_found_over_the_link_and_their_jumps():
 
 def test_what_is_measured_waits_for_the_clock():
     with Heard(free_port()) as heard:
-        questions, heard.link._questions = (
-            heard.link._questions,
-            dict.fromkeys(TEAM.names, _Deaf()),
-        )  # nobody is asked for the time
+        publishers = heard.link._publishers
+        heard.link._publishers = dict.fromkeys(publishers, _Deaf())  # nobody is asked for the time
         with Robot("A", heard.address) as robot:
             for _ in range(5):
                 robot.put_sample()
             assert until(lambda: ("A", True) in heard.presence) and heard.samples == []
-            heard.link._questions = questions
+            heard.link._publishers = publishers
             assert until(lambda: len(heard.samples) == 5)
 
 
@@ -499,7 +566,7 @@ def test_others_are_let_in_without_certificates_only_where_that_is_said(caplog):
 
 
 def test_a_port_that_is_taken_is_a_sentence():
-    with Heard(free_port()) as heard, pytest.raises(RobotError, match="cannot be opened"):
+    with Heard(free_port()) as heard, pytest.raises(RobotError, match="cannot open the link"):
         Heard(int(heard.address.rpartition(":")[2]))
 
 
@@ -572,7 +639,7 @@ def test_a_stranger_is_not_let_in(secured, certificates, tmp_path):
         with outsider(heard.address, tls) as stranger:
             for _ in range(20):
                 stranger.put("coloc/A/status", b"\x00")
-                assert not list(stranger.get("coloc/A/command", payload=encode(command(Halt())), timeout=0.05))
+                assert not list(stranger.get("coloc/A/command/first", payload=encode(command(Halt())), timeout=0.05))
             assert list(stranger.info.peers_zid()) == []
     with outsider(heard.address.replace("tls/", "tcp/")) as stranger:
         for _ in range(20):
@@ -587,19 +654,19 @@ def test_a_robot_speaks_only_as_itself_and_commands_nobody(secured, certificates
     heard, robot = secured
     with outsider(heard.address, tls_of(certificates, "B")) as bad:
         assert until(lambda: len(list(bad.info.peers_zid())) == 1)
-        bad.liveliness().declare_token("coloc/B/alive")
+        bad.liveliness().declare_token("coloc/B/alive/bad")
         assert until(lambda: ("B", True) in heard.presence)
         overheard = []
         bad.declare_subscriber(
             "coloc/**", lambda one: overheard.append(str(one.key_expr)), allowed_origin=zenoh.Locality.REMOTE
         )
-        bad.declare_queryable("coloc/A/command", lambda query: query.reply(query.key_expr, b"mine"))
-        bad.declare_queryable("coloc/*/command", lambda query: query.reply(query.key_expr, b"mine"))
-        bad.liveliness().declare_token("coloc/C/alive")
+        bad.declare_queryable("coloc/A/command/first", lambda query: query.reply(query.key_expr, b"mine"))
+        bad.declare_queryable("coloc/*/command/*", lambda query: query.reply(query.key_expr, b"mine"))
+        bad.liveliness().declare_token("coloc/C/alive/bad")
         for key in ("coloc/A/status", "coloc/C/status", "coloc/*/status", "coloc/**", "coloc/A/time", "coloc/A/hold"):
             for _ in range(5):
                 bad.put(key, b"\x00")
-        answers = list(bad.get("coloc/A/command", payload=encode(command(Halt())), timeout=0.5))
+        answers = list(bad.get("coloc/A/command/first", payload=encode(command(Halt())), timeout=0.5))
         assert {one.ok.payload.to_bytes() for one in answers if one.ok is not None} <= {b"mine"}  # it hears itself
         bad.put("coloc/B/status", b"\x00")
         assert until(lambda: heard.link.counts.malformed >= 1)
@@ -625,7 +692,7 @@ def test_a_robot_obeys_nobody_but_the_coordinator(certificates):
             session.liveliness().declare_token("coloc/coordinator/alive")
             for _ in range(10):
                 session.put("coloc/A/hold", encode(Hold(session="first", sent=time.monotonic_ns())))
-                asked = session.get("coloc/A/command", payload=encode(command(Halt())), timeout=0.1)
+                asked = session.get("coloc/A/command/first", payload=encode(command(Halt())), timeout=0.1)
                 assert not [one for one in asked if one.ok is not None]
             assert robot.bodies == [] and robot.link.last_heard == 0 and not robot.link.connected
     finally:

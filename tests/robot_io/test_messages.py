@@ -7,11 +7,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from coloc_graph.robot_io.link.command_filter import Commands
+from coloc_graph.robot_io.link.command_filter import CommandFilter
 from coloc_graph.robot_io.link.counters import LinkCounter
 from coloc_graph.robot_io.link.messages import (
-    LARGEST,
-    MOST_MARKERS,
+    MAX_MARKERS,
+    MAX_MESSAGE_BYTES,
     Capture,
     ClockQuestion,
     ClockReply,
@@ -21,13 +21,14 @@ from coloc_graph.robot_io.link.messages import (
     Event,
     Halt,
     Hold,
+    MessageError,
     OversizedError,
     Recover,
+    Refusal,
     Reply,
     Sample,
     Status,
     Wheels,
-    WireError,
     decode,
     encode,
 )
@@ -71,9 +72,10 @@ def command(body=DRIVE, **changes):
 
 BODIES = (Capture(capture=3), EndCapture(), DRIVE, msgspec.structs.replace(DRIVE, yaw=None), Halt(), Recover())
 VALID = [
-    *map(sample, (3, 0, MOST_MARKERS)), WHEELS, Event(session="s", number=0, stamp=1, kind="fault", text="why"), STATUS,
+    *map(sample, (3, 0, MAX_MARKERS)), WHEELS, Event(session="s", number=0, stamp=1, kind="fault", text="why"), STATUS,
     *map(command, BODIES), Reply(id="0" * 32, ok=False, text="no"), Hold(session="s", sent=10**12),
     ClockQuestion(asked=1), ClockReply(session="s", asked=1, received=2, sent=3),
+    Refusal(session="s", text="two of them"),
 ]  # fmt: skip
 
 
@@ -99,7 +101,7 @@ def test_detections_and_odometry_come_as_they_were():
 def test_of_too_many_markers_the_brightest_are_sent():
     seen = detections(100)
     sent = Sample.of(seen, session="s", number=0, capture=0, stamp=1)
-    assert sent.peak == sorted(seen.peak.tolist(), reverse=True)[:MOST_MARKERS]
+    assert sent.peak == sorted(seen.peak.tolist(), reverse=True)[:MAX_MARKERS]
 
 
 @pytest.mark.parametrize(
@@ -113,39 +115,64 @@ def test_of_too_many_markers_the_brightest_are_sent():
         (sample(covariance=[(1e300, 0.0, 1.0)] * 3), "positive definite"),
         (sample(area=[1.0] * 2), "differ in length"),
         (sample(flags=[16, 0, 0]), "flag"),
-        (sample(markers=["x" * 65, "", ""]), "name is too long"),
-        (sample(number=-1), "counts"),
-        (sample(stamp=2**63), "stamp"),
-        (sample(session="s" * 1000), "name is too long"),
-        (msgspec.structs.replace(sample(), **{name: getattr(sample(65), name) for name in ("uv",)}), "too many"),
-        (msgspec.structs.replace(WHEELS, pose=(math.nan, 0.0, 0.0)), "no place"),
-        (msgspec.structs.replace(WHEELS, covariance=(-1.0, 0.0, 0.0, 1.0, 0.0, 1.0)), "not positive"),
-        (Event(session="s", number=0, stamp=1, kind="k", text="x" * 5000), "text is too long"),
+        (sample(markers=["x" * 65, "", ""]), "name has more than 64"),
+        (sample(number=-1), "count is negative"),
+        (sample(stamp=2**63), "stamp is out"),
+        (sample(session="s" * 1000), "name has more than 64"),
+        (
+            msgspec.structs.replace(sample(), **{name: getattr(sample(65), name) for name in ("uv",)}),
+            "more than 64",
+        ),
+        (msgspec.structs.replace(WHEELS, pose=(math.nan, 0.0, 0.0)), "coordinate"),
+        (msgspec.structs.replace(WHEELS, covariance=(-1.0, 0.0, 0.0, 1.0, 0.0, 1.0)), "not positive semi"),
+        (Event(session="s", number=0, stamp=1, kind="k", text="x" * 5000), "text has more than 2000"),
         (msgspec.structs.replace(STATUS, hazards=["x"] * 17), "hazards"),
         (command(msgspec.structs.replace(DRIVE, speed=0.6)), "speed"),
         (command(msgspec.structs.replace(DRIVE, speed=math.nan)), "speed"),
-        (command(msgspec.structs.replace(DRIVE, yaw=math.inf)), "places"),
-        (command(msgspec.structs.replace(DRIVE, places=[(0.0, math.nan)])), "places"),
-        (command(msgspec.structs.replace(DRIVE, places=[(0.0, 0.0)] * 101)), "places"),
-        (command(id="i" * 65), "name is too long"),
+        (command(msgspec.structs.replace(DRIVE, yaw=math.inf)), "waypoints"),
+        (command(msgspec.structs.replace(DRIVE, places=[(0.0, math.nan)])), "waypoints"),
+        (command(msgspec.structs.replace(DRIVE, places=[(0.0, 0.0)] * 101)), "waypoints"),
+        (command(id="i" * 65), "name has more than 64"),
     ],
 )
 def test_what_cannot_be_is_refused(message, why):
-    with pytest.raises(WireError, match=why):
+    with pytest.raises(MessageError, match=why):
         decode(encode(message), type(message))
 
 
+#: Values out of range, by the name of a field.
+BEYOND = (
+    dict.fromkeys(("number", "capture"), (-1, 2**53))
+    | dict.fromkeys(("stamp", "still_since", "asked", "received", "sent", "deadline"), (2**62, -(2**62)))
+    | dict.fromkeys(("session", "id", "kind", "frame", "phase"), ("x" * 65,))
+    | dict.fromkeys(("text", "fault", "camera_fault"), ("x" * 2001,))
+)
+
+
+@pytest.mark.parametrize("message", [*VALID, *BODIES], ids=lambda one: type(one).__name__)
+def test_each_field_is_checked(message):
+    checked = set(msgspec.structs.asdict(message)) & set(BEYOND)
+    for name in checked:
+        for value in BEYOND[name]:
+            changed = msgspec.structs.replace(message, **{name: value})
+            with pytest.raises(MessageError, match=r"count is|stamp is|name has|text has|session is"):
+                if isinstance(message, (Capture, EndCapture, Drive, Halt, Recover)):
+                    decode(encode(command(changed)), Command)
+                else:
+                    decode(encode(changed), type(message))
+
+
 def test_other_kinds_fields_and_sizes_are_refused():
-    with pytest.raises(WireError, match="unknown field"):
+    with pytest.raises(MessageError, match="unknown field"):
         decode(msgspec.msgpack.encode({**msgspec.to_builtins(Hold(session="s", sent=1)), "more": 1}), Hold)
-    with pytest.raises(WireError, match="Invalid value 'Explode'"):
+    with pytest.raises(MessageError, match="Invalid value 'Explode'"):
         decode(encode(command()).replace(b"\xa5Drive", b"\xa7Explode"), Command)
-    with pytest.raises(WireError, match=r"Expected `int`, got `str` - at `\$.sent`"):
+    with pytest.raises(MessageError, match=r"Expected `int`, got `str` - at `\$.sent`"):
         decode(msgspec.msgpack.encode({"session": "s", "sent": "now"}), Hold)
-    with pytest.raises(WireError):
+    with pytest.raises(MessageError):
         decode(b"", Sample)
-    with pytest.raises(OversizedError, match=f"{LARGEST} at most"):
-        decode(bytes(LARGEST + 1), Sample)
+    with pytest.raises(OversizedError, match=f"larger than {MAX_MESSAGE_BYTES} bytes"):
+        decode(bytes(MAX_MESSAGE_BYTES + 1), Sample)
 
 
 def mutations(rng, message, n):
@@ -174,16 +201,16 @@ def mutations(rng, message, n):
 
 def test_tampered_messages_are_valid_or_refused():
     rng = random.Random(7)
-    n = 110_000 // len(VALID)
+    n = 33_000 // len(VALID)
     valid = refused = 0
     carried_out = []
     counter = LinkCounter()
-    commands = Commands("A", "s", lambda body: carried_out.append(body) or "", lambda: 0, counter)
+    commands = CommandFilter("A", "s", lambda body: carried_out.append(body) or "", lambda: 0, counter)
     for message in VALID:
         for data in mutations(rng, message, n):
             try:
                 again = decode(data, type(message))
-            except WireError:
+            except MessageError:
                 refused += 1
             else:
                 valid += 1
@@ -193,10 +220,10 @@ def test_tampered_messages_are_valid_or_refused():
             elif isinstance(message, Hold):
                 commands.take_hold(data)
     print(f"    {valid} valid, {refused} refused, {len(carried_out)} carried out")
-    assert valid + refused == n * len(VALID) >= 100_000
-    assert valid > 1000 and refused > 50_000
+    assert valid + refused == n * len(VALID) >= 30_000
+    assert valid > 300 and refused > 15_000
     counts = counter.counts()
-    assert counts.malformed > 20_000 and counts.taken == len(carried_out)
+    assert counts.malformed > 6_000 and counts.taken == len(carried_out)
     assert all(isinstance(body, Capture | EndCapture | Drive | Halt | Recover) for body in carried_out)
     assert all(0 < body.speed <= 0.5 for body in carried_out if isinstance(body, Drive))
 
@@ -204,5 +231,5 @@ def test_tampered_messages_are_valid_or_refused():
 def test_headers_that_promise_much_cost_nothing():
     for data in (b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff", b"\x91" * 200_000):
         for kind in (Sample, Command, Status):
-            with pytest.raises(WireError):
+            with pytest.raises(MessageError):
                 decode(data, kind)

@@ -1,4 +1,4 @@
-"""Commands as a robot takes them: each once, in time, for this session of its program, or not at all."""
+"""Commands as a robot takes them: each once, in time, and only for this session of its program; `CommandFilter`."""
 
 import logging
 import time
@@ -7,30 +7,47 @@ from collections.abc import Callable
 
 from coloc_graph.errors import ColocError
 from coloc_graph.robot_io.link.counters import LinkCounter
-from coloc_graph.robot_io.link.messages import Body, Command, Hold, Reply, WireError, decode
+from coloc_graph.robot_io.link.messages import Body, Command, Hold, MessageError, Reply, decode
 
 log = logging.getLogger(__name__)
 
-#: So many commands are remembered that must not be carried out again; the deadlines of earlier ones are over.
-REMEMBERED = 1000
+MAX_REMEMBERED = 1000  # commands whose replies are kept; the deadlines of earlier ones have passed
 
 
-class Commands:
-    """Carries out commands by `handler`, which gives what to answer, or raises; of one thread."""
+class CommandFilter:
+    """Carries out commands; for one thread.
+
+    Parameters
+    ----------
+    name
+        Name of the robot.
+    session
+        Session whose commands are carried out.
+    handler
+        Carries out a command and returns the answer, or raises.
+    clock
+        The robot's monotonic clock [ns].
+    counter
+        Counts commands that are taken and refused.
+
+    Attributes
+    ----------
+    last_heard
+        Time at which the newest permission to move was sent [ns, CLOCK_MONOTONIC]; 0 before the first.
+    """
 
     def __init__(
         self, name: str, session: str, handler: Callable[[Body], str], clock: Callable[[], int], counter: LinkCounter
     ) -> None:
         self._name, self._session, self._handler, self._clock, self._counter = name, session, handler, clock, counter
         self._done: OrderedDict[str, Reply] = OrderedDict()
-        #: When the coordinator last let it move [ns, CLOCK_MONOTONIC]; 0 where it never did.
         self.last_heard = 0
 
     def answer(self, data: bytes) -> Reply | None:
-        """The reply to what came as a command, which is carried out unless it must not be; None where it is none."""
+        """Carry out an encoded command unless it must be refused; return the reply, None if it is not valid."""
         try:
             command = decode(data, Command)
-        except WireError as error:
+        except MessageError as error:
             self._counter.refuse(error, f"a command to {self._name}")
             return None
         what = type(command.body).__name__
@@ -49,19 +66,19 @@ class Commands:
             reply = Reply(id=command.id, ok=True, text=self._handler(command.body))
         except ColocError as error:
             reply = Reply(id=command.id, ok=False, text=str(error)[:1000])
-        except Exception as error:  # the program's own fault must be heard of where it was asked
+        except Exception as error:  # the coordinator must learn of the program's own faults too
             log.exception("%s could not carry out `%s`", self._name, what)
             reply = Reply(id=command.id, ok=False, text=f"it failed: {error!r}"[:1000])
         self._done[command.id] = reply
-        while len(self._done) > REMEMBERED:
+        while len(self._done) > MAX_REMEMBERED:
             self._done.popitem(last=False)
         return reply
 
     def take_hold(self, data: bytes) -> None:
-        """Take in a permission to move, which counts from when it was sent: one that was held up is an old one."""
+        """Take in an encoded permission to move, which counts from when it was sent."""
         try:
             hold = decode(data, Hold)
-        except WireError as error:
+        except MessageError as error:
             self._counter.refuse(error, f"a permission to {self._name}")
             return
         if hold.session != self._session:

@@ -1,6 +1,7 @@
 """The coordinator's end of the link to its robots, on zenoh; `CoordinatorLink`, docs/link.md.
 
-What robots measure arrives whole and in order, also after a cut; commands are carried out once, in time, or refused.
+What robots measure arrives complete and in order, also after a cut; commands are carried out once and in time, or
+refused.
 """
 
 import contextlib
@@ -8,8 +9,7 @@ import queue
 import threading
 import time
 import uuid
-from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -20,7 +20,7 @@ from coloc_graph.errors import RobotError
 from coloc_graph.robot_io.link.clock import ClockFilter
 from coloc_graph.robot_io.link.counters import Counts, LinkCounter
 from coloc_graph.robot_io.link.messages import (
-    FARTHEST,
+    MAX_STAMP,
     Body,
     ClockQuestion,
     ClockReply,
@@ -28,39 +28,68 @@ from coloc_graph.robot_io.link.messages import (
     Event,
     Halt,
     Hold,
+    MessageError,
+    Refusal,
     Reply,
     Sample,
     Status,
     Wheels,
-    WireError,
     decode,
     encode,
+    is_session,
 )
-from coloc_graph.robot_io.link.reordering import InOrder
-from coloc_graph.robot_io.link.session import CACHED, FIRST, KEPT_KINDS, LinkSession, at_once, robot_of
+from coloc_graph.robot_io.link.robot_inbox import RobotInbox
+from coloc_graph.robot_io.link.session import KEPT_KINDS, URGENT, LinkSession, on_receiving_thread, robot_of, session_of
 from coloc_graph.robot_io.link.zenoh_config import Tls, config_of
 from coloc_graph.team import Team
 
 M = TypeVar("M", bound=msgspec.Struct)
 Clock = Callable[[], int]
 
-#: How often clocks are compared [s].
-COMPARED = 0.1
-#: How often what is missing is asked for, and, of a kind of which nothing comes, whether there is something newer [s].
-RECOVERED = 0.2
-NEWER = 1.0
-AGAIN = 0.25  # a command is sent again after this time, until its deadline [s]
-NO_SESSION = 0.02  # the same where the robot's session is not known, or nobody answers its key [s]
-WAITING = 0.02  # while answers are awaited, the caller's `waiting` is called at least this often [s]
+CLOCK_PERIOD = 0.1  # s between two comparisons of a robot's clock with ours
+RECOVERY_PERIOD = 0.2  # s between two requests for missing messages
+NEWEST_PERIOD = 1.0  # s without a message of a kind after which the newest one is requested
+RECOVERY_TIMEOUT = 5.0  # s that a request for missing messages may take
+COMMAND_PERIOD = 0.25  # s, at least, until a command that is not answered is sent again
+SESSION_PERIOD = 0.02  # s, the same while the robot's session is not known, or nobody answers its key
+WAITING_PERIOD = 0.02  # s, at most, between two calls of `waiting` while answers are awaited
 
 
 class CoordinatorLink:
-    """The coordinator's end; a context manager. Callbacks come on the link's threads, one at a time, and must be quick.
+    """The coordinator's end of the link; a context manager.
 
-    What a robot measured is asked for when something is known of its clock: `clocks` has it, by name. A robot's
-    messages come in order, none twice, `counts.missed` are lost for good. `exposed` lets others than this machine
-    connect without certificates. Raises `InputError` for an address that does not do, `RobotError` where it cannot
-    listen.
+    Callbacks come on the link's threads, one at a time, and must be quick. Messages of a robot are requested once its
+    clock is known. They come in order and none twice; `counts.missed` are lost. A robot's program that runs beside
+    another of the same name is refused.
+
+    Parameters
+    ----------
+    team
+        Robots that may connect.
+    listen
+        Address to listen on, tcp/HOST:PORT or tls/HOST:PORT.
+    on_sample, on_wheels, on_event, on_status
+        Called with a robot's name and a message.
+    on_presence
+        Called with a robot's name and True when it connects, False when it is gone.
+    tls
+        Certificates of this end.
+    exposed
+        Accept connections from other machines without certificates.
+    clock
+        This machine's monotonic clock [ns].
+
+    Attributes
+    ----------
+    clocks
+        `ClockFilter` of each robot, by name.
+
+    Raises
+    ------
+    InputError
+        If the address is not valid, or needs certificates.
+    RobotError
+        If the address cannot be listened on.
     """
 
     def __init__(
@@ -85,29 +114,32 @@ class CoordinatorLink:
         self._on_presence = on_presence
         self._counter = LinkCounter()
         self._lock = threading.RLock()
-        self._present = dict.fromkeys(team.names, False)
-        self._sessions: dict[str, str] = {}
-        self._orders: OrderedDict[tuple[str, type, str], InOrder] = OrderedDict()
-        self._heard: dict[str, tuple[str, list[Any]]] = {}
-        self._came: dict[tuple[str, type], float] = {}
+        self._inboxes = {name: self._inbox(name) for name in team.names}
         self._ended = threading.Event()
         self._session = LinkSession(listen, config_of(listen=listen, tls=tls, robots=team.names, exposed=exposed))
         session, keep = self._session.zenoh, self._session.keep
         try:
-            keep(session.declare_subscriber("coloc/*/status", self._taker(Status)))
-            keep(session.declare_subscriber("coloc/*/time", at_once(self._take_time)))
-            self._questions = {
-                name: keep(session.declare_publisher(f"coloc/{name}/question", **FIRST)) for name in team.names
+            self._publishers = {
+                (name, kind): keep(session.declare_publisher(f"coloc/{name}/{kind}", **URGENT))
+                for name in team.names
+                for kind in ("question", "hold", "refusal")
             }
-            self._holds = {name: keep(session.declare_publisher(f"coloc/{name}/hold", **FIRST)) for name in team.names}
-            keep(session.liveliness().declare_subscriber("coloc/*/alive", self._take_presence, history=True))
+            keep(session.declare_subscriber("coloc/*/status", self._receiver(Status)))
+            keep(session.declare_subscriber("coloc/*/time", on_receiving_thread(self._take_time)))
+            self._subscribers = [
+                keep(session.declare_subscriber(f"coloc/{name}/{kind}", self._receiver(type_)))
+                for name in team.names
+                for kind, type_ in KEPT_KINDS.items()
+            ]
+            keep(session.liveliness().declare_subscriber("coloc/*/alive/*", self._take_presence, history=True))
             keep(session.liveliness().declare_token("coloc/coordinator/alive"))
         except BaseException:
             self._session.close()
             raise
-        self._threads = [
-            threading.Thread(target=work, name=name, daemon=True)
-            for work, name in ((self._compare_clocks, "clocks"), (self._recover, "recovery"))
+        self._threads = [threading.Thread(target=self._compare_clocks, name="clocks", daemon=True)]
+        self._threads += [
+            threading.Thread(target=self._recover, args=(name,), name=f"recovery of {name}", daemon=True)
+            for name in team.names
         ]
         for thread in self._threads:
             thread.start()
@@ -121,32 +153,31 @@ class CoordinatorLink:
         self.close()
 
     def close(self) -> None:
-        """End it."""
+        """Close the link."""
         self._ended.set()
+        until = time.monotonic() + 2.0
         for thread in self._threads:
-            thread.join(2.0)
-        for _, subscribers in self._heard.values():
-            for one in subscribers:
-                with contextlib.suppress(zenoh.ZError):
-                    one.undeclare()
+            thread.join(max(until - time.monotonic(), 0.0))
         self._session.close()
 
     @property
     def counts(self) -> Counts:
-        """What came and what was refused."""
+        """Counts of received and refused messages."""
         return self._counter.counts()
 
     def synchronised(self, robot: str, limit: float = 1e-3) -> bool:
-        """Whether a robot's clock is known to `limit` [s] now."""
+        """Return whether a robot's clock is known to `limit` [s, one sigma] now."""
         return self.clocks[robot].synchronised(self._clock(), limit)
 
     def hold(self) -> None:
-        """Let robots that move go on moving for a moment, those of them whose clocks are known."""
+        """Permit moving robots whose clocks are known to go on moving for a moment."""
         now = self._clock()
-        for robot, session in list(self._sessions.items()):
-            if self._present[robot] and self.clocks[robot].known:
+        for robot, inbox in self._inboxes.items():
+            session = inbox.session
+            if session is not None and session == inbox.in_charge and inbox.present and self.clocks[robot].known:
                 with contextlib.suppress(zenoh.ZError):
-                    self._holds[robot].put(encode(Hold(session=session, sent=self.clocks[robot].to_robot(now))))
+                    message = Hold(session=session, sent=self.clocks[robot].to_robot(now))
+                    self._publishers[robot, "hold"].put(encode(message))
 
     def ask(self, robot: str, body: Body, timeout: float, waiting: Callable[[], None] = lambda: None) -> Reply:
         """Have one robot carry out a command; `ask_each` for one robot. Raises `RobotError` if it does not answer."""
@@ -163,8 +194,8 @@ class CoordinatorLink:
     ) -> dict[str, Reply | None]:
         """Have several robots carry out a command each, at the same time.
 
-        Each command is sent again until it is answered, and is carried out once. The robot refuses it afterwards,
-        except `Halt` where nothing is known of its clock.
+        Each command is sent again until it is answered, and is carried out once. After `timeout` the robot refuses it,
+        except `Halt` while its clock is not known.
 
         Parameters
         ----------
@@ -173,7 +204,7 @@ class CoordinatorLink:
         timeout
             Time to answer [s].
         waiting
-            Called on this thread at least every `WAITING` s until all have answered. What it raises ends the wait.
+            Called on this thread at least every `WAITING_PERIOD` until all have answered; its exceptions end the wait.
 
         Returns
         -------
@@ -188,27 +219,31 @@ class CoordinatorLink:
             for robot, body in bodies.items():
                 if replies[robot] is None and now >= again[robot]:
                     command = commands.get(robot) or self._command(robot, body, left)
-                    again[robot] = now + NO_SESSION
-                    if command is not None:
-                        commands[robot] = command
-                        wait = max(min(left, max(AGAIN, timeout / 3)), 0.01)
-                        again[robot] = now + wait
-                        self._send(robot, command, wait, came)
+                    again[robot] = now + SESSION_PERIOD
+                    if command is None:
+                        continue
+                    commands[robot] = command
+                    if command.session != self._inboxes[robot].session:
+                        replies[robot] = Reply(id=command.id, ok=False, text="its program was restarted meanwhile")
+                        continue
+                    wait = max(min(left, max(COMMAND_PERIOD, timeout / 3)), 0.01)
+                    again[robot] = now + wait
+                    self._send(robot, command, wait, came)
             waiting()
             with contextlib.suppress(queue.Empty):
-                robot, reply = came.get(timeout=max(min(left, WAITING), 0.001))
+                robot, reply = came.get(timeout=max(min(left, WAITING_PERIOD), 0.001))
                 if reply is None:  # this query is over, and nobody answered it
-                    again[robot] = min(again[robot], time.monotonic() + NO_SESSION)
+                    again[robot] = min(again[robot], time.monotonic() + SESSION_PERIOD)
                 elif reply.id == commands[robot].id:
                     replies[robot] = reply
         return replies
 
     def _command(self, robot: str, body: Body, left: float) -> Command | None:
-        """The command for the robot's session that runs now; None while that, or its clock, is not known."""
-        session, clock = self._sessions.get(robot), self.clocks[robot]
+        """Command for the robot's current session; None while that, or its clock, is not known."""
+        session, clock = self._inboxes[robot].session, self.clocks[robot]
         if session is None or not (clock.known or isinstance(body, Halt)):
             return None
-        deadline = clock.to_robot(self._clock() + round(1e9 * left)) if clock.known else FARTHEST - 1
+        deadline = clock.to_robot(self._clock() + round(1e9 * left)) if clock.known else MAX_STAMP - 1
         return Command(id=uuid.uuid4().hex, session=session, deadline=deadline, body=body)
 
     def _send(
@@ -221,107 +256,89 @@ class CoordinatorLink:
                 return
             try:
                 came.put((robot, decode(one.ok.payload.to_bytes(), Reply)))
-            except WireError as error:
+            except MessageError as error:
                 self._counter.refuse(error, f"an answer of {robot}")
 
         self._session.zenoh.get(
-            f"coloc/{robot}/command",
+            f"coloc/{robot}/command/{command.session}",
             zenoh.handlers.Callback(take, lambda: came.put((robot, None)), indirect=False),
             payload=encode(command),
             timeout=timeout,
-            **FIRST,
+            **URGENT,
         )
 
-    def _taker(self, type_: type[M], asked: bool = False) -> Callable[[zenoh.Sample], None]:
-        """What takes messages of one kind from zenoh, and never raises into its threads.
+    def _inbox(self, robot: str) -> RobotInbox:
+        return RobotInbox(robot, lambda message: self._calls[type(message)](robot, message), self._counter)
 
-        Those that were `asked` for may have come already: that is no replay.
-        """
+    def _receiver(self, type_: type[M], requested: bool = False) -> Callable[[zenoh.Sample], None]:
+        """Callback that takes in messages of one kind and never raises into zenoh's threads."""
 
         def take(sample: zenoh.Sample) -> None:
             robot = robot_of(sample)
-            if robot not in self.clocks:
-                self._counter.add("foreign", f"a message of `{robot[:40]}`, which is no robot of the team, is refused")
+            if robot not in self._inboxes:
+                self._counter.add("foreign", f"refused a message of `{robot[:40]}`, which is no robot of the team")
                 return
+            data = sample.payload.to_bytes()
             try:
-                message = decode(sample.payload.to_bytes(), type_)
-            except WireError as error:
+                message = decode(data, type_)
+            except MessageError as error:
                 self._counter.refuse(error, f"a {type_.__name__} of {robot}")
                 return
             with self._lock:
-                self._hand_over(robot, message, asked)
+                inbox = self._inboxes[robot]
+                if not isinstance(message, Status):
+                    inbox.take(message, data, requested=requested)
+                elif message.session == inbox.in_charge:
+                    self._counter.add("taken")
+                    self._calls[Status](robot, message)
+                else:
+                    self._counter.add("unknown")
 
         return take
 
-    def _hand_over(self, robot: str, message: Any, asked: bool) -> None:
-        if isinstance(message, Status):
-            self._counter.add("taken")
-            self._calls[Status](robot, message)
-            return
-        self._came[robot, type(message)] = time.monotonic()
-        key = robot, type(message), message.session
-        order = self._orders.get(key)
-        if order is None:
-            order = self._orders[key] = InOrder(CACHED)
-            while len(self._orders) > 12 * len(self.team.names):
-                self._orders.popitem(last=False)
-        if not (asked and order.knows(message.number)):
-            self._call(key, order, order.take(message.number, message))
+    def _recover(self, robot: str) -> None:
+        """Thread that requests a robot's missing messages until they have come or are lost."""
+        inbox = self._inboxes[robot]
+        while not self._ended.wait(0.0 if self._recovered(robot) else RECOVERY_PERIOD):
+            # where the last message of a kind was lost no later one tells of the gap: the newest is requested
+            for type_ in KEPT_KINDS.values():
+                quiet = time.monotonic() - inbox.last_taken.get(type_, 0.0) > NEWEST_PERIOD
+                if quiet and inbox.present and inbox.session == inbox.in_charge is not None:
+                    self._request(robot, type_, "_max=1")
+                    inbox.last_taken[type_] = time.monotonic()
 
-    def _call(self, key: tuple[str, type, str], order: InOrder, messages: Iterator[Any]) -> None:
-        """Hand over messages whose turn it is, and count what is not among them."""
-        robot, type_, _ = key
-        lost, again = order.lost, order.again
-        for message in messages:
-            self._counter.add("taken")
-            self._calls[type_](robot, message)
-        if order.again > again:
-            self._counter.add("replayed", times=order.again - again)
-        if order.lost > lost:
-            count = order.lost - lost
-            self._counter.add("missed", f"{count} {type_.__name__} of {robot} are lost for good", count)
-
-    def _recover(self) -> None:
-        """The thread that asks robots for what is missing of what they measured, until it comes or is no more."""
-        while not self._ended.wait(0.0 if self._recovered() else RECOVERED):
-            # of what is rare the newest tells what is missing before it; of the rest the next one that comes does
-            for robot, (session, _) in list(self._heard.items()):
-                for type_ in KEPT_KINDS.values():
-                    due = self._came.get((robot, type_), 0.0) + NEWER <= time.monotonic()
-                    if due and self._present[robot] and self._sessions.get(robot) == session:
-                        self._ask_again(robot, type_, "_max=1")
-                        self._came[robot, type_] = time.monotonic()
-
-    def _recovered(self) -> bool:
-        """Ask once for what is missing of each kind of each robot; whether anything came, and there is more."""
+    def _recovered(self, robot: str) -> bool:
+        """Request each gap once; return True if a gap has become smaller, and something is still missing."""
+        inbox = self._inboxes[robot]
         with self._lock:
-            orders = list(self._orders.items())
+            session, gaps = inbox.session, inbox.missing()
         more = False
-        for key, order in orders:
-            robot, type_, session = key
+        for type_, first, last in gaps:
+            if session is None or not inbox.present:
+                break
+            answered = self._request(robot, type_, f"_sn={first}..{last}")
             with self._lock:
-                missing = order.missing()
-                if missing is not None and self._sessions.get(robot, session) != session:
-                    self._call(key, order, order.end())  # who kept what is missing has ended
-                    continue
-            if missing is None or not self._present[robot] or robot not in self._sessions:
-                continue
-            answered = self._ask_again(robot, type_, f"_sn={missing[0]}..{missing[1]}")
-            with self._lock:
-                if answered and self._present[robot]:
-                    self._call(key, order, order.asked(*missing))
-                left = order.missing()
-                more |= left is not None and left[0] != missing[0]
+                if answered and inbox.present:
+                    inbox.answered(session, type_, first, last)
+                left = [one for kind, one, _ in inbox.missing() if kind is type_]
+                more |= bool(left) and left[0] != first
         return more
 
-    def _ask_again(self, robot: str, type_: type[M], which: str) -> bool:
-        """Have some of what a robot keeps come again; whether it answered."""
+    def _request(self, robot: str, type_: type[M], which: str) -> bool:
+        """Have a robot send some of its kept messages again.
+
+        Returns
+        -------
+        bool
+            True if the robot answered. No message at all is an answer only if its newest message comes on request:
+            a robot that cannot be reached sends none either.
+        """
         kind = next(kind for kind, one in KEPT_KINDS.items() if one is type_)
-        take = self._taker(type_, asked=True)
+        take, count = self._receiver(type_, requested=True), 0
         try:
             replies = self._session.zenoh.get(
                 f"coloc/{robot}/{kind}/@adv/pub/**?{which}",
-                timeout=5.0,
+                timeout=RECOVERY_TIMEOUT,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
                 consolidation=zenoh.ConsolidationMode.NONE,
             )
@@ -329,57 +346,63 @@ class CoordinatorLink:
                 if one.ok is None:
                     return False
                 take(one.ok)
+                count += 1
         except zenoh.ZError:
             return False
-        return True
+        return count > 0 or (which != "_max=1" and self._request(robot, type_, "_max=1"))
 
     def _take_presence(self, sample: zenoh.Sample) -> None:
-        robot = robot_of(sample)
-        if robot in self._present:
-            there = sample.kind == zenoh.SampleKind.PUT
-            with self._lock:
-                self._present[robot] = there
-                self._on_presence(robot, there)
+        robot, session = robot_of(sample), session_of(sample)
+        if robot not in self._inboxes or not is_session(session):
+            return
+        inbox = self._inboxes[robot]
+        with self._lock:
+            before = inbox.in_charge, inbox.present
+            if sample.kind == zenoh.SampleKind.PUT:
+                inbox.connect(session, self._clock())
+            else:
+                inbox.disconnect(session)
+            if (inbox.in_charge, inbox.present) == before:
+                return
+            if before[1]:
+                self._on_presence(robot, False)
+            if inbox.present:
+                self._on_presence(robot, True)
 
     def _compare_clocks(self) -> None:
-        """The thread that asks robots for the time, and for what they measured."""
-        while not self._ended.wait(COMPARED):
-            for robot in [robot for robot, there in self._present.items() if there]:
+        """Thread that asks robots for the time."""
+        while not self._ended.wait(CLOCK_PERIOD):
+            for robot in [robot for robot, inbox in self._inboxes.items() if inbox.present]:
                 with contextlib.suppress(zenoh.ZError):
-                    self._questions[robot].put(encode(ClockQuestion(asked=self._clock())))
-                    self._listen_to(robot)
-
-    def _listen_to(self, robot: str) -> None:
-        """Have what a session of a robot measured come, from its first on, once it has told its time.
-
-        What is missing is asked for by `_recover`, some at a time, and not by zenoh, which has a robot send all of it
-        at once: more than a bad network carries before zenoh takes the connection for dead.
-        """
-        session = self._sessions.get(robot)
-        before, subscribers = self._heard.get(robot, (None, []))
-        if session is None or session == before:
-            return
-        for one in subscribers:
-            one.undeclare()
-        self._heard[robot] = (
-            session,
-            [
-                self._session.zenoh.declare_subscriber(f"coloc/{robot}/{kind}", self._taker(type_))
-                for kind, type_ in KEPT_KINDS.items()
-            ],
-        )
+                    self._publishers[robot, "question"].put(encode(ClockQuestion(asked=self._clock())))
 
     def _take_time(self, sample: zenoh.Sample) -> None:
-        heard, robot = self._clock(), robot_of(sample)
-        if robot not in self.clocks:
-            self._counter.add("foreign", f"the time of `{robot[:40]}`, which is no robot of the team, is refused")
+        received, robot = self._clock(), robot_of(sample)
+        if robot not in self._inboxes:
+            self._counter.add("foreign", f"refused the time of `{robot[:40]}`, which is no robot of the team")
             return
         try:
             reply = decode(sample.payload.to_bytes(), ClockReply)
-            self.clocks[robot].add(reply.asked, reply.received, reply.sent, heard)
-        except WireError as error:
+            inbox = self._inboxes[robot]
+            if reply.session != inbox.in_charge:
+                self._counter.add("unknown")
+                return
+            self.clocks[robot].add(reply.asked, reply.received, reply.sent, received)
+        except MessageError as error:
             self._counter.refuse(error, f"the time of {robot}")
         except ValueError as error:
-            self._counter.add("malformed", f"the time of {robot} is refused: {error}")
+            self._counter.add("malformed", f"refused the time of {robot}: {error}")
         else:
-            self._sessions[robot] = reply.session
+            with self._lock:
+                if reply.session == inbox.in_charge:
+                    inbox.begin()
+                duplicates = inbox.duplicates(reply.asked)
+            self._refuse(robot, duplicates)
+
+    def _refuse(self, robot: str, sessions: list[str]) -> None:
+        """Tell programs that run beside the one in charge of a robot to end."""
+        text = f"another program runs as robot {robot} already: end it first, or give this one its own name"
+        for session in sessions:
+            self._counter.add("duplicate", f"refused a second program that runs as robot {robot}: end one of them")
+            with contextlib.suppress(zenoh.ZError):
+                self._publishers[robot, "refusal"].put(encode(Refusal(session=session, text=text)))

@@ -1,4 +1,4 @@
-"""What came over a link and what was refused, counted, and logged now and then."""
+"""Counts of the messages of a link that were taken and refused, logged at intervals."""
 
 import logging
 import threading
@@ -6,18 +6,36 @@ import time
 from collections import Counter
 from dataclasses import dataclass, fields
 
-from coloc_graph.robot_io.link.messages import OversizedError, WireError
+from coloc_graph.robot_io.link.messages import MessageError, OversizedError
 
 log = logging.getLogger(__name__)
 
-#: A refusal of one kind is logged so often at most [s].
-LOGGED = 5.0
+LOG_PERIOD = 5.0  # s, at least, between two log lines on one kind of refusal
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Messages that were taken, and refused: malformed, oversized, late, replayed (a command or a sample that came
-    again), or foreign (of no robot of the team). `missed` is what was lost for good."""
+    """Counts of messages.
+
+    Attributes
+    ----------
+    taken
+        Accepted.
+    malformed, oversized
+        Refused since they are not valid, or too large.
+    late
+        Commands refused after their deadline.
+    replayed
+        Commands and measurements that came again.
+    foreign
+        From a robot that is not in the team.
+    unknown
+        From a session whose clock is not known yet, or that ended long ago. The first are requested again later.
+    missed
+        Measurements that are lost.
+    duplicate
+        Refusals sent to a second program that runs under a robot's name.
+    """
 
     taken: int
     malformed: int
@@ -25,11 +43,13 @@ class Counts:
     late: int
     replayed: int
     foreign: int
+    unknown: int
     missed: int
+    duplicate: int
 
 
 class LinkCounter:
-    """Counts what comes, and logs what is refused, now and then; for several threads."""
+    """Counts what comes and logs what is refused, at most every `LOG_PERIOD`; for several threads."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -37,20 +57,20 @@ class LinkCounter:
         self._lock = threading.Lock()
 
     def add(self, what: str, why: str = "", times: int = 1) -> None:
-        """Count something of `Counts`; `why` it was refused is logged."""
+        """Count messages under a field of `Counts`, and log `why`, if given."""
         with self._lock:
             self._counts[what] += times
             number, now = self._counts[what], time.monotonic()
-            if not why or now - self._logged.get(what, -LOGGED) < LOGGED:
+            if not why or now - self._logged.get(what, -LOG_PERIOD) < LOG_PERIOD:
                 return
             self._logged[what] = now
-        log.warning("%s (%s: %d so far)", why, what, number)
+        log.warning("%s (%s: %d until now)", why, what, number)
 
-    def refuse(self, error: WireError, what: str) -> None:
-        """Count, and log, that `what` came and was none."""
-        self.add("oversized" if isinstance(error, OversizedError) else "malformed", f"{what} is refused: {error}")
+    def refuse(self, error: MessageError, what: str) -> None:
+        """Count and log a message, described by `what`, that is not valid."""
+        self.add("oversized" if isinstance(error, OversizedError) else "malformed", f"refused {what}: {error}")
 
     def counts(self) -> Counts:
-        """The numbers so far."""
+        """Return the present counts."""
         with self._lock:
             return Counts(**{one.name: self._counts[one.name] for one in fields(Counts)})

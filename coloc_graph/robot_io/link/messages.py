@@ -1,10 +1,11 @@
-"""What passes between robots and the coordinator: `encode`, `decode`, and the kinds of messages.
+"""Messages between robots and the coordinator: their kinds, `encode` and `decode`.
 
-Messages are MessagePack. Whatever comes in is checked here once, completely; `WireError` says what is wrong.
-Stamps are nanoseconds of the monotonic clock of the robot that sends, unless said otherwise.
+Messages are encoded as MessagePack and checked completely when they are decoded; `MessageError` says what is wrong.
+Stamps are nanoseconds of the sending robot's monotonic clock unless stated otherwise.
 """
 
 import math
+import re
 from typing import Any, TypeVar
 
 import msgspec
@@ -13,37 +14,51 @@ import numpy as np
 from coloc_graph.errors import ColocError
 from coloc_graph.run import Detections, OdometrySample
 
-#: Limits of what is taken: bytes of a message, marker centres in an image, places in a way.
-LARGEST = 256 * 1024
-MOST_MARKERS = 64
-MOST_PLACES = 100
-#: Letters in a text, and in the name of a session, a command, a marker.
-LONGEST_TEXT = 2000
-LONGEST_NAME = 64
-#: Stamps [ns] are within, and numbers that count below.
-FARTHEST = 2**62
-HIGHEST = 2**53
+MAX_MESSAGE_BYTES = 256 * 1024  # bytes of an encoded message
+MAX_MARKERS = 64  # marker centres in one image
+MAX_WAYPOINTS = 100  # waypoints of one drive
+MAX_TEXT_LENGTH = 2000  # characters of a text
+MAX_NAME_LENGTH = 64  # characters of the name of a session, command or marker
+MAX_STAMP = 2**62  # ns, bound of a time stamp's magnitude
+MAX_COUNT = 2**53  # bound of numbers that count
+MAX_COORDINATE = 1e6  # m, rad, bound of a coordinate's magnitude
+MAX_DRIVE_SPEED = 0.5  # m/s
 
 M = TypeVar("M", bound=msgspec.Struct)
 
 
-class WireError(ColocError):
-    """A message is malformed, or says what cannot be."""
+class MessageError(ColocError):
+    """A message is malformed or contradicts itself."""
 
 
-class OversizedError(WireError):
-    """A message is larger than any that is sent."""
+class OversizedError(MessageError):
+    """A message is larger than any valid one."""
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     def _check(self) -> None:
-        """Raise ValueError where its fields contradict each other."""
+        """Raise ValueError if a field is out of range or fields contradict each other."""
 
 
 class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The marker centres in one image of a robot's camera, as `run.Detections`; `covariance` is (uu, uv, vv) [px^2].
+    """Marker centres in one image of a robot's camera, as in `run.Detections`.
 
-    `number` counts all samples of a session from 0, `capture` is the one that the image belongs to.
+    Attributes
+    ----------
+    session
+        Run of the robot's program.
+    number
+        Count of the session's samples before this one.
+    capture
+        Number of the capture that the image belongs to.
+    stamp
+        Time of exposure [ns].
+    uv
+        Marker centres [px].
+    covariance
+        Their covariances (uu, uv, vv) [px^2].
+    markers, flags, peak, area
+        As in `run.Detections`, one each.
     """
 
     session: str
@@ -59,8 +74,8 @@ class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     @classmethod
     def of(cls, seen: Detections, *, session: str, number: int, capture: int, stamp: int) -> "Sample":
-        """The message of what was detected at `stamp`; of more centres than it can hold the brightest."""
-        order = np.argsort(-seen.peak, kind="stable")[:MOST_MARKERS]
+        """Message of detections at `stamp` [ns]; it holds the `MAX_MARKERS` brightest of them."""
+        order = np.argsort(-seen.peak, kind="stable")[:MAX_MARKERS]
         C = seen.covariance[order]
         return cls(
             session=session,
@@ -76,7 +91,7 @@ class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
         )
 
     def detections(self, robot: str, time: float) -> Detections:
-        """The record that it is, at a time [UTC s]."""
+        """Record of this message, at a time [UTC s]."""
         n = len(self.uv)
         uu, uv, vv = np.array(self.covariance, float).reshape(n, 3).T
         return Detections(
@@ -92,11 +107,11 @@ class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     def _check(self) -> None:
         n = len(self.uv)
-        if n > MOST_MARKERS or any(len(one) != n for one in (self.covariance, self.markers, self.flags, self.peak,
+        if n > MAX_MARKERS or any(len(one) != n for one in (self.covariance, self.markers, self.flags, self.peak,
                                                              self.area)):  # fmt: skip
-            raise ValueError("its lists differ in length, or hold too many markers")
+            raise ValueError(f"its lists differ in length or hold more than {MAX_MARKERS} markers")
         if not all(map(math.isfinite, (v for row in (*self.uv, *self.covariance, self.peak, self.area) for v in row))):
-            raise ValueError("it holds a number that is not finite")
+            raise ValueError("a number is not finite")
         if any(abs(u) > 1e5 or abs(v) > 1e5 for u, v in self.uv):
             raise ValueError("a marker is far outside any image")
         if any(not (0 < a < 1e9 and 0 < c < 1e9 and a * c > b * b) for a, b, c in self.covariance):
@@ -109,9 +124,22 @@ class Sample(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One sample of odometry, as `run.OdometrySample`; `covariance` is its upper triangle, row by row.
+    """One sample of wheel odometry, as in `run.OdometrySample`.
 
-    `frame` names the odometry frame that `pose` is in: another one where the wheels lost count.
+    Attributes
+    ----------
+    session
+        Run of the robot's program.
+    number
+        Count of the session's odometry messages before this one.
+    stamp
+        Time of the sample [ns].
+    frame
+        Name of the odometry frame of `pose`; it changes when the encoders lose count.
+    pose
+        x [m], y [m], yaw [rad].
+    covariance
+        Upper triangle of the covariance of (x, y, yaw), row by row.
     """
 
     session: str
@@ -123,27 +151,27 @@ class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     @classmethod
     def of(cls, sample: OdometrySample, *, session: str, number: int, stamp: int, frame: str = "") -> "Wheels":
-        """The message of a sample taken at `stamp`."""
+        """Message of a sample taken at `stamp` [ns]."""
         x, y, yaw = map(float, sample.pose)
         upper = sample.covariance[np.triu_indices(3)].tolist()
         return cls(session=session, number=number, stamp=stamp, frame=frame, pose=(x, y, yaw), covariance=tuple(upper))
 
     def sample(self, robot: str, time: float) -> OdometrySample:
-        """The record that it is, at a time [UTC s]."""
+        """Record of this message, at a time [UTC s]."""
         return OdometrySample(robot, time, np.array(self.pose), _symmetric(self.covariance))
 
     def _check(self) -> None:
-        if not all(math.isfinite(v) and abs(v) < 1e6 for v in (*self.pose, *self.covariance)):
-            raise ValueError("it holds a number that is no place")
+        if not all(math.isfinite(v) and abs(v) < MAX_COORDINATE for v in (*self.pose, *self.covariance)):
+            raise ValueError(f"a coordinate is not finite or beyond {MAX_COORDINATE:g}")
         if np.linalg.eigvalsh(_symmetric(self.covariance)).min() < -1e-12:
-            raise ValueError("its covariance is not positive")
+            raise ValueError("its covariance is not positive semi-definite")
         _named(self.session, self.frame)
         _counted(self.number)
         _stamped(self.stamp)
 
 
 class Event(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Something that happened to a robot: `kind` is one word, `text` a sentence or what belongs to the kind."""
+    """Something that happened to a robot: `kind` is one word, `text` a sentence or the kind's value."""
 
     session: str
     number: int
@@ -159,7 +187,7 @@ class Event(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Status(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How a robot is, ten times a second. `session` changes when its program begins anew."""
+    """State of a robot, sent ten times a second; `session` changes when its program is restarted."""
 
     session: str
     stamp: int
@@ -173,7 +201,7 @@ class Status(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     def _check(self) -> None:
         if len(self.hazards) > 16:
-            raise ValueError("it has too many hazards")
+            raise ValueError("it lists more than 16 hazards")
         _named(self.session, self.phase)
         _short(self.fault or "", self.camera_fault or "", *self.hazards)
         _counted(self.capture or 0)
@@ -181,7 +209,7 @@ class Status(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Capture(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
-    """Detect markers in each image, and send them as those of this capture, one attempt to measure a stance."""
+    """Detect markers in each image and send them under this capture's number, until `EndCapture`."""
 
     capture: int
 
@@ -190,12 +218,24 @@ class Capture(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, t
 
 
 class EndCapture(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
-    """Enough; how many samples were sent is answered."""
+    """End the capture; the answer is the number of samples that were sent."""
 
 
 class Drive(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
-    """Drive through places (x, y) [m] of your odometry frame at a speed [m/s], then turn to `yaw` [rad], if there is
-    one; `number` comes back in the event "arrived".
+    """Drive through waypoints, then turn.
+
+    Attributes
+    ----------
+    number
+        Number that comes back in the event "arrived".
+    places
+        Waypoints (x, y) [m] in the robot's odometry frame.
+    yaw
+        Heading at the end [rad], None for any.
+    speed
+        Speed [m/s].
+    backwards
+        Allow driving backwards where that means less turning.
     """
 
     number: int
@@ -206,26 +246,26 @@ class Drive(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag
 
     def _check(self) -> None:
         numbers = [v for place in self.places for v in place] + [self.yaw or 0.0]
-        if len(self.places) > MOST_PLACES or not all(math.isfinite(v) and abs(v) < 1e6 for v in numbers):
-            raise ValueError("its places are too many, or none")
-        if not 0 < self.speed <= 0.5:
-            raise ValueError(f"its speed is {self.speed} m/s")
+        if len(self.places) > MAX_WAYPOINTS or not all(math.isfinite(v) and abs(v) < MAX_COORDINATE for v in numbers):
+            raise ValueError(f"it has more than {MAX_WAYPOINTS} waypoints, or a coordinate beyond {MAX_COORDINATE:g}")
+        if not 0 < self.speed <= MAX_DRIVE_SPEED:
+            raise ValueError(f"its speed is {self.speed} m/s, not above 0 and at most {MAX_DRIVE_SPEED} m/s")
         _counted(self.number)
 
 
 class Halt(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
-    """Stop."""
+    """Stop the wheels."""
 
 
 class Recover(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True, tag=True):
-    """Whatever you stopped for: you may drive again."""
+    """Permit driving again after a fault."""
 
 
 Body = Capture | EndCapture | Drive | Halt | Recover
 
 
 class Command(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A command for one session of a robot: not after `deadline` [ns by the robot's clock], and once for each `id`."""
+    """A command for one session of a robot, carried out once an `id` and not after `deadline` [ns, robot's clock]."""
 
     id: str
     session: str
@@ -239,7 +279,7 @@ class Command(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Hold(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A session of a robot may go on moving for a moment from `sent` on [ns by the robot's clock]."""
+    """Permission for a session of a robot to go on moving for a moment from `sent` on [ns, robot's clock]."""
 
     session: str
     sent: int
@@ -250,7 +290,7 @@ class Hold(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Reply(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What came of a command; `text` says why not, or answers."""
+    """Outcome of a command; `text` is the answer, or the reason for a refusal."""
 
     id: str
     ok: bool
@@ -262,7 +302,7 @@ class Reply(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class ClockQuestion(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What time is it? Asked at an instant of the coordinator's clock [ns]."""
+    """Request for the time, sent at `asked` [ns, coordinator's clock]."""
 
     asked: int
 
@@ -271,7 +311,7 @@ class ClockQuestion(_Message, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class ClockReply(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When a question for the time came to a robot's session and when this was sent [ns]."""
+    """Times at which a robot received a request for the time and answered it [ns, robot's clock]."""
 
     session: str
     asked: int
@@ -279,25 +319,48 @@ class ClockReply(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True
     sent: int
 
     def _check(self) -> None:
-        _named(self.session)
+        if not is_session(self.session):
+            raise ValueError("its session is not a name of letters, digits, - and _")
         _stamped(self.asked, self.received, self.sent)
 
 
+class Refusal(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Order for one session of a robot to end, since another program runs under its name; `text` says so."""
+
+    session: str
+    text: str
+
+    def _check(self) -> None:
+        _named(self.session)
+        _short(self.text)
+
+
+def is_session(name: str) -> bool:
+    """Return whether a name can be that of a session: it is a part of zenoh keys."""
+    return re.fullmatch(f"[A-Za-z0-9_-]{{1,{MAX_NAME_LENGTH}}}", name) is not None
+
+
 def encode(message: msgspec.Struct) -> bytes:
-    """A message as bytes."""
+    """Encode a message as MessagePack."""
     return msgspec.msgpack.encode(message)
 
 
 def decode(data: bytes, kind: type[M]) -> M:
-    """The message in bytes that came from outside; `WireError` where there is none of that kind."""
-    if len(data) > LARGEST:
-        raise OversizedError(f"a {kind.__name__} of {len(data)} bytes is too large: {LARGEST} at most")
+    """Decode and check a message of one kind.
+
+    Raises
+    ------
+    MessageError
+        If the bytes are not a valid message of this kind; `OversizedError` if there are too many.
+    """
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise OversizedError(f"a {kind.__name__} of {len(data)} bytes is larger than {MAX_MESSAGE_BYTES} bytes")
     try:
         message = msgspec.msgpack.decode(data, type=kind)
         if isinstance(message, _Message):
             message._check()
     except (ValueError, OverflowError, RecursionError, msgspec.MsgspecError) as error:
-        raise WireError(f"what came is no {kind.__name__}: {error}") from error
+        raise MessageError(f"not a valid {kind.__name__}: {error}") from error
     return message
 
 
@@ -308,20 +371,20 @@ def _symmetric(upper: tuple[float, ...]) -> "np.ndarray[Any, np.dtype[np.float64
 
 
 def _short(*texts: str) -> None:
-    if any(len(text) > LONGEST_TEXT for text in texts):
-        raise ValueError("a text is too long")
+    if any(len(text) > MAX_TEXT_LENGTH for text in texts):
+        raise ValueError(f"a text has more than {MAX_TEXT_LENGTH} characters")
 
 
 def _named(*names: str) -> None:
-    if any(len(name) > LONGEST_NAME for name in names):
-        raise ValueError("a name is too long")
+    if any(len(name) > MAX_NAME_LENGTH for name in names):
+        raise ValueError(f"a name has more than {MAX_NAME_LENGTH} characters")
 
 
 def _counted(*numbers: int) -> None:
-    if any(not 0 <= number < HIGHEST for number in numbers):
-        raise ValueError("a number that counts is none")
+    if any(not 0 <= number < MAX_COUNT for number in numbers):
+        raise ValueError("a count is negative or too large")
 
 
 def _stamped(*stamps: int) -> None:
-    if any(abs(stamp) >= FARTHEST for stamp in stamps):
-        raise ValueError("a stamp is none")
+    if any(abs(stamp) >= MAX_STAMP for stamp in stamps):
+        raise ValueError("a time stamp is out of range")

@@ -1,71 +1,95 @@
-"""Messages that are numbered, handed over in order and once, while those that are missing are asked for."""
+"""Reordering of numbered messages: each is handed on once and in order, and the gaps are known; `ReorderBuffer`."""
 
-from collections.abc import Iterator
-from typing import Any
+#: Messages requested in one query. Each reply is progress on a bad network too, and 100 do not fill zenoh's queue,
+#: which would stop the robot's whole link.
+REQUEST_SIZE = 100
+#: Requests for a gap that were answered without it, after which it is counted as lost.
+MAX_REQUESTS = 3
+#: Bytes of messages held behind a gap; beyond it the gap is counted as lost.
+MAX_HELD_BYTES = 32 * 1024 * 1024
 
-#: So many are asked for at once [messages]: each answer is progress, on a bad network too, and does not fill zenoh's
-#: queue, which would stop the robot's whole link.
-AT_ONCE = 100
-#: After so many answers without what is missing there is none of it any more.
-TRIES = 3
 
+class ReorderBuffer:
+    """Encoded messages of one kind from one session, numbered from 0; for one thread at a time.
 
-class InOrder:
-    """Messages of one kind of one session of a robot, whose numbers begin at 0; of one thread at a time.
+    Parameters
+    ----------
+    window
+        Number of newest messages that the sender keeps. A gap further behind the newest cannot be filled any more and
+        is counted as lost.
+    next_number
+        Number of the first message to hand on.
 
-    What comes ahead of its turn is held, `most` of it at most, until what is missing has come or is lost for good.
+    Attributes
+    ----------
+    next_number
+        Number of the message that is handed on next.
+    lost
+        Count of the messages that were given up.
+    repeated
+        Count of the messages that came although they had been handed on, held or given up before.
     """
 
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._next = 0
-        self._held: dict[int, Any] = {}
-        self._tried = 0
-        #: Messages that were lost for good, and that came again.
-        self.lost = self.again = 0
+    def __init__(self, window: int, next_number: int = 0) -> None:
+        self._window = window
+        self._held: dict[int, bytes] = {}
+        self._held_bytes = 0
+        self._requests = 0
+        self.next_number = next_number
+        self.lost = self.repeated = 0
 
-    def take(self, number: int, message: Any) -> Iterator[Any]:
-        """Take one in; those whose turn it is come out."""
+    def take(self, number: int, message: bytes) -> list[bytes]:
+        """Accept a message and return those that can be handed on now, in order."""
         if self.knows(number):
-            self.again += 1
-            return
+            self.repeated += 1
+            return []
         self._held[number] = message
-        if len(self._held) > self._most:
-            self._give_up(min(self._held))
-        yield from self._turn()
+        self._held_bytes += len(message)
+        ready = self._skip_to(number + 1 - self._window)
+        while self._held_bytes > MAX_HELD_BYTES:
+            ready += self._skip_to(min(self._held))
+        return ready
 
     def knows(self, number: int) -> bool:
-        """Whether it came already, or was given up."""
-        return number < self._next or number in self._held
+        """Return whether a message was handed on, is held, or was given up."""
+        return number < self.next_number or number in self._held
 
     def missing(self) -> tuple[int, int] | None:
-        """The numbers to ask for, first and last."""
+        """First and last number to request next; None if there is no gap."""
         if not self._held:
             return None
-        return self._next, min(min(self._held) - 1, self._next + AT_ONCE - 1)
+        return self.next_number, min(min(self._held), self.next_number + REQUEST_SIZE) - 1
 
-    def asked(self, first: int, last: int) -> Iterator[Any]:
-        """What was missing, `first` to `last`, was asked for, and what there was of it came; what can, comes out."""
-        if self._next != first:
-            self._tried = 0
-            return
-        self._tried += 1
-        if self._tried >= TRIES and self._held:
-            self._give_up(min(last + 1, min(self._held)))
-            yield from self._turn()
+    def requested(self, first: int, last: int) -> list[bytes]:
+        """Note that the sender answered a request for `first` to `last`, and return what can be handed on now.
 
-    def end(self) -> Iterator[Any]:
-        """What is missing will not come any more; all that is held comes out."""
-        while self._held:
-            self._give_up(min(self._held))
-            yield from self._turn()
+        What it sent was taken before. After `MAX_REQUESTS` answers without number `first` the rest of the gap is lost.
+        """
+        if self.next_number != first or not self._held:
+            return []
+        self._requests += 1
+        return self._skip_to(min(last + 1, min(self._held))) if self._requests >= MAX_REQUESTS else []
 
-    def _turn(self) -> Iterator[Any]:
-        while self._next in self._held:
-            self._tried = 0
-            self._next += 1
-            yield self._held.pop(self._next - 1)
+    def end(self) -> list[bytes]:
+        """Give up all gaps, since the sender has ended, and return all that is held, in order."""
+        return self._skip_to(max(self._held, default=-1) + 1)
 
-    def _give_up(self, until: int) -> None:
-        self.lost += until - self._next
-        self._next, self._tried = until, 0
+    def _skip_to(self, number: int) -> list[bytes]:
+        """Give up what is missing below `number`; return what can be handed on, from below and beyond it."""
+        ready = []
+        for held in sorted(one for one in self._held if one < number) if number > self.next_number else []:
+            ready += self._advance_to(max(held, self.next_number))
+        return ready + self._advance_to(max(number, self.next_number))
+
+    def _advance_to(self, number: int) -> list[bytes]:
+        """Give up what is missing below `number`, below which nothing is held; return the messages from it on."""
+        if number > self.next_number:
+            self.lost += number - self.next_number
+            self.next_number, self._requests = number, 0
+        ready = []
+        while (message := self._held.pop(self.next_number, None)) is not None:
+            ready.append(message)
+            self._held_bytes -= len(message)
+            self.next_number += 1
+            self._requests = 0
+        return ready

@@ -11,34 +11,55 @@ from typing import Self
 import zenoh
 import zenoh.ext
 
-from coloc_graph.robot_io.link.command_filter import Commands
+from coloc_graph.errors import InputError
+from coloc_graph.robot_io.link.command_filter import CommandFilter
 from coloc_graph.robot_io.link.counters import Counts, LinkCounter
 from coloc_graph.robot_io.link.messages import (
     Body,
     ClockQuestion,
     ClockReply,
     Event,
+    MessageError,
+    Refusal,
     Sample,
     Status,
     Wheels,
-    WireError,
     decode,
     encode,
+    is_session,
 )
-from coloc_graph.robot_io.link.session import CACHED, FIRST, KEPT_KINDS, LinkSession, at_once, payload_of
+from coloc_graph.robot_io.link.session import CACHED, KEPT_KINDS, URGENT, LinkSession, on_receiving_thread, payload_of
 from coloc_graph.robot_io.link.zenoh_config import Tls, config_of
 
 Clock = Callable[[], int]
 
-#: So many commands wait at a robot at most; more are dropped, and asked again.
-WAITING = 64
+MAX_WAITING = 64  # commands that wait to be carried out; further ones are dropped and come again
 
 
 class RobotLink:
-    """A robot's end; a context manager. `handler` carries out a command and gives what to answer, or raises.
+    """A robot's end of the link; a context manager.
 
-    `session` tells this program's run from the one before. What is put while the coordinator does not hear it arrives
-    when it does, the newest `CACHED` of a kind. Raises `InputError` for an address that does not do.
+    Messages that the coordinator does not receive are kept, the newest `CACHED` of a kind, and sent when it is back.
+
+    Parameters
+    ----------
+    name
+        Name of the robot.
+    connect
+        Address of the coordinator, tcp/HOST:PORT or tls/HOST:PORT.
+    handler
+        Carries out a command and returns the answer, or raises.
+    session
+        Name of this run of the robot's program, another one each time: letters, digits, - and _.
+    tls
+        Certificates of this end.
+    clock
+        The robot's monotonic clock [ns].
+
+    Raises
+    ------
+    InputError
+        If the address or the session is not valid.
     """
 
     def __init__(
@@ -51,11 +72,14 @@ class RobotLink:
         tls: Tls | None = None,
         clock: Clock = time.monotonic_ns,
     ) -> None:
+        if not is_session(session):
+            raise InputError(f"`{session}` is no name of a session: use letters, digits, - and _")
         self.name, self.session, self._clock = name, session, clock
         self._counter = LinkCounter()
-        self._commands = Commands(name, session, handler, clock, self._counter)
-        self._asked: queue.Queue[zenoh.Query | None] = queue.Queue(WAITING)
+        self._commands = CommandFilter(name, session, handler, clock, self._counter)
+        self._asked: queue.Queue[zenoh.Query | None] = queue.Queue(MAX_WAITING)
         self._connected = False
+        self._refused: str | None = None
         self._session = LinkSession(connect, config_of(connect=connect, tls=tls))
         session_, keep = self._session.zenoh, self._session.keep
         try:
@@ -71,18 +95,19 @@ class RobotLink:
                 )
                 for kind, type_ in KEPT_KINDS.items()
             }
-            self._publishers[Status] = keep(session_.declare_publisher(f"coloc/{name}/status", **FIRST))
+            self._publishers[Status] = keep(session_.declare_publisher(f"coloc/{name}/status", **URGENT))
             keep(session_.declare_subscriber(f"coloc/{name}/hold", self._take_hold))
-            keep(session_.declare_queryable(f"coloc/{name}/command", self._take_command))
-            self._time = keep(session_.declare_publisher(f"coloc/{name}/time", **FIRST))
-            keep(session_.declare_subscriber(f"coloc/{name}/question", at_once(self._tell_time)))
+            keep(session_.declare_queryable(f"coloc/{name}/command/{session}", self._take_command))
+            keep(session_.declare_subscriber(f"coloc/{name}/refusal", self._take_refusal))
+            self._time = keep(session_.declare_publisher(f"coloc/{name}/time", **URGENT))
+            keep(session_.declare_subscriber(f"coloc/{name}/question", on_receiving_thread(self._tell_time)))
             liveliness = session_.liveliness()
             keep(liveliness.declare_subscriber("coloc/coordinator/alive", self._take_presence, history=True))
-            keep(liveliness.declare_token(f"coloc/{name}/alive"))
+            keep(liveliness.declare_token(f"coloc/{name}/alive/{session}"))
         except BaseException:
             self._session.close()
             raise
-        self._worker = threading.Thread(target=self._obey, name=f"commands to {name}", daemon=True)
+        self._worker = threading.Thread(target=self._carry_out, name=f"commands to {name}", daemon=True)
         self._worker.start()
 
     def __enter__(self) -> Self:
@@ -94,7 +119,7 @@ class RobotLink:
         self.close()
 
     def close(self) -> None:
-        """End it."""
+        """Close the link."""
         with contextlib.suppress(queue.Full):
             self._asked.put(None, timeout=1.0)
         self._worker.join(2.0)
@@ -102,21 +127,26 @@ class RobotLink:
 
     @property
     def counts(self) -> Counts:
-        """What came and what was refused."""
+        """Counts of received and refused messages."""
         return self._counter.counts()
 
     @property
     def connected(self) -> bool:
-        """Whether the coordinator is there; one that is lost is noticed within the link's lease."""
+        """True while the coordinator is connected; its loss is noticed within the link's lease."""
         return self._connected
 
     @property
     def last_heard(self) -> int:
-        """When the coordinator last let the robot move: when that was sent [ns, CLOCK_MONOTONIC]; 0 before."""
+        """Time at which the newest permission to move was sent [ns, CLOCK_MONOTONIC]; 0 before the first."""
         return self._commands.last_heard
 
+    @property
+    def refused(self) -> str | None:
+        """Reason for which the coordinator refuses this program; None if it does not."""
+        return self._refused
+
     def put(self, message: Sample | Wheels | Event | Status) -> None:
-        """Send something; never waits."""
+        """Send a message; never waits."""
         with contextlib.suppress(zenoh.ZError):
             self._publishers[type(message)].put(encode(message))
 
@@ -124,8 +154,8 @@ class RobotLink:
         with contextlib.suppress(queue.Full):
             self._asked.put_nowait(query)
 
-    def _obey(self) -> None:
-        """The thread that carries out commands, one after the other."""
+    def _carry_out(self) -> None:
+        """Thread that carries out commands, one after the other."""
         while (query := self._asked.get()) is not None:
             reply = self._commands.answer(payload_of(query))
             with contextlib.suppress(zenoh.ZError):  # who asked has gone
@@ -137,6 +167,15 @@ class RobotLink:
     def _take_hold(self, sample: zenoh.Sample) -> None:
         self._commands.take_hold(sample.payload.to_bytes())
 
+    def _take_refusal(self, sample: zenoh.Sample) -> None:
+        try:
+            refusal = decode(sample.payload.to_bytes(), Refusal)
+        except MessageError as error:
+            self._counter.refuse(error, f"a refusal of {self.name}")
+            return
+        if refusal.session == self.session:
+            self._refused = refusal.text
+
     def _take_presence(self, sample: zenoh.Sample) -> None:
         self._connected = sample.kind == zenoh.SampleKind.PUT
 
@@ -146,7 +185,7 @@ class RobotLink:
             asked = decode(sample.payload.to_bytes(), ClockQuestion).asked
             reply = ClockReply(session=self.session, asked=asked, received=received, sent=self._clock())
             self._time.put(encode(reply))
-        except WireError as error:
-            self._counter.refuse(error, f"a question for the time of {self.name}")
+        except MessageError as error:
+            self._counter.refuse(error, f"a request for the time of {self.name}")
         except zenoh.ZError:
             pass  # who asked has gone

@@ -1,7 +1,8 @@
-"""A zenoh session as both ends of the link use it, and what passes under which key.
+"""The zenoh session of either end of the link, and its keys; `LinkSession`.
 
-Robot NAME has coloc/NAME/samples, wheels, events (kept, and recovered), status, time, command (a query), alive (its
-liveliness token); the coordinator tells it coloc/NAME/question and hold, and has coloc/coordinator/alive.
+Robot NAME has the keys coloc/NAME/samples, wheels, events (kept and recovered), status, time, command/SESSION (a
+query) and alive/SESSION (its liveliness token). The coordinator publishes coloc/NAME/question, hold and refusal, and
+has coloc/coordinator/alive.
 """
 
 import contextlib
@@ -14,32 +15,37 @@ import zenoh
 from coloc_graph.errors import RobotError
 from coloc_graph.robot_io.link.messages import Event, Sample, Wheels
 
-#: What a robot sends and must not be lost, by the last part of its key.
+#: Kinds of messages that a robot keeps until they are received, by the last part of their key.
 KEPT_KINDS: dict[str, type[msgspec.Struct]] = {"samples": Sample, "wheels": Wheels, "events": Event}
-#: What a robot keeps for one who does not hear it, messages of a kind: 40 s of samples at 100 a second, 200 s of
-#: odometry at 20 a second.
+#: Messages of a kind that a robot keeps: 40 s of samples at 100 Hz, 200 s of odometry at 20 Hz.
 CACHED = 4000
-#: Commands and the time overtake what was measured.
-FIRST: dict[str, Any] = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
+#: Options of publishers and queries whose messages overtake measurements.
+URGENT: dict[str, Any] = {"priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
 
 
 class LinkSession:
-    """A zenoh session and what is declared on it; ends as a whole. `RobotError` where it cannot be opened."""
+    """A zenoh session and its declarations, closed together.
+
+    Raises
+    ------
+    RobotError
+        If the session cannot be opened at its address.
+    """
 
     def __init__(self, address: str, config: zenoh.Config) -> None:
         try:
             self.zenoh = zenoh.open(config)
         except zenoh.ZError as error:
-            raise RobotError(f"the link at {address} cannot be opened ({error}): give another address") from error
+            raise RobotError(f"cannot open the link at {address} ({error}): give another address") from error
         self._declared: list[Any] = []
 
     def keep(self, declared: Any) -> Any:
-        """Have something end with the session."""
+        """Undeclare something when the session is closed."""
         self._declared.append(declared)
         return declared
 
     def close(self) -> None:
-        """End it."""
+        """Close the session."""
         for declared in reversed(self._declared):
             with contextlib.suppress(Exception):
                 declared.undeclare()
@@ -47,17 +53,22 @@ class LinkSession:
             self.zenoh.close()  # type: ignore[no-untyped-call]
 
 
-def at_once(call: Callable[[zenoh.Sample], None]) -> "zenoh.handlers.Callback[zenoh.Sample]":
-    """A callback on the thread that receives, for what is timed and does little; others have threads of their own."""
+def on_receiving_thread(call: Callable[[zenoh.Sample], None]) -> "zenoh.handlers.Callback[zenoh.Sample]":
+    """Callback on the receiving thread itself, for quick work whose time matters."""
     return zenoh.handlers.Callback(call, indirect=False)
 
 
 def robot_of(sample: zenoh.Sample) -> str:
-    """Whose key it is; of a key with wildcards, which reaches us too, something that is no robot's name."""
+    """Name of the robot in a key; something that is no robot's name if the key has wildcards."""
     parts = str(sample.key_expr).split("/")
-    return parts[1] if len(parts) == 3 else parts[0]
+    return parts[1] if len(parts) >= 3 and not {"*", "**"} & set(parts) else parts[0]
+
+
+def session_of(sample: zenoh.Sample) -> str:
+    """Last part of a key: the session in the key of a liveliness token."""
+    return str(sample.key_expr).rpartition("/")[2]
 
 
 def payload_of(query: zenoh.Query) -> bytes:
-    """What came with a query."""
+    """Payload of a query, empty if it has none."""
     return b"" if query.payload is None else query.payload.to_bytes()

@@ -128,9 +128,10 @@ def _rules_of_coordinator(robots: Sequence[str]) -> dict[str, Any]:
     policies = []
     asks = [*_ASKS[:1], *_ASKS[2:]]
     for robot in robots:
+        told = [f"coloc/{robot}/{kind}" for kind in ("hold", "question", "refusal")]
         own = [
             _rule(f"{robot} tells of itself", "ingress", _TELLS, _keys(robot)),
-            _rule(f"{robot} hears what is for it", "ingress", asks, [f"coloc/{robot}/hold", f"coloc/{robot}/question"]),
+            _rule(f"{robot} hears what is for it", "ingress", asks, told),
             _rule(f"{robot} looks for the coordinator", "ingress", asks, _keys(COORDINATOR)),
             _rule(f"the coordinator to {robot}", "egress", ("put", "query"), _keys(robot)),
         ]
