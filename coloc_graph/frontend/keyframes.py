@@ -1,12 +1,13 @@
 """From a run with ranges and bearings to keyframes: `keyframes_of`."""
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
+from coloc_graph.frontend.sensor_delay import SensorDelay, sensor_delay
 from coloc_graph.measurements import LONGEST_STEP, Drive, RangeBearings, Steps
 from coloc_graph.run import OdometrySample, Ranges, Run
 from coloc_graph.team import Ranging, Wheels
@@ -22,6 +23,8 @@ LONGEST_GAP = 5.0
 #: A delay that is not known is looked for so far on either side [its sigmas], in steps of so much [s].
 DELAYS_SIGMAS = 4.0
 DELAY_STEP = 0.05
+LEAST_LATE = 0.12  # smaller differences between robots' delays are usual [s]
+CLEARLY = 5.0  # and a delay differs by this many of its sigmas
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,17 @@ def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
     ways = [_way(run, robot, samples[robot]) for robot in names]
     rows: list[tuple[float, int, int, float, float]] = []
     outside = 0
+    warnings = []
+    late = _late(run, ways, ranges)
     for robot in names:
+        if robot in late:
+            by, sigma = late[robot]
+            ranges[robot] = [replace(one, time=one.time - by) for one in ranges[robot]]
+            warnings.append(
+                f"{run.path}: the clock of {robot}'s range sensor is {abs(by):.2f} s "
+                f"{'ahead of' if by > 0 else 'behind'} that of its odometry (1 sigma {sigma:.3f} s, by how bearings "
+                "change while it turns); the times of its measurements were corrected"
+            )
         for one in ranges[robot]:
             for target, distance, bearing in zip(one.targets, one.range.tolist(), one.bearing.tolist(), strict=True):
                 if target in names and not between_robots:
@@ -69,7 +82,6 @@ def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
     table = np.array(rows)
     time, robot_of, target_of = table[:, 0], table[:, 1].astype(int), table[:, 2].astype(int)
     times, keyframe, target_keyframe = _instants(time, robot_of, target_of, len(names))
-    warnings = []
     if outside:
         warnings.append(f"{run.path}: {outside} ranges were measured where there is no odometry, and are left out")
     steps = []
@@ -93,6 +105,38 @@ def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
         ),
         warnings=tuple(warnings),
     )
+
+
+def _late(run: Run, ways: list[_Way | None], ranges: dict[str, list[Ranges]]) -> dict[str, tuple[float, float]]:
+    """Robots whose measurements are stamped late against their odometry, by how much, and the sigma of that [s].
+
+    A delay that all robots share is the odometry's own, which the estimate finds; who differs has a clock that is off.
+    """
+    standing = {one.name: n for n, one in enumerate(run.team.landmarks)}
+    found: dict[str, SensorDelay] = {}
+    for robot, way in zip(run.team.names, ways, strict=True):
+        seen = [
+            (one.time, standing[target], distance, bearing)
+            for one in ranges[robot]
+            for target, distance, bearing in zip(one.targets, one.range.tolist(), one.bearing.tolist(), strict=True)
+            if target in standing
+        ]
+        if way is None or not seen:
+            continue
+        table = np.array(seen)
+        delay = sensor_delay(table[:, 0], table[:, 1].astype(int), table[:, 2], table[:, 3], way.at)
+        if delay is not None:
+            found[robot] = delay
+    late = {}
+    for robot, delay in found.items():
+        wheels = run.team[robot].wheels or Wheels()
+        usual, tolerated = wheels.delay, max(DELAYS_SIGMAS * wheels.delay_sigma, LEAST_LATE)
+        if len(found) > 2:
+            usual, tolerated = float(np.median([one.value for one in found.values()])), LEAST_LATE
+        off = delay.value - usual
+        if abs(off) > max(tolerated, CLEARLY * delay.sigma):
+            late[robot] = off, delay.sigma
+    return late
 
 
 def _ranging(run: Run, robot: str) -> Ranging:

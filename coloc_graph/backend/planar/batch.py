@@ -24,6 +24,10 @@ MOST_ITERATIONS = 40
 MOST_HALVINGS = 6
 #: Where the fit has left less than this of residuals, they say nothing of noise.
 LEAST_LEFT = 0.3
+CHECK = (
+    "the measurements contradict each other, and it is not known which are wrong; check each robot's clock and "
+    "odometry, who is called who, and the positions of the landmarks"
+)
 #: Noise is not taken for less, or more, than so many times what is stated.
 NOISE_RANGE = (0.2, 5.0)
 
@@ -140,11 +144,13 @@ def _fitted(factors: DriveFactors, state: State) -> _Fit:
             if after <= cost + enough:
                 break
         else:
-            raise EstimationError(f"the search leads nowhere after {iteration} steps (error {cost:.6g})")
+            raise EstimationError(
+                f"the optimisation does not converge (half chi2 {cost:.6g} after {iteration} steps): {CHECK}"
+            )
         gained, state, cost = cost - after, tried, after
         if abs(gained) < enough and not halving:
             return _Fit(problem, state, eliminated, C, iteration)
-    raise EstimationError(f"the search did not end in {MOST_ITERATIONS} steps (error {cost:.6g})")
+    raise EstimationError(f"the optimisation did not end in {MOST_ITERATIONS} steps (half chi2 {cost:.6g}): {CHECK}")
 
 
 def whole_covariance(factors: DriveFactors, of_free: Array) -> Array:
