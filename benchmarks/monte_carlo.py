@@ -32,6 +32,7 @@ class MemoryRun:
         self.team = world.team
         self.warnings: tuple[str, ...] = ()
         self.stances = tuple(world.stances)
+        self.topics: dict[str, int] = {}
         self.planes: dict[int, Planes] = {}
         self._detections: dict[str, list[Detections]] = {name: [] for name in world.team.names}
         for k in range(len(world.stances)):

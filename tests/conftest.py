@@ -26,16 +26,17 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.realtime)
 
 
-def copy_run(source, to, *, change=lambda record: record, stances=None, team=None, truth=False):
+def copy_run(source, to, *, change=lambda record: record, stances=None, team=None, truth=False, more=()):
     """The run `source` written anew to `to`, without its truth unless asked for.
 
-    `change` is given each record and returns what is written instead (None: nothing).
+    `change` is given each record and returns what is written instead (None: nothing); `more` are written besides.
     """
     run = open_run(source)
     records = [*(run.stances if stances is None else stances), *run.planes.values()]
     for robot in run.team.names:
         records += [*run.detections(robot), *run.images(robot), *run.odometry(robot), *run.motions(robot)]
     records = [changed for record in records if (changed := change(record)) is not None]
+    records += more
     with RunWriter(to, team or run.team, image_format="raw") as writer:
         if truth:
             writer.write_true_team(read_true_team(source) or run.team)

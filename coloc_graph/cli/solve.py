@@ -25,14 +25,13 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument(
         "--method",
         choices=("chain", "smooth", "joint"),
-        default="joint",
-        help="chain is the paper's, joint calibrates mounts along",
+        help="of runs with stances: chain is the paper's, joint calibrates mounts along (default: joint)",
     )
     command.add_argument(
         "--scale",
         choices=("heights", "span"),
-        default="heights",
-        help="the plane's distance from the heights of camera and markers, or from the markers' span",
+        help="of runs with stances: the plane's distance from the heights of camera and markers, or from the markers' "
+        "span (default: heights)",
     )
     command.add_argument("--incremental", action="store_true", help="feed it stance by stance, as in the field")
     command.add_argument(
@@ -40,8 +39,10 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     )
     command.add_argument("--port", type=int, help="port of --view (default: 8080, or the first free one after it)")
     command.add_argument("--no-browser", action="store_true", help="with --view, do not open a browser")
-    command.add_argument("--without-odometry", action="store_true", help="leave out what the wheels say")
-    command.add_argument("--without-robots", action="store_true", help="leave out what robots measured of each other")
+    command.add_argument("--without-odometry", action="store_true", help="of runs with stances: ignore wheel odometry")
+    command.add_argument(
+        "--without-robots", action="store_true", help="of runs with ranges: ignore those between robots"
+    )
     command.add_argument("--processes", type=int, metavar="N", help="of a folder, so many at a time (one a core)")
     command.add_argument("--cluster", metavar="ADDRESS", help="of a folder, by the Dask scheduler at tcp://HOST:PORT")
     command.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -65,14 +66,20 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
     from coloc_graph.cli.view import announce, show
     from coloc_graph.errors import InputError
     from coloc_graph.pipeline.batch import SolveOptions
+    from coloc_graph.pipeline.contents import require_applicable
     from coloc_graph.results.writer import require_place
     from coloc_graph.run import open_run
 
     options = SolveOptions(
-        method=args.method, odometry=not args.without_odometry, incremental=args.incremental
-    ).resolved()
-    assert options.frontend is not None
-    options = replace(options, frontend=replace(options.frontend, scale=args.scale))
+        method=args.method,
+        odometry=not args.without_odometry,
+        incremental=args.incremental,
+        between_robots=not args.without_robots,
+    )
+    if args.scale is not None:
+        frontend = options.resolved().frontend
+        assert frontend is not None  # resolved
+        options = replace(options, frontend=replace(frontend, scale=args.scale))
     if Path(args.run_path).is_dir():
         return solve_folder(args, options)
     if args.processes is not None or args.cluster is not None:
@@ -80,13 +87,10 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
     require_place(args.out)  # before the work, not after it
     with _earlier_result_named(args.out):
         logged = open_run(args.run_path)
-    if logged.has_ranges and not logged.stances:
+        kind = require_applicable(logged, options)
+    if kind == "ranges":
         from coloc_graph.cli.solve_drive import solve_one_drive
 
-        if args.method != "joint":
-            raise InputError(
-                f"{args.run_path} holds ranges of robots that drive, and no stances: --method is not for it"
-            )
         with _earlier_result_named(args.out):
             solve_one_drive(args, logged)
         if args.view:
@@ -95,8 +99,8 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
             with Viewer(scene_of_result(args.out), listener=listener) as viewer:
                 show(viewer, browser=not args.no_browser)
         return 0
-    if args.without_robots:
-        raise InputError(f"{args.run_path} holds no ranges; --without-robots is for runs that do")
+    options = options.resolved()
+    assert options.method is not None  # resolved
     if not args.view:
         _solved(args, logged, options)
         return 0

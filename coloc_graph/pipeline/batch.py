@@ -12,6 +12,7 @@ from coloc_graph.backend import DisconnectedComponent, Estimate, PoseGraph, chai
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.frontend import Doubt, PairMeasurement, in_words, little_in_common, share_clock_offsets
 from coloc_graph.frontend.pairing.plane_check import implausible
+from coloc_graph.pipeline.contents import require_applicable, unused_in
 from coloc_graph.pipeline.incremental import (
     METHODS,
     EnteredStance,
@@ -93,8 +94,10 @@ def solve(
     holds nothing to solve and `EstimationError` where no measurement ties any robot to the reference; what is merely
     left out is said in `Solution.warnings`.
     """
-    options = (options or SolveOptions()).resolved()
-    _require_observers(run)
+    options = options or SolveOptions()
+    if require_applicable(run, options) == "ranges":
+        raise InputError(f"{run.path} is solved by its ranges: call coloc_graph.pipeline.ranging.solve_drive")
+    options = options.resolved()
     started = time.perf_counter()
     counted = _Counted(run, options, progress)
     solved = _incrementally(run, options, counted, entered) if options.incremental else _at_once(run, options, counted)
@@ -106,6 +109,7 @@ def solve(
         measurements=measured,
         warnings=(
             *run.warnings,
+            *map(str, unused_in(run, options)),
             *solved.clock_warnings,
             *in_words(solved.doubts),
             *_implausible(run, options, measured),
@@ -133,6 +137,7 @@ def _at_once(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
     graph = PoseGraph.of(run.team, run.stances, [*poses, *motions])
     graph = replace(graph, rigs=options.rigs(run.team) or graph.rigs)
     _require_ties(run, graph, measured)
+    assert options.method is not None  # resolved
     return _Solved(BATCH[options.method](graph), measured, clock_warnings, made - started, doubts=sources.doubts)
 
 
@@ -181,16 +186,6 @@ def _require_ties(run: Run, graph: PoseGraph, measured: Sequence[PairMeasurement
         raise EstimationError(
             f"{run.path}: no measurement ties a robot to the reference {run.team.reference}; "
             f"{_why_untied(loose, measured)}"
-        )
-
-
-def _require_observers(run: Run) -> None:
-    if not run.stances:
-        raise InputError(f"{run.path}: the run holds no stance, so that there is nothing to solve; record one first")
-    if not any(len(stance.observers) >= 2 for stance in run.stances):
-        raise InputError(
-            f"{run.path}: stance {run.stances[0].index} has one observer only, as has every other; "
-            "at least two robots must stand and watch the same mover"
         )
 
 

@@ -38,29 +38,42 @@ UNKNOWN_HEIGHT = 0.1
 class SolveOptions:
     """Everything that a result depends on besides the run.
 
-    `chain` is the paper: homographies by least squares in one image, eq. (2), composition. `smooth` takes
-    maximum-likelihood homographies and relative poses into a pose graph, with `odometry` and where the movers are
-    seen. `joint` takes the homographies themselves, and calibrates mounts, markers and clocks along with the poses.
-    `incremental` measures and enters stance by stance, as a team in the field would.
+    Parameters
+    ----------
+    method : {"joint", "smooth", "chain"}, optional
+        Of a run with stances. `chain` is the paper: homographies by least squares in one image, eq. (2), composition.
+        `smooth` takes maximum-likelihood homographies and relative poses into a pose graph, with odometry and
+        sightings of the movers. `joint` (the default) takes the homographies themselves, and calibrates mounts,
+        markers and clocks along with the poses.
+    frontend : FrontendOptions, optional
+        Of a run with stances: how images are measured. The default belongs to the method.
+    odometry : bool
+        Use wheel odometry. A run with ranges alone cannot do without.
+    incremental : bool
+        Measure and enter in the order of time, as a team in the field would.
+    between_robots : bool
+        Of a run with ranges: use the ranges between robots, not those to landmarks alone.
     """
 
-    method: Method = "joint"
+    method: Method | None = None
     frontend: FrontendOptions | None = None
     odometry: bool = True
     incremental: bool = False
+    between_robots: bool = True
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
+        if self.method is not None and self.method not in METHODS:
             raise InputError(f"there is no method `{self.method}`; choose one of {', '.join(METHODS)}")
         if self.incremental and self.method == "chain":
             raise InputError("a chain is composed, and never incremental: leave out `incremental`, or use joint")
 
     def resolved(self) -> "SolveOptions":
-        """With the front end that belongs to the method, where none is chosen."""
-        if self.frontend is not None:
-            return self
+        """Return the options of a run with stances, with the default method and front end where none is chosen."""
+        method = self.method or "joint"
         paper = FrontendOptions(criterion="transfer", pose="eq2")
-        return replace(self, frontend=paper if self.method == "chain" else FrontendOptions())
+        return replace(
+            self, method=method, frontend=self.frontend or (paper if method == "chain" else FrontendOptions())
+        )
 
     @property
     def by_span(self) -> bool:
@@ -80,7 +93,8 @@ def measure_stance(
 ) -> Iterator[PairMeasurement]:
     """What each pair of observers measured in a stance, one after the other, but for the offset of their clocks, which
     all stances know together: `share_clock_offsets`."""
-    frontend = options.resolved().frontend
+    options = options.resolved()
+    frontend = options.frontend
     assert frontend is not None
     # a joint estimate takes the scale from the spans by itself, and the heights for a start
     scale: Scale = "heights" if options.method == "joint" else frontend.scale

@@ -15,6 +15,7 @@ from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW, correspo
 from coloc_graph.frontend.pairing.plane_check import implausible
 from coloc_graph.frontend.stance import FrontendOptions, little_in_common, measure_pair
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_plane
+from coloc_graph.pipeline.contents import kind_of, unused_in
 from coloc_graph.run import Detections, Run, Stance
 from coloc_graph.team import Landmark
 
@@ -60,13 +61,15 @@ def _bodies(one: Detections) -> Iterable[str]:
 
 
 def inspect(run: Run) -> list[Finding]:
-    """Everything that is wrong with a run, without looking into its images."""
+    """Everything that is wrong with a run, and what a solve would not use of it, without looking into its images."""
     findings = [Finding("file", warning) for warning in run.warnings]
-    if run.has_ranges and not run.stances:
-        return [*findings, *_drive_findings(run)]
-    if not run.stances:
-        findings.append(Finding("run", "it holds no stance, so that there is nothing to solve: record one"))
-    elif run.team.reference not in run.stances[0].observers:
+    try:
+        findings += [Finding("run", str(one)) for one in unused_in(run)]
+        if kind_of(run) == "ranges":
+            return [*findings, *_drive_findings(run)]
+    except InputError as why:
+        findings.append(Finding("run", str(why).removeprefix(f"{run.path}: ")))
+    if run.stances and run.team.reference not in run.stances[0].observers:
         findings.append(
             Finding("stance 0", f"the reference {run.team.reference} does not observe: name an observer as reference")
         )

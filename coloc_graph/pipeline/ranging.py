@@ -13,6 +13,7 @@ from coloc_graph.backend.planar.incremental import EVERY
 from coloc_graph.errors import EstimationError
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.pipeline.contents import unused_in
 from coloc_graph.run import Run
 from coloc_graph.team import Landmark, Robot, Team
 
@@ -71,7 +72,7 @@ def solve_drive(run: Run, options: DriveOptions | None = None, progress: Progres
         run=run,
         options=options,
         estimate=estimate,
-        warnings=(*run.warnings, *drive.warnings, *_warnings(estimate)),
+        warnings=(*run.warnings, *map(str, unused_in(run)), *drive.warnings, *_warnings(estimate)),
         seconds_frontend=made - started,
         seconds_backend=time.perf_counter() - made,
         online=online,

@@ -5,13 +5,16 @@ import tomllib
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from coloc_graph._version import __version__
 from coloc_graph.errors import ColocError, InputError
 from coloc_graph.pipeline.batch import SolveOptions, solve
+from coloc_graph.pipeline.contents import require_applicable
+from coloc_graph.pipeline.ranging import DriveOptions, solve_drive
+from coloc_graph.results.ranging import write_drive_result
 from coloc_graph.results.writer import CONFIG, SUMMARY, holds_result, options_of, require_place, write_result
 from coloc_graph.run import open_run, run_id
 
@@ -71,7 +74,7 @@ def solve_runs(
     A result that is there already, of the same run, options and version, is left as it is. `executors` makes one
     more executor where one broke. `told` hears of each run as soon as it is over.
     """
-    options = (options or SolveOptions()).resolved()
+    options = options or SolveOptions()
     outcomes: dict[int, Outcome] = {}
 
     def take(number: int, outcome: Outcome) -> None:
@@ -105,7 +108,11 @@ def solve_one(run: Path, out: Path, options: SolveOptions) -> Outcome:
     """Solve a run and write its result; what is wrong with it is said in the outcome, whatever it is."""
     try:
         require_place(out)
-        write_result(solve(open_run(run), options), out)
+        opened = open_run(run)
+        if require_applicable(opened, options) == "ranges":
+            write_drive_result(solve_drive(opened, _of_ranges(options)), out)
+        else:
+            write_result(solve(opened, options), out)
         return Outcome(run, out, _summary(out))
     except ColocError as error:
         earlier = f"; {out} still holds an earlier result" if holds_result(out) else ""
@@ -114,6 +121,10 @@ def solve_one(run: Path, out: Path, options: SolveOptions) -> Outcome:
         return Outcome(run, out, {}, failed=f"the system says: {error.strerror} {error.filename or ''}".strip())
     except Exception as error:
         return Outcome(run, out, {}, failed=f"{run}: cannot be solved ({type(error).__name__}: {error})")
+
+
+def _of_ranges(options: SolveOptions) -> DriveOptions:
+    return DriveOptions(incremental=options.incremental, between_robots=options.between_robots)
 
 
 def _summary(out: Path) -> dict[str, Any]:
@@ -129,7 +140,7 @@ def _earlier(run: Path, out: Path, options: SolveOptions) -> dict[str, Any] | No
         config = tomllib.loads((out / CONFIG).read_text(encoding="utf-8"))
         same = (
             summary.get("version") == __version__
-            and config.get("options") == options_of(options)
+            and config.get("options") in (options_of(options.resolved()), asdict(_of_ranges(options)))
             and (out / SUMMARY).stat().st_mtime >= run.stat().st_mtime
             and summary.get("run_id") == run_id(run)
         )

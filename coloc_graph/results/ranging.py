@@ -20,8 +20,9 @@ from coloc_graph._version import __version__
 from coloc_graph.evaluation import Accuracy, Alignment, accuracy_json, align, evaluate
 from coloc_graph.exchange.tum import write_tum
 from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.pipeline.incremental import SolveOptions
 from coloc_graph.pipeline.ranging import DriveSolution, calibrated
-from coloc_graph.results.writer import CONFIG, whole_result, write_summary
+from coloc_graph.results.writer import CONFIG, unused_counts, whole_result, write_summary
 from coloc_graph.run import read_truth
 from coloc_graph.team import without_none, write_team
 
@@ -106,6 +107,7 @@ def summarise_drive(solution: DriveSolution, assessed: DriveAssessment | None) -
             "used": int((np.isfinite(estimate.residuals[:, 0]) & ~estimate.doubted).sum()),
             "rejected": int(estimate.doubted.sum()),
         },
+        "unused": unused_counts(solution.run, SolveOptions()),
         "chi2": estimate.chi2,
         "dof": estimate.dof,
         "iterations": estimate.iterations,

@@ -34,7 +34,8 @@ from coloc_graph.exchange.landmarks import landmark_rows, landmarks_csv, map_row
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.batch import Solution, SolveOptions
-from coloc_graph.run import read_truth, run_id
+from coloc_graph.pipeline.contents import unused_in
+from coloc_graph.run import Run, read_truth, run_id
 from coloc_graph.run.output_lock import locked_output
 from coloc_graph.team import Team, read_team, without_none, write_team
 
@@ -156,6 +157,7 @@ def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
         "robots": list(estimate.trajectories),
         "stances": len(solution.run.stances),
         "measurements": {"used": solution.used, "rejected": len(solution.measurements) - solution.used},
+        "unused": unused_counts(solution.run, solution.options),
         "chi2": estimate.chi2,
         "dof": estimate.dof,
         "iterations": estimate.iterations,
@@ -175,6 +177,14 @@ def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
     if accuracy is not None:
         summary["accuracy"] = accuracy_json(accuracy)
     return summary
+
+
+def unused_counts(run: Run, options: SolveOptions) -> dict[str, int]:
+    """Numbers of recorded data by kind that the estimate does not use."""
+    counts: dict[str, int] = {}
+    for one in unused_in(run, options):
+        counts[one.kind] = counts.get(one.kind, 0) + one.count
+    return counts
 
 
 def _measurements(solution: Solution) -> str:

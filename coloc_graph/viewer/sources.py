@@ -18,6 +18,7 @@ from coloc_graph.exchange.landmarks import landmark_rows, read_landmarks
 from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions
 from coloc_graph.measurements import RelativePose
 from coloc_graph.pipeline.batch import Progress, Solution, SolveOptions, solve
+from coloc_graph.pipeline.contents import kind_of
 from coloc_graph.results.writer import LANDMARKS, read_result
 from coloc_graph.run import Run, Stance, open_run
 from coloc_graph.team import read_team
@@ -93,10 +94,8 @@ def scene_of_run(run: Run, progress: Progress | None = None) -> Scene:
 
     Raises as `pipeline.solve` does.
     """
-    if run.has_ranges and not run.stances:
-        raise InputError(
-            f"{run.path} is of robots that drive, without stances: solve it, and view the folder of its result"
-        )
+    if kind_of(run) == "ranges":
+        raise InputError(f"{run.path} is solved by its ranges: solve it, and view the folder of its result")
     options = SolveOptions().resolved()
     return scene_of_solution(solve(run, options, progress))
 
@@ -123,7 +122,7 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
     where = run_path or result.run_path
     result.require_run(where)
     run = open_run(where)
-    if run.has_ranges and not run.stances:
+    if kind_of(run) == "ranges":
         return scene_of_drive(result, run)
     name = NAMES.get(str(result.summary.get("method")), str(result.summary.get("method")))
     robots, stances = run.team.names, run.stances

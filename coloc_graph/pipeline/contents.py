@@ -1,0 +1,149 @@
+"""What a run holds, which of it a solve uses, and which options apply to it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from coloc_graph.errors import InputError
+from coloc_graph.pipeline.incremental import SolveOptions
+from coloc_graph.run import Run
+
+#: What a run is solved by: leap-frog stances, or ranges and bearings of robots that measure while they drive.
+Kind = Literal["stances", "ranges"]
+
+#: Topics of measurements by kind, each with the noun for one message.
+NOUNS = {
+    "image": "image",
+    "detections": "detection record",
+    "odometry": "odometry sample",
+    "ranges": "range record",
+}
+
+
+@dataclass(frozen=True)
+class Unused:
+    """Recorded data that a solve does not use.
+
+    Parameters
+    ----------
+    kind : str
+        The topic's kind (`ranges`, `odometry`, `image`, `detections`), `stances`, `planes` or `landmarks`.
+    count : int
+        Number of messages; of landmarks, how many the team has.
+    what : str
+        The noun for what was counted, with its count.
+    reason : str
+        Why they are not used.
+    """
+
+    kind: str
+    count: int
+    what: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.what} not used: {self.reason}"
+
+
+def kind_of(run: Run) -> Kind:
+    """Return what a run is solved by.
+
+    Stances count where at least two robots observe in one of them, and win over ranges.
+
+    Raises
+    ------
+    InputError
+        The run holds nothing that can be solved.
+    """
+    if any(len(stance.observers) >= 2 for stance in run.stances):
+        return "stances"
+    if run.has_ranges:
+        return "ranges"
+    if run.stances:
+        raise InputError(
+            f"{run.path}: stance {run.stances[0].index} has one observer only, as has every other; "
+            "at least two robots must stand and watch the same mover"
+        )
+    held = [_noun(count, noun) for kind, noun in NOUNS.items() if (count := _count(run, kind, run.team.names))]
+    only = f"only {_joined(held)}" if held else "no measurement"
+    raise InputError(
+        f"{run.path}: the run holds no stances and no ranges ({only}), so that there is nothing to solve: "
+        "record stances, or ranges to other robots and landmarks"
+    )
+
+
+def unused_in(run: Run, options: SolveOptions | None = None) -> tuple[Unused, ...]:
+    """Return the recorded data that a solve of a run with these options does not use.
+
+    Raises `InputError` as `kind_of` does.
+    """
+    options = (options or SolveOptions()).resolved()
+    return tuple(_beside_ranges(run) if kind_of(run) == "ranges" else _beside_stances(run, options))
+
+
+def require_applicable(run: Run, options: SolveOptions) -> Kind:
+    """Return what a run is solved by; `InputError` where an option does not apply to it."""
+    kind = kind_of(run)
+    what, inapplicable = "holds stances", {"between_robots=False (--without-robots)": not options.between_robots}
+    if kind == "ranges":
+        what = "is solved by its ranges"
+        inapplicable = {
+            f"method={options.method!r} (--method)": options.method is not None,
+            "a frontend (--scale)": options.frontend is not None,
+            "odometry=False (--without-odometry)": not options.odometry,
+        }
+    for option, given in inapplicable.items():
+        if given:
+            raise InputError(f"{run.path} {what}, to which {option} does not apply: leave that out")
+    return kind
+
+
+def _beside_stances(run: Run, options: SolveOptions) -> Iterable[Unused]:
+    """Unused data of a run that is solved by its stances."""
+    names = run.team.names
+    found = [_unused(run, "ranges", names, "a run with stances is solved by its stances alone")]
+    detected = [robot for robot in names if run.has_detections(robot)]
+    found.append(_unused(run, "image", detected, "their markers are recorded as detections"))
+    if options.method == "chain":
+        found.append(_unused(run, "odometry", names, "a chain composes relative poses alone"))
+        if landmarks := run.team.landmarks:
+            what = _noun(len(landmarks), "landmark")
+            found.append(Unused("landmarks", len(landmarks), what, "a chain composes relative poses alone"))
+    elif run.team.floor is None:
+        found.append(_unused(run, "odometry", names, "the team states no floor, and wheels measure on a floor only"))
+    elif not options.odometry:
+        found.append(_unused(run, "odometry", names, "the options leave odometry out"))
+    return [one for one in found if one is not None]
+
+
+def _beside_ranges(run: Run) -> Iterable[Unused]:
+    """Unused data of a run that is solved by its ranges."""
+    names = run.team.names
+    found = [
+        _unused(run, "image", names, "no stance with two observers says who stood while they were taken"),
+        _unused(run, "detections", names, "no stance with two observers says who stood while they were made"),
+    ]
+    if run.stances:
+        what = _noun(len(run.stances), "stance")
+        found.append(Unused("stances", len(run.stances), what, "fewer than two robots observe in each"))
+    if run.planes:
+        what = _noun(len(run.planes), "record of planes", "records of planes")
+        found.append(Unused("planes", len(run.planes), what, "planes are stated for stances"))
+    return [one for one in found if one is not None]
+
+
+def _unused(run: Run, kind: str, robots: Iterable[str], reason: str) -> Unused | None:
+    count = _count(run, kind, robots)
+    return Unused(kind, count, _noun(count, NOUNS[kind]), reason) if count else None
+
+
+def _count(run: Run, kind: str, robots: Iterable[str]) -> int:
+    return sum(run.topics.get(f"/{robot}/{kind}", 0) for robot in robots)
+
+
+def _noun(count: int, one: str, many: str | None = None) -> str:
+    return f"{count} {one if count == 1 else many or one + 's'}"
+
+
+def _joined(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
