@@ -109,7 +109,7 @@ def solve(
         measurements=measured,
         warnings=(
             *run.warnings,
-            *map(str, unused_in(run, options)),
+            *(str(one) for one in unused_in(run, options) if not one.asked),
             *solved.clock_warnings,
             *in_words(solved.doubts),
             *_implausible(run, options, measured),

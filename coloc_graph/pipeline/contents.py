@@ -34,12 +34,15 @@ class Unused:
         The noun for what was counted, with its count.
     reason : str
         Why they are not used.
+    asked : bool
+        The options name this kind, and leave it out: no warning is needed.
     """
 
     kind: str
     count: int
     what: str
     reason: str
+    asked: bool = False
 
     def __str__(self) -> str:
         return f"{self.what} not used: {self.reason}"
@@ -112,7 +115,7 @@ def _beside_stances(run: Run, options: SolveOptions) -> Iterable[Unused]:
     elif run.team.floor is None:
         found.append(_unused(run, "odometry", names, "the team states no floor, and wheels measure on a floor only"))
     elif not options.odometry:
-        found.append(_unused(run, "odometry", names, "the options leave odometry out"))
+        found.append(_unused(run, "odometry", names, "the options leave odometry out", asked=True))
     return [one for one in found if one is not None]
 
 
@@ -132,9 +135,9 @@ def _beside_ranges(run: Run) -> Iterable[Unused]:
     return [one for one in found if one is not None]
 
 
-def _unused(run: Run, kind: str, robots: Iterable[str], reason: str) -> Unused | None:
+def _unused(run: Run, kind: str, robots: Iterable[str], reason: str, *, asked: bool = False) -> Unused | None:
     count = _count(run, kind, robots)
-    return Unused(kind, count, _noun(count, NOUNS[kind]), reason) if count else None
+    return Unused(kind, count, _noun(count, NOUNS[kind]), reason, asked) if count else None
 
 
 def _count(run: Run, kind: str, robots: Iterable[str]) -> int:

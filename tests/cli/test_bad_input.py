@@ -203,7 +203,7 @@ def test_a_robot_that_is_not_in_the_team(solve_refused, refused, tmp_path):
 
 def test_an_empty_run(solve_refused, tmp_path):
     sentence = solve_refused(foreign(tmp_path / "run.mcap", []))
-    assert "run.mcap: the run holds no stance" in sentence and "record one" in sentence
+    assert "run.mcap: the run holds no stances and no ranges" in sentence and "record stances" in sentence
 
 
 def test_one_observer_only(solve_refused, tmp_path):
