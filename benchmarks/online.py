@@ -36,11 +36,11 @@ def figures(stances: int, seed: int, folder: Path) -> dict[str, object]:
         field.start()
         began = time.monotonic()
         with Coordinator(team, folder / "mission", options, listen=address) as coordinator:
-            phase = coordinator.run(threading.Event())
+            state = coordinator.run(threading.Event())
         seconds = time.monotonic() - began
     run = open_run(folder / "mission" / "run.mcap")
     out: dict[str, object] = {
-        "ended": str(phase),
+        "ended": str(state),
         "stances": coordinator.stances,
         "seconds_a_stance": seconds / max(coordinator.stances, 1),
         "latency_median_s": statistics.median(coordinator.latencies),

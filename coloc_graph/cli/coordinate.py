@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.online.coordinator import Coordinator
     from coloc_graph.online.mission import MissionOptions
-    from coloc_graph.online.mission_states import Phase, as_dot
+    from coloc_graph.online.mission_states import MissionState, as_dot
     from coloc_graph.robot_io.link.zenoh_config import tls_of
     from coloc_graph.team import read_team
 
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     )
     out = Path(args.out)
     viewer = watched(team, args.port, browser=not args.no_browser, view=args.view)
-    with until_signal() as stop, viewer as told:
+    with until_signal() as stop, viewer as listener:
         coordinator = Coordinator(
             team,
             out,
@@ -87,11 +87,11 @@ def run(args: argparse.Namespace) -> int:
             tls=tls_of(args.tls, "coordinator") if args.tls else None,
             exposed=args.exposed,
             resume=args.resume,
-            entered=told.entered,
-            heard=told.heard,
+            on_stance=listener.on_stance,
+            on_status=listener.on_status,
         )
         with coordinator:
-            phase = coordinator.run(stop)
+            state = coordinator.run(stop)
     if coordinator.stances:
         report(out, stopped=stop.is_set())
-    return 0 if phase == Phase.DONE else 1
+    return 0 if state == MissionState.DONE else 1

@@ -77,7 +77,7 @@ def online(args: argparse.Namespace) -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.online.coordinator import Coordinator
     from coloc_graph.online.mission import MissionOptions
-    from coloc_graph.online.mission_states import Phase
+    from coloc_graph.online.mission_states import MissionState
     from coloc_graph.simulation.simulated_team import SimulatedTeam, field_team, free_address
 
     out = Path(args.out) / "online"
@@ -87,16 +87,16 @@ def online(args: argparse.Namespace) -> int:
     options = MissionOptions(goals=((100.0, 0.0),), stances=args.stances, speed=0.4)
     with (
         until_signal() as stop,
-        watched(team, args.port, browser=not args.no_browser) as told,
+        watched(team, args.port, browser=not args.no_browser) as listener,
         SimulatedTeam(team, out / "field", connect=address, seed=args.seed) as field,
     ):
         field.start()
         began = time.monotonic()
         coordinator = Coordinator(
-            team, out / "mission", options, listen=address, entered=told.entered, heard=told.heard
+            team, out / "mission", options, listen=address, on_stance=listener.on_stance, on_status=listener.on_status
         )
         with coordinator:
-            phase = coordinator.run(stop)
+            state = coordinator.run(stop)
     if coordinator.stances == 0:
         return 1
     report(out / "mission", field.truth_path, stopped=stop.is_set())
@@ -105,4 +105,4 @@ def online(args: argparse.Namespace) -> int:
         f"{coordinator.stances} stances in {time.monotonic() - began:.0f} s; from the last image of a stance "
         f"to its estimate at most {slowest:.2f} s; {field.truth_path} is the truth"
     )
-    return 0 if phase == Phase.DONE else 1
+    return 0 if state == MissionState.DONE else 1

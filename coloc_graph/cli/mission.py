@@ -1,4 +1,4 @@
-"""A mission as it is seen: in the viewer while it goes on, as a result when it is over."""
+"""A mission in the viewer while it goes on, and its result at the end."""
 
 import logging
 import sys
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from coloc_graph.online.mission import Heard
+    from coloc_graph.online.mission import MissionStatus
     from coloc_graph.pipeline.incremental import EnteredStance
     from coloc_graph.team import Team
 
@@ -19,18 +19,18 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Told:
-    """Who hears of a mission; None where nobody looks."""
+class MissionListener:
+    """Callbacks of a mission, as `Coordinator` takes them; None where nobody looks."""
 
-    entered: "Callable[[EnteredStance], None] | None" = None
-    heard: "Callable[[Heard], None] | None" = None
+    on_stance: "Callable[[EnteredStance], None] | None" = None
+    on_status: "Callable[[MissionStatus], None] | None" = None
 
 
 @contextmanager
-def watched(team: "Team", port: int | None, *, browser: bool, view: bool = True) -> Iterator[Told]:
-    """Feed a viewer while a mission goes on; nobody hears of it where there is no `view`."""
+def watched(team: "Team", port: int | None, *, browser: bool, view: bool = True) -> Iterator[MissionListener]:
+    """Show a mission in a viewer while it goes on; yield its callbacks, which are None without `view`."""
     if not view:
-        yield Told()
+        yield MissionListener()
         return
     from coloc_graph.cli.view import take_port
     from coloc_graph.viewer import LivePoses, LiveStance, Scene, Viewer
@@ -40,9 +40,9 @@ def watched(team: "Team", port: int | None, *, browser: bool, view: bool = True)
         log.info("the viewer is at %s", viewer.url)
         if browser and sys.stdout.isatty():
             webbrowser.open(viewer.url)
-        yield Told(
+        yield MissionListener(
             lambda one: viewer.publish(LiveStance(one.stance, one.estimate, one.measurements)),
-            lambda one: viewer.publish(LivePoses(one.time, one.T_world_body, one.note)),
+            lambda one: viewer.publish(LivePoses(one.time, one.T_world_body, one.text)),
         )
 
 

@@ -1,4 +1,4 @@
-"""Robots that were pushed while they stood, which their wheels do not know: found by what the cameras see."""
+"""Robots that were pushed while they stood, which their wheels cannot tell: found from the cameras."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -6,24 +6,24 @@ from collections.abc import Iterable, Iterator
 from coloc_graph.backend import Bump
 from coloc_graph.online.formation import Planar
 from coloc_graph.online.pose_tracker import compose
-from coloc_graph.online.robot_registry import Roster
+from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.visibility import InView
 
 
-def pushed(roster: Roster, bumps: Iterable[Bump]) -> Iterator[tuple[str, str]]:
-    """Put anchors that the estimate found pushed where they are; each robot, and what happened to it, comes back."""
+def pushed(registry: RobotRegistry, bumps: Iterable[Bump]) -> Iterator[tuple[str, str]]:
+    """Correct the poses of anchors that the estimate found displaced; yield each robot and a sentence about it."""
     for bump in bumps:
         T, robot = bump.T_before_after, bump.stay_put.robot
         by = T.x(), T.y(), T.rotation().yaw()
-        roster.carried(robot, compose(roster[robot].whereabouts.place(), by))
+        registry.displace(robot, compose(registry[robot].tracker.pose(), by))
         yield robot, bump.what
 
 
-def displaced(roster: Roster, view: InView, mover: Planar) -> Iterator[tuple[str, str]]:
-    """The same of observers that have the mover, which stands there by its wheels, plainly elsewhere than another."""
+def displaced(registry: RobotRegistry, view: InView, mover: Planar) -> Iterator[tuple[str, str]]:
+    """Correct the poses of observers that see the standing mover elsewhere than another does; yield as `pushed`."""
     for robot, place in view.displaced(mover).items():
-        before = roster[robot].whereabouts.place()
-        roster.carried(robot, place)
+        before = registry[robot].tracker.pose()
+        registry.displace(robot, place)
         far, turned = math.dist(place[:2], before[:2]), abs(math.remainder(place[2] - before[2], 2 * math.pi))
         yield (
             robot,

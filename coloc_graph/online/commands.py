@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from coloc_graph.errors import ColocError, RobotError
-from coloc_graph.online.robot_registry import Roster
+from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.robot_io.deadlines import PERMISSION_PERIOD
 from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
 from coloc_graph.robot_io.link.messages import Body, Drive, EndCapture, Halt
@@ -20,14 +20,14 @@ class Stopped(ColocError):
 
 
 class Commander:
-    """Commands to the robots of a roster; they move only while `renew` is called again and again.
+    """Commands to the robots of a registry; they move only while `renew` is called again and again.
 
     It runs on the thread of the mission's main loop alone: when that hangs, permissions end. Waiting for an answer
     renews them.
 
     Parameters
     ----------
-    link, roster
+    link, registry
         The link to the robots, and their states.
     speed
         Speed of drives [m/s].
@@ -36,9 +36,9 @@ class Commander:
     """
 
     def __init__(
-        self, link: CoordinatorLink, roster: Roster, speed: float, on_drive_resumed: Callable[[str], None]
+        self, link: CoordinatorLink, registry: RobotRegistry, speed: float, on_drive_resumed: Callable[[str], None]
     ) -> None:
-        self._link, self._roster, self._speed, self._on_drive_resumed = link, roster, speed, on_drive_resumed
+        self._link, self._registry, self._speed, self._on_drive_resumed = link, registry, speed, on_drive_resumed
         self._drives = time.time_ns() // 1_000_000  # drive numbers are unique across coordinators
         self._renewed = -PERMISSION_PERIOD
         self.stop = threading.Event()
@@ -77,28 +77,28 @@ class Commander:
         return answers
 
     def drive(
-        self, name: str, places: Iterable[Sequence[float]], yaw: float | None = None, *, backwards: bool = True
+        self, name: str, waypoints: Iterable[Sequence[float]], yaw: float | None = None, *, backwards: bool = True
     ) -> None:
-        """Send a robot through places (x, y) [m] in the world, and then turn it to `yaw` [rad]."""
-        member = self._roster[name]
-        own = [member.whereabouts.in_odometry((float(x), float(y), 0.0))[:2] for x, y in places]
-        last = None if yaw is None else member.whereabouts.in_odometry((0.0, 0.0, yaw))[2]
+        """Send a robot through waypoints (x, y) [m] in the world, and then turn it to `yaw` [rad]."""
+        robot = self._registry[name]
+        own = [robot.tracker.in_odometry((float(x), float(y), 0.0))[:2] for x, y in waypoints]
+        last = None if yaw is None else robot.tracker.in_odometry((0.0, 0.0, yaw))[2]
         self._drives += 1
-        member.way = Drive(number=self._drives, places=own, yaw=last, speed=self._speed, backwards=backwards)
-        member.arrived = member.stopped = False
-        self.ask(name, member.way)
+        robot.drive = Drive(number=self._drives, places=own, yaw=last, speed=self._speed, backwards=backwards)
+        robot.arrived = robot.interrupted = False
+        self.ask(name, robot.drive)
 
-    def drive_on(self) -> None:
+    def resume_drives(self) -> None:
         """Send on the robots that stopped on their way because no permission came in time."""
-        for name, member in self._roster.members.items():
-            if member.stopped and not member.arrived and member.way is not None:
-                member.stopped = False
+        for name, robot in self._registry.robots.items():
+            if robot.interrupted and not robot.arrived and robot.drive is not None:
+                robot.interrupted = False
                 self._on_drive_resumed(name)
-                self.ask(name, member.way)
+                self.ask(name, robot.drive)
 
     def halt_all(self) -> None:
         """Stop all robots that are present, and their cameras' captures; never raises for those that do not answer."""
-        present = [name for name, member in self._roster.members.items() if member.present]
+        present = [name for name, robot in self._registry.robots.items() if robot.present]
         for body in (Halt(), EndCapture()):
             with contextlib.suppress(RobotError):
                 self._link.ask_each(dict.fromkeys(present, body), STOP_ANSWER)

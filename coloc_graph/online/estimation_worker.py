@@ -1,4 +1,4 @@
-"""What is worked out while robots drive and while they wait, in a thread of its own; `Measuring`."""
+"""The estimator's thread, beside the mission's main loop; `EstimationWorker`."""
 
 import gc
 import logging
@@ -12,18 +12,17 @@ from coloc_graph.online.visibility import Precision, precision
 from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver, measure_stance
 from coloc_graph.run import Recorded, Stance
 
-#: What noise alone puts this far off less often contradicts what is known.
-CONTRADICTED = 1e-4
+CONTRADICTED = 1e-4  # a new stance less probable than this contradicts the estimate
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-class Measuring:
-    """Judges stances that go on, and enters those that are over; `solver` is its thread's alone meanwhile.
+class EstimationWorker:
+    """Judges the precision of a stance that goes on, and enters one that is over, on a thread of its own.
 
-    What was asked for is given once, when it is there. A failure, of whatever kind, is a `RobotError`: it voids a
-    stance, not a mission.
+    Only that thread uses `solver` meanwhile. Each result is returned once, as soon as it is there. A failure of
+    whatever kind is a `RobotError`: it voids a stance, not a mission.
     """
 
     def __init__(self, record: Recorded, solver: StanceSolver) -> None:
@@ -34,24 +33,24 @@ class Measuring:
         self._entering: Future[EnteredStance | list[Bump]] | None = None
 
     def end(self) -> None:
-        """Wait for what is under way, and do no more."""
+        """Wait for the present task, and do no more."""
         self._worker.shutdown(wait=True, cancel_futures=True)
 
     @property
     def judging(self) -> bool:
-        """Whether a judgement is under way, or has not been taken yet."""
+        """True while a judgement is under way, or its result has not been taken."""
         return self._judging is not None
 
     def judge(self, stance: Stance) -> None:
-        """Find how well a stance, as it is so far, measures its pairs."""
+        """Judge how precisely a stance, as it is so far, measures its pairs."""
         self._judging = self._worker.submit(self._judge, stance)
 
     def forget(self) -> None:
-        """What is judged just now is not wanted any more."""
+        """Drop the present judgement."""
         self._judging = None
 
     def judged(self) -> Precision | None:
-        """What was found; None while it is not."""
+        """Return the result of the judgement; None while there is none."""
         done = self._judging
         if done is None or not done.done():
             return None
@@ -59,11 +58,11 @@ class Measuring:
         return _result(done, "judging the stance")
 
     def enter(self, stance: Stance) -> None:
-        """Measure a stance and enter it."""
+        """Measure a stance and enter it into the estimate."""
         self._entering = self._worker.submit(self._enter, stance)
 
     def entered(self) -> EnteredStance | list[Bump] | None:
-        """The stance that is in; None while it is not; or the bumps of its anchors, and then it is not in."""
+        """Return the entered stance, None while it is not; or bumps of its anchors: then it has not entered."""
         done = self._entering
         if done is None or not done.done():
             return None
@@ -74,7 +73,7 @@ class Measuring:
         return precision(self._record, stance, self._solver.options.frontend, self._tracks_of(stance))
 
     def _tracks_of(self, stance: Stance) -> StanceTracks:
-        """The tracks of a stance, which go on while it does."""
+        """Return the tracks of a stance, which are continued while it goes on."""
         if self._tracks is None or self._tracks[0] != stance.start:
             frontend = self._solver.options.frontend or FrontendOptions()
             self._tracks = stance.start, StanceTracks(self._record, stance, frontend.tracker)
@@ -90,10 +89,10 @@ class Measuring:
             one = self._solver.enter(self._record, stance, pairs)
         except ColocError as error:
             raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
-        gc.freeze()  # what is recorded and known stays: to look through it for garbage would hold up later stances
+        gc.freeze()  # the record and the estimate stay: looking through them for garbage would hold up later stances
         if not one.estimate.refused and one.estimate.agreement.chance() > CONTRADICTED:
             return one
-        # contradicted: was an anchor pushed on the way to here?
+        # contradicted: was an anchor pushed since the stance before?
         bumped = [bump for bump in self._solver.estimator.bumps() if bump.stay_put.after == stance.index]
         if bumped:
             self._solver.withdraw()

@@ -1,4 +1,4 @@
-"""What a team is told to do, and what those who look on are told of it."""
+"""Goals and limits of a mission, its start in the world, and its status for listeners."""
 
 import math
 from dataclasses import dataclass, field
@@ -6,21 +6,41 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.errors import InputError
 from coloc_graph.online.formation import STAGGER, Course, Formation, Planar
 from coloc_graph.online.pose_tracker import compose, inverse
 from coloc_graph.pipeline.incremental import SolveOptions
 from coloc_graph.team import Team
 
+MOVER_AHEAD = 1.28  # start of the mover ahead of the observers' middle [m]
+
 
 @dataclass(frozen=True)
 class MissionOptions:
-    """What a team is to do.
+    """Goals and limits of a mission.
 
-    `goals` are x, y [m] of the way of the team's middle, on a floor whose x axis is the way ahead at the beginning;
-    it ends at the last one or after so many `stances`. A stance goes on until it measures all pairs to within
-    `place_sigma` [m] and `heading_sigma_deg`, with `least_points`, or for `longest` [s]. `speed` is the mover's and
-    that of a leap [m/s]. A stance does not begin where a clock is known worse than `clock_limit` [s]. Of one stance
-    `attempts` are made.
+    Attributes
+    ----------
+    goals
+        Waypoints x, y [m] of the middle of the observers, from where it is at the beginning, x ahead. The mission ends
+        at the last one.
+    stances
+        Number of stances after which it ends earlier; None for no limit.
+    mover
+        Name of the robot that drives before the others' cameras; None for the last one of the team.
+    place_sigma, heading_sigma_deg, least_points
+        A stance is long enough when it measures the relative pose of every pair with standard deviations below these
+        [m], [deg], and with so many points.
+    longest
+        A stance ends after this time at the latest [s].
+    speed
+        Speed of the mover, and of leaps [m/s].
+    clock_limit
+        A stance does not begin while the standard deviation of a robot's clock is above this [s].
+    attempts
+        Number of attempts at one stance, after which the mission fails.
+    solve
+        Options of the estimator.
     """
 
     goals: tuple[tuple[float, float], ...] = ((7.2, 0.0),)
@@ -37,26 +57,46 @@ class MissionOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
-    """What observers of a mission are told: the time [UTC s], all robots' places (4, 4), and a line for people."""
+class MissionStatus:
+    """Status of a mission: time [UTC s], poses of all robots in the world (4, 4), and a line for people."""
 
     time: float
     T_world_body: dict[str, NDArray[np.float64]]
-    note: str
+    text: str
+
+
+def roles(team: Team, mover: str | None) -> tuple[str, tuple[str, ...]]:
+    """Return the mover, by default the team's last robot, and the observers.
+
+    Raises
+    ------
+    InputError
+        If the mover has no markers, or there are fewer than two observers with the reference among them.
+    """
+    mover = mover or team.names[-1]
+    if team[mover].markers is None:
+        raise InputError(f"{mover} is to move and has no markers: give it some, or name another with --mover")
+    observers = tuple(name for name in team.names if name != mover)
+    if len(observers) < 2 or team.reference not in observers:
+        raise InputError(
+            f"a mission needs two robots that observe {mover}, and the reference {team.reference} among them"
+        )
+    return mover, observers
 
 
 def in_world(
     team: Team, mover: str, goals: tuple[tuple[float, float], ...]
 ) -> tuple[dict[str, Planar], tuple[tuple[float, float], ...]]:
-    """Where the robots begin, and the course, in the world, which is the reference's body at the beginning.
+    """Return the start poses of all robots and the course's waypoints in the world.
 
-    Both are given on a floor whose x axis is the way ahead and whose origin is the observers' middle.
+    The world is the reference's body at the beginning. Goals and the team's start poses are given on a floor whose x
+    axis is the direction of travel at the beginning and whose origin is the middle of the observers.
     """
     formation = Formation(Course(((0.0, 0.0), (10.0, 0.0))), tuple(n for n in team.names if n != mover))
     starts: dict[str, Planar] = {}
     for n, name in enumerate(formation.observers):
         starts[name] = formation.place(name, STAGGER * (n % 2))
-    starts[mover] = 1.28, 0.0, 0.0
+    starts[mover] = MOVER_AHEAD, 0.0, 0.0
     for robot in team.robots:
         if robot.devices is not None and robot.devices.start is not None:
             x, y, yaw_deg = robot.devices.start

@@ -1,4 +1,4 @@
-"""What the coordinator is doing: the phases of a mission, and which follows which."""
+"""States of a mission, and which may follow which."""
 
 import logging
 import time
@@ -9,72 +9,81 @@ from enum import StrEnum
 log = logging.getLogger(__name__)
 
 
-class Phase(StrEnum):
-    """What goes on; the value is what is shown."""
+class MissionState(StrEnum):
+    """State of a mission; the value is its name for people."""
 
-    GATHERING = "gathering"  # waits until every robot answers, with a camera and wheels that work
-    SYNCHRONISING = "synchronising"  # until every clock is known well enough
-    PLACING = "placing"  # the next observer leaps to its place, the mover goes to where it begins
-    LOOKING = "looking"  # all stand; is the mover in the observers' views?
-    CAPTURING = "capturing"  # the mover drives about before the observers' cameras
-    TURNING_BACK = "turning back"  # the same, and the mover is on its way back into their views
-    COLLECTING = "collecting"  # all stand; waits for the last detections
-    ESTIMATING = "estimating"  # the stance is measured and entered
-    HOLDING = "holding"  # something is wrong: all stand until it is mended
+    GATHERING = "gathering"  # wait until every robot answers, and its camera and wheels work
+    SYNCHRONISING = "synchronising"  # wait until every clock is known
+    PLACING = "placing"  # the next observer leaps, the mover drives to its first waypoint
+    LOOKING = "looking"  # all stand: is the mover in the observers' views?
+    CAPTURING = "capturing"  # the mover drives before the observers' cameras
+    TURNING_BACK = "turning back"  # the same, while the mover drives back into their views
+    COLLECTING = "collecting"  # all stand: wait for the last detections
+    ESTIMATING = "estimating"  # all stand: the stance is measured and enters the estimate
+    HOLDING = "holding"  # something is wrong: all stand until it is put right
     DONE = "done"
     FAILED = "failed"
 
 
-#: Which phase may follow which.
-FOLLOWS: dict[Phase, tuple[Phase, ...]] = {
-    Phase.GATHERING: (Phase.SYNCHRONISING,),
-    Phase.SYNCHRONISING: (Phase.PLACING, Phase.HOLDING),
-    Phase.PLACING: (Phase.LOOKING, Phase.HOLDING),
-    Phase.LOOKING: (Phase.CAPTURING, Phase.HOLDING),
-    Phase.CAPTURING: (Phase.COLLECTING, Phase.TURNING_BACK, Phase.HOLDING),
-    Phase.TURNING_BACK: (Phase.CAPTURING, Phase.COLLECTING, Phase.HOLDING),
-    Phase.COLLECTING: (Phase.ESTIMATING, Phase.HOLDING),
-    Phase.ESTIMATING: (Phase.PLACING, Phase.DONE, Phase.HOLDING),
-    Phase.HOLDING: (Phase.SYNCHRONISING,),
-    Phase.DONE: (),
-    Phase.FAILED: (),
+NEXT_STATES: dict[MissionState, tuple[MissionState, ...]] = {
+    MissionState.GATHERING: (MissionState.SYNCHRONISING,),
+    MissionState.SYNCHRONISING: (MissionState.PLACING, MissionState.HOLDING),
+    MissionState.PLACING: (MissionState.LOOKING, MissionState.HOLDING),
+    MissionState.LOOKING: (MissionState.CAPTURING, MissionState.HOLDING),
+    MissionState.CAPTURING: (MissionState.COLLECTING, MissionState.TURNING_BACK, MissionState.HOLDING),
+    MissionState.TURNING_BACK: (MissionState.CAPTURING, MissionState.COLLECTING, MissionState.HOLDING),
+    MissionState.COLLECTING: (MissionState.ESTIMATING, MissionState.HOLDING),
+    MissionState.ESTIMATING: (MissionState.PLACING, MissionState.DONE, MissionState.HOLDING),
+    MissionState.HOLDING: (MissionState.SYNCHRONISING,),
+    MissionState.DONE: (),
+    MissionState.FAILED: (),
 }
 
 
 @dataclass(frozen=True)
-class Change:
-    """A phase that began, when [s, monotonic clock], in which stance, and why."""
+class StateChange:
+    """A state that began at `time` [s, monotonic clock] in a stance, and the reason."""
 
-    phase: Phase
+    state: MissionState
     time: float
     stance: int
-    why: str
+    reason: str
 
 
-class Phases:
-    """The phase of a mission, and every change of it; `changed` hears of each."""
+class StateMachine:
+    """The state of a mission. `on_change` is called with every change of it."""
 
-    def __init__(self, changed: Callable[[Change], None]) -> None:
-        self._changed = changed
-        self.now = Phase.GATHERING
+    def __init__(self, on_change: Callable[[StateChange], None]) -> None:
+        self._on_change = on_change
+        self.now = MissionState.GATHERING
         self.since = time.monotonic()
 
-    def enter(self, phase: Phase, stance: int, why: str = "") -> None:
-        """Begin a phase. `ValueError` where it cannot follow, but for the end, which any may come to."""
-        if phase not in FOLLOWS[self.now] and (phase != Phase.FAILED or not FOLLOWS[self.now]):
-            raise ValueError(f"{phase} cannot follow {self.now}")
-        self.now, self.since = phase, time.monotonic()
+    def enter(self, state: MissionState, stance: int, reason: str = "") -> None:
+        """Begin a state.
+
+        Raises
+        ------
+        ValueError
+            If it cannot follow the present one. `FAILED` can follow any but the last ones.
+        """
+        if state not in NEXT_STATES[self.now] and (state != MissionState.FAILED or not NEXT_STATES[self.now]):
+            raise ValueError(f"{state} cannot follow {self.now}")
+        self.now, self.since = state, time.monotonic()
         log.log(
-            logging.WARNING if phase in (Phase.HOLDING, Phase.FAILED) else logging.INFO,
-            "stance %d: %s%s", stance, phase, f": {why}" if why else "",
+            logging.WARNING if state in (MissionState.HOLDING, MissionState.FAILED) else logging.INFO,
+            "stance %d: %s%s", stance, state, f": {reason}" if reason else "",
         )  # fmt: skip
-        self._changed(Change(phase, self.since, stance, why))
+        self._on_change(StateChange(state, self.since, stance, reason))
+
+    def lasted(self, seconds: float) -> bool:
+        """Return whether the present state has lasted for longer than `seconds` [s]."""
+        return time.monotonic() - self.since > seconds
 
 
 def as_dot() -> str:
-    """The phases as a Graphviz drawing."""
+    """Draw the states as a Graphviz graph."""
     lines = ["digraph mission {", "  rankdir=LR;", '  node [shape=box, style=rounded, fontname="sans-serif"];']
-    lines += [f'  "{phase}" -> "{after}";' for phase, follows in FOLLOWS.items() for after in follows]
-    going = [phase for phase in FOLLOWS if FOLLOWS[phase]]
-    lines += [f'  "{phase}" -> "{Phase.FAILED}" [style=dotted];' for phase in going]
+    lines += [f'  "{state}" -> "{after}";' for state, follows in NEXT_STATES.items() for after in follows]
+    going = [state for state in NEXT_STATES if NEXT_STATES[state]]
+    lines += [f'  "{state}" -> "{MissionState.FAILED}" [style=dotted];' for state in going]
     return "\n".join([*lines, "}"])

@@ -1,8 +1,7 @@
-"""Where a robot is in the world at any instant: its last pose that was estimated, and its wheels since."""
+"""Pose of a robot in the world at any instant; `PoseTracker`."""
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,74 +11,66 @@ from coloc_graph.run import OdometrySample
 
 Array = NDArray[np.float64]
 
-#: A robot whose wheels have told of less than this has not moved [m], [rad].
-STILL = 2e-3
-STILL_TURN = 4e-3
-#: Where a robot may be that somebody pushed or carried [m], [m], [rad]; a sample that is known no better says that.
-CARRIED = (0.5, 0.5, 1.0)
-#: So much of the past is remembered [s].
-MEMORY = 600.0
+STILL = 2e-3  # a robot whose odometry changed by less has not moved [m]
+STILL_TURN = 4e-3  # the same for its heading [rad]
+CARRIED = (0.5, 0.5, 1.0)  # sigmas of the pose of a robot that was pushed or carried [m], [m], [rad]
+MEMORY = 600.0  # odometry that is kept [s]
 
 
 def compose(a: Planar, b: Planar) -> Planar:
-    """The pose b, given in a."""
+    """Compose two planar poses: `T_world_b = compose(T_world_a, T_a_b)`."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]
 
 
 def inverse(a: Planar) -> Planar:
-    """The inverse of a pose."""
+    """Invert a planar pose."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return -c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]
 
 
-@dataclass(frozen=True)
-class Fix:
-    """A pose in the world at an instant [s]."""
-
-    time: float
-    place: Planar
-
-
 class PoseTracker:
-    """One robot's; `start` is where it is said to stand at the beginning."""
+    """Pose of one robot in the world: its last estimated pose, composed with its odometry since.
+
+    This is the transform map -> odom of REP-105. `start` is the pose at the beginning (x [m], y [m], yaw [rad]).
+    """
 
     def __init__(self, start: Planar) -> None:
         self._times: list[float] = []
         self._poses: list[Planar] = []
-        self._fix = Fix(-math.inf, start)
+        self._fix_time, self._fix_pose = -math.inf, start
         self._T_world_odom: Planar | None = None
-        self._carried = -math.inf
+        self._displaced = -math.inf
 
-    def take(self, sample: OdometrySample) -> None:
-        """Take in what the wheels say; samples come in the order of time."""
+    def add(self, sample: OdometrySample) -> None:
+        """Add an odometry sample, in the order of time."""
         x, y, yaw = map(float, sample.pose)
         self._times.append(sample.time)
         self._poses.append((x, y, yaw))
         if sample.covariance[0, 0] >= 0.99 * CARRIED[0] ** 2:
-            self._carried = sample.time
+            self._displaced = sample.time
         if self._T_world_odom is None:
             self._tie()
         if len(self._times) > 2 and self._times[-1] - self._times[0] > 1.2 * MEMORY:
             keep = bisect_right(self._times, self._times[-1] - MEMORY)
             del self._times[:keep], self._poses[:keep]
 
-    def fix(self, time: float, place: Planar) -> None:
-        """Its pose at an instant is known now."""
-        self._fix = Fix(time, place)
+    def fix(self, time: float, pose: Planar) -> None:
+        """Set the pose in the world at an instant [s], as it was estimated."""
+        self._fix_time, self._fix_pose = time, pose
         self._tie()
 
-    def carry(self, time: float, place: Planar) -> None:
-        """It was moved before an instant by what its wheels do not know, to a place."""
-        self._carried = time
-        self.fix(time, place)
+    def displace(self, time: float, pose: Planar) -> None:
+        """Set the pose of a robot that was moved before an instant [s], which its wheels cannot tell."""
+        self._displaced = time
+        self.fix(time, pose)
 
     def _tie(self) -> None:
         if self._times:
-            self._T_world_odom = compose(self._fix.place, inverse(self.odometry_at(self._fix.time)))
+            self._T_world_odom = compose(self._fix_pose, inverse(self.odometry_at(self._fix_time)))
 
     def odometry_at(self, time: float) -> Planar:
-        """Its pose in the odometry frame; at rest before and after the samples."""
+        """Return its pose in the odometry frame at an instant [s], constant before and after the samples."""
         n = bisect_right(self._times, time)
         if n == 0 or n == len(self._times):
             return self._poses[max(n - 1, 0)]
@@ -90,24 +81,30 @@ class PoseTracker:
 
     @property
     def known(self) -> bool:
-        """Whether its wheels have said anything yet."""
+        """True if odometry has been received."""
         return self._T_world_odom is not None
 
-    def place(self, time: float = math.inf) -> Planar:
-        """x [m], y [m], yaw [rad] in the world at an instant, by default the newest."""
+    def pose(self, time: float = math.inf) -> Planar:
+        """Return x [m], y [m], yaw [rad] in the world at an instant [s], by default the newest."""
         if self._T_world_odom is None:
-            return self._fix.place
+            return self._fix_pose
         return compose(self._T_world_odom, self.odometry_at(time))
 
-    def in_odometry(self, place: Planar) -> Planar:
-        """A pose in the world as the robot's own odometry counts it."""
+    def in_odometry(self, pose: Planar) -> Planar:
+        """Convert a pose in the world to the robot's odometry frame.
+
+        Raises
+        ------
+        LookupError
+            If no odometry has been received.
+        """
         if self._T_world_odom is None:
-            raise LookupError("its wheels have said nothing yet")
-        return compose(inverse(self._T_world_odom), place)
+            raise LookupError("no odometry received yet")
+        return compose(inverse(self._T_world_odom), pose)
 
     def moved_since(self, time: float) -> bool:
-        """Whether its wheels have turned, or it was carried, since an instant [s]."""
-        if self._carried > time:
+        """Return whether the robot has moved since an instant [s], by its wheels or otherwise."""
+        if self._displaced > time:
             return True
         if not self._times:
             return False

@@ -1,56 +1,71 @@
-"""What the coordinator knows of each robot: whether it is there, how it is, where it is, and by which clock."""
+"""State of each robot as the coordinator knows it: presence, status, pose, clock; `RobotRegistry`."""
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from coloc_graph.measurements import Sighting
 from coloc_graph.online.formation import Planar
 from coloc_graph.online.odometry_restart import DROVE, JoinedOdometry
 from coloc_graph.online.pose_tracker import PoseTracker
 from coloc_graph.online.record import Record
-from coloc_graph.robot_io.link.messages import Drive, Sample, Status, Wheels
+from coloc_graph.pipeline.incremental import EnteredStance
+from coloc_graph.robot_io.link.messages import Drive, Event, Sample, Status, Wheels
 from coloc_graph.run import Detections, OdometrySample
 from coloc_graph.run.schemas import to_seconds
 
-#: A robot that has said nothing of itself for this long is not there [s].
-SILENT = 1.0
-#: Samples whose times differ by less than this are the same one [s]: clocks are measured anew after a restart.
-SAME = 0.005
+SILENT = 1.0  # a robot without a status message for this time is taken for absent [s]
+SAME = 0.005  # samples closer in time are the same one: clocks are compared anew after a restart [s]
 
 
 @dataclass(eq=False)
-class Member:
-    """One robot of the team."""
+class RobotState:
+    """State of one robot.
+
+    Attributes
+    ----------
+    name
+        Name of the robot.
+    tracker
+        Its pose in the world.
+    to_coordinator
+        Converts its stamps [ns] to the coordinator's clock [ns].
+    odometry
+        Joins its odometry across restarts.
+    frame
+        Odometry frame of its newest sample.
+    present
+        True while its program is connected.
+    status, status_time, session
+        Newest status message, when it came [s, monotonic clock], and its program's session.
+    drive, arrived, interrupted
+        Last drive command, whether it has been completed, and whether the robot stopped on the way.
+    odometry_until, detections_until
+        Odometry and detections up to these times are in the record already [UTC s].
+    """
 
     name: str
-    whereabouts: PoseTracker
+    tracker: PoseTracker
     to_coordinator: Callable[[int], int]
     odometry: JoinedOdometry = field(default_factory=JoinedOdometry)
-    #: The odometry frame that its wheels' samples were in last.
     frame: str | None = None
     present: bool = False
     status: Status | None = None
-    heard: float = -math.inf
+    status_time: float = -math.inf
     session: str | None = None
-    #: Of the stance that is captured: how many samples came, and the time of the newest by the coordinator's clock.
-    samples: int = 0
-    newest: float = -math.inf
-    #: What it was told to do last, whether it is there, and whether it stopped on the way.
-    way: Drive | None = None
+    drive: Drive | None = None
     arrived: bool = True
-    stopped: bool = False
-    #: What its wheels said up to then is recorded already [UTC s].
-    recorded: float = -math.inf
-    #: And what its camera saw.
-    seen: float = -math.inf
+    interrupted: bool = False
+    odometry_until: float = -math.inf
+    detections_until: float = -math.inf
 
     def trouble(self, *, drives: bool = False) -> str | None:
-        """Why nothing can be done with it just now, in words."""
+        """Describe what keeps the robot from taking part; None if nothing does. Hazards do not stop one that drives."""
         if not self.present or self.status is None:
             return f"{self.name} is not there: start its program, or check the network"
-        if time.monotonic() - self.heard > SILENT:
-            return f"{self.name} has said nothing for {time.monotonic() - self.heard:.1f} s: check the network"
+        if time.monotonic() - self.status_time > SILENT:
+            return f"{self.name} has sent nothing for {time.monotonic() - self.status_time:.1f} s: check the network"
         if self.status.camera_fault:
             return f"{self.name}: {self.status.camera_fault}"
         if self.status.fault:
@@ -60,71 +75,114 @@ class Member:
         return None
 
     def take_status(self, status: Status) -> bool:
-        """Take in how it is; whether it is a new session, whose program began anew."""
-        self.status, self.heard = status, time.monotonic()
+        """Take in a status message; return whether its session is a new one: the robot's program was restarted."""
+        self.status, self.status_time = status, time.monotonic()
         if status.session == self.session:
             return False
         self.session = status.session
         return True
 
+    def take_event(self, event: Event) -> None:
+        """Take in an event: the end of a drive, or a stop on the way."""
+        self.arrived |= self.drive is not None and (event.kind, event.text) == ("arrived", str(self.drive.number))
+        self.interrupted |= event.kind in ("stopped", "fault")
 
-class Roster:
-    """The members of a team, and the record of all they send, in the coordinator's time [UTC s]."""
+    def stands_since(self) -> int | None:
+        """Time since when it stands, by the coordinator's clock [ns]; None if it moves, or nothing is known."""
+        since = self.status.still_since if self.status is not None else None
+        return None if since is None else self.to_coordinator(since)
 
-    def __init__(self, record: Record, starts: dict[str, Planar], clock_of: Callable[[str], Callable[[int], int]],
-                 epoch: int) -> None:  # fmt: skip
+
+class RobotRegistry:
+    """States of a team's robots; writes all that they send into the record, in the coordinator's time [UTC s].
+
+    Parameters
+    ----------
+    record
+        Record of the mission.
+    starts
+        Pose of each robot in the world at the beginning (x [m], y [m], yaw [rad]).
+    clock_of
+        Returns the conversion of a robot's stamps to the coordinator's clock.
+    epoch
+        UTC minus the coordinator's monotonic clock [ns].
+    """
+
+    def __init__(
+        self,
+        record: Record,
+        starts: dict[str, Planar],
+        clock_of: Callable[[str], Callable[[int], int]],
+        epoch: int,
+    ) -> None:
         self.record, self.epoch = record, epoch
-        self.members = {name: Member(name, PoseTracker(start), clock_of(name)) for name, start in starts.items()}
+        self.robots = {name: RobotState(name, PoseTracker(start), clock_of(name)) for name, start in starts.items()}
 
-    def __getitem__(self, name: str) -> Member:
-        return self.members[name]
+    def __getitem__(self, name: str) -> RobotState:
+        return self.robots[name]
 
-    def utc(self, stamp: int) -> float:
-        """An instant of the coordinator's clock [ns] as the record counts time [UTC s]."""
-        return to_seconds(stamp + self.epoch)
+    def utc(self, stamp: int | None = None) -> float:
+        """Convert an instant of the coordinator's clock [ns], by default now, to the record's time [UTC s]."""
+        return to_seconds((time.monotonic_ns() if stamp is None else stamp) + self.epoch)
 
     def take_wheels(self, name: str, wheels: Wheels) -> None:
-        """Take in where a robot's wheels say it is; what is recorded already is not taken twice."""
-        member = self.members[name]
-        sample = wheels.sample(name, self.utc(member.to_coordinator(wheels.stamp)))
-        if sample.time <= member.recorded:
+        """Take in a sample of odometry, unless it is recorded already."""
+        robot = self.robots[name]
+        sample = wheels.sample(name, self.utc(robot.to_coordinator(wheels.stamp)))
+        if sample.time <= robot.odometry_until:
             x, y, yaw = map(float, sample.pose)
-            member.odometry.align((x, y, yaw))
+            robot.odometry.align((x, y, yaw))
             return
-        if member.frame is not None and wheels.frame != member.frame:
-            member.odometry.restart(moving=member.status is None or member.status.moving)
-        member.frame = wheels.frame
-        kept = self.record.take(member.odometry.take(sample))
+        if robot.frame is not None and wheels.frame != robot.frame:
+            robot.odometry.restart(moving=robot.status is None or robot.status.moving)
+        robot.frame = wheels.frame
+        kept = self.record.take(robot.odometry.take(sample))
         assert isinstance(kept, OdometrySample)
-        member.whereabouts.take(kept)
-
-    def go_on(self) -> None:
-        """After a coordinator began anew: go on from what is recorded of all wheels."""
-        for name, member in self.members.items():
-            for detections in self.record.detections(name, 0.0, math.inf):
-                member.seen = detections.time + SAME
-            for sample in self.record.odometry(name):
-                member.whereabouts.take(sample)
-                member.recorded = sample.time + SAME
-            if (last := self.record.last_odometry(name)) is not None:
-                x, y, yaw = map(float, last.pose)
-                member.odometry.go_on((x, y, yaw), DROVE)
-
-    def carried(self, name: str, place: Planar) -> None:
-        """A robot that stands was moved by what its wheels do not know, to a place in the world."""
-        member = self.members[name]
-        member.odometry.carried()
-        member.whereabouts.carry(self.utc(time.monotonic_ns()), place)
+        robot.tracker.add(kept)
 
     def take_sample(self, name: str, sample: Sample) -> Detections | None:
-        """Take in what a robot's camera saw; None where it is recorded already."""
-        member = self.members[name]
-        if self.utc(member.to_coordinator(sample.stamp)) <= member.seen:
+        """Take in the detections of one image; return them as recorded, None if they are recorded already."""
+        robot = self.robots[name]
+        time_ = self.utc(robot.to_coordinator(sample.stamp))
+        if time_ <= robot.detections_until:
             return None
-        seen = self.record.take(sample.detections(name, self.utc(member.to_coordinator(sample.stamp))))
+        seen = self.record.take(sample.detections(name, time_))
         assert isinstance(seen, Detections)
         return seen
 
-    def places(self) -> dict[str, Planar]:
-        """Where all robots are now, in the world."""
-        return {name: member.whereabouts.place() for name, member in self.members.items()}
+    def restore(self) -> None:
+        """Continue from what an earlier coordinator recorded of all robots."""
+        for name, robot in self.robots.items():
+            for detections in self.record.detections(name, 0.0, math.inf):
+                robot.detections_until = detections.time + SAME
+            for sample in self.record.odometry(name):
+                robot.tracker.add(sample)
+                robot.odometry_until = sample.time + SAME
+            if (last := self.record.last_odometry(name)) is not None:
+                x, y, yaw = map(float, last.pose)
+                robot.odometry.go_on((x, y, yaw), DROVE)
+
+    def displace(self, name: str, pose: Planar) -> None:
+        """Set the pose of a robot that was moved while it stood, which its wheels cannot tell."""
+        robot = self.robots[name]
+        robot.odometry.carried()
+        robot.tracker.displace(self.utc(), pose)
+
+    def follow(self, entered: EnteredStance) -> None:
+        """Set the poses of the robots that a stance's estimate has newly found."""
+        sighted = {m.seen: m.time for m in entered.measurements if isinstance(m, Sighting)}
+        for name, pose in entered.estimate.poses.items():
+            if name in entered.stance.observers or name in sighted:
+                T = pose.matrix()
+                planar = float(T[0, 3]), float(T[1, 3]), math.atan2(T[1, 0], T[0, 0])
+                self.robots[name].tracker.fix(sighted.get(name, entered.stance.start), planar)
+
+    def poses(self, names: Sequence[str] | None = None) -> dict[str, Planar]:
+        """Return the present poses in the world, of all robots by default."""
+        return {name: self.robots[name].tracker.pose() for name in names or self.robots}
+
+    def stood(self, seconds: float) -> bool:
+        """Return whether all robots have stood for `seconds` [s]."""
+        since = [robot.stands_since() for robot in self.robots.values()]
+        now = time.monotonic_ns()
+        return all(one is not None and now - one >= seconds * 1e9 for one in since)

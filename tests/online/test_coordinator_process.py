@@ -61,9 +61,9 @@ class Mission:
         path = self.folder / "mission" / "mission.jsonl"
         return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
-    def wait_for(self, phase, timeout=60.0):
+    def wait_for(self, state, timeout=60.0):
         until = time.monotonic() + timeout
-        while not any(row.get("phase") == phase for row in self.rows()):
+        while not any(row.get("state") == state for row in self.rows()):
             assert time.monotonic() < until, self.rows()
             time.sleep(0.05)
 
@@ -104,7 +104,7 @@ def test_a_second_coordinator_of_the_same_folder_is_refused_and_changes_nothing(
     )
     out, err = second.communicate(timeout=30.0)
     assert second.returncode == 2 and out == b"" and err.count(b"\n") == 1
-    assert b"another coordinator is at work in" in err
+    assert b"is being written by another command" in err
     assert {path.name: path.stat().st_ino for path in folder.iterdir()} == before
 
 
@@ -182,11 +182,14 @@ def test_log_messages_that_nobody_reads_are_dropped_counted_and_never_waited_for
 
 def test_a_mission_folder_is_locked_and_given_back(tmp_path):
     folder = tmp_path / "mission"
-    with MissionFolder(folder, resume=False), pytest.raises(InputError, match="another coordinator is at work"):
+    with MissionFolder(folder, resume=False), pytest.raises(InputError, match="another command"):
         MissionFolder(folder, resume=True)
     assert not folder.exists()  # nothing came to be in it
     folder.mkdir()
     (folder / "run.mcap").touch()
+    (tmp_path / "alias").symlink_to(folder)
+    with MissionFolder(folder, resume=True), pytest.raises(InputError, match="another command"):
+        MissionFolder(tmp_path / "alias", resume=True)
     for _ in range(2):  # the lock is given back
         with pytest.raises(InputError, match="--resume"):
             MissionFolder(folder, resume=False)

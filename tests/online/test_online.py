@@ -77,7 +77,7 @@ def more_happens(m, in_mid_stance):
 
 
 def reasons(mission, stance):
-    return " | ".join(why for k, phase, why in mission.phases() if k == stance and phase == "holding")
+    return " | ".join(why for k, state, why in mission.states() if k == stance and state == "holding")
 
 
 def test_the_mission_ends_by_itself_with_every_stance_once(mission):
@@ -94,7 +94,7 @@ def test_the_mission_ends_by_itself_with_every_stance_once(mission):
 
 def test_what_happened_is_named(mission):
     assert "C is not there" in reasons(mission, 1)
-    assert "not there" in reasons(mission, 2) or "has said nothing" in reasons(mission, 2)
+    assert "not there" in reasons(mission, 2) or "has sent nothing" in reasons(mission, 2)
     assert any(row["what"] == "resumed" and row["stances"] == 3 for row in mission.rows)
     if mission.stances < WHOLE:
         return

@@ -10,9 +10,9 @@ import pytest
 from coloc_graph.errors import InputError, RobotError, RunError
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.online.encoder_log import Counted, Ledger, way_since
-from coloc_graph.online.estimation_worker import Measuring
+from coloc_graph.online.estimation_worker import EstimationWorker
 from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Course, Formation
-from coloc_graph.online.mission_states import FOLLOWS, Phase, Phases, as_dot
+from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateMachine, as_dot
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_restart import DROVE, STOOD, JoinedOdometry
 from coloc_graph.online.pose_tracker import PoseTracker, compose, inverse
@@ -129,14 +129,14 @@ def test_a_robot_goes_backwards_only_where_it_may():
 
 def test_a_robot_is_where_it_was_last_seen_and_its_wheels_went_since():
     place = PoseTracker((1.0, 2.0, math.pi / 2))
-    assert place.place() == (1.0, 2.0, math.pi / 2) and not place.known
+    assert place.pose() == (1.0, 2.0, math.pi / 2) and not place.known
     for n in range(11):
-        place.take(odometry("A", 10.0 + n, 5.0 + 0.1 * n, 0.0, 0.0))
-    assert place.place(10.0) == pytest.approx((1.0, 2.0, math.pi / 2))
-    assert place.place() == pytest.approx((1.0, 3.0, math.pi / 2))
+        place.add(odometry("A", 10.0 + n, 5.0 + 0.1 * n, 0.0, 0.0))
+    assert place.pose(10.0) == pytest.approx((1.0, 2.0, math.pi / 2))
+    assert place.pose() == pytest.approx((1.0, 3.0, math.pi / 2))
     place.fix(15.0, (0.0, 0.0, 0.0))
-    assert place.place(15.0) == pytest.approx((0.0, 0.0, 0.0))
-    assert place.place() == pytest.approx((0.5, 0.0, 0.0))
+    assert place.pose(15.0) == pytest.approx((0.0, 0.0, 0.0))
+    assert place.pose() == pytest.approx((0.5, 0.0, 0.0))
     assert place.in_odometry((0.0, 0.0, 0.0)) == pytest.approx((5.5, 0.0, 0.0))
     assert place.moved_since(12.0) and not place.moved_since(20.0)
     assert compose(inverse((1.0, 2.0, 3.0)), (1.0, 2.0, 3.0)) == pytest.approx((0.0, 0.0, 0.0))
@@ -221,14 +221,14 @@ def test_a_robot_that_was_carried_is_no_anchor_in_the_record_either():
     joined, seen, resumed = JoinedOdometry(), PoseTracker((0.0, 0.0, 0.0)), PoseTracker((0.0, 0.0, 0.0))
     for n in range(3):
         sample = joined.take(odometry("A", float(n), 0.0, 0.0, 0.0))
-        seen.take(sample)
-        resumed.take(sample)
+        seen.add(sample)
+        resumed.add(sample)
     assert not seen.moved_since(1.0)
     joined.carried()
-    seen.carry(2.5, (0.1, 0.0, 0.2))
-    assert seen.moved_since(1.0) and not seen.moved_since(2.6) and seen.place() == pytest.approx((0.1, 0.0, 0.2))
-    resumed.take(joined.take(odometry("A", 3.0, 0.0, 0.0, 0.0)))
-    resumed.take(joined.take(odometry("A", 4.0, 0.0, 0.0, 0.0)))
+    seen.displace(2.5, (0.1, 0.0, 0.2))
+    assert seen.moved_since(1.0) and not seen.moved_since(2.6) and seen.pose() == pytest.approx((0.1, 0.0, 0.2))
+    resumed.add(joined.take(odometry("A", 3.0, 0.0, 0.0, 0.0)))
+    resumed.add(joined.take(odometry("A", 4.0, 0.0, 0.0, 0.0)))
     assert resumed.moved_since(1.0) and not resumed.moved_since(3.0)
 
 
@@ -257,7 +257,7 @@ def test_an_anchor_that_was_pushed_is_named_and_its_stance_comes_again(tmp_path,
 
     seen = open_run(copied(hallway, tmp_path / "run.mcap", change=pushed, stances=run.stances[:6]))
     solver = StanceSolver(seen.team)
-    measuring = Measuring(seen, solver)
+    measuring = EstimationWorker(seen, solver)
 
     def entered(one):
         measuring.enter(one)
@@ -290,7 +290,7 @@ def test_an_anchor_that_was_pushed_is_named_and_its_stance_comes_again(tmp_path,
             return iter(sorted(samples, key=lambda one: one.time))
 
     measuring.end()
-    measuring = Measuring(Told(), solver)
+    measuring = EstimationWorker(Told(), solver)
     assert isinstance(entered(replace(seen.stances[5], anchors=())), EnteredStance)
     assert not solver.estimator.refused
     T = np.linalg.inv(stands) @ solver.estimator.pose(anchor, 5).matrix()
@@ -362,7 +362,7 @@ def test_a_stance_that_measures_nothing_and_a_fault_are_errors_of_the_stance(tmp
     stance = Stance(0, 1e9, 1e9 + 2, ("A", "B"), ("C",))
     solver = StanceSolver(team)
     with record(tmp_path / "run.mcap", team) as kept:
-        measuring = Measuring(kept, solver)
+        measuring = EstimationWorker(kept, solver)
         assert measuring.judged() is None and measuring.entered() is None and not measuring.judging
         measuring.enter(stance)
         with pytest.raises(RobotError, match=why):
@@ -375,20 +375,20 @@ def test_a_stance_that_measures_nothing_and_a_fault_are_errors_of_the_stance(tmp
         measuring.end()
 
 
-def test_phases_follow_each_other_as_drawn():
+def test_states_follow_each_other_as_drawn():
     heard = []
-    phases = Phases(heard.append)
+    states = StateMachine(heard.append)
     with pytest.raises(ValueError, match="capturing cannot follow gathering"):
-        phases.enter(Phase.CAPTURING, 0)
-    for phase in (Phase.SYNCHRONISING, Phase.HOLDING, Phase.SYNCHRONISING, Phase.FAILED):
-        phases.enter(phase, 3, "because")
-    assert [(change.phase, change.stance, change.why) for change in heard][-1] == (Phase.FAILED, 3, "because")
+        states.enter(MissionState.CAPTURING, 0)
+    for state in (MissionState.SYNCHRONISING, MissionState.HOLDING, MissionState.SYNCHRONISING, MissionState.FAILED):
+        states.enter(state, 3, "because")
+    assert [(change.state, change.stance, change.reason) for change in heard][-1] == (MissionState.FAILED, 3, "because")
     with pytest.raises(ValueError, match="failed cannot follow failed"):
-        phases.enter(Phase.FAILED, 3)
+        states.enter(MissionState.FAILED, 3)
     drawn = as_dot()
-    assert all(f'"{phase}"' in drawn for phase in Phase)
-    assert drawn.count("->") == sum(map(len, FOLLOWS.values())) + len(Phase) - 2
-    reached = {Phase.GATHERING}
-    for _ in Phase:
-        reached |= {after for phase in reached for after in FOLLOWS[phase]}
-    assert reached == set(Phase) - {Phase.FAILED}
+    assert all(f'"{state}"' in drawn for state in MissionState)
+    assert drawn.count("->") == sum(map(len, NEXT_STATES.values())) + len(MissionState) - 2
+    reached = {MissionState.GATHERING}
+    for _ in MissionState:
+        reached |= {after for state in reached for after in NEXT_STATES[state]}
+    assert reached == set(MissionState) - {MissionState.FAILED}

@@ -50,19 +50,19 @@ class Mission:
             return []
         return [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
 
-    def phases(self) -> list[tuple[int, str, str]]:
-        return [(row["stance"], row["phase"], row["why"]) for row in self.rows if row["what"] == "phase"]
+    def states(self) -> list[tuple[int, str, str]]:
+        return [(row["stance"], row["state"], row["reason"]) for row in self.rows if row["what"] == "state"]
 
-    def wait_for(self, stance: int, phase: str, timeout: float = 120.0) -> None:
-        """Until a phase of a stance, or a later stance, is the newest."""
+    def wait_for(self, stance: int, state: str, timeout: float = 120.0) -> None:
+        """Wait until a state of a stance, or a later stance, is the newest."""
         until = time.monotonic() + timeout
         while time.monotonic() < until:
-            now = self.phases()[-1:]
-            if now and (now[0][0] > stance or now[0][1] in ("done", "failed") or now[0][:2] == (stance, phase)):
+            now = self.states()[-1:]
+            if now and (now[0][0] > stance or now[0][1] in ("done", "failed") or now[0][:2] == (stance, state)):
                 return
             assert self.coordinator is None or self.coordinator.poll() is None, self.log()
             time.sleep(0.05)
-        raise AssertionError(f"stance {stance} has not come to {phase} within {timeout} s\n{self.log()}")
+        raise AssertionError(f"stance {stance} has not come to {state} within {timeout} s\n{self.log()}")
 
     def wait_moving(self, timeout: float = 10.0) -> None:
         until = time.monotonic() + timeout

@@ -1,0 +1,48 @@
+"""Messages of all robots on their way from the link's threads to the mission's main loop; `Inbox`."""
+
+import queue
+import time
+from collections.abc import Iterator
+
+from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
+from coloc_graph.robot_io.link.messages import Event, Sample, Status, Wheels
+from coloc_graph.robot_io.link.zenoh_config import Tls
+from coloc_graph.team import Team
+
+Message = Sample | Wheels | Event | Status | bool  # a bool is presence: the robot's program came, or has gone
+LONGEST = 0.3  # time after which messages that keep coming are interrupted [s]
+
+
+class Inbox:
+    """Queue of (robot, message), filled by any thread and read by one."""
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[tuple[str, Message]] = queue.SimpleQueue()
+
+    def put(self, robot: str, message: Message) -> None:
+        """Add a message of a robot; never waits."""
+        self._queue.put((robot, message))
+
+    def messages(self, seconds: float) -> Iterator[tuple[str, Message]]:
+        """Yield messages as they come for `seconds` [s], and those that wait then, for `LONGEST` more at most."""
+        until = time.monotonic() + seconds
+        while (now := time.monotonic()) < until + LONGEST:
+            try:
+                yield self._queue.get(timeout=max(until - now, 0.001))
+            except queue.Empty:
+                return
+
+
+def linked(inbox: Inbox, team: Team, *, listen: str, tls: Tls | None, exposed: bool) -> CoordinatorLink:
+    """Open the link to the robots, all of whose messages go into the inbox; see `CoordinatorLink`."""
+    return CoordinatorLink(
+        team,
+        listen=listen,
+        tls=tls,
+        exposed=exposed,
+        on_sample=inbox.put,
+        on_wheels=inbox.put,
+        on_event=inbox.put,
+        on_status=inbox.put,
+        on_presence=inbox.put,
+    )

@@ -1,0 +1,386 @@
+"""The mission itself, state by state: who moves when, what is a stance, and when all must stand; `LeapFrog`."""
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from coloc_graph.errors import ColocError, RobotError
+from coloc_graph.online.bumps import displaced, pushed
+from coloc_graph.online.commands import Commander, Stopped
+from coloc_graph.online.estimation_worker import EstimationWorker
+from coloc_graph.online.formation import STAGGER, Formation
+from coloc_graph.online.leap_planner import LeapPlanner, StancePlan
+from coloc_graph.online.mission import MissionOptions, roles
+from coloc_graph.online.mission_log import MissionLog
+from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateChange, StateMachine
+from coloc_graph.online.robot_registry import RobotRegistry
+from coloc_graph.online.stance_attempt import OUT_OF_VIEW, StanceAttempt
+from coloc_graph.online.visibility import InView
+from coloc_graph.pipeline.incremental import EnteredStance
+from coloc_graph.robot_io.link.messages import Body, Capture, EndCapture, Halt, Recover
+from coloc_graph.run import Detections, Stance
+from coloc_graph.team import Team
+
+SETTLED = 0.25  # all robots have stood for this time before a stance begins [s]
+MARGIN = 0.02  # a stance ends this long after its last image [s]
+DRIVE_TIME = 40.0  # longest time of a drive [s]
+LOOK_TIME = 4.0  # longest time to see the mover, and for it to set off [s]
+COLLECT_TIME = 30.0  # longest time until the last images have come [s]
+HOLD_TIME = 120.0  # longest time until what is wrong is put right [s]
+CALM = 0.5  # robots are well for this time before the mission goes on [s]
+RECOVER_PERIOD = 1.0  # robots that stopped for a reason are told to recover after this time [s]
+
+#: States in which all robots stand and wait: nothing that happens to them there voids a stance.
+_WAITING = {
+    MissionState.GATHERING,
+    MissionState.SYNCHRONISING,
+    MissionState.HOLDING,
+    MissionState.COLLECTING,
+    MissionState.ESTIMATING,
+}
+
+
+class LeapFrog:
+    """The states of a mission, one `step` at a time. It needs no network: robots are a registry and a commander.
+
+    Parameters
+    ----------
+    team, options
+        The team, and the mission's goals and limits.
+    formation
+        Formation of the observers along the course.
+    registry, commander, worker, log
+        States of the robots, commands to them, the estimator's thread, and the mission's log.
+    synchronised
+        Returns whether a robot's clock is known well enough.
+    on_stance
+        Called with each stance that has entered the estimate.
+    """
+
+    def __init__(
+        self,
+        team: Team,
+        options: MissionOptions,
+        formation: Formation,
+        *,
+        registry: RobotRegistry,
+        commander: Commander,
+        worker: EstimationWorker,
+        log: MissionLog,
+        synchronised: Callable[[str], bool],
+        on_stance: Callable[[EnteredStance], None] | None = None,
+    ) -> None:
+        self._team, self._options, self._formation = team, options, formation
+        self._registry, self._commander, self._worker, self._log = registry, commander, worker, log
+        self._synchronised, self._on_stance = synchronised, on_stance
+        self.mover, self.observers = roles(team, options.mover)
+        self.stances: list[Stance] = []
+        self.latencies: list[float] = []
+        self.attempt: StanceAttempt | None = None
+        self.states = StateMachine(self._note_state)
+        self._planner = LeapPlanner(team, self.mover, formation, registry)
+        self._plan: StancePlan | None = None
+        self._failures = 0  # attempts at the present stance that failed
+        self._captures = time.time_ns() // 1_000_000  # capture numbers are unique across coordinators
+        self._recovered = -math.inf
+        self._steps = {
+            MissionState.GATHERING: self._gather,
+            MissionState.SYNCHRONISING: self._synchronise,
+            MissionState.PLACING: self._place,
+            MissionState.LOOKING: self._look,
+            MissionState.CAPTURING: self._capture,
+            MissionState.TURNING_BACK: self._capture,
+            MissionState.COLLECTING: self._collect,
+            MissionState.ESTIMATING: self._estimate,
+            MissionState.HOLDING: self._hold,
+        }
+
+    @property
+    def ended(self) -> bool:
+        """True once the mission is done or has failed."""
+        return not NEXT_STATES[self.states.now]
+
+    def step(self) -> None:
+        """Do what the present state asks for now. What goes wrong voids the stance, and all robots hold.
+
+        Raises
+        ------
+        Stopped
+            If the mission is told to stop while it waits for a robot's answer.
+        """
+        try:
+            trouble = self._trouble()
+            if trouble is None:
+                self._steps[self.states.now]()
+            else:
+                self._void(trouble)
+        except Stopped:
+            raise
+        except ColocError as error:
+            self._void(str(error))
+
+    def take_image(self, capture: int, seen: Detections) -> None:
+        """Take in the detections of an image that an observer took for a capture."""
+        if self.attempt is not None:
+            self.attempt.take(capture, seen, self._registry[self.mover].tracker)
+
+    def describe(self) -> str:
+        """Describe the present state in one line for people."""
+        text = f"stance {self._index}: {self.states.now}"
+        if self.states.now in (MissionState.CAPTURING, MissionState.TURNING_BACK) and self.attempt is not None:
+            found = self.attempt.precision
+            if found is not None:
+                text += f", {found.points} points"
+                if not found.why:
+                    text += f", {1e3 * found.place:.1f} mm, {math.degrees(found.heading):.2f} deg"
+        return text
+
+    # states
+
+    def _gather(self) -> None:
+        if self._waits_for() is None:
+            self._enter(MissionState.SYNCHRONISING)
+
+    def _synchronise(self) -> None:
+        late = [name for name in self._team.names if not self._synchronised(name)]
+        if not late:
+            self._begin_stance()
+        elif self.states.lasted(HOLD_TIME):
+            self._fail(f"the clocks of {', '.join(late)} are not known to {1e3 * self._options.clock_limit:g} ms")
+
+    def _begin_stance(self) -> None:
+        """Plan the next stance, and send the robots off."""
+        self._plan = self._planner.plan(self._index, self.stances[-1] if self.stances else None, self._failures)
+        for robot in self._registry.robots.values():
+            robot.arrived, robot.drive = True, None
+        if self._plan.leap is not None:
+            leaper, (x, y, yaw) = self._plan.leap
+            self._commander.drive(leaper, [(x, y)], yaw, backwards=False)
+        self._commander.drive(self.mover, self._plan.patrol[:1])
+        self._enter(MissionState.PLACING)
+
+    def _place(self) -> None:
+        self._commander.resume_drives()
+        under_way = [name for name, robot in self._registry.robots.items() if not robot.arrived]
+        if under_way:
+            if self.states.lasted(DRIVE_TIME):
+                raise RobotError(
+                    f"{' and '.join(under_way)} did not arrive within {DRIVE_TIME:.0f} s: see what is in the way"
+                )
+        elif self._registry.stood(SETTLED):
+            self._begin_attempt()
+
+    def _begin_attempt(self) -> None:
+        assert self._plan is not None
+        now = self._registry.utc()
+        self._captures += 1
+        self.attempt = StanceAttempt(
+            Stance(self._index, now, now, self.observers, (self.mover,), self._anchors()),
+            InView(self._team, self.mover, self._registry.poses(self.observers)),
+            self._captures,
+            self._plan.patrol,
+            self._registry[self.mover].tracker.pose(),
+        )
+        self._worker.forget()
+        for name in self.observers:
+            self._commander.ask(name, Capture(capture=self._captures))
+        self._enter(MissionState.LOOKING)
+
+    def _look(self) -> None:
+        attempt = self._attempted()
+        missing = attempt.view.missing()
+        if not missing:
+            self._commander.drive(self.mover, attempt.first_round())
+            self._enter(MissionState.CAPTURING)
+        elif self.states.lasted(LOOK_TIME):
+            self._note_bumped(displaced(self._registry, attempt.view, attempt.mover_pose))
+            raise RobotError(
+                f"{' and '.join(missing)} did not see {self.mover} where it should be: put the robots where they "
+                "are said to stand, clear what is between them, and check that its lights are on"
+            )
+
+    def _capture(self) -> None:
+        attempt = self._attempted()
+        if not attempt.set_off:
+            # a stance begins when its mover sets off: images of it standing would weigh too much
+            status = self._registry[self.mover].status
+            attempt.set_off = status is not None and status.still_since is None
+            if not attempt.set_off and self.states.lasted(LOOK_TIME):
+                raise RobotError(f"{self.mover} did not start moving within {LOOK_TIME:g} s: check what blocks it")
+            attempt.begin(self._registry.record.rounded(self._registry.utc()))
+        self._keep_in_view(attempt)
+        found = self._worker.judged()
+        if found is not None:
+            attempt.precision = found
+            if found.suffices(self._options):
+                self._end_capture("the stance is precise enough")
+                return
+        left = attempt.stance.start + self._options.longest - self._registry.utc()
+        if not self._worker.judging and (stance := attempt.to_judge(left)) is not None:
+            self._worker.judge(stance)
+        self._commander.resume_drives()
+        if self._registry[self.mover].arrived and self.states.now == MissionState.CAPTURING:
+            self._commander.drive(self.mover, attempt.next_round())
+        if left < 0:
+            self._end_capture(f"{self._options.longest:g} s are over")
+
+    def _keep_in_view(self, attempt: StanceAttempt) -> None:
+        """Send the mover back where it has left an observer's view."""
+        missing = attempt.view.missing()
+        seconds = attempt.out_of_view(bool(missing))
+        if not missing:
+            if self.states.now == MissionState.TURNING_BACK:
+                self._commander.drive(self.mover, attempt.whole_round())
+                self._enter(MissionState.CAPTURING)
+        elif seconds > OUT_OF_VIEW and self.states.now == MissionState.CAPTURING:
+            self._commander.drive(self.mover, attempt.way_back())
+            self._enter(MissionState.TURNING_BACK, f"{self.mover} left the view of {' and '.join(missing)}")
+        elif seconds > DRIVE_TIME / 2:
+            raise RobotError(f"{self.mover} did not come back into the view of {' and '.join(missing)}")
+
+    def _end_capture(self, reason: str) -> None:
+        commands: dict[str, Body] = {self.mover: Halt(), **dict.fromkeys(self.observers, EndCapture())}
+        answers = self._commander.ask_each(commands)
+        self._attempted().expect({name: int(answers[name] or 0) for name in self.observers})
+        self._enter(MissionState.COLLECTING, reason)
+
+    def _collect(self) -> None:
+        attempt = self._attempted()
+        if attempt.complete:
+            self._enter(MissionState.ESTIMATING)
+            end = self._registry.record.rounded(attempt.last_image + MARGIN)
+            self._worker.enter(replace(attempt.stance, end=end, anchors=self._anchors()))
+        elif self.states.lasted(COLLECT_TIME):
+            raise RobotError(f"not all images of stance {self._index} came within {COLLECT_TIME:.0f} s")
+
+    def _estimate(self) -> None:
+        one = self._worker.entered()
+        if one is None:
+            return
+        if not isinstance(one, EnteredStance):
+            self._note_bumped(pushed(self._registry, one))
+            return
+        self._registry.record.complete(one.stance)
+        self.stances.append(one.stance)
+        latency = self._registry.utc() - self._attempted().last_image
+        self.latencies.append(latency)
+        self._registry.follow(one)
+        self._log.note(
+            "entered",
+            stance=one.stance.index,
+            anchors=one.stance.anchors,
+            latency=round(latency, 4),
+            points=min((len(p.correspondences) for p in one.pairs if p.correspondences is not None), default=0),
+            poses={name: np.round(pose.matrix(), 12).tolist() for name, pose in one.estimate.poses.items()},
+            rejected=[str(refusal.measurement) for refusal in one.estimate.refused],
+        )
+        if self._on_stance is not None:
+            self._on_stance(one)
+        self._failures, self.attempt = 0, None
+        if self._at_goal():
+            self._enter(MissionState.DONE, f"{len(self.stances)} stances")
+        else:
+            self._begin_stance()
+
+    def _hold(self) -> None:
+        waits = self._waits_for()
+        if waits is None:
+            self._enter(MissionState.SYNCHRONISING)
+        elif self.states.lasted(HOLD_TIME):
+            self._fail(f"nothing has changed for {HOLD_TIME:.0f} s: {waits}")
+
+    # what goes wrong
+
+    def _void(self, reason: str) -> None:
+        """Stop all robots until what is wrong is put right; the stance is void, and is tried again."""
+        self.attempt = None
+        self._failures += 1
+        if self._failures >= self._options.attempts:
+            self._fail(f"{self._failures} attempts at stance {self._index} failed, the last one: {reason}")
+            return
+        self._enter(MissionState.HOLDING, reason)
+        self._commander.halt_all()
+
+    def _fail(self, reason: str) -> None:
+        self._enter(MissionState.FAILED, reason)
+
+    def _trouble(self) -> str | None:
+        """Describe why the present state cannot go on; None if it can."""
+        if self.states.now in _WAITING:
+            return None
+        for name, robot in self._registry.robots.items():
+            why = robot.trouble(drives=self._planner.drives(name))
+            if why is None and not self._synchronised(name):
+                why = (
+                    f"the clock of {name} jumped, or is no longer known to {1e3 * self._options.clock_limit:g} ms: "
+                    "it is compared anew"
+                )
+            if why is not None:
+                return why
+        if self.attempt is not None:
+            start = self.attempt.stance.start
+            moved = [name for name in self.observers if self._registry[name].tracker.moved_since(start)]
+            if moved:
+                return f"{' and '.join(moved)} moved during stance {self.attempt.stance.index}"
+        return None
+
+    def _waits_for(self) -> str | None:
+        """Describe what keeps the robots from beginning; those that stopped for a reason are told to recover."""
+        for name, robot in self._registry.robots.items():
+            why = robot.trouble(drives=True)
+            if why is not None:
+                fault = robot.present and robot.status is not None and robot.status.fault
+                if fault and time.monotonic() - self._recovered > RECOVER_PERIOD:
+                    self._recovered = time.monotonic()
+                    with contextlib.suppress(RobotError):
+                        self._commander.ask(name, Recover())
+                return why
+            if not robot.tracker.known:
+                return f"no odometry received from {name} yet"
+        return None if self.states.lasted(CALM) else "a moment"
+
+    def _note_bumped(self, found: Iterable[tuple[str, str]]) -> None:
+        """Note robots that were pushed, if any, and raise `RobotError`: they are no anchors of the next attempt."""
+        reasons = dict(found)
+        for robot, text in reasons.items():
+            self._log.note("bumped", robot=robot, text=text)
+        if reasons:
+            raise RobotError("; ".join(reasons.values()))
+
+    # the stance
+
+    def _attempted(self) -> StanceAttempt:
+        assert self.attempt is not None
+        return self.attempt
+
+    @property
+    def _index(self) -> int:
+        """Number of the stance that is under way."""
+        return self.stances[-1].index + 1 if self.stances else 0
+
+    def _anchors(self) -> tuple[str, ...]:
+        """Return the observers of the stance before that have stood since, by their wheels."""
+        if not self.stances:
+            return ()
+        before = self.stances[-1]
+        return tuple(
+            name
+            for name in self.observers
+            if name in before.observers and not self._registry[name].tracker.moved_since(before.end)
+        )
+
+    def _at_goal(self) -> bool:
+        if self._options.stances is not None and len(self.stances) >= self._options.stances:
+            return True
+        reached = self._formation.progress(self._registry.poses(self.observers))
+        return reached >= self._formation.course.length - STAGGER / 2
+
+    def _enter(self, state: MissionState, reason: str = "") -> None:
+        self.states.enter(state, self._index, reason)
+
+    def _note_state(self, change: StateChange) -> None:
+        self._log.note("state", state=str(change.state), stance=change.stance, reason=change.reason)

@@ -1,0 +1,35 @@
+"""The log of a mission: its states and events, one JSON object a line; `MissionLog`."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+
+class MissionLog:
+    """Appends to `path`; a context manager.
+
+    Parameters
+    ----------
+    path
+        File of JSON lines. Each has `time` [UTC s], `what` happened, and more.
+    now
+        Returns the time [UTC s].
+    """
+
+    def __init__(self, path: Path, now: Callable[[], float]) -> None:
+        self._file, self._now = path.open("a", encoding="utf-8"), now
+
+    def note(self, what: str, **more: object) -> None:
+        """Add a line, which a killed coordinator leaves behind complete."""
+        self._file.write(json.dumps({"time": self._now(), "what": what, **more}) + "\n")
+        self._file.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
