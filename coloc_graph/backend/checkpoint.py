@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError
+from coloc_graph.input_file import read_bytes
 from coloc_graph.measurements import (
     HomographyMeasurement,
     MarkerSpan,
@@ -193,7 +194,7 @@ def write(saved: Checkpoint, path: Path) -> None:
 def read(path: Path) -> Checkpoint:
     """The checkpoint in a file; `InputError` where it is none."""
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, "give the path of a checkpoint")
         if msgspec.json.decode(content, type=_Format).format != FORMAT:
             raise InputError(f"{path}: is not a checkpoint of this version ({FORMAT}); solve the run again")
         file = msgspec.json.decode(content, type=_File)
@@ -213,9 +214,7 @@ def read(path: Path) -> Checkpoint:
             require_valid(measurements, saved.floor)
         if not all(0 <= number < len(saved.base.measurements) for number in saved.base.rejected):
             raise ValueError("a measurement that is not there is rejected")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a checkpoint") from error
-    except (msgspec.DecodeError, ValueError, EstimationError) as error:
+    except (msgspec.DecodeError, ValueError, OverflowError, RecursionError, EstimationError) as error:
         raise InputError(f"{path}: is not a checkpoint, or a damaged one ({error}); solve the run again") from error
     return saved
 

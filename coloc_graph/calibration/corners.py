@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from coloc_graph.calibration.board import Board, charuco_board
 from coloc_graph.errors import InputError
+from coloc_graph.input_file import read_bytes
+from coloc_graph.run.image_header import read_image_header, too_large
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -149,8 +151,16 @@ def _refined(image: Image, points: Array, uv: NDArray[np.float32], square: float
 def read_image(path: Path) -> Image:
     """The grey values of an image file; `InputError` where it is none."""
     # a camera's pixels are where its sensor has them, whatever a file says about how to hold it
-    encoded = np.fromfile(path, np.uint8)
-    image = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(encoded) else None
+    data = read_bytes(path, "leave it out, or give it anew")
+    header = read_image_header(data)
+    why = too_large(header, data) if header is not None else None
+    if why is not None:
+        raise InputError(f"{path}: {why}; leave it out, or make it smaller")
+    try:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except (cv2.error, MemoryError):
+        image = None
     if image is None:
         raise InputError(f"{path}: cannot be read as an image; leave it out, or give it anew")
     return np.asarray(image, np.uint8)

@@ -30,6 +30,8 @@ def folds(intrinsics: Array, width: int, height: int) -> str | None:
     if (intrinsics[:2] <= 0).any():
         return "has a focal length that is not positive"
     camera = camera_of(intrinsics, width, height)
+    if (radius := camera.fold_radius()) is not None:
+        return f"folds the image {radius:.0f} px from its middle: not every pixel has one ray"
     corners = pixel_grid(width, height, 33, 33).reshape(-1, 2)
     x = camera.normalise(corners)
     if not np.isfinite(x).all():

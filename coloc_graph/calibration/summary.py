@@ -1,7 +1,6 @@
 """A calibration as numbers: calibration.json and --json, and what a mount's calibration reads of a camera's."""
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from coloc_graph.calibration.mount import MountCalibration
 from coloc_graph.calibration.team_file import CAMERA_FIELDS
 from coloc_graph.calibration.verdict import verdict
 from coloc_graph.errors import InputError
+from coloc_graph.input_file import read_json
 from coloc_graph.team import Camera
 
 SUMMARY = "calibration.json"
@@ -67,14 +67,10 @@ def read_covariance(path: str | Path, camera: Camera) -> NDArray[np.float64]:
     path = Path(path)
     path = path / SUMMARY if path.is_dir() else path
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
+        summary = read_json(path, "give the folder that `coloc calibrate camera --out` wrote")
         covariance = np.array(summary["covariance"], float)
         of = msgspec.convert(summary["camera"], Camera)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); give the folder that `coloc calibrate camera --out` wrote"
-        ) from error
-    except (ValueError, KeyError, TypeError, msgspec.ValidationError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError, msgspec.ValidationError) as error:
         raise InputError(f"{path}: is no calibration of a camera ({error}); calibrate the camera anew") from error
     names = [name for name in CAMERA_FIELDS if name not in ("noise_px", "bias_px")]
     if any(getattr(of, name) != getattr(camera, name) for name in names):

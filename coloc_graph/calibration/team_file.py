@@ -7,8 +7,9 @@ from typing import Any
 import msgspec
 
 from coloc_graph.errors import TeamError
+from coloc_graph.input_file import MAX_DESCRIPTION_SIZE, read_text
 from coloc_graph.run.atomic_file import write_whole
-from coloc_graph.team import Camera, Mount, Team, read_team
+from coloc_graph.team import Camera, Mount, Team, parse_team
 
 #: What a calibration says of a camera, and of a mount; the rest is the robot's own.
 CAMERA_FIELDS = ("width", "height", "fx", "fy", "cx", "cy", "distortion", "noise_px", "bias_px")
@@ -31,15 +32,20 @@ def _values(struct: Camera | Mount, names: tuple[str, ...]) -> dict[str, Any]:
 
 def _write(path: Path, robot: str, part: str, values: Mapping[str, Any], out: Path) -> None:
     import tomlkit
+    from tomlkit.exceptions import TOMLKitError
 
-    team = read_team(path)
+    text = read_text(path, "give the path of a team.toml", limit=MAX_DESCRIPTION_SIZE, error=TeamError)
+    team = parse_team(path, text)
     number = team.names.index(team[robot].name)
-    document: Any = tomlkit.parse(path.read_bytes().decode())
-    table = document["robots"][number][part]
-    for name, value in values.items():
-        if getattr(getattr(team[robot], part), name) != (tuple(value) if isinstance(value, list) else value):
-            table[name] = value
-    text = tomlkit.dumps(document)
+    try:
+        document: Any = tomlkit.parse(text)
+        table = document["robots"][number][part]
+        for name, value in values.items():
+            if getattr(getattr(team[robot], part), name) != (tuple(value) if isinstance(value, list) else value):
+                table[name] = value
+        text = tomlkit.dumps(document)
+    except (TOMLKitError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise TeamError(f"{path}: cannot be changed ({error}); write the values of `{part}` by hand") from error
     _require_same(path, text, team, robot, part, values)
     write_whole(out, text)
 
@@ -50,5 +56,5 @@ def _require_same(path: Path, text: str, team: Team, robot: str, part: str, valu
     for one in wanted["robots"]:
         if one["name"] == robot:
             one[part] |= values
-    if msgspec.to_builtins(msgspec.toml.decode(text, type=Team)) != wanted:
+    if msgspec.to_builtins(parse_team(path, text)) != wanted:
         raise TeamError(f"{path}: cannot be changed as it is written; write the values of `{part}` by hand")

@@ -5,6 +5,7 @@ to the bit. Source: ROS `sensor_msgs/CameraInfo`, and the files of `camera_calib
 """
 
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,21 @@ from typing import Any
 import numpy as np
 import yaml
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
+from coloc_graph.input_file import decode_text, quoted, read_bytes
 from coloc_graph.run.atomic_file import write_whole
 from coloc_graph.team import Camera
+from coloc_graph.team.camera import MAX_SIDE
 
-#: Distortion models of ROS that are OpenCV's, and how many coefficients they may have here.
-MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}
+Array = NDArray[np.float64]
+
+#: Distortion models of ROS that are OpenCV's, and how many coefficients they have, without zeros behind the last; "" is
+#: no distortion.
+MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "": (0,)}
+#: Largest text of one camera_info [bytes]; PyYAML takes a second for some hundred kilobytes.
+MAX_SIZE = 64 * 1024
 #: Names of the fields: those of a calibrator's file, of a message in ROS 2, and in ROS 1.
 NAMES = {
     "width": ("image_width", "width"),
@@ -70,14 +79,20 @@ def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Came
     if K[0, 0] == 0:
         raise InputError(f"{path}: the camera is not calibrated (its matrix is zero); calibrate it first")
     if model not in MODELS:
-        known = " and ".join(MODELS)
+        known = " and ".join(name for name in MODELS if name)
         raise InputError(
-            f"{path}: `distortion_model` is {model}{', a fisheye' if model == 'equidistant' else ''}, and the lens "
-            f"models here are {known}; calibrate the camera anew with `coloc calibrate camera`"
+            f"{path}: `distortion_model` is {quoted(model)}{', a fisheye' if model == 'equidistant' else ''}, and the "
+            f"lens models here are {known}; calibrate the camera anew with `coloc calibrate camera`"
         )
+    most = max(MODELS[model])
+    if not D[most:].any():
+        D = D[:most]
     if len(D) not in MODELS[model]:
         counts = " or ".join(map(str, MODELS[model]))
-        raise InputError(f"{path}: {model} has {counts} coefficients, and there are {len(D)}; check the file")
+        raise InputError(
+            f"{path}: {quoted(model)} has {counts} coefficients (zeros behind them are left out), and there are "
+            f"{len(D)}; check the file"
+        )
     if K[0, 1] != 0 or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
         raise InputError(
             f"{path}: the camera matrix is [fx {K[0, 1]:g} cx; {K[1, 0]:g} fy cy; ...], and a pinhole without skew has "
@@ -97,6 +112,11 @@ def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Came
         camera = Camera(**values) if base is None else replace(base, **values)
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: {error}") from error
+    if (radius := camera.fold_radius()) is not None:
+        raise InputError(
+            f"{path}: its lens model folds {radius:.0f} px from the middle of the image, so that pixels beyond have no "
+            "ray; calibrate the camera anew, with corners out to the image's border"
+        )
     return camera, _left_out(path, fields, K)
 
 
@@ -105,18 +125,45 @@ def _matrix(values: Any) -> dict[str, Any]:
     return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML without aliases, which a few lines repeat a billion times, and without dates."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+            raise yaml.MarkedYAMLError(problem="it has an alias, which is not read", problem_mark=mark)
+        return super().compose_node(parent, index)
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, expression) for tag, expression in resolvers if not tag.endswith(":timestamp")]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+
+
+def _text(path: Path) -> str:
+    """Text of the first document: a topic that is printed ends each message with ---; the first is as good as any."""
+    remedy = "give the path of a camera_info YAML"
+    data = read_bytes(path, remedy)
+    if len(data) > MAX_SIZE:
+        data = re.split(rb"(?<=.)^---", data[:MAX_SIZE], maxsplit=1, flags=re.MULTILINE | re.DOTALL)[0]
+    if len(data) >= MAX_SIZE:
+        raise InputError(f"{path}: its first camera_info is larger than {MAX_SIZE // 1024} KiB; {remedy}")
+    return decode_text(path, data, remedy)
+
+
 def _fields(path: Path) -> Mapping[str, Any]:
     try:
-        # a topic that is printed ends each message with ---; the first is as good as any
-        fields = next(iter(yaml.safe_load_all(path.read_text(encoding="utf-8"))), None)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a camera_info YAML") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not text; give the path of a camera_info YAML") from error
+        fields = next(iter(yaml.load_all(_text(path), _Loader)), None)
+    except RecursionError as error:
+        raise InputError(f"{path}: is nested too deep; give the path of a camera_info YAML") from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
-        raise InputError(f"{path}{where}: is not YAML ({getattr(error, 'problem', error)}); check the file") from error
+        what = quoted(getattr(error, "problem", None) or error)
+        raise InputError(f"{path}{where}: is not YAML that is read ({what}); check the file") from error
+    except ValueError as error:  # a number of more digits than Python reads
+        raise InputError(f"{path}: holds what is no number ({error}); check the file") from error
     if not isinstance(fields, dict):
         raise InputError(f"{path}: holds no fields; give a camera_info YAML, with camera_matrix and the others")
     return fields
@@ -131,8 +178,10 @@ def _get(path: Path, fields: Mapping[str, Any], name: str) -> Any:
 
 def _whole(path: Path, fields: Mapping[str, Any], name: str) -> int:
     value = _get(path, fields, name)
-    if not isinstance(value, int) or isinstance(value, bool) or value <= 0:
-        raise InputError(f"{path}: `{NAMES[name][0]}` is {value!r}; give a whole number of pixels")
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 < value <= MAX_SIDE:
+        raise InputError(
+            f"{path}: `{NAMES[name][0]}` is {quoted(value)}; give a whole number of pixels, {MAX_SIDE} at most"
+        )
     return value
 
 
@@ -144,11 +193,11 @@ def _numbers(path: Path, fields: Mapping[str, Any], name: str, shape: tuple[int,
     try:
         # YAML 1.1 takes 1e-05 for text, which C++ writes
         numbers = np.array([float(one) for one in value])
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: `{called}` is not a list of numbers; check the file") from error
     if not np.isfinite(numbers).all():
         raise InputError(f"{path}: `{called}` holds a number that is not finite; calibrate the camera anew")
-    if stated is not None and not all(isinstance(one, int) for one in stated):
+    if stated is not None and not all(isinstance(one, int) and 0 <= one <= MAX_SIDE for one in stated):
         raise InputError(f"{path}: `{called}` has rows and cols that are not whole numbers; check the file")
     for size in (shape, stated):
         if size is not None and math.prod(size) != len(numbers):
@@ -162,16 +211,17 @@ def _require_whole_image(path: Path, fields: Mapping[str, Any], width: int, heig
     for name in ("binning_x", "binning_y"):
         if fields.get(name, 0) not in (0, 1):
             raise InputError(
-                f"{path}: `{name}` is {fields[name]}: the images are binned, and the matrix is that of the whole ones; "
-                "calibrate the camera with images as they are used"
+                f"{path}: `{name}` is {quoted(fields[name])}: the images are binned, and the matrix is that of "
+                "the whole ones; calibrate the camera with images as they are used"
             )
     roi = fields.get("roi") or {}
     if not isinstance(roi, dict):
-        raise InputError(f"{path}: `roi` is {roi!r}; give x_offset, y_offset, width and height, or leave it out")
+        raise InputError(f"{path}: `roi` is {quoted(roi)}; give x_offset, y_offset, width and height, or leave it out")
     part = tuple(roi.get(name, 0) for name in ("x_offset", "y_offset", "width", "height"))
     if part not in ((0, 0, 0, 0), (0, 0, width, height)):
+        x, y, w, h = map(quoted, part)
         raise InputError(
-            f"{path}: `roi` is a part of the image, {part[2]}x{part[3]} at ({part[0]}, {part[1]}); "
+            f"{path}: `roi` is a part of the image, {w} x {h} at ({x}, {y}); "
             "calibrate the camera with images as they are used"
         )
 

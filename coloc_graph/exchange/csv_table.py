@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import TracksError
+from coloc_graph.input_file import decode_text, read_bytes
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
@@ -109,15 +110,8 @@ def read_table(path: Path, what: str, header: Sequence[str], *, optional: Sequen
 
 
 def _text(path: Path, what: str) -> str:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise TracksError(f"{path}: cannot be read ({error.strerror}); give the path of a CSV with {what}") from error
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise TracksError(f"{path}, line {line}: is not UTF-8 text; save the {what} as CSV in UTF-8") from error
+    data = read_bytes(path, f"give the path of a CSV with {what}", error=TracksError)
+    return decode_text(path, data, f"save the {what} as CSV in UTF-8", error=TracksError)
 
 
 def _rows(path: Path, text: str) -> tuple[list[list[str]], list[int]]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
+from coloc_graph.input_file import quoted, read_text
 
 Array = NDArray[np.float64]
 
@@ -22,12 +23,7 @@ class DatTable:
 
 def read_dat(path: Path, columns: int) -> DatTable:
     """The rows of a file; `InputError`, with its line, for one that is not so many finite numbers, or where none is."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the folder of a whole dataset") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no text (byte {error.start}); give the file as it was published") from error
+    text = read_text(path, "give the folder of a whole dataset, with the files as they were published")
     rows, lines = [], []
     for line, content in enumerate(text.split("\n"), start=1):
         words = content.split("#", 1)[0].split()
@@ -44,7 +40,7 @@ def read_dat(path: Path, columns: int) -> DatTable:
         values = np.array(rows, float)
     except ValueError:
         row, word = next((n, word) for n, words in enumerate(rows) for word in words if not _is_number(word))
-        raise InputError(f"{path}, line {lines[row]}: `{word}` is not a number; repair the row") from None
+        raise InputError(f"{path}, line {lines[row]}: {quoted(word)} is not a number; repair the row") from None
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
         raise InputError(f"{path}, line {lines[int(bad.argmax())]}: holds a number that is not finite; repair the row")

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.exchange.ros_bag import COMPRESSED_IMAGE, Bag, BagMessage
+from coloc_graph.input_file import quoted
 from coloc_graph.run import EncodedImage, Image
+from coloc_graph.run.image_header import read_image_header, too_large
 from coloc_graph.team import Camera
 
 #: Encodings of sensor_msgs/Image that are read: bytes a pixel, and what makes grey or BGR of them.
@@ -48,8 +50,17 @@ def image_of(bag: Bag, message: BagMessage, robot: str, time: float, camera: Cam
         data = bytes(found.data)
         image_format = next((name for magic, name in MAGIC.items() if data.startswith(magic)), None)
         if image_format is None:
-            raise bag.error(message, f"has format `{found.format}`; record JPEG, PNG, or sensor_msgs/Image")
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            raise bag.error(message, f"has format {quoted(found.format)}; record JPEG, PNG, or sensor_msgs/Image")
+        header = read_image_header(data)
+        if header is None:
+            raise bag.error(message, f"is a {image_format} that is damaged; record the bag again")
+        _require_size(bag, message, (header.height, header.width), camera)
+        if why := too_large(header, data):
+            raise bag.error(message, f"{why}; record smaller images")
+        try:
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except (cv2.error, MemoryError):
+            pixels = None
         if pixels is None:
             raise bag.error(message, f"is a {image_format} that is damaged; record the bag again")
         if pixels.dtype != np.uint8 or not (pixels.ndim == 2 or pixels.shape[2] == 3):
@@ -58,14 +69,14 @@ def image_of(bag: Bag, message: BagMessage, robot: str, time: float, camera: Cam
             )
         _require_size(bag, message, pixels.shape, camera)
         return EncodedImage(robot, time, image_format, data)
+    _require_size(bag, message, (int(found.height), int(found.width)), camera)
     pixels = _pixels(bag, message, found)
-    _require_size(bag, message, pixels.shape, camera)
     return Image(robot, time, pixels)
 
 
 def _pixels(bag: Bag, message: BagMessage, found: Any) -> NDArray[np.uint8]:
     if found.encoding not in ENCODINGS:
-        raise bag.error(message, f"has encoding `{found.encoding}`; what is read is {', '.join(ENCODINGS)}")
+        raise bag.error(message, f"has encoding {quoted(found.encoding)}; what is read is {', '.join(ENCODINGS)}")
     size, conversion = ENCODINGS[found.encoding]
     height, width, step = int(found.height), int(found.width), int(found.step)
     data = np.asarray(found.data, np.uint8)
@@ -104,7 +115,7 @@ def camera_of(bag: Bag, message: BagMessage, stated: Camera, *, rectified: bool)
     elif found.distortion_model not in LENSES:
         raise bag.error(
             message,
-            f"has the lens model `{found.distortion_model}`; calibrate with plumb_bob or rational_polynomial, or "
+            f"has the lens model {quoted(found.distortion_model)}; calibrate with plumb_bob or rational_polynomial, or "
             "import rectified images with `rectified = true`",
         )
     roi = found.roi
@@ -117,16 +128,26 @@ def camera_of(bag: Bag, message: BagMessage, stated: Camera, *, rectified: bool)
         raise bag.error(message, "is of a camera that is not calibrated; calibrate it, or leave `camera_info` out")
     if len(D) not in (0, 4, 5, 8):
         raise bag.error(message, f"has {len(D)} coefficients of distortion; what is read is up to OpenCV's first 8")
-    return msgspec.structs.replace(
-        stated,
-        width=int(found.width),
-        height=int(found.height),
-        fx=float(K[0]),
-        fy=float(K[4]),
-        cx=float(K[2]),
-        cy=float(K[5]),
-        distortion=tuple(float(one) for one in D),
-    )
+    try:
+        camera = msgspec.structs.replace(
+            stated,
+            width=int(found.width),
+            height=int(found.height),
+            fx=float(K[0]),
+            fy=float(K[4]),
+            cx=float(K[2]),
+            cy=float(K[5]),
+            distortion=tuple(float(one) for one in D),
+        )
+    except ValueError as error:
+        raise bag.error(message, f"is of no camera ({error}); calibrate it, or leave `camera_info` out") from error
+    if (radius := camera.fold_radius()) is not None:
+        raise bag.error(
+            message,
+            f"has a lens model that folds {radius:.0f} px from the middle of the image, so that pixels beyond have no "
+            "ray; calibrate the camera anew, or leave `camera_info` out of the map and give the camera in the team",
+        )
+    return camera
 
 
 def _numbers(found: Any, name: str) -> list[float]:

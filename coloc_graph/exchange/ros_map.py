@@ -8,6 +8,7 @@ import msgspec
 
 from coloc_graph.errors import BagError
 from coloc_graph.exchange.stances import MotionThresholds
+from coloc_graph.input_file import convert, read_toml
 from coloc_graph.team import Team, read_team
 
 #: From what it is known when a robot moves.
@@ -100,12 +101,8 @@ class RosMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 def read_map(path: str | Path) -> tuple[RosMap, Team]:
     """The map in a TOML file, and its team; `BagError` (`TeamError` for the team) names the file and the path in it."""
     path = Path(path)
-    try:
-        found = msgspec.toml.decode(path.read_bytes(), type=RosMap)
-    except OSError as error:
-        raise BagError(f"{path}: cannot be read ({error.strerror}); give the path of a map, see docs/ros.md") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise BagError(f"{path}: {error}; see docs/ros.md for the fields") from error
+    fields = read_toml(path, "give the path of a map, see docs/ros.md", error=BagError)
+    found = convert(path, fields, RosMap, "see docs/ros.md for the fields", error=BagError)
     team = read_team(path.parent / found.team)
     for number, robot in enumerate(found.robots):
         if robot.name not in team.names:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.lie import quaternion
 from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.input_file import read_text
 
 Array = NDArray[np.float64]
 
@@ -84,10 +85,7 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); give a trajectory in the TUM format") from error
+    return read_text(path, "give a trajectory in the TUM format").splitlines()
 
 
 def _numbers(path: Path, line: int, parts: list[str], count: int) -> list[float]:

@@ -1,11 +1,9 @@
 """What is compared with what: estimates and truth from results, runs, and TUM files of other programs."""
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,9 +20,8 @@ from coloc_graph.evaluation import (
 )
 from coloc_graph.exchange.tum import read_tum
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.results.writer import CONFIG, holds_result, read_result
+from coloc_graph.results.writer import holds_result, read_result, stated_team_of
 from coloc_graph.run import is_mcap, read_truth
-from coloc_graph.team import Team
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +77,7 @@ def of_result(
     """
     result = read_result(path)
     estimated = _with_poses(result.trajectories, f"{path}")
-    team = _team_of(Path(path))
+    team = stated_team_of(Path(path))
     if truth:
         true = read_truths(truth)
     else:
@@ -160,16 +157,6 @@ def _with_poses(trajectories: Mapping[str, Trajectory], where: str) -> dict[str,
             f"{where}: there are no poses{f' of robot {empty[0]}' if empty else ''}; nothing can be compared"
         )
     return dict(trajectories)
-
-
-def _team_of(path: Path) -> Team:
-    """The team in a result's config.toml."""
-    try:
-        return msgspec.convert(tomllib.loads((path / CONFIG).read_text(encoding="utf-8"))["team"], Team)
-    except OSError as error:
-        raise InputError(f"{path / CONFIG}: cannot be read ({error.strerror}); solve the run again") from error
-    except (ValueError, KeyError) as error:
-        raise InputError(f"{path / CONFIG} is damaged ({error}); solve the run again") from error
 
 
 def is_result(path: str | Path) -> bool:

@@ -1,7 +1,5 @@
 """Many runs, each solved by itself: in any process, resumed where it stopped, and a bad one ends none of the others."""
 
-import json
-import tomllib
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import AbstractContextManager
@@ -11,11 +9,20 @@ from typing import Any
 
 from coloc_graph._version import __version__
 from coloc_graph.errors import ColocError, InputError
+from coloc_graph.input_file import read_toml
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.contents import require_applicable
 from coloc_graph.pipeline.ranging import DriveOptions, solve_drive
 from coloc_graph.results.ranging import write_drive_result
-from coloc_graph.results.writer import CONFIG, SUMMARY, holds_result, options_of, require_place, write_result
+from coloc_graph.results.writer import (
+    CONFIG,
+    SUMMARY,
+    holds_result,
+    options_of,
+    read_summary,
+    require_place,
+    write_result,
+)
 from coloc_graph.run import open_run, run_id
 
 #: A run whose process dies is tried so often: whose fault it was is not known when several are under way.
@@ -128,7 +135,7 @@ def _of_ranges(options: SolveOptions) -> DriveOptions:
 
 
 def _summary(out: Path) -> dict[str, Any]:
-    return dict(json.loads((out / SUMMARY).read_text(encoding="utf-8")))
+    return read_summary(out)
 
 
 def _earlier(run: Path, out: Path, options: SolveOptions) -> dict[str, Any] | None:
@@ -137,7 +144,7 @@ def _earlier(run: Path, out: Path, options: SolveOptions) -> dict[str, Any] | No
         return None
     try:
         summary = _summary(out)
-        config = tomllib.loads((out / CONFIG).read_text(encoding="utf-8"))
+        config = read_toml(out / CONFIG, "solve the run again")
         same = (
             summary.get("version") == __version__
             and config.get("options") in (options_of(options.resolved()), asdict(_of_ranges(options)))

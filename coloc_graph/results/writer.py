@@ -33,11 +33,13 @@ from coloc_graph.exchange.g2o import write_g2o
 from coloc_graph.exchange.landmarks import landmark_rows, landmarks_csv, map_row
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.input_file import convert, read_json, read_toml
 from coloc_graph.pipeline.batch import Solution, SolveOptions
 from coloc_graph.pipeline.contents import unused_in
 from coloc_graph.run import Run, read_truth, run_id
 from coloc_graph.run.output_lock import locked_output
 from coloc_graph.team import Team, read_team, without_none, write_team
+from coloc_graph.team.landmark import require_name
 
 SUMMARY = "summary.json"
 CONFIG = "config.toml"
@@ -260,18 +262,43 @@ class Result:
 def read_result(path: str | Path) -> Result:
     """The result in a folder; `InputError` where it is none."""
     path = Path(path)
-    try:
-        summary = json.loads((path / SUMMARY).read_text(encoding="utf-8"))
-        robots, run = list(summary["robots"]), str(summary["run"])
-    except OSError as error:
-        raise InputError(
-            f"{path} is not a result: {SUMMARY} cannot be read ({error.strerror}); "
-            "give the folder that `coloc solve --out` wrote"
-        ) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path / SUMMARY} is damaged ({error}); solve the run again") from error
-    trajectories = {robot: read_tum(path / "trajectories" / f"{robot}.tum") for robot in robots}
-    return Result(path, summary, trajectories, Path(os.path.normpath(path / run)), summary.get("run_id"))
+    if not (path / SUMMARY).exists():
+        raise InputError(f"{path} is not a result: it has no {SUMMARY}; give the folder that `coloc solve --out` wrote")
+    summary = read_summary(path)
+    said = convert(path / SUMMARY, summary, _Said, "solve the run again")
+    trajectories = {robot: read_tum(path / "trajectories" / f"{robot}.tum") for robot in said.robots}
+    return Result(path, summary, trajectories, Path(os.path.normpath(path / said.run)), said.run_id)
+
+
+class _Said(msgspec.Struct):
+    """Fields of summary.json by which a result is read."""
+
+    robots: tuple[str, ...]
+    run: str
+    run_id: str | None = None
+    method: str = ""
+    world: str = ""
+    bumped: tuple[tuple[str, int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        for robot in self.robots:
+            require_name(robot)
+        if "\0" in self.run:
+            raise ValueError("`run` is no path")
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """Fields of the summary of the result in a folder.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is damaged.
+    """
+    summary = read_json(path / SUMMARY, "solve the run again")
+    if not isinstance(summary, dict):
+        raise InputError(f"{path / SUMMARY} is damaged (it holds no fields); solve the run again")
+    return summary
 
 
 def team_of(result: Result) -> Team:
@@ -279,12 +306,20 @@ def team_of(result: Result) -> Team:
 
     Raises `TeamError` or `InputError` where the result is damaged.
     """
-    found, config = result.path / "team.toml", result.path / CONFIG
+    found = result.path / "team.toml"
     if found.exists():
         return read_team(found)
-    try:
-        return msgspec.convert(msgspec.toml.decode(config.read_bytes())["team"], Team)
-    except OSError as error:
-        raise InputError(f"{config}: cannot be read ({error.strerror}); solve the run again") from error
-    except (msgspec.DecodeError, UnicodeDecodeError, KeyError) as error:
-        raise InputError(f"{config}: is damaged ({error}); solve the run again") from error
+    return stated_team_of(result.path)
+
+
+def stated_team_of(path: Path) -> Team:
+    """The team in the config.toml of the result in a folder.
+
+    Raises
+    ------
+    InputError
+        If it is missing or damaged.
+    """
+    config = path / CONFIG
+    fields = read_toml(config, "solve the run again")
+    return convert(config, fields.get("team"), Team, "solve the run again")

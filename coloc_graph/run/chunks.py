@@ -19,6 +19,8 @@ from coloc_graph.errors import RunError
 
 #: Larger than any image; a larger length is damage, and nothing is allocated for it.
 MAX_RECORD = 256 * 1024 * 1024
+#: Most records in one chunk. Writers make chunks of kilobytes to a few megabytes; the smallest message takes 31 bytes.
+MAX_RECORDS = 250_000
 HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, its CRC, length of the compression's name
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -43,12 +45,14 @@ class Message(NamedTuple):
 
 @dataclass(slots=True)
 class ChunkInfo:
-    """Where a chunk is in the file [bytes], the times in it [ns], and how many messages of which channel."""
+    """Place of a chunk in the file and its `size` without compression [bytes], the times in it [ns], and the number of
+    messages by channel."""
 
     offset: int
     length: int
     start: int
     end: int
+    size: int
     counts: dict[int, int] = field(default_factory=dict)
     index_offsets: dict[int, int] = field(default_factory=dict)
     index_length: int = 0
@@ -70,8 +74,11 @@ def damaged(path: Path, offset: int, what: str) -> RunError:
 def records(path: Path, data: bytes, offset: int) -> Iterator[tuple[int, memoryview]]:
     """(opcode, body) of the records in `data`, which is at (or, compressed, in the chunk at) `offset`."""
     view = memoryview(data)
-    at, end = 0, len(view)
+    at, end, left = 0, len(view), MAX_RECORDS
     while at < end:
+        left -= 1
+        if left < 0:
+            raise damaged(path, offset, f"a part with more than {MAX_RECORDS} records")
         opcode, length = HEAD.unpack_from(view, at) if at + HEAD.size <= end else (0, 0)
         at += HEAD.size
         until = at + length
@@ -97,7 +104,9 @@ def decompressed(path: Path, file: BinaryIO, chunk: ChunkInfo) -> bytes:
     name = body[at : at + name_length]
     at += name_length + 8
     data = body[at:]
-    if (start, end) != (chunk.start, chunk.end) or len(data) != int.from_bytes(body[at - 8 : at], "little"):
+    if (start, end, size) != (chunk.start, chunk.end, chunk.size) or len(data) != int.from_bytes(
+        body[at - 8 : at], "little"
+    ):
         raise damaged(path, chunk.offset, "a chunk whose head contradicts itself")
     if size > MAX_RECORD:
         raise damaged(path, chunk.offset, f"a chunk of {size} bytes")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from coloc_graph.errors import RunError
 from coloc_graph.run import schemas
 from coloc_graph.run.encode import check_planes, check_ranges, check_stance
+from coloc_graph.run.image_header import read_image_header, too_large
 from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Ranges, Stance
 from coloc_graph.team import Team
 
@@ -24,7 +25,7 @@ class MalformedError(ValueError):
 def _json(data: memoryview, kind: type[T]) -> T:
     try:
         return msgspec.json.decode(data, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError) as error:
         raise MalformedError(str(error)) from error
 
 
@@ -162,9 +163,16 @@ def _decompress(message: Any) -> NDArray[np.uint8]:
 
     if message.format not in ("jpeg", "png"):
         raise MalformedError(f"`format` is `{message.format}`; it must be jpeg or png")
+    header = read_image_header(message.data)
+    if header is None:
+        raise MalformedError(f"`data` is not a {message.format}")
+    if header.bits != 8 or header.channels not in (1, 3):
+        raise MalformedError(f"`data` has {header}; it must be 8-bit grey or BGR")
+    if why := too_large(header, message.data):
+        raise MalformedError(f"`data` {why}")
     try:
         pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
+    except (cv2.error, MemoryError) as error:
         raise MalformedError(f"`data` is not a {message.format}") from error
     if pixels is None:
         raise MalformedError(f"`data` is not a {message.format}")

@@ -18,6 +18,7 @@ from coloc_graph.errors import RunError
 from coloc_graph.run.chunks import (
     HEAD,
     MAX_RECORD,
+    MAX_RECORDS,
     ChannelInfo,
     ChunkInfo,
     Definitions,
@@ -30,6 +31,8 @@ from coloc_graph.run.chunks import (
 )
 
 MAGIC = b"\x89MCAP0\r\n"
+#: Bytes that come out of one byte of a file; images without noise, and zstd, come to a few hundred.
+MAX_COMPRESSION = 2000
 FOOTER_HEAD = HEAD.pack(Opcode.FOOTER, 20)
 FOOTER_SIZE = len(FOOTER_HEAD) + 20
 
@@ -81,10 +84,14 @@ class _Walk:
         self._check_magic()
         footer = self._footer()
         reached = self._walk(whole=footer is not None)
+        self._require_plausible_size()
+        counted = 0
         for chunk in self.chunks:
             # a writer can do without indexes, and a whole chunk can have its indexes cut off
             if not chunk.counts or (footer is None and chunk is self.chunks[-1]):
-                self._count_messages(chunk)
+                counted += self._count_messages(chunk)
+            if counted > max(self.size, MAX_RECORDS):
+                raise damaged(self.path, chunk.offset, f"more than {counted} messages in {self.size} bytes")
         if footer is not None and footer.summary_start:
             self._compare_with_summary(footer)
         lost = None if footer is not None else max(self.size - reached, 0)
@@ -149,8 +156,8 @@ class _Walk:
         elif opcode == Opcode.CHUNK:
             if length < 40:
                 raise damaged(self.path, offset, "a chunk without a head")
-            start, end = struct.unpack("<QQ", self._read(offset + HEAD.size, 16))
-            self.chunks.append(ChunkInfo(offset, HEAD.size + length, start, end))
+            start, end, size = struct.unpack("<QQQ", self._read(offset + HEAD.size, 24))
+            self.chunks.append(ChunkInfo(offset, HEAD.size + length, start, end, size))
         elif opcode == Opcode.MESSAGE_INDEX:
             self._note_index(offset, length)
         elif opcode == Opcode.MESSAGE:
@@ -168,10 +175,20 @@ class _Walk:
             chunk.counts[channel] = chunk.counts.get(channel, 0) + size // 16
             chunk.index_offsets[channel] = offset
 
-    def _count_messages(self, chunk: ChunkInfo) -> None:
+    def _require_plausible_size(self) -> None:
+        """Refuse a file that is all compression: reading it takes time and memory by what comes out of it."""
+        size = sum(chunk.size for chunk in self.chunks)
+        if size > MAX_RECORD + MAX_COMPRESSION * self.size:
+            raise RunError(
+                f"{self.path}: is {self.size} bytes that hold {size}, as no recording does; record it again, or "
+                "compress it less"
+            )
+
+    def _count_messages(self, chunk: ChunkInfo) -> int:
         chunk.counts = {}
         for message in messages(self.path, self.file, chunk):
             chunk.counts[message.channel] = chunk.counts.get(message.channel, 0) + 1
+        return sum(chunk.counts.values())
 
     def _compare_with_summary(self, footer: Footer) -> None:
         """What was found must be what the writer says it wrote: headers and indexes have no checksums."""

@@ -11,8 +11,9 @@ from coloc_graph.run.index import Index
 
 T = TypeVar("T")
 
-#: So many chunks of a run are kept once they are read.
-KEPT = 24
+KEPT_CHUNKS = 24  # chunks of a run that are kept once they are read
+KEPT_MESSAGES = 250_000  # messages in them, at most, but for the newest chunk
+KEPT_BYTES = 64 * 1024 * 1024  # size of them without compression, at most, but for the newest chunk
 
 
 class Item(NamedTuple):
@@ -68,10 +69,18 @@ def _keep(index: Index, chunk: ChunkInfo, read: Iterable[Message]) -> dict[int, 
     by_channel: dict[int, list[Message]] = {}
     for one in read:
         by_channel.setdefault(one.channel, []).append(one)
-    while len(index.newest) >= KEPT:
-        index.newest.pop(next(iter(index.newest)), None)
     index.newest[chunk.offset] = by_channel
+    while len(index.newest) > 1 and _too_much(index.newest):
+        index.newest.pop(next(iter(index.newest)), None)
     return by_channel
+
+
+def _too_much(newest: dict[int, dict[int, list[Message]]]) -> bool:
+    """True if the chunks that are kept are too many, or too large."""
+    kept = [every for by_channel in tuple(newest.values()) if (every := tuple(by_channel.values()))]
+    messages_kept = sum(len(each) for every in kept for each in every)
+    bytes_kept = sum(memoryview(every[0][0].data.obj).nbytes for every in kept)  # all are views of one chunk
+    return len(newest) > KEPT_CHUNKS or messages_kept > KEPT_MESSAGES or bytes_kept > KEPT_BYTES
 
 
 def decoded(index: Index, items: tuple[str, Iterator[Item]], decoder: Callable[[Item], T]) -> Iterator[T]:

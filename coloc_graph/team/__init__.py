@@ -7,7 +7,7 @@ are one standard deviation: what a simulated truth is drawn from and what the es
 from coloc_graph.team.blink import IMAGES_A_BIT, Blink
 from coloc_graph.team.body import LEAST_SLIP, R_BODY_OPTICAL, Devices, Markers, Mount, Slip
 from coloc_graph.team.camera import Camera
-from coloc_graph.team.file import read_team, without_none, write_team
+from coloc_graph.team.file import parse_team, read_team, team_of_fields, without_none, write_team
 from coloc_graph.team.landmark import Landmark, Tag
 from coloc_graph.team.sensors import Ranging, Wheels
 from coloc_graph.team.team import Floor, Robot, Team
@@ -29,7 +29,9 @@ __all__ = [
     "Tag",
     "Team",
     "Wheels",
+    "parse_team",
     "read_team",
+    "team_of_fields",
     "without_none",
     "write_team",
 ]

@@ -6,9 +6,17 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from coloc_graph.input_file import quoted
 from coloc_graph.team.checks import require_finite, require_not_negative
 
 Array = NDArray[np.float64]
+
+
+#: Longest side of an image [px], that of a JPEG.
+MAX_SIDE = 65_535
+#: Rays by which a lens model is checked: the largest x / z, that of a ray 86 deg off the axis, and their number.
+MAX_RAY = 15.0
+RAYS = 6001
 
 
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -38,6 +46,9 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         for name in ("width", "height", "fx", "fy", "fps", "noise_px"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
+        for name in ("width", "height"):
+            if getattr(self, name) > MAX_SIDE:
+                raise ValueError(f"`{name}` is {quoted(getattr(self, name))}; give pixels, {MAX_SIDE} at most")
         require_not_negative(self, ("shot_gain", "bias_px"))
         if len(self.distortion) not in (0, 4, 5, 8):
             raise ValueError(
@@ -65,6 +76,25 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         with np.errstate(invalid="ignore"):
             inside = (uv >= -0.5).all(-1) & (uv[..., 0] < self.width - 0.5) & (uv[..., 1] < self.height - 0.5)
         return uv, inside & ahead
+
+    def fold_radius(self) -> float | None:
+        """Distance from the principal point at which the lens model folds back within the image [px].
+
+        None if every pixel has one ray. Beyond the fold the model maps rays from further outside onto the same pixels:
+        no lens does, and a calibration without corners there does not notice.
+        """
+        if not self.distortion:
+            return None
+        across = max(abs(edge - self.cx) for edge in (-0.5, self.width - 0.5)) / self.fx
+        down = max(abs(edge - self.cy) for edge in (-0.5, self.height - 0.5)) / self.fy
+        r = np.linspace(0.0, MAX_RAY, RAYS)
+        zero = np.zeros_like(r)
+        with np.errstate(all="ignore"):
+            seen = r * self._lens(r, zero)[0]
+            grows = self._unfolded(r, zero) & np.isfinite(seen) & (seen >= 0)
+        # up to the first that no longer grows
+        reached = float(seen[: max(1, len(r) if grows.all() else int(np.argmin(grows)))].max())
+        return None if reached >= math.hypot(across, down) else reached * math.sqrt(self.fx * self.fy)
 
     def _unfolded(self, x: Array, y: Array) -> NDArray[np.bool_]:
         """Where the distorted radius still grows: beyond, a lens model folds far points back into the image."""

@@ -6,18 +6,37 @@ from typing import Any
 import msgspec
 
 from coloc_graph.errors import TeamError
+from coloc_graph.input_file import MAX_DESCRIPTION_SIZE, convert, parse_toml, read_text
 from coloc_graph.team.team import Team
 
 
 def read_team(path: str | Path) -> Team:
-    """The team described by a TOML file; `TeamError` names the file and the path in it."""
+    """Read the team that a TOML file describes.
+
+    Raises
+    ------
+    TeamError
+        If the file cannot be read, or is not a team; it names the file and the path in it.
+    """
     path = Path(path)
-    try:
-        return msgspec.toml.decode(path.read_bytes(), type=Team)
-    except OSError as error:
-        raise TeamError(f"{path}: cannot be read ({error.strerror}); give the path of a team.toml") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise TeamError(f"{path}: {error}; see docs/team.md for the fields") from error
+    remedy = "give the path of a team.toml"
+    return parse_team(path, read_text(path, remedy, limit=MAX_DESCRIPTION_SIZE, error=TeamError))
+
+
+def parse_team(path: Path, text: str) -> Team:
+    """The team that a TOML text from `path` describes; see `read_team`."""
+    return team_of_fields(path, parse_toml(path, text, error=TeamError))
+
+
+def team_of_fields(path: Path, fields: Any) -> Team:
+    """The team with these fields, as a TOML file at `path` has them.
+
+    Raises
+    ------
+    TeamError
+        If a field is missing, unknown or wrong.
+    """
+    return convert(path, fields, Team, "see docs/team.md for the fields", error=TeamError)
 
 
 def write_team(team: Team, path: str | Path) -> None:

@@ -3,7 +3,6 @@
 import csv
 import itertools
 import os
-import tomllib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -16,6 +15,7 @@ from coloc_graph.backend.graph import PoseKeys
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.exchange.landmarks import landmark_rows, read_landmarks
 from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions
+from coloc_graph.input_file import read_toml
 from coloc_graph.measurements import RelativePose
 from coloc_graph.pipeline.batch import Progress, Solution, SolveOptions, solve
 from coloc_graph.pipeline.contents import kind_of
@@ -253,7 +253,7 @@ def stayed(robots: Sequence[str], stances: Sequence[Stance], held: Sequence[tupl
 def _frontend(path: Path) -> FrontendOptions:
     """The front end that a result was made with; as it is by default where the file does not say."""
     try:
-        stated = tomllib.loads(path.read_text(encoding="utf-8"))["options"]["frontend"]
+        stated = read_toml(path, "solve the run again")["options"]["frontend"]
         return FrontendOptions(**(stated | {"tracker": TrackerOptions(**stated.get("tracker", {}))}))
-    except (OSError, KeyError, TypeError, AttributeError, tomllib.TOMLDecodeError):
+    except (InputError, KeyError, TypeError, AttributeError):
         return FrontendOptions()

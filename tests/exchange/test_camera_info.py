@@ -48,9 +48,9 @@ def read(tmp_path):
 @pytest.mark.parametrize("coefficients", [0, 4, 5, 8])
 def test_a_camera_comes_back_to_the_bit(tmp_path, coefficients):
     rng = np.random.default_rng(coefficients)
-    for scale in (1.0, 1e-7, 1e-300):
+    for scale in (1e-3, 1e-7, 1e-300):
         lens = tuple((scale * rng.normal(size=coefficients)).tolist())
-        fx, fy, cx, cy = (300 * rng.uniform(0.1, 2, 4)).tolist()
+        fx, fy, cx, cy = (300 * rng.uniform(0.9, 2, 4)).tolist()
         camera = Camera(width=321, height=239, fx=fx, fy=fy, cx=cx, cy=cy, distortion=lens, fps=30.0, noise_px=0.17)
         write_camera_info(camera, "A", tmp_path / "a.yaml")
         assert read_camera_info(tmp_path / "a.yaml", camera) == (camera, ())
@@ -77,23 +77,33 @@ def test_what_is_of_rectified_images_is_left_out_with_a_warning(read):
 
 
 @pytest.mark.parametrize(("old", "new", "says"), [
-    ("plumb_bob", "equidistant", "`distortion_model` is equidistant, a fisheye"),
-    ("plumb_bob", "division", "`distortion_model` is division, and the lens models here are plumb_bob and rational"),
-    ("plumb_bob", "rational_polynomial", "rational_polynomial has 8 coefficients, and there are 5"),
-    ("d: [-0.34, ", "d: [-0.34, 0.1, ", "plumb_bob has 0 or 4 or 5 coefficients, and there are 6"),
+    ("plumb_bob", "equidistant", "`distortion_model` is `equidistant`, a fisheye"),
+    ("plumb_bob", "division", "`distortion_model` is `division`, and the lens models here are plumb_bob and rational"),
+    ("plumb_bob", "rational_polynomial", "`rational_polynomial` has 8 coefficients (zeros behind"),
+    ("d: [-0.34, ", "d: [0.1, -0.34, 0.1, ", "`plumb_bob` has 0 or 4 or 5 coefficients (zeros"),
+    ("plumb_bob", "''", "`` has 0 coefficients"),
+    ("d: [-0.34, 0.11,", "d: [-1.5, 0.0,", "its lens model folds 135 px from the middle of the image"),
     ("binning_x: 0", "binning_x: 2", "`binning_x` is 2: the images are binned"),
-    ("height: 0, width: 0", "height: 100, width: 200", "`roi` is a part of the image, 200x100 at (0, 0)"),
+    ("height: 0, width: 0", "height: 100, width: 200", "`roi` is a part of the image, 200 x 100 at (0, 0)"),
     ("k: [430.2, 0.0,", "k: [430.2, 1.5,", "without skew"),
     ("k: [430.2,", "k: [0.0,", "is not calibrated"),
     ("k: [430.2,", "k: [-430.2,", "`fx` is -430.2"),
     ("k: [430.2,", "k: [.nan,", "`k` holds a number that is not finite"),
     ("k: [430.2,", "k: [wide,", "`k` is not a list of numbers"),
     ("k: [430.2,", "k: [430.2, 0,", "`k` has 10 numbers where 3x3 are needed"),
-    ("width: 640", "width: wide", "`image_width` is 'wide'; give a whole number"),
+    ("width: 640", "width: wide", "`image_width` is `wide`; give a whole number"),
     ("\nwidth: 640", "", "has no `image_width`"),
     ("\nd: [", "\nd: {rows: 1, cols: 4}\ne: [", "`d` is not a list of numbers"),
     ("\nd: [", "\nd: {rows: 1, cols: 4, data: [1, 2, 3, 4, 5]}\ne: [", "`d` has 5 numbers where 1x4 are needed"),
     ("roi: {", "roi: [", "line"),
+    ("width: 640", f"width: {'1' * 400}", "`image_width` is a number of 1326 bits; give a whole number"),
+    ("width: 640", f"width: {'1' * 5000}", "what is no number"),
+    ("width: 640", "width: 70000", "`image_width` is 70000; give a whole number of pixels, 65535 at most"),
+    ("width: 640", "width: 2001-13-45", "`image_width` is `2001-13-45`"),
+    ("width: 640", "a: &a [1]\nwidth: *a", "line 5: is not YAML that is read (`it has an alias, which is not read`)"),
+    ("width: 640", f"width: {'[' * 20_000}", "is nested too deep"),
+    ("k: [430.2,", f"k: [{'1' * 400},", "not a list of numbers"),
+    ("binning_x: 0", "binning_x: [1, 2]", "`binning_x` is a list of 2"),
 ])  # fmt: skip
 def test_what_our_camera_cannot_say_is_refused(read, old, new, says):
     assert old in MESSAGE
@@ -102,8 +112,30 @@ def test_what_our_camera_cannot_say_is_refused(read, old, new, says):
     assert says in str(error.value) and "camera.yaml" in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(("old", "new", "distortion"), [
+    ("d: [-0.34, 0.11, 7.0e-05, -0.0006, 0.0]", "d: [-0.34, 0.11, 7.0e-05, -0.0006, 0.0, 0, 0, 0]",
+     (-0.34, 0.11, 7e-05, -6e-04, 0.0)),
+    ("plumb_bob\nd: [-0.34, 0.11, 7.0e-05, -0.0006, 0.0]",
+     "rational_polynomial\nd: [1.2, 0.3, 0, 0, 0.1, 1.5, 0.4, 0.2, 0, 0, 0, 0, 0, 0]",
+     (1.2, 0.3, 0.0, 0.0, 0.1, 1.5, 0.4, 0.2)),
+    ("plumb_bob\nd: [-0.34, 0.11, 7.0e-05, -0.0006, 0.0]", "''\nd: []", ()),
+])  # fmt: skip
+def test_zeros_behind_the_coefficients_and_no_model_are_read(read, old, new, distortion):
+    assert old in MESSAGE
+    camera, warnings = read(MESSAGE.replace(old, new))
+    assert camera.distortion == distortion and warnings == ()
+
+
+def test_a_byte_order_mark_is_nothing_and_of_a_long_topic_the_first_message_is_read(read):
+    camera, _ = read(MESSAGE)
+    assert read(b"\xef\xbb\xbf" + MESSAGE.encode())[0] == camera
+    assert read(MESSAGE + 200 * MESSAGE)[0] == camera
+
+
 @pytest.mark.parametrize(("text", "says"), [
-    (b"\xff\xfe\x00", "is not text"),
+    (b"\xff\xfe\x00", "is text in UTF-16; save it as UTF-8"),
+    (b"image_width: 3\nname: \xe4", "line 2: is not UTF-8 text"),
+    ("a: 1\n" * 20_000, "larger than 64 KiB"),
     ("just words", "holds no fields"),
     ("", "holds no fields"),
     ("a: [1, 2", "is not YAML"),

@@ -176,12 +176,15 @@ def test_a_run_without_truth_has_no_accuracy(short, copied, tmp_path):
 @pytest.mark.parametrize(
     ("summary", "words"),
     [
-        (None, r"is not a result: summary.json cannot be read \(No such file"),
-        ("{", "summary.json is damaged"),
+        (None, r"is not a result: it has no summary.json"),
+        ("{", "summary.json: is damaged"),
         ("[]", "summary.json is damaged"),
-        ("{}", r"summary.json is damaged \('robots'\); solve the run again"),
+        ("{}", r"summary.json: .* missing required field `robots`; solve the run again"),
         ('{"robots": ["A"], "run": "x.mcap"}', "A.tum: cannot be read"),
-        ('{"robots": 3, "run": "x.mcap"}', "summary.json is damaged"),
+        ('{"robots": 3, "run": "x.mcap"}', "summary.json: Expected `array`"),
+        ('{"robots": ["../A"], "run": "x.mcap"}', "summary.json: the name `../A` is not usable"),
+        ("[" * 100_000, "summary.json: is damaged"),
+        ('{"robots": ' + "1" * 5000 + "}", "summary.json: is damaged"),
     ],
 )
 def test_what_is_no_result_is_refused_in_words(tmp_path, summary, words):

@@ -1,6 +1,7 @@
 """The team file: what is written reads back, and what is wrong is named by its path."""
 
 import contextlib
+import time
 
 import cv2
 import numpy as np
@@ -287,3 +288,52 @@ def test_a_slip_that_is_too_tight_to_be_solved_is_refused(tmp_path, sigma, degre
     path.write_text(text)
     with pytest.raises(TeamError, match=r"slip|sigma.*finite"):
         read_team(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("x = " + "[" * 5000, "is nested too deep"),
+        ("x = " + "1" * 5000, "is not TOML: Exceeds the limit"),
+        ("x = " + "1" * 400, "`x` is a number of"),
+        ("a." * 40 + "b = 1", "line 1: a key has more than 32 parts"),
+        ("\n[" + "a.  " * 100_000 + "b]", "line 2: a key has more than 32 parts"),
+        ("reference = 2001-13-45", "is not TOML"),
+        ("reference = 2001-01-01", "Expected `str`"),
+        ('reference = "A"\nx = 1', "see docs/team.md"),
+    ],
+)
+def test_hostile_toml_is_one_sentence_at_once(tmp_path, text, says):
+    path = tmp_path / "team.toml"
+    path.write_text(text)
+    began = time.process_time()
+    with pytest.raises(TeamError) as refusal:
+        read_team(path)
+    assert says in str(refusal.value) and str(path) in str(refusal.value)
+    assert "\n" not in str(refusal.value) and len(str(refusal.value)) < 1000
+    assert time.process_time() - began < 2
+
+
+def test_a_team_with_a_byte_order_mark_is_read_and_utf_16_is_named(tmp_path):
+    path = tmp_path / "team.toml"
+    write_team(reference_team(), path)
+    text = path.read_text()
+    path.write_text(text, encoding="utf-8-sig")
+    assert read_team(path) == reference_team()
+    path.write_text(text, encoding="utf-16")
+    with pytest.raises(TeamError, match="is text in UTF-16; save it as UTF-8"):
+        read_team(path)
+
+
+def test_a_camera_of_an_impossible_size_is_refused():
+    with pytest.raises(ValueError, match="`width` is 70000; give pixels, 65535 at most"):
+        Camera(width=70_000, height=10, fx=1.0, fy=1.0, cx=0.0, cy=0.0)
+
+
+@pytest.mark.parametrize("k1", [-0.3, -0.5, -1.5])
+def test_a_lens_that_folds_within_the_image_is_found_where_it_folds(k1):
+    camera = Camera(width=1280, height=800, fx=600.0, fy=600.0, cx=640.0, cy=400.0, distortion=(k1, 0.0, 0.0, 0.0))
+    r = np.sqrt(1 / (-3 * k1))  # where r (1 + k1 r^2) no longer grows
+    assert camera.fold_radius() == pytest.approx(600 * r * (1 + k1 * r**2), rel=1e-3)
+    mild = Camera(width=1280, height=800, fx=600.0, fy=600.0, cx=640.0, cy=400.0, distortion=(-0.1, 0.01, 0.0, 0.0))
+    assert mild.fold_radius() is None
