@@ -40,8 +40,8 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.viewer import Viewer
     from coloc_graph.viewer.access import is_loopback
-    from coloc_graph.viewer.app import left_out
     from coloc_graph.viewer.browser import require_browser, write_png
+    from coloc_graph.viewer.notes import left_out
 
     writes = bool(args.export or args.png)
     for out in (args.export, args.png):

@@ -9,8 +9,9 @@ import numpy as np
 
 from coloc_graph.errors import ColocError
 from coloc_graph.viewer import inspect, palette
+from coloc_graph.viewer.cameras import camera_on, initial_camera, seen_size
 from coloc_graph.viewer.frame import Frame, ViewState, frame_of, thinned_rows
-from coloc_graph.viewer.handles import GraphView, Image, camera_on, initial_camera, seen_size
+from coloc_graph.viewer.handles import GraphView, Image
 from coloc_graph.viewer.panel import legend
 from coloc_graph.viewer.scene import Scene
 from coloc_graph.viewer.server import open_listener, start_server, stop_server

@@ -19,19 +19,9 @@ MARGIN = 2.0
 FINE = 60.0
 #: How large a frustum is drawn [m].
 FRUSTUM = 0.14
-#: Robots are as large as they are from up to so far [m], and larger from farther away; so many times at most.
-NEAR = 25.0
-LARGEST = 64.0
 #: Of teams that are larger nobody's name is written; robots that are drawn larger than this have one label for all.
 MOST_NAMES = 16
 APART = 8.0
-#: The camera at the beginning: its vertical field of view and how steeply it looks down [rad], what it is taken to be
-#: wide for its height, and the share of the picture that the data fill. Robots are so tall [m].
-FOV = float(np.radians(40))
-PITCH = float(np.radians(40))
-ASPECT = 1.3
-FILLED = 0.85
-TALL = 0.6
 #: Widths of trajectories [px].
 ESTIMATE_PX = 5.0
 OTHER_PX = 2.0
@@ -268,35 +258,3 @@ class GraphView:
             if before is None or before.shape != value.shape or not (before == value).all():
                 setattr(handle, part, value)
                 self._sent[key] = value
-
-
-def seen_size(distance: float) -> float:
-    """How many times as large as they are robots are drawn for an eye at so many metres; a power of two."""
-    return float(2 ** np.floor(np.log2(np.clip(distance / NEAR, 1.0, LARGEST)))) if np.isfinite(distance) else 1.0
-
-
-def initial_camera(server: viser.ViserServer, scene: Scene, aside: float = 0.0) -> None:
-    """Frame the data: from behind and the right of the way the team went, looking down on it."""
-    position, look_at = camera_on(scene, aside)
-    server.initial_camera.fov = FOV
-    server.initial_camera.far = max(1000.0, 10 * float(np.linalg.norm(position - look_at)))
-    server.initial_camera.position, server.initial_camera.look_at = position, look_at
-
-
-def camera_on(scene: Scene, aside: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where a camera sees all of the data from, and where it looks: (3,) and (3,) [m]."""
-    low, high = extent(scene)
-    high = high + np.array([0.0, aside])
-    middle, along = (low + high) / 2, high - low
-    # a long way is seen from its side, and a little from behind
-    side = np.array([-0.35, -1.0]) if along[0] >= along[1] else np.array([-1.0, -0.35])
-    side *= np.cos(PITCH) / np.linalg.norm(side)
-    back = np.array([*side, np.sin(PITCH)])
-    right = np.cross([0.0, 0.0, 1.0], back) / np.cos(PITCH)
-    up = np.cross(back, right)
-    corners = np.array([(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0.0, TALL)])
-    corners -= (*middle, 0.0)
-    # from how far a corner is just seen, across and up: its offset is the half angle's tangent times its depth
-    tangent = np.tan(FOV / 2) * FILLED
-    needed = np.maximum(np.abs(corners @ right) / (tangent * ASPECT), np.abs(corners @ up) / tangent) + corners @ back
-    return np.array([*middle, 0.0]) + float(needed.max()) * back, np.array([*middle, 0.0])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.viewer import palette
-from coloc_graph.viewer.scene import Array, Edges, Index, Layer, Links, Mask
+from coloc_graph.viewer.scene import Array, Edges, Index, Layer, Links, Mask, Scene
 
 Float32 = NDArray[np.float32]
 
@@ -79,3 +79,12 @@ def about_z(angle: Array) -> Float32:
     out = np.zeros((*np.shape(angle), 4), np.float32)
     out[..., 0], out[..., 3] = np.cos(angle / 2), np.sin(angle / 2)
     return out
+
+
+def readable_sigma(scene: Scene) -> float:
+    """Number of sigmas, 3 to 100, at which the largest ellipse is visible but not larger than its surroundings."""
+    if not scene.layers or not scene.layers[0].there.any():
+        return 3.0
+    covariance = scene.layers[0].covariance[scene.layers[0].there]
+    largest = float(np.sqrt(np.nanmax(covariance.trace(axis1=1, axis2=2), initial=0.0)))
+    return next((k for k in (100.0, 30.0, 10.0) if k * largest < 0.3), 3.0) if largest > 0 else 3.0

@@ -38,8 +38,8 @@ from coloc_graph.viewer import (
     scene_of_solution,
     with_other,
 )
+from coloc_graph.viewer.cameras import seen_size
 from coloc_graph.viewer.frame import MOVING, ViewState, dashed, frame_of, pick, thinned_rows
-from coloc_graph.viewer.handles import seen_size
 from coloc_graph.viewer.live import LiveScene
 from coloc_graph.viewer.motion import extent, pose_at
 from coloc_graph.viewer.panel import HANDS_OFF, set_value
@@ -435,7 +435,7 @@ def test_live_poses_that_cannot_be_shown_are_named_and_the_others_shown(short_so
     assert np.allclose(shown[0, :2], (1, 0)) and not shown[1:].any()
     with Viewer(empty_scene(short_solution.run, "joint"), port=0) as viewer:
         viewer.publish(poses)
-        assert shows(viewer, "A", (1.0, 0.0, 0.0)) and viewer._told == {words}
+        assert shows(viewer, "A", (1.0, 0.0, 0.0)) and viewer.notifications == {words}
 
 
 def test_an_arrow_key_that_moves_the_slider_which_has_the_focus_steps_once(scene):
@@ -612,7 +612,7 @@ def test_truth_that_does_not_cover_the_estimate_is_said_to_be_left_out(short, co
 
 
 def test_images_that_are_missing_are_said(short, copied, tmp_path):
-    from coloc_graph.viewer.app import missing_images
+    from coloc_graph.viewer.notes import missing_images
 
     blind = copied(short, tmp_path / "blind.mcap", change=lambda r: None if hasattr(r, "uv") and r.robot == "A" else r)
     assert missing_images(empty_scene(open_run(short), "joint")) == ""

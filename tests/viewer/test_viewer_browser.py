@@ -108,7 +108,7 @@ def test_slider_click_and_keys(scene, page_of):
         seen = [(n, pixel_of(client, np.add(pose[:3], (0, 0, 0.1)))) for n, pose in enumerate(viewer.frame.poses)]
         number, uv = next((n, uv) for n, uv in seen if on_canvas(client, uv))
         click(page, uv)
-        assert until(lambda: viewer._picked == ("robot", number))
+        assert until(lambda: viewer.picked == ("robot", number))
         assert until(lambda: page.get_by_text(f"Robot {scene.robots[number]}, stance {last}").first.is_visible())
         assert until(lambda: page.get_by_text("height [m]").first.is_visible())
 
@@ -122,7 +122,7 @@ def test_slider_click_and_keys(scene, page_of):
         assert until(lambda: segments_of(page, "/refused") == len(viewer.frame.refused.points) > 1)
         assert until(lambda: not page.get_by_text("height [m]").first.is_visible())
         click(page, pixel_of(client, middle_of(viewer, edge)))
-        assert until(lambda: viewer._picked == ("edge", edge))
+        assert until(lambda: viewer.picked == ("edge", edge))
         assert until(lambda: page.get_by_text(why).first.is_visible())
         viewer.pick(None)
         viewer.publish(scene)
@@ -131,7 +131,7 @@ def test_slider_click_and_keys(scene, page_of):
         # and one on any other opens what was measured
         edge, uv = clear_edge(viewer, client)
         click(page, uv)
-        assert until(lambda: viewer._picked == ("edge", edge))
+        assert until(lambda: viewer.picked == ("edge", edge))
         edges = scene.edges
         title = f"{scene.robots[edges.i[edge]]} - {scene.robots[edges.j[edge]]}, stance {edges.rows[edge]}"
         assert until(lambda: page.get_by_text(title).first.is_visible())

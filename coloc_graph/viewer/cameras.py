@@ -1,0 +1,99 @@
+"""The cameras of the browsers: framing the data, following a robot, and the size at which robots can be seen."""
+
+from collections.abc import Callable
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from coloc_graph.viewer.frame import Frame
+from coloc_graph.viewer.motion import extent
+from coloc_graph.viewer.scene import Scene
+
+NEAR = 25.0  # m; robots that are farther away are drawn larger than they are
+LARGEST = 64.0  # largest factor by which they are
+FOV = float(np.radians(40))  # rad, vertical field of view
+PITCH = float(np.radians(40))  # rad, by which the first camera looks down
+ASPECT = 1.3  # width over height of a picture, at least
+FILLED = 0.85  # share of the picture that the data fill
+TALL = 0.6  # m, height of a robot with its label
+
+
+class Cameras:
+    """The cameras of all browsers that are connected; moved by the render thread alone."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._followed: tuple[str, NDArray[np.float64]] | None = None
+
+    def on_size_change(self, current: Callable[[], float], wake: Callable[[], None]) -> None:
+        """Call `wake` when a camera has moved so far that robots are drawn at another size than the current."""
+
+        @self._server.on_client_connect
+        def _(client: viser.ClientHandle) -> None:
+            @client.camera.on_update
+            def _(_: viser.CameraHandle) -> None:
+                if self.size() != current():
+                    wake()
+
+    def size(self) -> float:
+        """Factor by which robots are drawn larger than they are, by the nearest camera."""
+        eyes = [(client.camera.position, client.camera.look_at) for client in self._server.get_clients().values()]
+        if not eyes:
+            first = self._server.initial_camera
+            eyes = [(np.asarray(first.position), np.asarray(first.look_at))]
+        return seen_size(min(float(np.linalg.norm(eye - at)) for eye, at in eyes))
+
+    def frame_all(self, scene: Scene, aside: float = 0.0) -> None:
+        """Turn all cameras to all of the data."""
+        initial_camera(self._server, scene, aside)
+        position, look_at = camera_on(scene, aside)
+        for client in self._server.get_clients().values():
+            client.camera.position, client.camera.look_at = position, look_at
+
+    def follow(self, robot: str, scene: Scene, frame: Frame) -> None:
+        """Move all cameras along with a robot; a name that is no robot's ends it."""
+        if robot not in scene.robots:
+            self._followed = None
+            return
+        here = frame.poses[scene.robots.index(robot), :3]
+        if not np.isfinite(here).all():
+            return
+        before, self._followed = self._followed, (robot, here)
+        for client in self._server.get_clients().values():
+            is_new = before is None or before[0] != robot
+            shift = here - (client.camera.look_at if is_new or before is None else before[1])
+            if np.abs(shift).max() > 1e-6:
+                client.camera.position = client.camera.position + shift  # what it looks at moves with it
+
+
+def seen_size(distance: float) -> float:
+    """Factor by which robots are drawn larger for a camera at a distance [m]: a power of two."""
+    return float(2 ** np.floor(np.log2(np.clip(distance / NEAR, 1.0, LARGEST)))) if np.isfinite(distance) else 1.0
+
+
+def initial_camera(server: viser.ViserServer, scene: Scene, aside: float = 0.0) -> None:
+    """Frame the data: from behind and the right of the way the team went, looking down on it."""
+    position, look_at = camera_on(scene, aside)
+    server.initial_camera.fov = FOV
+    server.initial_camera.far = max(1000.0, 10 * float(np.linalg.norm(position - look_at)))
+    server.initial_camera.position, server.initial_camera.look_at = position, look_at
+
+
+def camera_on(scene: Scene, aside: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Position of a camera that sees all of the data, and the point it looks at: (3,) and (3,) [m], world frame."""
+    low, high = extent(scene)
+    high = high + np.array([0.0, aside])
+    middle, along = (low + high) / 2, high - low
+    # a long way is seen from its side, and a little from behind
+    side = np.array([-0.35, -1.0]) if along[0] >= along[1] else np.array([-1.0, -0.35])
+    side *= np.cos(PITCH) / np.linalg.norm(side)
+    back = np.array([*side, np.sin(PITCH)])
+    right = np.cross([0.0, 0.0, 1.0], back) / np.cos(PITCH)
+    up = np.cross(back, right)
+    corners = np.array([(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0.0, TALL)])
+    corners -= (*middle, 0.0)
+    # from how far a corner is just seen, across and up: its offset is the half angle's tangent times its depth
+    tangent = np.tan(FOV / 2) * FILLED
+    needed = np.maximum(np.abs(corners @ right) / (tangent * ASPECT), np.abs(corners @ up) / tangent) + corners @ back
+    return np.array([*middle, 0.0]) + float(needed.max()) * back, np.array([*middle, 0.0])
