@@ -155,8 +155,9 @@ def measure_pair(
     tracks = tracks or StanceTracks(run, stance, options.tracker)
     try:
         plane = stance_plane(run, stance, robot_i)
-        tracks_i, tracks_j = tracks.of(robot_i, stance.end), tracks.of(robot_j, stance.end)
-        every, pairs = tracks.all(stance.end), pairs or measured_pairs(tracks, stance.end)
+        tracks_i, tracks_j = tracks.pair(robot_i, robot_j, stance.end, _window(run))
+        every = tracks.all(stance.end) | {robot_i: tracks_i, robot_j: tracks_j}
+        pairs = pairs or measured_pairs(tracks, stance.end)
         seen = _Seen(run, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j, pairs, every)
         if run.team.clock_sigma > 0:
             made = _measure_with_clocks(seen, alone)

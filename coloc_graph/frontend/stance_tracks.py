@@ -1,7 +1,7 @@
 """What the cameras saw in one stance: the plane of the markers, and their tracks."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -12,14 +12,18 @@ from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend.homography.plane import plane_from_mount
 from coloc_graph.frontend.images.detection import Blobs, detector_for
 from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks
+from coloc_graph.frontend.pairing.rigid_alignment import align_paths
 from coloc_graph.frontend.tracks.blink_codes import BlinkCodes
 from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers, of_named
+from coloc_graph.frontend.tracks.rigid_path import RigidPath, rigid_path
 from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.measurements import Plane
 from coloc_graph.run import Detections, Flag, Recorded, Stance
 from coloc_graph.team import Markers
 
 Array = NDArray[np.float64]
+
+MIN_SAMPLES = 25  # samples a track of the causal tracker, on average, below which a lone mover is tracked with hindsight
 
 
 def stance_markers(run: Recorded, stance: Stance) -> Markers | None:
@@ -78,6 +82,7 @@ class StanceTracks:
         self._landmarks = {landmark.name for landmark in run.team.landmarks}
         self._named_landmarks: dict[str, list[Track]] = {}
         self._watches: dict[str, LandmarkWatch] = {}
+        self._paths: dict[str, tuple[float, RigidPath]] = {}
 
     def of(self, robot: str, end: float | None = None) -> list[Track]:
         """Those of an observer, up to an instant (default: the stance's end), which never goes back.
@@ -89,6 +94,51 @@ class StanceTracks:
         if made is None or made[0] != end:
             self._made[robot] = made = end, self._of(robot, end)
         return made[1]
+
+    def pair(self, robot_i: str, robot_j: str, end: float, window: float) -> tuple[list[Track], list[Track]]:
+        """Tracks of two observers up to an instant [UTC s], whose images within a `window` [s] are of one instant.
+
+        Where one robot with two markers moves alone and the causal tracker broke often, as where lights move far from
+        image to image, its path is found with hindsight and the order of its lights with both cameras.
+        """
+        tracks = self.of(robot_i, end), self.of(robot_j, end)
+        if not any(map(self._broken, tracks)):
+            return tracks
+        paths = align_paths(self._path(robot_i, end), self._path(robot_j, end), window)
+        found = paths[0].tracks(self.stance.movers[0]), paths[1].tracks(self.stance.movers[0])
+        return found if all(found) else tracks
+
+    def _broken(self, tracks: Sequence[Track]) -> bool:
+        movers = self.stance.movers
+        markers = self.run.team[movers[0]].markers if len(movers) == 1 else None
+        if markers is None or len(markers.positions) != 2 or any(track.marker for track in tracks):
+            return False
+        return sum(map(len, tracks)) < MIN_SAMPLES * max(len(tracks), 2)
+
+    def _path(self, robot: str, end: float) -> RigidPath:
+        made = self._paths.get(robot)
+        if made is None or made[0] != end:
+            run, (mover,) = self.run, self.stance.movers
+            markers = run.team[mover].markers
+            assert markers is not None and markers.span is not None
+            plane = stance_plane(run, self.stance, robot)
+            seen = list(self._seen(robot, end))
+            self._paths[robot] = made = end, rigid_path(robot, seen, run.team[robot].camera, plane, markers.span)
+        return made[1]
+
+    def _seen(self, robot: str, end: float) -> Iterator[Detections]:
+        """What an observer's whole images show of the lone mover's markers, up to an instant."""
+        run, (mover,) = self.run, self.stance.movers
+        if run.has_detections(robot):
+            yield from run.detections(robot, self.stance.start, end)
+            return
+        detector = detector_for(run.team[mover].markers, run.team[robot].camera)
+        for image in run.images(robot, self.stance.start, end):
+            blobs = detector(image.pixels)
+            names = ("",) * len(blobs)
+            yield Detections(
+                robot, image.time, blobs.uv, blobs.covariance, names, blobs.flags, blobs.peak, blobs.area
+            )
 
     def all(self, end: float) -> dict[str, list[Track]]:
         """Those of all observers up to an instant [UTC s]; none of one whose camera is not above the markers' plane."""

@@ -1,0 +1,243 @@
+"""Track one robot's two markers with hindsight, however far they move from image to image.
+
+Two equal lights on one rigid body, whose span on the marker plane is known, are found image by image: no motion model
+is needed for that. Which light is which then follows from the heading of the line through both: an image tells it
+modulo half a turn, and neighbouring images decide the rest where the robot turns by clearly less than a quarter between
+them. Where they do not decide, the path is cut in two. `pairing.rigid_alignment` joins the pieces with what another
+camera saw at the same instants.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.frontend.homography.plane import on_plane
+from coloc_graph.frontend.tracks.tracking import DOUBTFUL, Track
+from coloc_graph.geometry.lie import across
+from coloc_graph.measurements import Plane
+from coloc_graph.run import Detections
+from coloc_graph.team import Camera
+
+Array = NDArray[np.float64]
+
+SPAN_TOLERANCE = 0.35  # share of the span; a tilt that is wrong by 1 deg makes 0.15 at 2 m
+SPAN_SCALE = 0.1  # share of the span that counts as one standard deviation between rival pairs of lights
+MAX_LIGHTS = 12  # brightest lights of an image that are looked at
+CELL = 2.0  # px, side of the cells in which lights that stand still are counted
+STATIC_SHARE = 0.5  # share of the images in which a light that stands still is seen in one cell, at least
+MAX_GAP = 4.0  # median image intervals over which a heading is extrapolated
+MIN_HEADING_SIGMA = 0.05  # rad, least scale of the heading's prediction error
+LINK_LOG_RATIO = 12.0  # least logarithm of the likelihood ratio of a heading against its opposite
+MAX_JUMP = 8.0  # median steps of the body between two images beyond which the path is cut
+
+
+@dataclass(frozen=True, eq=False)
+class RigidPath:
+    """Two lights of one body in one camera, image by image.
+
+    `times` (n,) [s], `uv` (n, 2, 2) [px] with `covariance` (n, 2, 2, 2) [px^2] and `peak` (n, 2) of both lights,
+    `places` (n, 2, 2) [m] on the marker plane. Within one `piece` (n,) the order of the two lights is consistent.
+    `images` is the number of images in all, `lights` (images,) the number of moving lights in each.
+    """
+
+    robot: str
+    times: Array
+    uv: Array
+    covariance: Array
+    peak: Array
+    places: Array
+    piece: NDArray[np.int64]
+    lights: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def step(self) -> float:
+        """Median distance that a light moves from one image to the next [px]."""
+        same = self.piece[1:] == self.piece[:-1]
+        moved = np.linalg.norm(np.diff(self.uv, axis=0), axis=2)[same]
+        return float(np.median(moved)) if len(moved) else float("nan")
+
+    @property
+    def pieces(self) -> int:
+        """Number of pieces, 0 of an empty path."""
+        return int(self.piece[-1]) + 1 if len(self) else 0
+
+    def swapped(self, which: NDArray[np.bool_], piece: NDArray[np.int64]) -> "RigidPath":
+        """The path with both lights exchanged at some samples (n,), in other pieces (n,)."""
+        order = np.where(which[:, None], [1, 0], [0, 1])
+        rows = np.arange(len(self))[:, None]
+        return RigidPath(
+            self.robot,
+            self.times,
+            self.uv[rows, order],
+            self.covariance[rows, order],
+            self.peak[rows, order],
+            self.places[rows, order],
+            piece,
+            self.lights,
+        )
+
+    def without(self, samples: NDArray[np.int64]) -> "RigidPath":
+        """The path without some samples, by their numbers (k,)."""
+        keep = np.ones(len(self), bool)
+        keep[samples] = False
+        columns = (self.times, self.uv, self.covariance, self.peak, self.places, self.piece)
+        return RigidPath(self.robot, *(one[keep] for one in columns), self.lights)
+
+    def tracks(self, mover: str) -> list[Track]:
+        """Two tracks a piece, all of one body."""
+        made = []
+        for piece in np.unique(self.piece).tolist():
+            own = self.piece == piece
+            for light in range(2):
+                columns = (one[own, light] for one in (self.uv, self.covariance, self.peak))
+                made.append(Track(self.robot, "", self.times[own], *columns, body=0, mover=mover))
+        return made
+
+
+def rigid_path(robot: str, seen: Sequence[Detections], camera: Camera, plane: Plane, span: float) -> RigidPath:
+    """Find the path of a body with two lights in all images of one camera.
+
+    Parameters
+    ----------
+    robot
+        Name of the robot whose camera it is.
+    seen
+        Detections of whole images, in the order of time.
+    camera, plane
+        The camera, and the plane of the markers in its frame.
+    span
+        Distance between the two markers [m].
+    """
+    images = [_moving(one, still) for still in [_static_cells(seen)] for one in seen]
+    lights = np.array([len(one.uv) for one in images], np.int64)
+    # two axes of the plane make metric coordinates on it
+    axes = across(plane.N)
+    if np.cross(*axes) @ plane.N < 0:
+        axes = axes[::-1]  # the same way round in every camera
+    rows: list[tuple[int, NDArray[np.int64], Array, Array]] = []  # image, pairs (m, 2), places (m, 2, 2), costs (m,)
+    for number, one in enumerate(images):
+        if len(one.uv) < 2:
+            continue
+        places = on_plane(camera.normalise(one.uv), plane) @ axes.T
+        a, b = np.triu_indices(len(places), 1)
+        off = np.linalg.norm(places[a] - places[b], axis=1) / span - 1
+        good = np.flatnonzero(np.abs(off) < SPAN_TOLERANCE)  # not of NaN, above the horizon
+        if len(good):
+            pairs = np.stack([a[good], b[good]], axis=1)
+            rows.append((number, pairs, places[pairs], 0.5 * np.square(off[good] / SPAN_SCALE)))
+    chosen = _likeliest(rows, span)
+    own = [(images[row[0]], row[1][n], row[2][n]) for row, n in zip(rows, chosen, strict=True)]
+    path = RigidPath(
+        robot,
+        np.array([one.time for one, _, _ in own]),
+        np.array([one.uv[pair] for one, pair, _ in own]).reshape(-1, 2, 2),
+        np.array([one.covariance[pair] for one, pair, _ in own]).reshape(-1, 2, 2, 2),
+        np.array([one.peak[pair] for one, pair, _ in own]).reshape(-1, 2),
+        np.array([places for _, _, places in own]).reshape(-1, 2, 2),
+        np.zeros(len(own), np.int64),
+        lights,
+    )
+    return path.swapped(*_ordered(path)) if len(path) else path
+
+
+def _static_cells(seen: Sequence[Detections]) -> NDArray[np.int64]:
+    """Cells (m, 2) of the image in which a light is seen most of the time."""
+    every = [np.unique(np.floor(one.uv / CELL).astype(np.int64), axis=0) for one in seen if len(one.uv)]
+    if not every:
+        return np.zeros((0, 2), np.int64)
+    cells, counts = np.unique(np.concatenate(every), axis=0, return_counts=True)
+    return cells[counts > max(STATIC_SHARE * len(seen), 3)]
+
+
+def _moving(seen: Detections, static: NDArray[np.int64]) -> Detections:
+    """Detections that may be of the body: not doubtful, not of lights that stand still, the brightest."""
+    keep = (seen.flags & DOUBTFUL) == 0
+    if len(static) and len(seen.uv):
+        cells = np.floor(seen.uv / CELL).astype(np.int64)
+        keep &= np.abs(cells[:, None] - static[None]).max(axis=2).min(axis=1) > 1
+    which = np.flatnonzero(keep)
+    which = np.sort(which[np.argsort(-seen.peak[which], kind="stable")[:MAX_LIGHTS]])
+    columns = (getattr(seen, name)[which] for name in ("flags", "peak", "area"))
+    markers = tuple(seen.markers[n] for n in which)
+    return Detections(seen.robot, seen.time, seen.uv[which], seen.covariance[which], markers, *columns)
+
+
+def _likeliest(rows: Sequence[tuple[int, NDArray[np.int64], Array, Array]], span: float) -> list[int]:
+    """One pair of lights an image: those that go on best, by dynamic programming."""
+    if not rows:
+        return []
+    middles = [row[2].mean(axis=1) for row in rows]
+    sure = [m[0] for m in middles if len(m) == 1]
+    steps = np.linalg.norm(np.diff(np.array(sure).reshape(-1, 2), axis=0), axis=1)
+    scale = max(2 * float(np.median(steps)), 0.05 * span) if len(steps) else span
+    total, back = rows[0][3], []
+    for before, middle, row in zip(middles, middles[1:], rows[1:], strict=False):
+        moved = np.linalg.norm(middle[:, None] - before[None], axis=2) / scale
+        cost = total[None] + np.minimum(0.5 * np.square(moved), 20.0)
+        best = cost.argmin(axis=1)
+        back.append(best)
+        total = cost[np.arange(len(best)), best] + row[3]
+    chosen = [int(total.argmin())]
+    for best in reversed(back):
+        chosen.append(int(best[chosen[-1]]))
+    return chosen[::-1]
+
+
+def _ordered(path: RigidPath) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Which samples' lights to exchange so that their order is consistent, and the piece of each sample.
+
+    The heading's prediction error (constant rate, or no turn, whichever predicts better) is known modulo half a turn.
+    Its robust scale over the stance says how sure the choice of the nearer half is.
+    """
+    n = len(path)
+    if n < 2:
+        return np.zeros(n, bool), np.zeros(n, np.int64)
+    arm = path.places[:, 1] - path.places[:, 0]
+    heading = np.arctan2(arm[:, 1], arm[:, 0])
+    turn = _half(np.diff(heading))  # modulo half a turn
+    dt = np.diff(path.times)
+    usual = float(np.median(dt))
+    rate = turn / dt
+    # errors of a constant rate, forward and backward in time; of the first and the last link only one of both
+    ahead, behind = np.full(n - 1, np.nan), np.full(n - 1, np.nan)
+    near = dt <= MAX_GAP * usual
+    both = near[1:] & near[:-1]
+    ahead[1:] = np.where(both, _half(turn[1:] - rate[:-1] * dt[1:]), np.nan)
+    behind[:-1] = np.where(both, _half(turn[:-1] - rate[1:] * dt[:-1]), np.nan)
+    constant, none = _scale(ahead), _scale(turn[near])
+    if constant < none:
+        error = np.fmax(np.abs(ahead), np.abs(behind))
+        predicted = np.where(np.isfinite(ahead), np.concatenate([[0.0], rate[:-1]]) * dt, np.append(rate[1:], 0.0) * dt)
+        sigma = constant
+    else:
+        error, predicted, sigma = np.abs(turn), np.zeros(n - 1), none
+    error = np.where(np.isfinite(error), error, np.pi / 2)
+    sigma = np.maximum(sigma, MIN_HEADING_SIGMA) * np.maximum(dt / usual, 1.0)
+    ratio = (np.pi**2 - 2 * np.pi * error) / (2 * sigma**2)
+    middle = path.places.mean(axis=1)
+    jump = np.linalg.norm(np.diff(middle, axis=0), axis=1) / np.maximum(dt / usual, 1.0)
+    sure = near & (ratio > LINK_LOG_RATIO) & (jump <= MAX_JUMP * max(float(np.median(jump)), 1e-3))
+    # the true turn is the one nearest to the prediction; an odd number of half turns exchanges the lights
+    true = predicted + _half(np.diff(heading) - predicted)
+    odd = np.rint((true - np.diff(heading)) / np.pi).astype(np.int64) % 2 == 1
+    exchanged = np.concatenate([[False], np.cumsum(odd) % 2 == 1])
+    return exchanged, np.concatenate([[0], np.cumsum(~sure)])
+
+
+def _half(angle: Array) -> Array:
+    """Angles [rad] modulo half a turn, in [-pi/2, pi/2)."""
+    return np.asarray((angle + np.pi / 2) % np.pi - np.pi / 2)
+
+
+def _scale(error: Array) -> float:
+    """Robust standard deviation of errors that may hold NaN, no less than their tails say; infinite of fewer than 3."""
+    finite = np.abs(error[np.isfinite(error)])
+    if len(finite) < 3:
+        return float("inf")
+    middle, tail = np.quantile(finite, [0.5, 0.9])
+    return float(max(middle / 0.6745, tail / 1.645))
