@@ -23,7 +23,9 @@ from coloc_graph.team import Markers
 
 Array = NDArray[np.float64]
 
-MIN_SAMPLES = 25  # samples a track of the causal tracker, on average, below which a lone mover is tracked with hindsight
+MIN_SAMPLES = (
+    25  # samples a track of the causal tracker, on average, below which a lone mover is tracked with hindsight
+)
 
 
 def stance_markers(run: Recorded, stance: Stance) -> Markers | None:
@@ -136,9 +138,7 @@ class StanceTracks:
         for image in run.images(robot, self.stance.start, end):
             blobs = detector(image.pixels)
             names = ("",) * len(blobs)
-            yield Detections(
-                robot, image.time, blobs.uv, blobs.covariance, names, blobs.flags, blobs.peak, blobs.area
-            )
+            yield Detections(robot, image.time, blobs.uv, blobs.covariance, names, blobs.flags, blobs.peak, blobs.area)
 
     def all(self, end: float) -> dict[str, list[Track]]:
         """Those of all observers up to an instant [UTC s]; none of one whose camera is not above the markers' plane."""

@@ -6,6 +6,7 @@ every image that both cameras took at one instant ties the order of the lights i
 pieces of a path that were cut in one camera are joined by what the other saw meanwhile.
 """
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +19,9 @@ MIN_SHARED = 5  # instants at which both cameras see both lights
 MIN_COHERENCE = 0.8  # length of the mean direction, modulo half a turn, of what should be one turn
 MIN_CONTRAST = 3.0  # ratio of the misfits of both halves above which the smaller one is right
 UNANIMOUS = 0.9  # share of the instants of two pieces that must agree
+OUTLIER = 6.0  # median residuals of one homography beyond which a sample is another light
+MIN_RESIDUAL = 0.01  # m, residual below which no sample is an outlier
+MIN_INLIERS = 0.7  # share of the samples that the homography must explain to judge the others
 
 
 def align_paths(path_i: RigidPath, path_j: RigidPath, window: float) -> tuple[RigidPath, RigidPath]:
@@ -58,7 +62,25 @@ def align_paths(path_i: RigidPath, path_j: RigidPath, window: float) -> tuple[Ri
     of_i, of_j = path_i.piece, count + path_j.piece
     made = path_i.swapped(parity[of_i], root[of_i]), path_j.swapped(parity[of_j], root[of_j])
     wrong = (root[of_i[m]] == root[of_j[n]]) & ((agree > 0) == (parity[of_i[m]] ^ parity[of_j[n]]))
+    wrong |= _outliers(made[0].places[m], made[1].places[n], root[of_i[m]] == root[of_j[n]])
     return made[0].without(m[wrong]), made[1].without(n[wrong])
+
+
+def _outliers(places_i: Array, places_j: Array, tied: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Samples (n,) of which one homography between the places (n, 2, 2) does not explain a light, of those `tied`."""
+    none = np.zeros(len(tied), bool)
+    if 2 * tied.sum() < 2 * MIN_SHARED:
+        return none
+    a, b = places_i.reshape(-1, 2), places_j.reshape(-1, 2)
+    own = np.repeat(tied, 2)
+    H, _ = cv2.findHomography(a[own], b[own], cv2.USAC_MAGSAC, MIN_RESIDUAL)
+    if H is None:
+        return none
+    moved = np.column_stack([a, np.ones(len(a))]) @ np.asarray(H, float).T
+    with np.errstate(all="ignore"):
+        off = np.linalg.norm(moved[:, :2] / moved[:, 2:] - b, axis=1)
+    far = ~(off <= max(OUTLIER * float(np.median(off[own])), MIN_RESIDUAL))
+    return tied & far.reshape(-1, 2).any(axis=1) if (~far[own]).mean() >= MIN_INLIERS else none
 
 
 def _direction(path: RigidPath) -> Array:
