@@ -8,7 +8,7 @@ camera saw at the same instants.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,23 +70,28 @@ class RigidPath:
         """The path with both lights exchanged at some samples (n,), in other pieces (n,)."""
         order = np.where(which[:, None], [1, 0], [0, 1])
         rows = np.arange(len(self))[:, None]
-        return RigidPath(
-            self.robot,
-            self.times,
-            self.uv[rows, order],
-            self.covariance[rows, order],
-            self.peak[rows, order],
-            self.places[rows, order],
-            piece,
-            self.lights,
+        return replace(
+            self,
+            uv=self.uv[rows, order],
+            covariance=self.covariance[rows, order],
+            peak=self.peak[rows, order],
+            places=self.places[rows, order],
+            piece=piece,
         )
 
     def without(self, samples: NDArray[np.int64]) -> "RigidPath":
         """The path without some samples, by their numbers (k,)."""
         keep = np.ones(len(self), bool)
         keep[samples] = False
-        columns = (self.times, self.uv, self.covariance, self.peak, self.places, self.piece)
-        return RigidPath(self.robot, *(one[keep] for one in columns), self.lights)
+        return replace(
+            self,
+            times=self.times[keep],
+            uv=self.uv[keep],
+            covariance=self.covariance[keep],
+            peak=self.peak[keep],
+            places=self.places[keep],
+            piece=self.piece[keep],
+        )
 
     def tracks(self, mover: str) -> list[Track]:
         """Two tracks a piece, all of one body."""
@@ -94,8 +99,8 @@ class RigidPath:
         for piece in np.unique(self.piece).tolist():
             own = self.piece == piece
             for light in range(2):
-                columns = (one[own, light] for one in (self.uv, self.covariance, self.peak))
-                made.append(Track(self.robot, "", self.times[own], *columns, body=0, mover=mover))
+                uv, covariance, peak = (one[own, light] for one in (self.uv, self.covariance, self.peak))
+                made.append(Track(self.robot, "", self.times[own], uv, covariance, peak, body=0, mover=mover))
         return made
 
 
