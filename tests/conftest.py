@@ -1,6 +1,7 @@
 """Small runs and their solutions, made once for the whole suite."""
 
 import dataclasses
+import signal
 
 import numpy as np
 import pytest
@@ -12,6 +13,13 @@ from coloc_graph.simulation import simulate
 
 #: What runs in real time, against devices, links and browsers: not beside other tests.
 REALTIME = ("camera", "create", "link", "live_world", "online", "viewer_browser", "viewer_export")
+
+
+# Under `nohup` or in the background of a script SIGHUP or SIGINT are ignored, which the programs that tests start would
+# inherit. A handler that does nothing ignores them as well, and is not inherited.
+for _number in (signal.SIGHUP, signal.SIGINT):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, lambda *_: None)
 
 
 def pytest_addoption(parser):

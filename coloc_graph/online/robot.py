@@ -240,7 +240,7 @@ class RobotProgram:
                     self._halt()
                     self._tell("arrived", str(self._drive))
                 else:
-                    wheels.drive(twist.v, twist.w)
+                    wheels.drive(twist.v, twist.w, granted=self._link.last_heard * 1e-9)
             except RobotError as error:
                 self._halt()
                 self._wheels_fault = wheels.fault

@@ -23,9 +23,10 @@ from coloc_graph.robot_io.create.odometry import DeltaWay, EncoderWay, Odometer,
 from coloc_graph.robot_io.create.physics import Body, Physics, Wall
 from coloc_graph.robot_io.create.protocol import Mode, Packet, decode_values
 from coloc_graph.robot_io.create.state import DELTAS
+from coloc_graph.robot_io.deadlines import STAND_WITHIN, reaction_time
 
 #: After whatever befalls it, the wheels are to stand still within this [s].
-STOPPED = 0.5
+STOPPED = STAND_WITHIN
 
 
 def until(met, timeout=3.0):
@@ -47,9 +48,8 @@ def keep(create, v, w, seconds):
 
 
 def set_off(create, robot, v=0.2, w=0.0):
-    """Have it moving at full speed, by a lease of the longest kind."""
-    create.drive(v, w, 0.5)
-    assert until(lambda: max(robot.speeds) > 0.9 * v), robot.speeds
+    """Have it moving at full speed."""
+    assert until(lambda: create.drive(v, w, 0.5) is not None and max(robot.speeds) > 0.9 * v), robot.speeds
 
 
 def stopped_after(robot, since, within=STOPPED):
@@ -189,11 +189,11 @@ def test_a_reader_that_fails_stops_the_wheels(create, robot, monkeypatch):
     stopped_after(robot, since)
 
 
-def test_a_watchdog_that_fails_stops_the_wheels(create, robot, monkeypatch):
+def test_a_deadline_thread_that_fails_stops_the_wheels(create, robot, monkeypatch):
     set_off(create, robot)
 
     since = time.monotonic()
-    monkeypatch.setattr("coloc_graph.robot_io.create.driver.STALE", "a bug")
+    monkeypatch.setattr("coloc_graph.robot_io.create.driver.HUNG", "a bug")
     assert until(lambda: create.fault is not None)
     stopped_after(robot, since)
 
@@ -398,8 +398,8 @@ def test_a_kill_amid_a_command_stops_the_wheels(robot):
     with Create(robot.port, 2) as create:
         set_off(create, robot)
         create._line._serial.write(oi.drive_direct(200, 200)[:-2])  # the next bytes are taken for its speeds
-        since, stopper = time.monotonic(), create._line._stopper
-        stopper._process.stdin.close()  # as at a kill
+        since, watchdog = time.monotonic(), create._line._watchdog
+        watchdog._process.stdin.close()  # as at a kill
         stopped_after(robot, since)
 
 
@@ -409,16 +409,62 @@ def test_a_process_that_is_paused_has_its_wheels_stopped(robot):
         stopped_after(robot, time.monotonic())
 
 
-def test_nothing_is_driven_once_the_stopper_is_gone(robot):
+def test_nothing_is_driven_once_the_watchdog_is_gone(robot):
     with Create(robot.port, 2) as create:
         set_off(create, robot)
-        create._line._stopper._process.kill()
+        create._line._watchdog._process.kill()
         since = time.monotonic()
-        with pytest.raises(RobotError, match=r"stops the wheels when this one is killed has ended.*open it again"):
+        with pytest.raises(RobotError, match=r"its watchdog process has ended.*open it again"):
             keep(create, 0.2, 0.0, 2.0)
         stopped_after(robot, since)
+        assert "watchdog" in create.fault
     with Create(robot.port, 2) as create:
         set_off(create, robot)
+
+
+def test_a_watchdog_that_does_not_answer_stops_the_wheels_and_is_a_fault_if_it_lasts(robot):
+    with Create(robot.port, 2) as create:
+        watchdog = create._line._watchdog._process
+        keep(create, 0.45, 0.0, 0.4)
+        watchdog.send_signal(signal.SIGSTOP)
+        since = time.monotonic()
+        keep(create, 0.45, 0.0, STOPPED)
+        assert robot.speeds == (0.0, 0.0) and robot.still_since - since < STOPPED
+        assert create.drive(0.45, 0.0) == (0.0, 0.0) and create.fault is None
+        with pytest.raises(RobotError, match=r"its watchdog process has not answered for 1 s: .*recover"):
+            keep(create, 0.45, 0.0, 2.0)
+        watchdog.send_signal(signal.SIGCONT)
+        assert until(lambda: create._line.watchdog_silence == 0.0)
+        create.recover()
+        set_off(create, robot)
+
+
+def test_the_watchdog_holds_the_deadline_of_a_motion_by_itself(robot, monkeypatch):
+    """The driver's own threads end no motion here: they only show that they run."""
+    with Create(robot.port, 2) as create:
+        halts = []
+        monkeypatch.setattr(create, "_halt", halts.append)
+        create.drive(0.4, 0.0)
+        since = time.monotonic()
+        assert until(lambda: robot.still_since is None)
+        stopped_after(robot, since)
+        assert halts
+        monkeypatch.undo()
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.2, 0.45, 0.5])
+def test_deadlines_are_shorter_the_faster_it_drives(create, robot, speed):
+    """Of each: the time from the last sign of life to the stop command, and the wheels' own time to stand."""
+    before = time.monotonic()
+    create.drive(speed, 0.0, 0.5)
+    assert reaction_time(speed) - 0.1 < create._deadline - before <= reaction_time(speed) + 1e-3
+    assert reaction_time(speed) + speed / 2.0 <= STOPPED - 0.1
+    create.drive(speed, 0.0, 0.5, granted=before - 0.05)
+    assert create._deadline <= before - 0.05 + reaction_time(speed)
+    assert create.drive(speed, 0.0, granted=before - 0.4) == (0.0, 0.0)
+    assert not create.moving or until(lambda: not create.moving)
+    create.drive(0.0, 2.0, 0.5)  # turning on the spot: the wheels turn as fast
+    assert create._deadline <= time.monotonic() + reaction_time(0.23)
 
 
 def test_signal_handlers_are_as_before_after_the_last_is_closed(robot):

@@ -1,6 +1,7 @@
-"""The wheels of a robot: `Create`, a driver for the iRobot Create 1 and 2 whose motion ends by itself.
+"""Driver for the iRobot Create 1 and 2 whose motion ends by itself; `Create`.
 
-The robot has no watchdog: it goes on with the last command. The driver is the watchdog instead (docs/wheels.md).
+The robot has no command timeout: it keeps the last speed for ever. The driver, and a watchdog process beside it, stop
+the wheels instead (docs/wheels.md).
 """
 
 import contextlib
@@ -19,33 +20,53 @@ from coloc_graph.robot_io.create.line import LEAVE, CreateLine
 from coloc_graph.robot_io.create.odometry import WHEELS
 from coloc_graph.robot_io.create.protocol import Mode, Packet
 from coloc_graph.robot_io.create.state import HAZARDS, CreateState
+from coloc_graph.robot_io.deadlines import reaction_time
 from coloc_graph.run.messages import OdometrySample
 
-#: How long a drive command holds by default, and at most [s].
-LEASE = 0.2
-LONGEST_LEASE = 0.5
-#: Without a frame for this long [s], a moving robot is stopped and a standing one does not set off.
-STALE = 0.3
-#: How often what must end is looked for, and a stop that the robot has not taken is sent again [s].
-WATCH = 0.01
-REPEAT = 0.05
-#: How often a Create 1 is asked for way and turn [s].
-DELTA_PERIOD = 0.5
+LEASE = 0.2  # s for which a drive command holds by default
+MAX_LEASE = 0.5  # s, bound of the lease that may be asked for
+STALE = 0.3  # s without a frame after which a moving robot has a fault and a standing one does not set off
+FRESH = 0.1  # s that a command waits for a frame before that, since this process may not have run
+HUNG = 1.0  # s without an answer of the watchdog after which there is a fault
+WATCH_PERIOD = 0.01  # s between two checks of what must end
+REPEAT_PERIOD = 0.05  # s until a stop command that the robot has not taken is sent again
+DELTA_PERIOD = 0.5  # s between two requests for distance and angle from a Create 1
 
 log = logging.getLogger(__name__)
 
 
 class Create:
-    """One robot's wheels on a serial port; a context manager, at whose end the wheels stand still.
+    """The wheels of one robot on a serial port; a context manager, at whose end the wheels stand.
 
-    `model` is 1 or 2, or None to find out. `max_speed` [m/s] and `max_turn` [rad/s] bound every command. `stop_on`
-    is a choice of "bump", "cliff", "wheel_drop", "charger". `full` asks for full mode, in which the robot does not
-    stop by itself at a cliff, a dropped wheel or the charger. `robot` names the odometry's samples, one of which
-    comes every `odometry_period` [s] while it moves; their times are `epoch` [s] ahead of the monotonic clock, by
-    default UTC as it is when the line opens.
+    After a fault methods raise `RobotError` until `recover`.
 
-    Methods raise `RobotError` where the robot does not answer, is lost, or was stopped for a reason that still
-    holds; `recover` says that it may go on. Source: iRobot Create Open Interface specification.
+    Parameters
+    ----------
+    port
+        Serial port.
+    model
+        1 or 2, None to find out.
+    robot
+        Name of the robot in odometry samples.
+    max_speed, max_turn
+        Bounds of every command [m/s], [rad/s].
+    stop_on
+        Hazards to stop on: "bump", "cliff", "wheel_drop", "charger".
+    full
+        Ask for full mode, in which the robot itself does not stop at a cliff, a dropped wheel or the charger.
+    odometry_period
+        Time between two odometry samples while the robot moves [s].
+    epoch
+        Offset of the samples' times from the monotonic clock [s]; None for UTC when the line is opened.
+
+    Raises
+    ------
+    InputError
+        If an argument is out of range.
+
+    Notes
+    -----
+    Source: iRobot Create Open Interface; iRobot Create 2 Open Interface specification.
     """
 
     def __init__(
@@ -74,9 +95,14 @@ class Create:
         self._feed = SensorFeed(2, robot, odometry_period, epoch)
 
     def open(self) -> Self:
-        """Find the robot, have it stream and enter its mode. `RobotError` if it does not answer within a second a baud.
+        """Open the line, start the stream and enter the mode.
 
         A robot that does not enter its mode, because it charges or a wheel hangs, can be read, not driven.
+
+        Raises
+        ------
+        RobotError
+            If the robot does not answer within a second at its baud rate.
         """
         if self._line is not None:
             raise RobotError(f"the Create on {self.port} is open already: close it first")
@@ -92,7 +118,7 @@ class Create:
         self._last_ask = time.monotonic()
         self._threads = [
             threading.Thread(target=self._alive, args=(work, line), name=f"{name} of {self.port}", daemon=True)
-            for name, work in (("reader", self._read), ("watchdog", self._watch))
+            for name, work in (("reader", self._read), ("deadlines", self._watch))
         ]
         self._line = line
         try:
@@ -130,24 +156,53 @@ class Create:
         self._line = None
         release(self)
 
-    def drive(self, v: float, w: float, lease: float = LEASE) -> tuple[float, float]:
-        """Drive ahead at `v` [m/s] while turning at `w` [rad/s], for `lease` [s] at most: renew it before.
+    def drive(self, v: float, w: float, lease: float = LEASE, granted: float | None = None) -> tuple[float, float]:
+        """Drive for a moment; call it again before that ends.
 
-        What is beyond the limits is slowed down so that the curve stays the same; returned is (v, w) as sent, in
-        whole mm/s of each wheel. `InputError` for arguments that are no motion, `RobotError` if it must not drive.
+        The motion ends after `lease`, and so early that the wheels stand within `STAND_WITHIN` of the last sign of
+        life of what it depends on: this call, `granted`, sensor data, and the watchdog. The faster, the earlier.
+
+        Parameters
+        ----------
+        v, w
+            Speed ahead [m/s] and turn rate to the left [rad/s]. Beyond the limits both are reduced alike, so that the
+            curve stays the same.
+        lease
+            Duration of the motion [s].
+        granted
+            Time of a permission that the motion depends on [s, monotonic].
+
+        Returns
+        -------
+        tuple of float
+            (v, w) as sent, in whole mm/s of each wheel; (0, 0) if too long ago was seen what the motion depends on.
+
+        Raises
+        ------
+        InputError
+            If the arguments are not a motion.
+        RobotError
+            If the robot must not drive.
         """
         if not (math.isfinite(v) and math.isfinite(w)):
             raise InputError(f"drive({v}, {w}) is no motion: give finite m/s and rad/s")
-        if not 0 < lease <= LONGEST_LEASE:
-            raise InputError(f"a lease is above 0 and at most {LONGEST_LEASE} s, not {lease} s: renew it instead")
+        if not 0 < lease <= MAX_LEASE:
+            raise InputError(f"a lease is above 0 and at most {MAX_LEASE} s, not {lease} s: renew it instead")
         halts, line = self._halts if self._line else None, self._may_drive()
         half = WHEELS[self.model].base / 2
         wheel = (abs(v) + abs(w) * half) * 1e3 / oi.MAX_WHEEL_SPEED
         slower = max(1.0, abs(v) / self.max_speed, abs(w) / self.max_turn, wheel)
         left, right = (round((v + side * w * half) / slower * 1e3) for side in (-1, 1))
+        now = time.monotonic()
+        seen = min(self._feed.last, now - line.watchdog_silence, now if granted is None else granted)
+        deadline = min(now + lease, seen + reaction_time(max(abs(left), abs(right)) * 1e-3))
+        if deadline <= now:
+            self._halt(None)
+            return 0.0, 0.0
         self._ask |= (left, right) != self._commanded
-        self._commanded, self._deadline = (left, right), time.monotonic() + lease
+        self._commanded, self._deadline = (left, right), deadline
         try:
+            line.permit(deadline)
             line.send(oi.drive_direct(right, left))
         except RobotError as error:
             self._halt(str(error))
@@ -158,7 +213,7 @@ class Create:
         return (left + right) / 2e3, (right - left) * 1e-3 / (2 * half)
 
     def stop(self) -> None:
-        """Stop the wheels now. `RobotError` if it could not be told."""
+        """Stop the wheels now. Raises `RobotError` if the command cannot be sent."""
         self._halt(None)
         if self._line is None or self._line.lost:
             self._may_drive()
@@ -169,10 +224,19 @@ class Create:
             self._halt(reason)
 
     def recover(self, timeout: float = 1.0) -> None:
-        """After a stop with a reason, or after the robot left its mode: it may be driven again.
+        """Permit driving again after a fault.
 
-        `RobotError` if it does not enter its mode within `timeout` [s] or the line is lost. A hazard that is still
-        there (a cliff to back away from) does not stop it again, a new one does.
+        A hazard that is still there (a cliff to back away from) does not stop the robot again, a new one does.
+
+        Parameters
+        ----------
+        timeout
+            Time that the robot has to enter its mode [s].
+
+        Raises
+        ------
+        RobotError
+            If it does not enter its mode in time, or the line is lost.
         """
         line = self._line
         if line is None or line.lost:
@@ -201,33 +265,33 @@ class Create:
 
     @property
     def odometry(self) -> OdometrySample:
-        """The newest sample; `take_odometry` gives all of them."""
+        """The newest odometry sample; `take_odometry` returns all of them."""
         if self._line is None or self._feed.sample is None:
             raise RobotError(f"the Create on {self.port} has no odometry yet: open it, and wait for the first sample")
         return self._feed.sample
 
     def take_odometry(self) -> list[OdometrySample]:
-        """All samples since this was last called (the newest 20 000), each with its increment's covariance."""
+        """Return all samples since the last call (the newest 20 000), each with its increment's covariance."""
         return self._feed.take_samples()
 
     @property
     def moving(self) -> bool:
-        """Whether a drive command holds, or the robot still says that it has one."""
+        """True while a drive command holds, or the robot reports that it has one."""
         return self._line is not None and (self._deadline is not None or self._feed.told_to_move)
 
     @property
     def fault(self) -> str | None:
-        """Why it does not drive, None where it does."""
+        """Reason for which the robot does not drive; None if it does."""
         return self._fault if self._line else "it is not open"
 
     @property
     def lost(self) -> bool:
-        """Whether its line is lost, or it is not open: open it anew."""
+        """True if the line is lost or not open: open it again."""
         return self._line is None or self._line.lost is not None
 
     @property
     def frames(self) -> tuple[int, int]:
-        """Frames of the stream since it was opened: sound, damaged."""
+        """Counts of valid and of damaged frames since the line was opened."""
         return (self._line.decoder.good, self._line.decoder.bad) if self._line else (0, 0)
 
     @property
@@ -235,26 +299,29 @@ class Create:
         return bytes([oi.FULL if self._mode == Mode.FULL else oi.SAFE])
 
     def _may_drive(self) -> CreateLine:
-        """The line. `RobotError` where it must not be driven."""
+        """Return the line. Raises `RobotError` if the robot must not drive."""
         if self._line is None:
             raise RobotError(f"the Create on {self.port} is not open: open it, best as a context manager")
         why, remedy = self._fault, "put it right and call recover()"
         if self._line.lost:
             why, remedy = f"its line is lost ({self._line.lost})", "check the cable, close it and open it again"
-        elif why is None and self._feed.age > STALE:
+        elif why is None and not self._wait(lambda: self._feed.age <= STALE, FRESH):
             why = f"no sensor data came for {STALE} s"
+            self._halt(why)
         if why is not None:
             raise RobotError(f"the Create on {self.port} does not drive, {why}: {remedy}")
         return self._line
 
     def _halt(self, fault: str | None) -> None:
-        """Stop the wheels and remember why; never raises."""
+        """Stop the wheels and keep the reason; never raises."""
         self._halts, self._blames = object(), object() if fault else self._blames
         new, self._fault = bool(fault and not self._fault), self._fault or fault
         self._deadline, self._commanded, self._halted_at = None, (0, 0), time.monotonic()
         if self._line is not None:
             with contextlib.suppress(RobotError):
                 self._line.send(oi.HALT)
+            with contextlib.suppress(RobotError):
+                self._line.permit(None)
         if new:
             log.warning("Create on %s stops: %s", self.port, fault)
 
@@ -262,7 +329,7 @@ class Create:
         return self._feed.wait(met, lambda: self._line is None or self._line.lost is not None, timeout)
 
     def _alive(self, work: Callable[[CreateLine], None], line: CreateLine) -> None:
-        """A thread that does not die without a word, or with the wheels turning."""
+        """Run a thread's work; when it fails, stop the wheels and report it."""
         try:
             work(line)
         except BaseException as error:
@@ -272,7 +339,7 @@ class Create:
                     line.stop_when_back(self._ended)
 
     def _read(self, line: CreateLine) -> None:
-        """The reader thread: frames as they come, and what they tell to stop for."""
+        """Reader thread: take in frames, and stop for what they report."""
         while not self._ended.is_set():
             for values in line.read():
                 if line.model == 1 and Packet.DISTANCE in values:
@@ -286,7 +353,7 @@ class Create:
                 line.send(oi.stream(line.layouts[1]))
 
     def _judge(self, state: CreateState) -> None:
-        """Stop where the robot left its mode, or met what it is to stop on."""
+        """Stop if the robot left its mode or met a hazard to stop on."""
         hazards = state.hazards()
         new = [said for name, said in hazards.items() if name in self._stop_on and name not in self._hazards]
         left_mode = self._armed and state.mode != self._mode and not self._ended.is_set()
@@ -297,13 +364,17 @@ class Create:
             self._halt(f"it met {' and '.join(new)}")
 
     def _watch(self, line: CreateLine) -> None:
-        """The watchdog thread: ends a motion when nothing else does, and sees to it that a stop is taken."""
-        while not self._ended.wait(WATCH):
+        """Deadline thread: end each motion in time, and repeat a stop that the robot has not taken."""
+        while not self._ended.wait(WATCH_PERIOD):
             line.beat()
             now, deadline = time.monotonic(), self._deadline
             if deadline is not None and now >= deadline:
                 self._halt(None)
             elif deadline is not None and self._feed.age > STALE:
                 self._halt(f"no sensor data came for {STALE} s")
-            elif deadline is None and self._feed.told_to_move and now - self._halted_at > REPEAT and not line.lost:
+            elif self._fault is None and line.watchdog_silence > HUNG:
+                self._halt(f"its watchdog process has not answered for {HUNG:g} s")
+            elif deadline is not None or line.lost:
+                continue
+            elif self._feed.told_to_move and now - self._halted_at > REPEAT_PERIOD:
                 self._halt(None)

@@ -1,4 +1,4 @@
-"""The serial line to a Create: found, opened, written to and read from, each with a timeout; `CreateLine`."""
+"""The serial line to a Create, with timeouts for all that is done on it; `CreateLine`."""
 
 import contextlib
 import errno
@@ -12,30 +12,43 @@ from coloc_graph.errors import RobotError
 from coloc_graph.robot_io.create import protocol as oi
 from coloc_graph.robot_io.create.odometry import WHEELS
 from coloc_graph.robot_io.create.state import DELTAS, STREAMED
-from coloc_graph.robot_io.create.watchdog import Stopper
+from coloc_graph.robot_io.create.watchdog import Watchdog
 
-#: How long a robot may take to answer at one baud, a write or a read to end, a lost port to come back, and one that
-#: another driver held to be free [s].
-ANSWER = 1.0
-WRITE = 0.2
-READ = 0.05
-BACK = 10.0
-FREED = 0.5
-#: Leaves a robot still, silent and passive.
+ANSWER = 1.0  # s that a robot may take to answer at one baud rate
+WRITE = 0.2  # s that a write may take
+READ = 0.05  # s that a read waits for bytes
+BACK = 10.0  # s during which a lost port is waited for
+FREED = 0.5  # s during which a port that another driver held is waited for
+#: Commands that leave a robot standing, silent and in passive mode.
 LEAVE = oi.HALT + oi.pause_stream() + bytes([oi.START])
 
 
 class CreateLine:
-    """An open line on which a robot streams; `RobotError` where none answers. `model` 1, 2 or None to find out.
+    """An open serial line on which a robot streams.
 
-    `lost` says why it can be used no more, None while it can.
+    Parameters
+    ----------
+    port
+        Serial port.
+    model
+        1 or 2, None to find out by baud rate and checksum.
+
+    Attributes
+    ----------
+    lost
+        Reason for which the line cannot be used any more; None while it can.
+
+    Raises
+    ------
+    RobotError
+        If the port cannot be opened, no robot answers, or the watchdog cannot be started.
     """
 
     def __init__(self, port: str, model: int | None) -> None:
         self.port = port
         self.lost: str | None = None
         self._lock = threading.RLock()
-        self._stopper: Stopper | None = None
+        self._watchdog: Watchdog | None = None
         models = [model] if model else [2, 1]
         try:
             self._serial = self._first_opened(models[0])
@@ -46,21 +59,19 @@ class CreateLine:
             if not self.model:
                 bauds = " or ".join(str(WHEELS[one].baud) for one in models)
                 raise RobotError(f"no Create answers on {port} at {bauds} baud: switch it on, check model and cable")
-            self._stopper = self._stood_by()
+            self._watchdog = self._started_watchdog()
         except BaseException:
             self.close()
             raise
 
-    def _stood_by(self) -> Stopper:
+    def _started_watchdog(self) -> Watchdog:
         try:
-            return Stopper(self._serial.fileno(), oi.HALT, LEAVE)
+            return Watchdog(self._serial.fileno(), oi.HALT, LEAVE)
         except OSError as error:
-            raise RobotError(
-                f"the process that stops the wheels on {self.port} when this one is killed cannot be started ({error})"
-            ) from error
+            raise RobotError(f"cannot start the watchdog process of {self.port} ({error}): free some memory") from error
 
     def _first_opened(self, model: int) -> serial.Serial:
-        """The port, once the stopper of a driver that was killed has let go of it."""
+        """Open the port once the watchdog of a driver that was killed has let go of it."""
         until = time.monotonic() + FREED
         while True:
             try:
@@ -71,7 +82,7 @@ class CreateLine:
                 time.sleep(0.01)
 
     def _answers(self, model: int) -> bool:
-        """Whether sound frames come at this model's baud."""
+        """Return whether valid frames come at this model's baud rate."""
         self.layouts = [STREAMED[1], (*STREAMED[1], *DELTAS)] if model == 1 else [STREAMED[2]]
         self.decoder = oi.StreamDecoder(*self.layouts)
         try:
@@ -86,7 +97,7 @@ class CreateLine:
         return self.decoder.header_counts is not None
 
     def send(self, data: bytes) -> None:
-        """Write these bytes. `RobotError` where the line is lost or takes nothing."""
+        """Write these bytes. Raises `RobotError` if the line is lost or takes nothing."""
         if self.lost is None:
             held = self._lock.acquire(timeout=2 * WRITE)
             try:
@@ -109,7 +120,7 @@ class CreateLine:
             data = data[self._serial.write(data) or 0 :]
 
     def read(self) -> list[dict[int, int]]:
-        """The frames that have come, after `READ` at most. `RobotError` where the line is lost."""
+        """Return the frames that come within `READ`. Raises `RobotError` if the line is lost."""
         try:
             return self.decoder.feed(self._serial.read(max(1, self._serial.in_waiting)))
         except (OSError, TypeError) as error:
@@ -120,16 +131,29 @@ class CreateLine:
                 f"the line on {self.port} is lost ({self.lost}): check the cable, open it again"
             ) from error
 
+    def permit(self, until: float | None) -> None:
+        """Tell the watchdog until when the wheels may turn [s, monotonic]; None when they stand."""
+        self._require_watchdog(self._watchdog is None or self._watchdog.permit(until))
+
     def beat(self) -> None:
-        """Tell the stopper that this process lives. `RobotError` where that one ended: nobody would stop the robot."""
-        if self._stopper is not None and self.lost is None and not self._stopper.beat():
-            with contextlib.suppress(RobotError):
-                self.send(oi.HALT)
-            self.lost = self.lost or "the process that stops the wheels when this one is killed has ended"
+        """Show the watchdog that the driver runs. Raises `RobotError` if the watchdog has ended."""
+        self._require_watchdog(self._watchdog is None or self._watchdog.beat())
+
+    @property
+    def watchdog_silence(self) -> float:
+        """Time for which the watchdog has not answered [s]."""
+        return self._watchdog.silence if self._watchdog is not None else 0.0
+
+    def _require_watchdog(self, running: bool) -> None:
+        if not running:
+            if self.lost is None:
+                with contextlib.suppress(RobotError):
+                    self.send(oi.HALT)
+                self.lost = self.lost or "its watchdog process has ended"
             raise RobotError(f"the line on {self.port} is lost ({self.lost}): open it again")
 
     def stop_when_back(self, ended: threading.Event) -> bool:
-        """For some seconds after the line was lost, stop the robot if its port comes back. Whether it did."""
+        """Stop the robot if its port comes back within `BACK`; return whether it did."""
         until = time.monotonic() + BACK
         self.close()
         while time.monotonic() < until and not ended.wait(0.05):
@@ -143,10 +167,10 @@ class CreateLine:
         return serial.Serial(self.port, WHEELS[model].baud, timeout=READ, write_timeout=0, exclusive=True)
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port."""
         self.lost = self.lost or "closed"
-        stopper, self._stopper = self._stopper, None
-        if stopper is not None:
-            stopper.end()
+        watchdog, self._watchdog = self._watchdog, None
+        if watchdog is not None:
+            watchdog.end()
         with contextlib.suppress(OSError):
             self._serial.close()
