@@ -68,7 +68,7 @@ class Bare:
             noise = gtsam.noiseModel.Gaussian.SqrtInformation(R)
         else:
             noise = gtsam.noiseModel.Gaussian.Covariance(measured.covariance)
-        factors.add(gtsam.BetweenFactorPose3(i, j, measured.T_i_j, noise))
+        factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(measured.T_i_j), noise))
 
     def start(self, pose):
         """Where the search for a pose starts."""
@@ -84,10 +84,10 @@ def bare_batch(team, keyed, reference, covariances):
     bare.gauge(factors, reference)
     for measured, i, j in sorted(keyed, key=lambda one: isinstance(one[0], Odometry)):
         if j not in poses:
-            poses[j] = bare.start(poses[i].compose(measured.T_i_j))
+            poses[j] = bare.start(poses[i].compose(gtsam.Pose3(measured.T_i_j)))
             bare.pose(factors, j)
         elif i not in poses:
-            poses[i] = bare.start(poses[j].compose(measured.T_i_j.inverse()))
+            poses[i] = bare.start(poses[j].compose(gtsam.Pose3(measured.T_i_j).inverse()))
             bare.pose(factors, i)
         bare.between(factors, i, j, measured)
     for key, pose in poses.items():
@@ -150,7 +150,7 @@ def incremental(lengths: list[int], floor: Floor | None) -> None:
             new[reference] = gtsam.Pose3()
             bare.gauge(factors, reference)
         for measured, i, j in sorted(here, key=lambda one: isinstance(one[0], Odometry)):
-            for a, b, T in ((i, j, measured.T_i_j), (j, i, measured.T_i_j.inverse())):
+            for a, b, T in ((i, j, gtsam.Pose3(measured.T_i_j)), (j, i, gtsam.Pose3(measured.T_i_j).inverse())):
                 if b not in known and b not in new and (a in known or a in new):
                     at = new[a] if a in new else isam.calculateEstimatePose3(a)
                     new[b] = bare.start(at.compose(T))

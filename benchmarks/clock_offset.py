@@ -109,7 +109,7 @@ def errors(world: World, measurements: tuple[PairMeasurement, ...]) -> list[tupl
         if one.relative_pose is None:
             out.append((np.nan, np.nan, np.nan))
             continue
-        xi = gtsam.Pose3.Logmap(one.relative_pose.T_i_j.between(gtsam.Pose3(se3_inverse(i) @ j)))
+        xi = gtsam.Pose3.Logmap(gtsam.Pose3(one.relative_pose.T_i_j).between(gtsam.Pose3(se3_inverse(i) @ j)))
         nees = xi @ np.linalg.solve(one.relative_pose.covariance, xi) / 6
         out.append((1e3 * np.linalg.norm(xi[3:]), 1e3 * np.linalg.norm(xi[:3]), nees))
     return out

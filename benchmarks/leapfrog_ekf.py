@@ -35,7 +35,7 @@ from coloc_graph.backend import Estimate, Method, PoseGraph, chain, joint, repla
 from coloc_graph.backend.calibration import is_calibration
 from coloc_graph.backend.estimate import make_estimate
 from coloc_graph.backend.factors import factors_for
-from coloc_graph.backend.graph import Link
+from coloc_graph.backend.graph import Link, pose_of
 from coloc_graph.evaluation import align, evaluate, nees_of
 from coloc_graph.evaluation.nees import PLANAR
 from coloc_graph.measurements import Odometry
@@ -137,7 +137,7 @@ def ekf(graph: PoseGraph, method: Method = "joint", steps: int = STEPS) -> Estim
         seen = [link for link in links[stance.index] if not isinstance(link, Odometry)]
         for link in (*ways, *seen):  # a pose starts where wheels say, or else cameras
             i, j = map(graph.places.key, link.ends)
-            for known, new, T in ((i, j, link.T_i_j), (j, i, link.T_i_j.inverse())):
+            for known, new, T in ((i, j, pose_of(link)), (j, i, pose_of(link).inverse())):
                 if known in state and new not in state:
                     state.enter(new, factors_of.start(state.values.atPose3(known).compose(T)))
                     state.take(factors_of.of_pose(new))

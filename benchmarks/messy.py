@@ -46,7 +46,7 @@ def step(seed: int, *, messy: bool) -> dict[str, object]:
     pose = measured.relative_pose
     if pose is None:
         return {"seed": seed, "why": measured.homography.unusable}
-    xi = gtsam.Pose3.Logmap(pose.T_i_j.between(gtsam.Pose3(se3_inverse(T["A"]) @ T["B"])))
+    xi = gtsam.Pose3.Logmap(gtsam.Pose3(pose.T_i_j).between(gtsam.Pose3(se3_inverse(T["A"]) @ T["B"])))
     squared = float(xi @ np.linalg.solve(pose.covariance + 1e-10 * np.eye(6), xi))
     far = np.linalg.norm(xi[3:]) > FAR or np.linalg.norm(xi[:3]) > TURNED
     return {

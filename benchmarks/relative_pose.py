@@ -88,7 +88,7 @@ def one_cell(index: int, runs: int, outliers: bool) -> dict[str, float]:
     T_i_j = gtsam.Pose3(se3_inverse(T_i) @ T_j)
 
     _, exact, _ = poses_of(world, true_i, true_j, eq2=False)
-    along = exact.T_i_j.translation() / baseline
+    along = exact.T_i_j[:3, 3] / baseline
     bound = float(np.sqrt(along @ exact.covariance[3:, 3:] @ along))
     rng = np.random.default_rng((1, index))
     eq2, ours, nees, ratio, dirty = [], [], [], [], []
@@ -97,14 +97,14 @@ def one_cell(index: int, runs: int, outliers: bool) -> dict[str, float]:
         uv_i = true_i + NOISE * rng.standard_normal(true_i.shape)
         uv_j = true_j + NOISE * rng.standard_normal(true_j.shape)
         paper, pose, per_dof = poses_of(world, uv_i, uv_j)
-        eq2.append(np.linalg.norm(paper.T_i_j.translation()) - baseline)
-        ours.append(np.linalg.norm(pose.T_i_j.translation()) - baseline)
-        xi = pose.T_i_j.localCoordinates(T_i_j)[planar]
+        eq2.append(np.linalg.norm(paper.T_i_j[:3, 3]) - baseline)
+        ours.append(np.linalg.norm(pose.T_i_j[:3, 3]) - baseline)
+        xi = gtsam.Pose3(pose.T_i_j).localCoordinates(T_i_j)[planar]
         nees.append(xi @ np.linalg.solve(pose.covariance[np.ix_(planar, planar)], xi) / 3)
         ratio.append(per_dof)
         if outliers:
             _, pose, _ = poses_of(world, *spoiled(rng, (uv_i, uv_j), more), eq2=False)
-            dirty.append(np.linalg.norm(pose.T_i_j.translation()) - baseline)
+            dirty.append(np.linalg.norm(pose.T_i_j[:3, 3]) - baseline)
     rmse = float(np.sqrt(np.mean(np.square(ours))))
     figures = {
         "l": baseline, "theta_deg": theta, "eq2_cm": 100 * float(np.mean(np.abs(eq2))),

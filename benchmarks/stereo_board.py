@@ -247,7 +247,7 @@ def chi2_per_dof(measurements: Sequence[PairMeasurement]) -> float:
 
 def _poses(solution: pipeline.Solution) -> Array:
     """T_right_left (n, 4, 4) of each pair by eq. (2)."""
-    found = [m.relative_pose.T_ci_cj.matrix() for m in solution.measurements if m.relative_pose is not None]
+    found = [m.relative_pose.T_ci_cj for m in solution.measurements if m.relative_pose is not None]
     return se3_inverse(np.array(found))
 
 

@@ -6,15 +6,28 @@ alone has a covariance (3, 3) of the tangent's heading, x and y.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
+
+from coloc_graph.errors import MeasurementError
 
 Array = NDArray[np.float64]
 
 #: A robot at a stance: a node of the graph.
 Node = tuple[str, int]
+
+
+def _as_arrays(measured: Any, *names: str) -> None:
+    """Make float arrays of these fields of a measurement; a field that has a `matrix()` gives that."""
+    for name in names:
+        value = getattr(measured, name)
+        try:
+            array = np.asarray(value.matrix() if hasattr(value, "matrix") else value, float)
+        except (TypeError, ValueError) as error:
+            raise MeasurementError(f"{name} of the {measured} is no array of numbers: {error}") from error
+        object.__setattr__(measured, name, array)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,27 +104,44 @@ class MarkerSpan:
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """The pose of observer j's body in observer i's body, made of one homography measurement.
+    """Pose of observer j's body in observer i's body at one stance, however it was measured.
 
-    `covariance` is (6, 6). `T_ci_cj` is the same between the cameras. `solution` names which of the two SVD
-    solutions agrees with the known normal, `normal_error` [rad] is the angle between that solution's normal
-    and the known one. `homography` is what it was made of, with the marker `plane` in camera i as it was thought to
-    be, the `movers` whose markers these were, and their `spans`: from these the joint estimate finds the mounts along
-    with the poses.
+    Parameters
+    ----------
+    stance
+        Number of the stance.
+    robot_i, robot_j
+        Names of the two observers.
+    T_i_j
+        Pose of body j in body i, (4, 4); a `gtsam.Pose3` is taken, too.
+    covariance
+        Covariance (6, 6): rotation [rad] first, then translation [m], in the frame of body j.
+    T_ci_cj
+        Pose of camera j in camera i, (4, 4), where a homography gave it.
+    solution
+        Number of the SVD solution whose normal is nearest to the known one.
+    normal_error
+        Angle [rad] between these two normals.
+    homography, plane, spans, movers
+        The homography it was made of, the marker plane in camera i as stated, the spans between two markers that were
+        seen, and the robots whose markers they were. The joint estimate calibrates the mounts from these.
     """
 
     stance: int
     robot_i: str
     robot_j: str
-    T_i_j: gtsam.Pose3
+    T_i_j: Array
     covariance: Array
-    T_ci_cj: gtsam.Pose3
-    solution: int
-    normal_error: float
+    T_ci_cj: Array | None = None
+    solution: int | None = None
+    normal_error: float | None = None
     homography: HomographyMeasurement | None = None
     plane: Plane | None = None
     spans: tuple[MarkerSpan, ...] = ()
     movers: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _as_arrays(self, "T_i_j", "covariance")
 
     @property
     def ends(self) -> tuple[Node, Node]:
@@ -124,21 +154,36 @@ class RelativePose:
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """Where a robot stands whose markers another one at rest sees: the pose of `seen` in `observer`, at `time`.
+    """Pose of a robot, or a landmark, whose markers an observer at rest sees.
 
-    `time` [UTC s] is by the observer's clock: a robot that moves during the stance has its pose of the stance then.
-    `covariance` is (3, 3): heading, x, y, since both stand on the floor. `x_markers` (2, 2) are the rays (x, y, 1) to
-    its first two markers, with `x_covariance` (2, 2, 2): what it was made of, from which the joint estimate goes on.
+    Parameters
+    ----------
+    stance
+        Number of the stance.
+    observer, seen
+        Names of the robot that sees, and of the robot or landmark that is seen.
+    time
+        When [UTC s, observer's clock]; the pose at this stance of a robot that moves during it is its pose then.
+    T_observer_seen
+        Pose of body `seen` in body `observer`, (4, 4); a `gtsam.Pose3` is taken, too.
+    covariance
+        Covariance (3, 3) of heading [rad], x, y [m], in the frame of `seen`: both stand on the floor.
+    x_markers, x_covariance
+        Rays (x, y, 1) to its first two markers, (2, 2), and their covariance (2, 2, 2). The joint estimate takes these
+        instead of the pose.
     """
 
     stance: int
     observer: str
     seen: str
     time: float
-    T_observer_seen: gtsam.Pose3
+    T_observer_seen: Array
     covariance: Array
     x_markers: Array | None = None
     x_covariance: Array | None = None
+
+    def __post_init__(self) -> None:
+        _as_arrays(self, "T_observer_seen", "covariance")
 
     @property
     def ends(self) -> tuple[Node, Node]:
@@ -146,8 +191,8 @@ class Sighting:
         return (self.observer, self.stance), (self.seen, self.stance)
 
     @property
-    def T_i_j(self) -> gtsam.Pose3:
-        """The pose of the second end in the first."""
+    def T_i_j(self) -> Array:
+        """Pose (4, 4) of the second end in the first."""
         return self.T_observer_seen
 
     def __str__(self) -> str:
@@ -156,16 +201,28 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class Odometry:
-    """What a robot's wheels say of its way between two stances: its body at `after` in its body at `before`.
+    """Motion of a robot between two stances by its wheels.
 
-    `covariance` is (3, 3): heading, x, y, since wheels know nothing else.
+    Parameters
+    ----------
+    robot
+        Name of the robot.
+    before, after
+        Numbers of the two stances, in the order of time.
+    T_before_after
+        Pose of its body at `after` in its body at `before`, (4, 4); a `gtsam.Pose3` is taken, too.
+    covariance
+        Covariance (3, 3) of heading [rad], x, y [m], in the frame of the body at `after`.
     """
 
     robot: str
     before: int
     after: int
-    T_before_after: gtsam.Pose3
+    T_before_after: Array
     covariance: Array
+
+    def __post_init__(self) -> None:
+        _as_arrays(self, "T_before_after", "covariance")
 
     @property
     def ends(self) -> tuple[Node, Node]:
@@ -173,8 +230,8 @@ class Odometry:
         return (self.robot, self.before), (self.robot, self.after)
 
     @property
-    def T_i_j(self) -> gtsam.Pose3:
-        """The pose of the second end in the first."""
+    def T_i_j(self) -> Array:
+        """Pose (4, 4) of the second end in the first."""
         return self.T_before_after
 
     def __str__(self) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.estimate import Estimate, make_estimate
 from coloc_graph.backend.factors import GAUGE_SIGMA, link_covariance
-from coloc_graph.backend.graph import Link, PoseGraph, StayPut
+from coloc_graph.backend.graph import Link, PoseGraph, StayPut, pose_of
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import RelativePose
 
@@ -39,10 +39,10 @@ def chain(graph: PoseGraph) -> Estimate:
     covariances: dict[int, Array] = {graph.reference_key: GAUGE_SIGMA**2 * np.eye(6)}
     for via, to, link, forwards in steps:
         if forwards:
-            back = link.T_i_j.inverse().AdjointMap()
+            back = pose_of(link).inverse().AdjointMap()
             covariances[to] = back @ covariances[via] @ back.T + link_covariance(link)
         else:
-            forth = link.T_i_j.AdjointMap()
+            forth = pose_of(link).AdjointMap()
             covariances[to] = forth @ (covariances[via] + link_covariance(link)) @ forth.T
     values = gtsam.Values()
     for key, pose in poses.items():
@@ -84,7 +84,7 @@ def compose(
     graph: PoseGraph,
     steps: Sequence[Step],
     place: Callable[[gtsam.Pose3], gtsam.Pose3] = lambda pose: pose,
-    expected: Callable[[Link], gtsam.Pose3] = lambda link: link.T_i_j,
+    expected: Callable[[Link], gtsam.Pose3] = pose_of,
     known: Mapping[int, gtsam.Pose3] | None = None,
 ) -> dict[int, gtsam.Pose3]:
     """Poses T_world_body by key, of the reference and wherever the steps lead, each put where `place` says.

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-import gtsam
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
@@ -126,9 +125,9 @@ class _Measured(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     T_i_j: list[list[float]]
     covariance: list[list[float]]
     time: float = 0.0
-    T_ci_cj: list[list[float]] = []
-    solution: int = 0
-    normal_error: float = 0.0
+    T_ci_cj: list[list[float]] | None = None
+    solution: int | None = None
+    normal_error: float | None = None
     homography: _Homography | None = None
     plane: _Plane | None = None
     movers: tuple[str, ...] = ()
@@ -221,13 +220,13 @@ def read(path: Path) -> Checkpoint:
 
 def _of(measured: Measurement) -> _Measured:
     kind = {RelativePose: "relative_pose", Sighting: "sighting", Odometry: "odometry"}[type(measured)]
-    out = _Measured(kind, measured.ends, measured.T_i_j.matrix().tolist(), np.asarray(measured.covariance).tolist())
+    out = _Measured(kind, measured.ends, measured.T_i_j.tolist(), np.asarray(measured.covariance).tolist())
     if isinstance(measured, Sighting):
         out.time = measured.time
         out.x_markers, out.x_covariance = _array(measured.x_markers), _array(measured.x_covariance)
     elif isinstance(measured, RelativePose):
-        out.T_ci_cj, out.solution = measured.T_ci_cj.matrix().tolist(), measured.solution
-        out.normal_error, out.movers = measured.normal_error, measured.movers
+        out.T_ci_cj = None if measured.T_ci_cj is None else measured.T_ci_cj.tolist()
+        out.solution, out.normal_error, out.movers = measured.solution, measured.normal_error, measured.movers
         out.homography = None if measured.homography is None else _fields(measured.homography, _Homography)
         out.plane = None if measured.plane is None else _fields(measured.plane, _Plane)
         out.spans = [_fields(one, _Span) for one in measured.spans]
@@ -282,7 +281,7 @@ def _to(one: _Measured) -> Measurement:
             robot_j=robot_j,
             T_i_j=T_i_j,
             covariance=covariance,
-            T_ci_cj=_pose(one.T_ci_cj),
+            T_ci_cj=None if one.T_ci_cj is None else _pose(one.T_ci_cj),
             solution=one.solution,
             normal_error=one.normal_error,
             homography=_homography(one, before, robot_i, robot_j),
@@ -299,8 +298,8 @@ def _homography(one: _Measured, stance: int, robot_i: str, robot_j: str) -> Homo
     return HomographyMeasurement(stance, robot_i, robot_j, **_values(one.homography))
 
 
-def _pose(rows: list[list[float]]) -> gtsam.Pose3:
+def _pose(rows: list[list[float]]) -> NDArray[np.float64]:
     T = np.array(rows, float)
     if T.shape != (4, 4):
         raise ValueError(f"a pose has the shape {T.shape}")
-    return gtsam.Pose3(T)
+    return T

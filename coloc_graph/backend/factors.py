@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors
 from coloc_graph.backend.calibration import Variables, is_calibration
-from coloc_graph.backend.graph import Link, PoseGraph, StayPut
+from coloc_graph.backend.graph import Link, PoseGraph, StayPut, pose_of
 from coloc_graph.backend.homography_factor import homography_factor, markers_factor, related, sighted
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import RelativePose, Sighting
@@ -130,7 +130,7 @@ class Factors:
                 return markers_factor(link, i, j, self.variables)
             assert isinstance(link, RelativePose)
             return homography_factor(link, i, j, self.variables, self.floor is not None)
-        return self.between(link, i, j, link.T_i_j)
+        return self.between(link, i, j, pose_of(link))
 
     @staticmethod
     def between(link: Link, i: int, j: int, T_i_j: gtsam.Pose3) -> gtsam.NonlinearFactor:
@@ -149,7 +149,7 @@ class Factors:
             factor = self.of_link(link, i, j)
             self._ready[id(link)] = factor
             return related(link, factor, errors)
-        return link.T_i_j
+        return pose_of(link)
 
     def of_graph(
         self, graph: PoseGraph, keys: Iterable[int]

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import gtsam
+import numpy as np
+from numpy.typing import NDArray
 
 from coloc_graph.backend.landmarks import ALWAYS, MAP, OnMap, landmarks_of, map_of, of_seen
 from coloc_graph.backend.validation import require_valid
@@ -13,6 +15,8 @@ from coloc_graph.errors import EstimationError, MeasurementError
 from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.team import Floor, Landmark, Robot, Slip, Team
+
+Array = NDArray[np.float64]
 
 #: GTSAM's keys number the robots of a team in one byte.
 MOST_ROBOTS = 255
@@ -37,9 +41,9 @@ class StayPut:
         return (self.robot, self.before), (self.robot, self.after)
 
     @property
-    def T_i_j(self) -> gtsam.Pose3:
-        """The pose of the second end in the first."""
-        return gtsam.Pose3()
+    def T_i_j(self) -> Array:
+        """Pose (4, 4) of the second end in the first."""
+        return np.eye(4)
 
     def __str__(self) -> str:
         return f"{self.robot} staying put from stance {self.before} to {self.after}"
@@ -47,6 +51,11 @@ class StayPut:
 
 #: What the graph holds between two nodes.
 Link = Measurement | StayPut | OnMap
+
+
+def pose_of(link: Link) -> gtsam.Pose3:
+    """Pose of a link's second end in its first."""
+    return gtsam.Pose3(link.T_i_j)
 
 
 class PoseKeys:

@@ -14,7 +14,7 @@ from coloc_graph.backend.batched_factors import BatchedFactor, Seen
 from coloc_graph.backend.calibration import Variables, sigmas_of_plane
 from coloc_graph.backend.camera_model import MarkersModel
 from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
-from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose, yaw
 from coloc_graph.measurements import RelativePose, Sighting
 
 Array = NDArray[np.float64]
@@ -54,7 +54,7 @@ def related(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[
     values.insert(i, gtsam.Pose3())
     for key in variable:
         values.insert(key, errors(key))
-    T_i_j = gtsam.Pose3(gtsam.Rot3.Yaw(link.T_i_j.rotation().yaw()), np.array([link.T_i_j.x(), link.T_i_j.y(), 0.0]))
+    T_i_j = gtsam.Pose3(floor_pose(link.T_i_j[0, 3], link.T_i_j[1, 3], yaw(link.T_i_j)))
     values.insert(j, T_i_j)
     for _ in range(MOST_STEPS):
         values.update(j, T_i_j)
@@ -62,7 +62,7 @@ def related(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[
         planar = A[:, 8:11]  # heading, x, y of j
         step = np.linalg.lstsq(planar, b, rcond=None)[0]
         if not np.abs(step).max() < 0.5:
-            return link.T_i_j
+            return gtsam.Pose3(link.T_i_j)
         T_i_j = T_i_j.compose(gtsam.Pose3(gtsam.Rot3.Yaw(step[0]), np.array([step[1], step[2], 0.0])))
         if np.linalg.norm(planar @ step) < 1.0:  # what is left is far within the noise
             break
@@ -80,7 +80,7 @@ def sighted(link: Sighting, variables: Variables, errors: Callable[[int], Array]
     keys = variables.mount(link.observer), variables.markers(link.seen)
     mount, markers = (np.zeros(n) if key is None else errors(key) for key, n in zip(keys, (3, 2), strict=True))
     place = _markers_model(link, variables).place(mount, markers)
-    return link.T_i_j if place is None else gtsam.Pose3(floor_pose(*place))
+    return gtsam.Pose3(link.T_i_j) if place is None else gtsam.Pose3(floor_pose(*place))
 
 
 def _markers_model(link: Sighting, variables: Variables) -> MarkersModel:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.factors import Factors
-from coloc_graph.backend.graph import Link
+from coloc_graph.backend.graph import Link, pose_of
 from coloc_graph.measurements import Odometry, RelativePose, Sighting
 
 Array = NDArray[np.float64]
@@ -68,7 +68,7 @@ class InsertionPlanner:
                 i, j = self._ends(link)
                 has_i, has_j = (key in self._tied or key in start for key in (i, j))
                 is_new = i not in self._tied or j not in self._tied
-                T_i_j = self._factors.expected(link, i, j, self._errors) if is_new else link.T_i_j
+                T_i_j = self._factors.expected(link, i, j, self._errors) if is_new else pose_of(link)
                 tested = isinstance(link, RelativePose | Sighting)
                 if i == j:
                     continue

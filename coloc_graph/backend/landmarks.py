@@ -30,7 +30,7 @@ class OnMap:
     """
 
     landmark: str
-    T_map_landmark: gtsam.Pose3
+    T_map_landmark: Array
     covariance: Array
 
     @property
@@ -39,8 +39,8 @@ class OnMap:
         return (MAP, ALWAYS), (self.landmark, ALWAYS)
 
     @property
-    def T_i_j(self) -> gtsam.Pose3:
-        """The pose of the second end in the first."""
+    def T_i_j(self) -> Array:
+        """Pose (4, 4) of the second end in the first."""
         return self.T_map_landmark
 
     def __str__(self) -> str:
@@ -91,4 +91,4 @@ def _on_map(landmark: Landmark) -> OnMap:
     x, y = landmark.position
     sigmas = np.array([np.deg2rad(landmark.yaw_sigma_deg), landmark.position_sigma, landmark.position_sigma])
     T_map_landmark = floor_pose(x, y, np.deg2rad(landmark.yaw_deg))
-    return OnMap(landmark.name, gtsam.Pose3(T_map_landmark), np.diag(np.maximum(sigmas, LEAST_SIGMA) ** 2))
+    return OnMap(landmark.name, T_map_landmark, np.diag(np.maximum(sigmas, LEAST_SIGMA) ** 2))

@@ -12,7 +12,7 @@ from coloc_graph.backend.batched_factors import BatchedFactors
 from coloc_graph.backend.chain import compose, spanning_tree
 from coloc_graph.backend.chi2_test import Agreement, agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
-from coloc_graph.backend.graph import Link, PoseGraph
+from coloc_graph.backend.graph import Link, PoseGraph, pose_of
 from coloc_graph.backend.marginals import Posterior
 from coloc_graph.backend.solver import optimise
 
@@ -105,7 +105,7 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
 
     def expected(link: Link) -> gtsam.Pose3:
         i, j = map(graph.places.key, link.ends)
-        return factors_of.expected(link, i, j, errors) if mounts else link.T_i_j
+        return factors_of.expected(link, i, j, errors) if mounts else pose_of(link)
 
     known = {} if start is None else {key: start.atPose3(key) for key in poses_in(start)}
     values = gtsam.Values()

@@ -22,6 +22,7 @@ LEAST_SIGMA = 1e-9
 #: How far a rotation may be from one, and a covariance from symmetric (of its largest entry).
 ROUNDING = 1e-6
 _IDENTITY = np.eye(3)
+_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def require_valid(measurements: Sequence[Measurement], floor: Floor | None) -> None:
@@ -50,12 +51,16 @@ def _all_well(measurements: Sequence[Measurement], floor: Floor | None) -> bool:
         if np.shape(measured.covariance) != C[index, known, known].shape or (floor is None and known.start):
             return False
         C[index, known, known] = measured.covariance
-    T = np.array([m.T_i_j.matrix() for m in measurements])
+    if any(m.T_i_j.shape != (4, 4) for m in measurements):
+        return False
+    T = np.array([m.T_i_j for m in measurements])
     R = T[:, :3, :3]
     # NaN compares as False
     if not (np.abs(T).max() <= FARTHEST and np.abs(R.mT @ R - _IDENTITY).max() <= ROUNDING):
         return False
-    if not (np.linalg.det(R).min() > 0 and np.abs(C).max() <= FARTHEST**2):
+    if not (np.linalg.det(R).min() > 0 and np.abs(T[:, 3] - _LAST_ROW).max() <= ROUNDING):
+        return False
+    if not np.abs(C).max() <= FARTHEST**2:
         return False
     if (
         np.abs(C - C.mT).max(axis=(1, 2)) > ROUNDING * np.array([np.abs(m.covariance).max() for m in measurements])
@@ -72,7 +77,10 @@ def _size(measured: Measurement) -> int:
 
 
 def _why_not_poses(measurements: Sequence[Measurement]) -> tuple[int, str] | None:
-    T = np.array([m.T_i_j.matrix() for m in measurements])
+    for index, measured in enumerate(measurements):
+        if measured.T_i_j.shape != (4, 4):
+            return index, f"has a pose of shape {measured.T_i_j.shape}; give (4, 4)"
+    T = np.array([m.T_i_j for m in measurements])
     finite = np.isfinite(T).all(axis=(1, 2))
     if not finite.all():
         return int(np.argmin(finite)), "is not finite: a pose holds no number"
@@ -84,6 +92,9 @@ def _why_not_poses(measurements: Sequence[Measurement]) -> tuple[int, str] | Non
     if off.max() > ROUNDING:
         return int(np.argmax(off)), f"is no rigid motion: R^T R is off the identity by {off.max():.2g}"
     flipped = np.linalg.det(R) < 0
+    if (np.abs(T[:, 3] - _LAST_ROW) > ROUNDING).any():
+        index = int(np.argmax(np.abs(T[:, 3] - _LAST_ROW).max(axis=1)))
+        return index, "is no rigid motion: its last row is not 0, 0, 0, 1"
     if flipped.any():
         return int(np.argmax(flipped)), "is no rigid motion but a reflection"
     return None

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ def fuse(said: Said, scale: float = 1.0) -> Fused:
 def fuse_scaled(said: Said, chance: float) -> Fused:
     """`fuse`, with own errors larger where the values disagree by more than this chance; chi2 is that of the first."""
     first = fuse(said)
-    if not first.dof or first.chi2 <= chi2_distribution.isf(chance, first.dof):
+    if not first.dof or first.chi2 <= chdtri(first.dof, chance):
         return first
     again = fuse(said, first.chi2 / first.dof)
     return Fused(again.value, again.covariance, first.chi2, first.dof, again.scale, again.weights)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from coloc_graph.calibration.bundle import adjust_pose, project, rms, start_pose
 from coloc_graph.calibration.corners import View
@@ -251,8 +251,8 @@ def _refused_by_others(views: Sequence[View], said: Said, kept: list[int]) -> tu
         rest = fuse(said.of(others))
         apart = said.values[kept[worst]] - rest.value
         # of boards that are not quite flat, or a floor that is not, all are off by more than noise: so many times
-        usual = min(float(np.median(off) / chi2_distribution.median(3)), rest.chi2 / rest.dof) if rest.dof else 1.0
-        by_chance = off[worst] <= max(usual, 1.0) * chi2_distribution.isf(CHANCE / len(views), 3)
+        usual = min(float(np.median(off) / chdtri(3, 0.5)), rest.chi2 / rest.dof) if rest.dof else 1.0
+        by_chance = off[worst] <= max(usual, 1.0) * chdtri(3, CHANCE / len(views))
         if by_chance or (abs(apart[0]) < NEAR_HEIGHT and np.abs(apart[1:]).max() < math.radians(NEAR_DEG)):
             break
         if len(kept) == 2:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from coloc_graph.evaluation.truth import with_truth
 from coloc_graph.geometry.lie import floor_pose, se3_inverse, se3_log, yaw
@@ -40,14 +41,12 @@ class Nees:
 
 def nees(estimated: Trajectory, T_true: Array, components: list[int]) -> Nees | None:
     """The NEES of a trajectory against true poses (n, 4, 4), with its interval; None where no pose has a covariance."""
-    from scipy.stats import chi2
-
     z = whitened(estimated, T_true, components)
     if not len(z):
         return None
     count = effective_poses(z)
     dof = count * z.shape[1]
-    low, high = chi2.ppf([0.025, 0.975], dof) / dof
+    low, high = chdtri(dof, [0.975, 0.025]) / dof
     return Nees(float((z**2).mean()), len(z), count, float(low), float(high))
 
 

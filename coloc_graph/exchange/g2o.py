@@ -37,18 +37,18 @@ _STAY_PUT = re.compile(r"# STAY_PUT (\S+) (\d+) (\d+)")
 def write_g2o(estimate: Estimate, path: Path) -> None:
     """Write what was estimated, and what was measured between it and not refused."""
     graph = estimate.graph
-    poses: dict[int, gtsam.Pose3] = {}
+    poses: dict[int, Array] = {}
     names: dict[int, list[str]] = {}
     for robot, trajectory in estimate.trajectories.items():
         assert trajectory.stances is not None
         for stance, T in zip(trajectory.stances.tolist(), trajectory.T_world_body, strict=True):
             key = graph.key(robot, stance)
-            poses.setdefault(key, gtsam.Pose3(T))
+            poses.setdefault(key, T)
             names.setdefault(key, []).append(f"{robot}@{stance}")
     still = estimate.landmarks if estimate.map is None else {**estimate.landmarks, MAP: estimate.map}
     for name, placed in still.items():
         key = graph.places.still()[name]
-        poses[key], names[key] = placed.T_world_body, ["the map" if name == MAP else f"landmark {name}"]
+        poses[key], names[key] = placed.T_world_body.matrix(), ["the map" if name == MAP else f"landmark {name}"]
     ids = {key: number for number, key in enumerate(poses)}
 
     lines = []
@@ -77,9 +77,9 @@ def _information(C: Array) -> Array:
     return information[np.ix_(_TRANSLATION_FIRST, _TRANSLATION_FIRST)]
 
 
-def _pose(pose: gtsam.Pose3) -> str:
-    w, x, y, z = quaternion(pose.rotation().matrix())
-    return " ".join(repr(float(number)) for number in (*pose.translation(), x, y, z, w))
+def _pose(T: Array) -> str:
+    w, x, y, z = quaternion(T[:3, :3])
+    return " ".join(repr(float(number)) for number in (*T[:3, 3], x, y, z, w))
 
 
 @dataclass(frozen=True, eq=False)

@@ -130,7 +130,8 @@ def _measure_cell(cell: tuple[float, float], depth: Depth, seed: int, runs: int,
                 overlap_px=overlaps[1, n],
             )
             pose = most_likely_pose(measurement, robot_i.mount, robot_j.mount, plane, run.team.floor)
-            lengths[1, n] = np.linalg.norm(pose.T_ci_cj.translation())
+            assert pose.T_ci_cj is not None
+            lengths[1, n] = np.linalg.norm(pose.T_ci_cj[:3, 3])
         except DegenerateGeometry:
             pass
     usable = np.isfinite(H).all(axis=(1, 2))

@@ -3,7 +3,6 @@
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -229,8 +228,9 @@ def _sighting(
     return sighting
 
 
-def _faces(T_observer_landmark: gtsam.Pose3, observer: Robot) -> bool:
-    p_landmark = T_observer_landmark.transformTo(observer.mount.T_body_camera[:3, 3])
+def _faces(T_observer_landmark: Array, observer: Robot) -> bool:
+    """True if a landmark shows its front to the observer's camera."""
+    p_landmark = se3_inverse(T_observer_landmark) @ observer.mount.T_body_camera[:, 3]
     return bool(p_landmark[0] > 0)
 
 

@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose, se3_between
 from coloc_graph.measurements import Odometry
 from coloc_graph.run import OdometrySample
 
@@ -73,5 +72,5 @@ class WheelTrack:
         late = clock_sigma * np.array([self.speed_at(start), self.speed_at(end)])
         covariance[1:, 1:] += (late**2).sum() * np.eye(2)
         T_odom = floor_pose(x[[0, -1]], y[[0, -1]], yaw[[0, -1]])
-        T_before_after = gtsam.Pose3(T_odom[0]).between(gtsam.Pose3(T_odom[1]))
+        T_before_after = se3_between(*T_odom)
         return Odometry(self.robot, before, after, T_before_after, (covariance + covariance.T) / 2)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -69,7 +68,7 @@ def sight(
     best = int(good[np.argmin(cost)])
     noise = np.stack([pair[0].covariance[shared[best, 0]], pair[1].covariance[shared[best, 1]]])
     pose, covariance = _pose(observer, markers, plane, uv[best], noise)
-    T_observer_seen = gtsam.Pose3(floor_pose(pose[1], pose[2], pose[0]))
+    T_observer_seen = floor_pose(pose[1], pose[2], pose[0])
     bias = observer.camera.bias_px**2 * np.eye(2)
     x = observer.camera.normalise(uv[best])
     J = observer.camera.per_pixel(x)

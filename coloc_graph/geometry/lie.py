@@ -146,6 +146,13 @@ def se3_inverse(T_a_b: ArrayLike) -> Array:
     return out
 
 
+def se3_between(T_w_a: ArrayLike, T_w_b: ArrayLike) -> Array:
+    """Poses T_a_b of T_w_a and T_w_b, (..., 4, 4); far from w it loses fewer digits than the product."""
+    A, B = np.asarray(T_w_a, float), np.asarray(T_w_b, float)
+    Rt = A[..., :3, :3].mT
+    return se3(Rt @ B[..., :3, :3], (Rt @ (B[..., :3, 3] - A[..., :3, 3])[..., None])[..., 0])
+
+
 def se3(R: ArrayLike, t: ArrayLike) -> Array:
     """Poses (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
     R = np.asarray(R, float)

@@ -189,6 +189,6 @@ def _measurement_row(measured: PairMeasurement, why_not: str | None) -> list[str
         str(h.inliers),
         number(h.residual, 2),
         number(h.overlap_px, 0),
-        number(math.degrees(pose.normal_error) if pose else None, 2),
+        number(None if pose is None or pose.normal_error is None else math.degrees(pose.normal_error), 2),
         "yes" if why_not is None else f'<span class="bad">{escape(why_not)}</span>',
     ]

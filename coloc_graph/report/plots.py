@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from coloc_graph.backend import Estimate
 from coloc_graph.geometry.lie import se3_inverse, yaw
@@ -210,7 +210,7 @@ def residual_figure(measurements: Iterable[HomographyMeasurement]) -> Figure:
     above, below = figure.subplots(2, 1, sharex=True)
 
     dof = np.array([max(one.dof, 1) for one in good], float)
-    least, most = (np.sqrt(chi2.ppf(p, dof) / dof) for p in (0.025, 0.975))
+    least, most = (np.sqrt(chdtri(dof, p) / dof) for p in (0.975, 0.025))
     _bars(above, stance, least, most, len(measured))
     above.axhline(1, color=GREY, linewidth=0.9, linestyle="--")
     above.scatter(stance, [one.residual for one in good], s=size, color=COLOURS[0], zorder=3)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,11 +73,11 @@ def measured_team(
         root = root @ (np.eye(len(root)) + 0.3 * rng.standard_normal(root.shape))
         return np.asarray(root @ root.T)
 
-    def noisy(T_i_j: Array, C: Array) -> gtsam.Pose3:
+    def noisy(T_i_j: Array, C: Array) -> Array:
         xi = np.zeros(6)
         drawn = np.linalg.cholesky(C) @ rng.standard_normal(len(C))
         xi[slice(0, 6) if len(C) == 6 else slice(2, 5)] = drawn
-        return gtsam.Pose3(T_i_j @ se3_exp(-xi))
+        return T_i_j @ se3_exp(-xi)
 
     # at stance k the driver of k-1 stands at a new place, and so does one who makes room in the paper's pair
     at = {name: place(n, 0) for n, name in enumerate(names)}
@@ -120,8 +119,8 @@ def measured_team(
                 is_wrong = astray.uniform() < wrong
                 if is_wrong:
                     x, y, yaw = astray.uniform((-1.5, -1.5, -np.pi / 2), (1.5, 1.5, np.pi / 2))
-                    T_i_j = gtsam.Pose3(floor_pose(x, y, yaw))
-                measured = RelativePose(k, i, j, T_i_j, C, T_i_j, 0, 0.0)
+                    T_i_j = floor_pose(x, y, yaw)
+                measured = RelativePose(k, i, j, T_i_j, C)
                 made.append(measured)
                 if is_wrong:
                     bad.append(measured)

@@ -273,7 +273,7 @@ def _edge_lines(scene: Scene, edge: int, found: Inspection | None) -> Iterator[s
             ),
         ]
     if pose is not None:
-        rows.append(("distance", f"{np.linalg.norm(pose.T_i_j.translation()):.4f} m"))
+        rows.append(("distance", f"{np.linalg.norm(pose.T_i_j[:3, 3]):.4f} m"))
     yield _table(("measured again", ""), rows)
     if h.warning:
         yield f"_{h.warning}_"

@@ -20,8 +20,7 @@ SIGMAS = np.array([0.004, 0.005, 0.01, 0.02, 0.015, 0.01])
 def relative(stance, i, j, T_i_j, sigmas=SIGMAS, covariance=None):
     """A measurement as the front end would give it."""
     C = np.diag(np.square(sigmas)) if covariance is None else covariance
-    T = T_i_j if isinstance(T_i_j, gtsam.Pose3) else gtsam.Pose3(T_i_j)
-    return RelativePose(stance, i, j, T, np.asarray(C, float), T, 0, 0.0)
+    return RelativePose(stance, i, j, T_i_j, C)
 
 
 def leapfrog(stances):
@@ -233,7 +232,9 @@ def test_the_floor_keeps_heights_and_tilts_that_the_measurements_do_not_know(rng
     when = leapfrog(6)
     poses = [relative(s.index, *s.observers, T) for s, T in zip(when, [floor_pose(0.4, 0.1, 0.3)] * 6, strict=True)]
     noisy = [
-        relative(p.stance, p.robot_i, p.robot_j, p.T_i_j.compose(gtsam.Pose3.Expmap(rng.normal(0, SIGMAS))))
+        relative(
+            p.stance, p.robot_i, p.robot_j, gtsam.Pose3(p.T_i_j).compose(gtsam.Pose3.Expmap(rng.normal(0, SIGMAS)))
+        )
         for p in poses
     ]
     estimate = smooth(graph_of(when, noisy, floor=Floor()))

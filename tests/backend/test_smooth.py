@@ -143,7 +143,7 @@ def three(seed, **options):
 def test_in_a_chain_of_three_odometry_contradicts_a_wrong_homography():
     team = three(3)
     (wrong,) = [m for m in team.measurements if isinstance(m, RelativePose) and m.stance == 6]
-    T = gtsam.Pose3(floor_pose(0.05, 0.06, 0.1)).compose(wrong.T_i_j)
+    T = gtsam.Pose3(floor_pose(0.05, 0.06, 0.1)).compose(gtsam.Pose3(wrong.T_i_j))
     bad = RelativePose(6, wrong.robot_i, wrong.robot_j, T, wrong.covariance, T, 0, 0.0)
     made = [bad if m is wrong else m for m in team.measurements]
     estimate = smooth(graph_of_team(team, made))
@@ -170,7 +170,7 @@ def test_a_bumped_anchor_is_found_and_named_and_no_homography_is_blamed(size, re
             T = gtsam.Pose3(bump).inverse().compose(T) if i == robot else T.compose(gtsam.Pose3(bump))
             m = RelativePose(6, i, j, T, m.covariance, T, 0, 0.0)
         elif isinstance(m, Odometry) and m.robot == robot and a == 6:
-            m = Odometry(robot, a, b, gtsam.Pose3(bump).inverse().compose(m.T_before_after), m.covariance)
+            m = Odometry(robot, a, b, gtsam.Pose3(bump).inverse().compose(gtsam.Pose3(m.T_before_after)), m.covariance)
         made.append(m)
     estimate = smooth(graph_of_team(team, made))
     (found,) = estimate.bumped

@@ -103,7 +103,7 @@ def hallway_world(seed, offset, stances=1, **options):
 def error_of(world, found, k=0):
     stance = world.stances[k]
     i, j = (world.paths[robot].pose_at([stance.start])[0] for robot in stance.observers)
-    return gtsam.Pose3.Logmap(found.relative_pose.T_i_j.between(gtsam.Pose3(se3_inverse(i) @ j)))
+    return gtsam.Pose3.Logmap(gtsam.Pose3(found.relative_pose.T_i_j).between(gtsam.Pose3(se3_inverse(i) @ j)))
 
 
 @pytest.mark.parametrize("names", [True, False])
@@ -166,7 +166,7 @@ def test_constant_speed_is_told_and_its_doubt_is_in_the_pose(tmp_path, place):
     assert "not observable" in h.warning and "stop and go" in h.warning
     assert found.offset_evidence is None
     assert h.time_offset_sigma == pytest.approx(OFFSET)
-    xi = gtsam.Pose3.Logmap(found.relative_pose.T_i_j.between(gtsam.Pose3(Scene().T_i_j)))
+    xi = gtsam.Pose3.Logmap(gtsam.Pose3(found.relative_pose.T_i_j).between(gtsam.Pose3(Scene().T_i_j)))
     assert xi @ np.linalg.solve(found.relative_pose.covariance, xi) < 30
     sure = steady(tmp_path, place, clock_sigma=1e-4)
     assert np.trace(sure.relative_pose.covariance) < 0.7 * np.trace(found.relative_pose.covariance)

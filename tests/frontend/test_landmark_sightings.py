@@ -115,7 +115,7 @@ def test_a_tag_is_sighted_where_it_stands_as_surely_as_it_says():
         seen = watched(team, [seen_by(team, T, rng) for _ in range(4)])
         (made,), doubts = sight_landmarks(Run(team), STANCE, [("A", seen)])
         assert not doubts and (made.observer, made.seen) == ("A", "L1")
-        off = se3_inverse(made.T_observer_seen.matrix()) @ T
+        off = se3_inverse(made.T_observer_seen) @ T
         xi = np.array([np.arctan2(off[1, 0], off[0, 0]), *off[:2, 3]])
         assert np.abs(xi[1:]).max() < 0.02 and abs(xi[0]) < np.deg2rad(4)
         sigmas.append(xi @ np.linalg.solve(made.covariance, xi))
@@ -186,7 +186,7 @@ def test_coloured_lights_are_a_landmark_and_which_is_which_is_by_the_side_it_fac
     assert [track.marker for track in seen.tracks] == ["L1/0", "L1/1"] and not seen.doubts
     assert np.abs(np.concatenate([track.uv for track in seen.tracks]) - uv).max() < 0.3
     (made,), _ = sight_landmarks(Run(team), STANCE, [("A", seen)])
-    assert np.abs((made.T_observer_seen.matrix() - T)[:2]).max() < 0.05
+    assert np.abs((made.T_observer_seen - T)[:2]).max() < 0.05
 
 
 def test_lights_that_may_be_others_are_refused_in_words_and_never_guessed():
@@ -246,7 +246,7 @@ def test_one_false_sample_moves_no_landmark_and_a_plane_that_is_stated_leaves_th
         tracks.append(Track("A", f"L1/{n}", np.arange(9.0), seen, np.tile(0.0025 * np.eye(2), (9, 1, 1)), np.zeros(9)))
     run = Run(team)
     (made,), doubts = sight_landmarks(run, STANCE, [("A", SeenLandmarks(tracks))])
-    assert not doubts and np.abs((made.T_observer_seen.matrix() - T)[:2]).max() < 0.01
+    assert not doubts and np.abs((made.T_observer_seen - T)[:2]).max() < 0.01
     assert sight_landmarks(run, STANCE, [("A", SeenLandmarks(tracks))], {("A", "L1")}) == ([], [])
     run.planes = {STANCE.index: None}
     assert sight_landmarks(run, STANCE, [("A", SeenLandmarks(tracks))]) == ([], [])

@@ -50,7 +50,7 @@ def measured(pairs):
 
 
 def error(pose):
-    return pose.T_i_j.localCoordinates(gtsam.Pose3(T_I_J))
+    return gtsam.Pose3(pose.T_i_j).localCoordinates(gtsam.Pose3(T_I_J))
 
 
 @pytest.mark.parametrize("floor", [None, Floor(), Floor(tilt_sigma_deg=0.1, height_sigma=1e-3)])

@@ -40,7 +40,7 @@ def test_nees_of_odometry_between_any_two_instants_is_inside_its_interval():
         for start, stop in ((100.0, end + 5), (101.0 + 0.31 * (end - 101), 101.0 + 0.77 * (end - 101))):
             way = wheels.between(0, 1, start, stop)
             T = path.pose_at(np.array([start, stop]))
-            off = planar(se3_inverse(way.T_before_after.matrix()) @ se3_inverse(T[0]) @ T[1])
+            off = planar(se3_inverse(way.T_before_after) @ se3_inverse(T[0]) @ T[1])
             nees.append(off @ np.linalg.solve(way.covariance, off))
     for part in (nees[::2], nees[1::2]):  # the whole way, and one that begins and ends between samples
         low, high = chi2.ppf([0.005, 0.995], 3 * len(part))
@@ -58,7 +58,7 @@ def test_a_way_by_hand():
         OdometrySample("A", 1.0 + k, np.array(p, float), c) for k, (p, c) in enumerate(zip(poses, C, strict=True))
     ]
     way = WheelTrack("A", samples).between(3, 4, 0.0, 9.0)
-    np.testing.assert_allclose(way.T_before_after.matrix(), floor_pose(1, 1, np.pi / 2), atol=1e-12)
+    np.testing.assert_allclose(way.T_before_after, floor_pose(1, 1, np.pi / 2), atol=1e-12)
     expected = np.diag([1e-4, 4e-4, 4e-4 + 1e-4])
     expected[0, 2] = expected[2, 0] = 1e-4  # turned too far left, it ends too far left
     np.testing.assert_allclose(way.covariance, expected + np.diag([1e-6, 2.5e-7, 2.5e-7]), atol=1e-9)
@@ -116,7 +116,7 @@ def test_nees_of_sightings_is_inside_its_interval(rng, tolerance):
         )
         tracks = seen_from(rng, msgspec.structs.replace(observer, mount_if_any=true_mount), mover, truth[None])
         seen = sight(STANCE, stated, mover, tracks, plane)
-        off = planar(se3_inverse(seen.T_observer_seen.matrix()) @ truth)
+        off = planar(se3_inverse(seen.T_observer_seen) @ truth)
         nees.append(off @ np.linalg.solve(seen.covariance, off))
     low, high = chi2.ppf([0.005, 0.995], 3 * len(nees))
     assert low < sum(nees) < high
@@ -146,7 +146,7 @@ def test_lights_without_names_are_told_apart_by_the_way_the_wheels_drove(rng, re
     )
     for given in (tracks, tracks[::-1]):
         seen = sight(STANCE, team["A"], team["C"], given, plane, wheels)
-        assert abs(planar(seen.T_observer_seen.matrix())[0]) < 0.2
+        assert abs(planar(seen.T_observer_seen)[0]) < 0.2
     assert sight(STANCE, team["A"], team["C"], tracks, plane) is None  # nothing tells
     still = WheelTrack("C", [OdometrySample("C", 0.1 * k, np.zeros(3), np.eye(3)) for k in range(30)])
     assert sight(STANCE, team["A"], team["C"], tracks, plane, still) is None
@@ -181,7 +181,7 @@ def test_a_run_gives_one_sighting_of_the_mover_a_stance_near_its_truth(hallway):
         for robot in (one.observer, "C"):
             index = np.searchsorted(truth[robot].times, one.time + 1e-6, side="right") - 1
             poses.append(truth[robot].T_world_body[index])
-        off = planar(se3_inverse(one.T_observer_seen.matrix()) @ se3_inverse(poses[0]) @ poses[1])
+        off = planar(se3_inverse(one.T_observer_seen) @ se3_inverse(poses[0]) @ poses[1])
         assert np.abs(off[1:]).max() < 0.05  # the truth's samples are 2 cm apart
 
 

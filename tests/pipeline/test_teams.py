@@ -220,7 +220,7 @@ def test_without_names_the_markers_of_several_movers_find_themselves(tmp_path):
     assert measured.homography.points > 200
     assert measured.homography.inliers > 0.95 * measured.homography.points
     true = [world.paths[name].pose_at(run.stances[0].start)[0] for name in run.stances[0].observers]
-    off = measured.relative_pose.T_i_j.matrix() - np.linalg.inv(true[0]) @ true[1]
+    off = measured.relative_pose.T_i_j - np.linalg.inv(true[0]) @ true[1]
     assert np.abs(off[:3, 3]).max() < 0.02
 
 
@@ -234,7 +234,7 @@ def test_a_messy_world_gives_a_right_pose_or_none(tmp_path):
         if measured.relative_pose is None:
             continue
         i, j = (world.paths[name].pose_at(run.stances[0].start)[0] for name in "AB")
-        off = measured.relative_pose.T_i_j.matrix() - np.linalg.inv(i) @ j
+        off = measured.relative_pose.T_i_j - np.linalg.inv(i) @ j
         assert np.abs(off[:3, 3]).max() < 0.02
         right += 1
     assert right
@@ -286,7 +286,7 @@ def test_colours_tell_two_movers_apart_even_in_lock_step(tmp_path):
         assert {track.mover for track in tracks.of(robot)} == {"C", "D"}
     measured = measure_pair(run, run.stances[0], "A", "B", FrontendOptions(), tracks)
     assert measured.homography.unusable is None
-    off = measured.relative_pose.T_i_j.matrix() - np.linalg.inv(poses["A"]) @ poses["B"]
+    off = measured.relative_pose.T_i_j - np.linalg.inv(poses["A"]) @ poses["B"]
     assert np.abs(off[:3, 3]).max() < 0.02
     assert {span.mover for span in measured.relative_pose.spans} == {"C", "D"}
 

@@ -587,7 +587,7 @@ def nees(samples, true_start, true_end):
     """Of the whole way that the samples tell, against the true poses (x, y, yaw) at its ends."""
     way = WheelTrack("A", samples).between(0, 1, samples[0].time, samples[-1].time)
     T_start, T_end = (floor_pose(*true) for true in (true_start, true_end))
-    off = planar(se3_inverse(way.T_before_after.matrix()) @ se3_inverse(T_start) @ T_end)
+    off = planar(se3_inverse(way.T_before_after) @ se3_inverse(T_start) @ T_end)
     return off @ np.linalg.solve(way.covariance, off), off
 
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,9 +73,9 @@ def eq2_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount,
         stance=measurement.stance,
         robot_i=measurement.robot_i,
         robot_j=measurement.robot_j,
-        T_i_j=gtsam.Pose3(T_i_j[0]),
+        T_i_j=T_i_j[0],
         covariance=np.full((6, 6), np.nan),
-        T_ci_cj=gtsam.Pose3(T_ci_cj[0]),
+        T_ci_cj=T_ci_cj[0],
         solution=int(which),
         normal_error=float(normal_error),
     )

@@ -7,7 +7,6 @@ H count, weighed by their information, against the few unknowns that are left wh
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -111,9 +110,9 @@ def _result(
         stance=measurement.stance,
         robot_i=measurement.robot_i,
         robot_j=measurement.robot_j,
-        T_i_j=gtsam.Pose3(T_i_j[0]),
+        T_i_j=T_i_j[0],
         covariance=half @ half.T,
-        T_ci_cj=gtsam.Pose3(T_ci_cj[0]),
+        T_ci_cj=T_ci_cj[0],
         solution=start.solution,
         normal_error=start.normal_error,
     )
@@ -125,7 +124,7 @@ def _mount_sigmas(mount: Mount) -> list[float]:
 
 def _free(start: RelativePose, mount_i: Mount, mount_j: Mount, plane: Plane) -> _Model:
     """Unknowns: the pose's tangent (6), the normal across itself (2), d (1), both mounts (3 + 3)."""
-    T_start = start.T_i_j.matrix()
+    T_start = start.T_i_j
     sides = across(plane.N)
 
     def build(u: Array) -> tuple[Array, Array, Array, Array]:
@@ -142,7 +141,7 @@ def _free(start: RelativePose, mount_i: Mount, mount_j: Mount, plane: Plane) -> 
 
 def _on_floor(start: RelativePose, mount_i: Mount, mount_j: Mount, plane: Plane, floor: Floor) -> _Model:
     """Unknowns: x, y, heading (3), tilt of i and of j on the floor (2 + 2), height of j over i (1), d, mounts."""
-    T_start = start.T_i_j.matrix()
+    T_start = start.T_i_j
     x, y, heading = T_start[0, 3], T_start[1, 3], float(yaw(T_start))
     down = np.array([0.0, 0.0, -1.0])
 

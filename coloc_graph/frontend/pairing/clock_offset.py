@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.fit import (
@@ -147,7 +147,7 @@ def fuse(evidence: Sequence[ClockOffset], prior: ClockOffset) -> tuple[ClockOffs
     values, weights = np.array([e.value for e in evidence]), np.array([e.sigma**-2 for e in evidence])
     mean = float(weights @ values / weights.sum())
     chi2, dof = float(weights @ (values - mean) ** 2), len(evidence) - 1
-    chance = float(chi2_distribution.sf(chi2, dof)) if dof else 1.0
+    chance = float(chdtrc(dof, chi2)) if dof else 1.0
     spread = max(1.0, chi2 / dof) if dof and chance < 0.05 else 1.0
     return _combined(prior, ClockOffset(mean, float(np.sqrt(spread / weights.sum())))), chance
 

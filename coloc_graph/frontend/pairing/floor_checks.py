@@ -49,7 +49,7 @@ def on_one_floor(H_j_i: Array, robot_i: Robot, robot_j: Robot, plane: Plane) -> 
 
 def require_on_floor(pose: RelativePose, floor: Floor) -> None:
     """Raise `DegenerateGeometry` where two robots that stand on one floor would not, by what was measured."""
-    T_i_j, tangent = pose.T_i_j.matrix(), [0, 1, 5]
+    T_i_j, tangent = pose.T_i_j, [0, 1, 5]
     tilt = T_i_j[:3, :3].T @ np.array([0.0, 0.0, 1.0])  # the vertical of i in j
     off = np.array([-tilt[1], tilt[0], T_i_j[2, 3]])
     level = np.deg2rad(floor.tilt_sigma_deg)
