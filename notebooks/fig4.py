@@ -23,7 +23,7 @@
 # %%
 from IPython.display import SVG, display
 
-from coloc_graph.experiments import single_step_results as fig4
+from coloc_graph.experiments import draw, fig4
 from coloc_graph.report import figure_svg
 
 cells = [(baseline, theta) for baseline in (0.6, 1.2) for theta in (0.0, 20.0, 40.0)]
@@ -31,7 +31,7 @@ result = fig4(runs=20, cells=cells, seed=0)
 print(result.summary)
 
 # %%
-display(SVG(figure_svg(result.figure())))
+display(SVG(figure_svg(draw(result))))
 
 # %% [markdown]
 # Above is eq. (2): the error grows with the distance and falls with the angle, as in the paper, and at 60 cm and

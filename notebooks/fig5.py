@@ -19,7 +19,7 @@
 # %%
 from IPython.display import SVG, display
 
-from coloc_graph.experiments import fig5
+from coloc_graph.experiments import draw, fig5
 from coloc_graph.report import figure_svg
 
 cells = [(baseline, theta) for baseline in (0.6, 0.8, 1.0, 1.2) for theta in (0.0, 30.0)]
@@ -27,7 +27,7 @@ result = fig5(runs=15, cells=cells, seed=0)
 print(result.summary)
 
 # %%
-display(SVG(figure_svg(result.figure())))
+display(SVG(figure_svg(draw(result))))
 
 # %% [markdown]
 # Both methods follow the overlap. Ours lies below eq. (2) everywhere, and the gap is widest where little is shared:

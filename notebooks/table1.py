@@ -20,7 +20,7 @@
 # %%
 from IPython.display import SVG, display
 
-from coloc_graph.experiments import multi_step_results as table1
+from coloc_graph.experiments import draw, table1
 from coloc_graph.report import figure_svg
 
 result = table1(runs=2, seed=0)
@@ -31,7 +31,7 @@ for row in [result.header, *result.rows]:
     print("".join(cell.rjust(20) for cell in row))
 
 # %%
-display(SVG(figure_svg(result.figure())))
+display(SVG(figure_svg(draw(result))))
 
 # %% [markdown]
 # The paper shows one run, and so its 0.01 cm for a-c is luck as well as skill: over more seeds eq. (2) is off by

@@ -19,7 +19,7 @@
 # %%
 from IPython.display import SVG, display
 
-from coloc_graph.experiments import table2
+from coloc_graph.experiments import draw, table2
 from coloc_graph.report import figure_svg
 
 result = table2(runs=2, stances=6, seed=0)
@@ -30,7 +30,7 @@ for row in [result.header, *result.rows]:
     print("".join(cell.rjust(16) for cell in row))
 
 # %%
-display(SVG(figure_svg(result.figure())))
+display(SVG(figure_svg(draw(result))))
 
 # %% [markdown]
 # The length hides most of the error of a chain: heading errors bend it to the side, which hardly changes how long it

@@ -5,12 +5,10 @@ eq. (2) as the paper computes it, and our estimate, side by side.
 Both depths go the same road: a run is simulated to a file, opened, and measured by the front end.
 """
 
-from coloc_graph.experiments.fig5 import Fig5, fig5
-from coloc_graph.experiments.multi_step_results import Table1, table1
-from coloc_graph.experiments.output import Experiment, require_place, save
+from coloc_graph.experiments.multi_step_results import Table1, Table2, table1, table2
+from coloc_graph.experiments.output import Experiment, draw, require_place, save
 from coloc_graph.experiments.single_step import CELLS, Cell, measure_cells
-from coloc_graph.experiments.single_step_results import Fig4, fig4
-from coloc_graph.experiments.table2 import Table2, table2
+from coloc_graph.experiments.single_step_results import Fig4, Fig5, fig4, fig5
 
 __all__ = [
     "CELLS",
@@ -20,6 +18,7 @@ __all__ = [
     "Fig5",
     "Table1",
     "Table2",
+    "draw",
     "fig4",
     "fig5",
     "measure_cells",

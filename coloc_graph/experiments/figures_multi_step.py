@@ -8,7 +8,7 @@ from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from coloc_graph.experiments.multi_step import Outing
-from coloc_graph.experiments.multi_step_results import Table1
+from coloc_graph.experiments.multi_step_results import Table1, Table2
 from coloc_graph.experiments.paper import TABLE1
 from coloc_graph.experiments.style import (
     DEPTHS,
@@ -22,7 +22,6 @@ from coloc_graph.experiments.style import (
     PAPER_MARKER,
     titled,
 )
-from coloc_graph.experiments.table2 import Table2
 from coloc_graph.report.drawing import GREY, INK, PALE, styled
 
 Array = NDArray[np.float64]

@@ -11,10 +11,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
-from coloc_graph.experiments.fig5 import Fig5, estimates_of
 from coloc_graph.experiments.paper import BIN_CM, FIG4_MEAN_CM, fig4_within_1cm
 from coloc_graph.experiments.single_step import Cell
-from coloc_graph.experiments.single_step_results import Fig4, histogram
+from coloc_graph.experiments.single_step_results import Fig4, Fig5, estimates_of, histogram
 from coloc_graph.experiments.style import DEPTHS, EQ2, EQ2_LABEL, EQ2_MARKER, OURS, OURS_LABEL, OURS_MARKER, titled
 from coloc_graph.report.drawing import GREY, styled
 

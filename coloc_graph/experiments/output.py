@@ -1,42 +1,37 @@
-"""What an experiment's result can do, and how it is written: NAME.png, NAME.svg and NAME.json in a folder."""
+"""Drawing an experiment, and writing it as NAME.png, NAME.svg and NAME.json to a folder."""
 
 import json
 import os
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from coloc_graph._version import __version__
 from coloc_graph.errors import InputError
+from coloc_graph.experiments.multi_step_results import Table1, Table2
+from coloc_graph.experiments.single_step_results import Fig4, Fig5
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Experiment(Protocol):
-    """A measured experiment: a table of text, a sentence, all numbers, and a figure."""
+#: A measured experiment: `name`, a table of text (`header`, `rows`), a sentence (`summary`) and `numbers()` for JSON.
+Experiment = Fig4 | Fig5 | Table1 | Table2
 
-    @property
-    def name(self) -> str:
-        """What it reproduces, as the command names it."""
 
-    @property
-    def header(self) -> Sequence[str]:
-        """The table's columns."""
+def draw(experiment: Experiment) -> "Figure":
+    """Draw the figure of an experiment, laid out as in the paper."""
+    from coloc_graph.experiments.figures_multi_step import table1_figure, table2_figure
+    from coloc_graph.experiments.figures_single_step import fig4_figure, fig5_figure
 
-    @property
-    def rows(self) -> Sequence[Sequence[str]]:
-        """The table's rows, as wide as the header."""
-
-    @property
-    def summary(self) -> str:
-        """The result in a sentence."""
-
-    def numbers(self) -> dict[str, Any]:
-        """Everything that the figure and the table show, for JSON."""
-
-    def figure(self) -> "Figure":
-        """The picture."""
+    match experiment:
+        case Fig4():
+            return fig4_figure(experiment)
+        case Fig5():
+            return fig5_figure(experiment)
+        case Table1():
+            return table1_figure(experiment)
+        case Table2():
+            return table2_figure(experiment)
 
 
 def as_json(experiment: Experiment) -> dict[str, Any]:
@@ -69,7 +64,7 @@ def save(experiment: Experiment, out: str | Path) -> tuple[Path, Path, Path]:
     out = Path(out)
     require_place(out, experiment.name)
     png, svg, numbers = (out / f"{experiment.name}.{kind}" for kind in ("png", "svg", "json"))
-    figure = experiment.figure()
+    figure = draw(experiment)
     picture, text = png_bytes(figure), figure_svg(figure, experiment.name)
     out.mkdir(parents=True, exist_ok=True)
     png.write_bytes(picture)

@@ -97,7 +97,7 @@ def test_right_measurements_that_are_doubted_are_taken_back(monkeypatch):
 @pytest.fixture
 def large(monkeypatch):
     """Graphs of a few links are taken for large ones, in which the search goes on from where the fit was."""
-    batch, fit = (sys.modules[f"coloc_graph.backend.{name}"] for name in ("batch", "fit"))
+    batch, fit = (sys.modules[f"coloc_graph.backend.{name}"] for name in ("batch", "optimize"))
     monkeypatch.setattr(batch, "ALL_TESTED", 0)
     monkeypatch.setattr(fit, "ALL_TESTED", 0)
     monkeypatch.setattr(batch, "LEAST_CHANCE_OF_ALL", 0.0)

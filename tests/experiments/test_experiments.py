@@ -15,14 +15,11 @@ import pytest
 from coloc_graph import experiments
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
-from coloc_graph.experiments import CELLS, Fig4, Fig5, measure_cells, require_place, save, table2
-from coloc_graph.experiments import multi_step_results as table1
-from coloc_graph.experiments import single_step_results as fig4
-from coloc_graph.experiments.fig5 import estimates_of
+from coloc_graph.experiments import CELLS, Fig4, Fig5, fig4, measure_cells, require_place, save, table1, table2
 from coloc_graph.experiments.figures_single_step import fig4_figure, fig5_figure
 from coloc_graph.experiments.paper import TABLE1_FROM_A, TABLE1_STEPS, TABLE2
 from coloc_graph.experiments.pool import spread
-from coloc_graph.experiments.single_step_results import histogram, paper_says
+from coloc_graph.experiments.single_step_results import estimates_of, histogram, paper_says
 
 #: The paper's Tables I and II as they are printed.
 PRINTED_1 = """

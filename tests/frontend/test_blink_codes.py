@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_teams import lock_step
+from crowd_scene import lockstep_run
 
 from coloc_graph.errors import InputError
 from coloc_graph.frontend import FrontendOptions, StanceTracks, Track, measure_pair
@@ -104,7 +104,7 @@ def test_white_movers_that_blink_are_told_apart_in_images_even_in_lock_step(tmp_
         on = np.repeat([lamps[name].on(np.array([0.04 * k]))[0] for name in "CD"], 2)
         return render(spots(uv[on], 1.5, 220.0), background=12.0, rng=np.random.default_rng(k))
 
-    run, poses, lights = lock_step(tmp_path / "run.mcap", TEAM, image, frames=150, step=0.04)
+    run, poses, lights = lockstep_run(tmp_path / "run.mcap", TEAM, image, frames=150, step=0.04)
     tracks = StanceTracks(run, run.stances[0])
     for robot in "AB":
         named = 0

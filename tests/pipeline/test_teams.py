@@ -6,25 +6,22 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from crowd_scene import FACTS, movers, seen_by_both
+from crowd_scene import FACTS, lockstep_run, movers, seen_by_both
 from msgspec.structs import replace as msgspec_replace
 
 from coloc_graph.backend import Estimator, joint
 from coloc_graph.errors import InputError
 from coloc_graph.frontend import FrontendOptions, StanceTracks, Track, correspond, little_in_common, measure_pair
 from coloc_graph.frontend.pairing.observer_pairs import PARTNERS, pairs_of, share
-from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Sighting
 from coloc_graph.pipeline import incremental as stance_solver
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.results.writer import assess
-from coloc_graph.run import Detections, Image, RunWriter, Stance, open_run
+from coloc_graph.run import Detections, RunWriter, open_run
 from coloc_graph.simulation import Imperfections, record, reference_team, simulate
-from coloc_graph.simulation.crowd import STEP, lights_of
 from coloc_graph.simulation.scenarios import team_of
 from coloc_graph.simulation.teams import build_team_world
 from coloc_graph.team import Floor
-from coloc_graph.team.shared_view import View
 
 UNEVEN = Imperfections(mount_sigma_deg=0.5, height_sigma=0.003, floor_sigma_deg=0.1)
 
@@ -250,27 +247,6 @@ def coloured(uv, colours):
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
-def lock_step(path, team, image, frames=70, step=0.1):
-    """A run of A and B that watch C and D, who drive the same way side by side; where A and B stand; and where they see
-    the four lights, (frames, 4, 2) [px]. `image` makes one of these in frame k.
-    """
-    seen = {}
-    poses = {"A": floor_pose(0, 0.4, -0.3), "B": floor_pose(0, -0.4, 0.3)}
-    s = np.linspace(0, 2 * np.pi, frames)
-    x, y = 1.4 + 0.3 * np.sin(s), 0.25 * np.sin(2 * s)
-    yaw = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
-    way = np.stack([np.stack([x, y + side, yaw], axis=1) for side in (-0.3, 0.3)], axis=1)
-    p_lights = lights_of(way, STEP * np.arange(frames), team["C"].markers.p_body)
-    with RunWriter(path, team, image_format="raw") as writer:
-        writer.write(Stance(0, 100.0, 110.0, ("A", "B"), ("C", "D")))
-        for robot, T in poses.items():
-            view = View(team[robot].camera, T @ team[robot].mount.T_body_camera)
-            seen[robot], _ = view.project(p_lights.reshape(frames, 4, 3))
-            for k in range(frames):
-                writer.write(Image(robot, 101.0 + step * k, image(seen[robot][k], k)))
-    return open_run(path), poses, seen
-
-
 def test_colours_tell_two_movers_apart_even_in_lock_step(tmp_path):
     """Side by side they drive the same way, and only their colours say which is which."""
     team = reference_team(names=("A", "B", "C", "D"))
@@ -280,7 +256,7 @@ def test_colours_tell_two_movers_apart_even_in_lock_step(tmp_path):
     )
     team = msgspec_replace(team, robots=robots)
     colours = [(0, 0, 230)] * 2 + [(0, 230, 0)] * 2
-    run, poses, _ = lock_step(tmp_path / "run.mcap", team, lambda uv, k: coloured(uv, colours))
+    run, poses, _ = lockstep_run(tmp_path / "run.mcap", team, lambda uv, k: coloured(uv, colours))
     tracks = StanceTracks(run, run.stances[0])
     for robot in "AB":
         assert {track.mover for track in tracks.of(robot)} == {"C", "D"}

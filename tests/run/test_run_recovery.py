@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_run import check_everything, everything, make
+from conformance_run import check_everything, everything, make
 
 from coloc_graph.errors import RunError
 from coloc_graph.run import RunWriter, open_run, read_true_team, read_truth
 
+SUPPORT = str(Path(__file__).parents[1] / "support")
 SLACK = 0.15  # of a busy machine's scheduler
 
 
@@ -160,7 +161,7 @@ def test_a_file_that_vanishes_while_it_is_read_is_a_sentence(tmp_path):
 RECORDER = """
 import sys, time
 sys.path.insert(0, sys.argv[2])
-from test_run import make
+from conformance_run import make
 from coloc_graph.run import Image, RunWriter
 writer = RunWriter(sys.argv[1], make.team())
 pixels = make.pixels(0)
@@ -177,7 +178,7 @@ time.sleep(60)
 
 def record(path, seconds):
     return subprocess.Popen(
-        [sys.executable, "-c", RECORDER, str(path), str(Path(__file__).parent), str(seconds)],
+        [sys.executable, "-c", RECORDER, str(path), SUPPORT, str(seconds)],
         stdout=subprocess.PIPE,
         text=True,
         cwd=Path(__file__).parents[2],

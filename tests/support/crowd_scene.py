@@ -8,6 +8,7 @@ from coloc_graph.frontend import Detector, MarkerTracker, plane_from_mount
 from coloc_graph.frontend.images.detection import Blobs
 from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers
 from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.run import Image, RunWriter, Stance, open_run
 from coloc_graph.simulation.crowd import STEP, Faults, detect, lights_of, wander
 from coloc_graph.simulation.rig import reference_team
 from coloc_graph.team.shared_view import View
@@ -61,3 +62,24 @@ def light_of(track, seen):
 
 def right(found, both):
     return all(both[0][1][a] == both[1][1][b] for a, b in found.chosen)
+
+
+def lockstep_run(path, team, image, frames=70, step=0.1):
+    """A run of A and B that watch C and D, who drive the same way side by side; where A and B stand; and where they see
+    the four lights, (frames, 4, 2) [px]. `image` makes one of these in frame k.
+    """
+    seen = {}
+    poses = {"A": floor_pose(0, 0.4, -0.3), "B": floor_pose(0, -0.4, 0.3)}
+    s = np.linspace(0, 2 * np.pi, frames)
+    x, y = 1.4 + 0.3 * np.sin(s), 0.25 * np.sin(2 * s)
+    yaw = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
+    way = np.stack([np.stack([x, y + side, yaw], axis=1) for side in (-0.3, 0.3)], axis=1)
+    p_lights = lights_of(way, STEP * np.arange(frames), team["C"].markers.p_body)
+    with RunWriter(path, team, image_format="raw") as writer:
+        writer.write(Stance(0, 100.0, 110.0, ("A", "B"), ("C", "D")))
+        for robot, T in poses.items():
+            view = View(team[robot].camera, T @ team[robot].mount.T_body_camera)
+            seen[robot], _ = view.project(p_lights.reshape(frames, 4, 3))
+            for k in range(frames):
+                writer.write(Image(robot, 101.0 + step * k, image(seen[robot][k], k)))
+    return open_run(path), poses, seen
