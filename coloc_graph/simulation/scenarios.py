@@ -39,7 +39,8 @@ class Scenario:
     """A leap-frog: `poses[k]` is where robot `pair[k % 2]` stands; in stance k, poses k and k+1 are taken.
 
     Robot `pair[(k + 1) % 2]` drives from `poses[k-1]` to `poses[k+1]` between stances k-1 and k, and `mover`
-    drives about during the stances. `box` is where its markers are spread.
+    drives about during the stances. `box` is where its markers are spread. If it `meanders`, it drives one curve in a
+    stance, as on a mission; otherwise to poses drawn one by one, as in the single steps of the paper.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Scenario:
     box: Box
     pair: tuple[str, str] = ("A", "B")
     mover: str = "C"
+    meanders: bool = False
 
     def __post_init__(self) -> None:
         if len(self.poses) < 2:
@@ -165,7 +167,8 @@ def hallway(stances: int = 40, rng: np.random.Generator | None = None) -> Scenar
     # row by row, so that a longer hallway begins as a shorter one does
     off = rng.standard_normal((stances + 1, 3)) * (0.01, 0.01, np.deg2rad(1.0))
     poses = np.stack([0.185 * k, 0.36 * side, -HALF_ANGLE * side], axis=1) + off
-    return Scenario("hallway", tuple((float(x), float(y), float(w)) for x, y, w in poses), Box((0.3, 2.5), (-1.0, 1.0)))
+    places = tuple((float(x), float(y), float(w)) for x, y, w in poses)
+    return Scenario("hallway", places, Box((0.3, 2.5), (-1.0, 1.0)), meanders=True)
 
 
 def team_of(
@@ -225,6 +228,7 @@ def course(
         "landmarks",
         tuple((float(x), float(y), float(w)) for x, y, w in poses),
         Box((0.3, 2.5), (-0.8, 0.8)),
+        meanders=True,
         headings=tuple(_along(LEAP * (k[:-1] + 0.5), lap)[:, 2].tolist()),
         landmarks=tuple((float(x), float(y), float(w)) for x, y, w in landmarks),
     )

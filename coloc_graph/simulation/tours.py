@@ -73,12 +73,12 @@ def scatter(
     offsets = (np.arange(burst) - (burst - 1) / 2) * BURST_SPACING
     instants = (passed[:, None] + offsets).ravel()
     recorded = np.repeat(recorded, burst, axis=0)
-    _leave_out(recorded, int(recorded.sum()) - points)
+    leave_out(recorded, int(recorded.sum()) - points)
     used = recorded.any(axis=1)
     return Tour(leg, instants[used], recorded[used])
 
 
-def _leave_out(recorded: NDArray[np.bool_], surplus: int) -> None:
+def leave_out(recorded: NDArray[np.bool_], surplus: int) -> None:
     """Strike the last `surplus` records, so that exactly the number asked for is left."""
     if surplus > 0:
         rows, columns = np.nonzero(recorded)
@@ -106,14 +106,14 @@ def _draw(
         tried += n
         P, turn = rng.uniform(low, high, (n, 2)), rng.uniform(-np.pi, np.pi, n)
         which = rng.integers(len(markers), size=n)
-        ok = _both_see(views, np.column_stack([P, np.full(n, markers[0, 2])]))
+        ok = both_see(views, np.column_stack([P, np.full(n, markers[0, 2])]))
         P, turn, which = P[ok], turn[ok], which[ok]
         c, s = np.cos(turn), np.sin(turn)
         R_world_body = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
         arms = np.einsum("nij,mj->nmi", R_world_body, markers[:, :2])
         body = P - arms[np.arange(len(P)), which]
         xy = body[:, None] + arms
-        both = _both_see(views, np.concatenate([xy, np.full((*xy.shape[:2], 1), markers[0, 2])], axis=-1))
+        both = both_see(views, np.concatenate([xy, np.full((*xy.shape[:2], 1), markers[0, 2])], axis=-1))
         both &= ((xy >= low) & (xy <= high)).all(axis=-1)
         # a pose that shows n markers is found n times as often: thinned so that all places stay equally likely
         kept = rng.uniform(size=len(both)) * both.sum(axis=-1) < 1
@@ -125,7 +125,8 @@ def _draw(
     return all_poses[:enough], all_seen[:enough]
 
 
-def _both_see(views: tuple[View, View], points_world: Array) -> NDArray[np.bool_]:
+def both_see(views: tuple[View, View], points_world: Array) -> NDArray[np.bool_]:
+    """Which points (..., 3) [world, m] both cameras see, (...)."""
     return views[0].sees(points_world, TRACK_MARGIN) & views[1].sees(points_world, TRACK_MARGIN)
 
 

@@ -12,6 +12,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.geometry.lie import floor_pose, rotation_z
 from coloc_graph.run.messages import Stance
 from coloc_graph.simulation.landmarks import drawn, in_view, standing_landmarks, unsurveyed, with_landmarks
+from coloc_graph.simulation.meander import meander
 from coloc_graph.simulation.paths import Array, Path, PathBuilder, drive, tilt_rotation
 from coloc_graph.simulation.rig import IMAGE_BIAS, MILD_LENS, Imperfections, reference_team, stated_team, true_team
 from coloc_graph.simulation.scenarios import Pose, Scenario
@@ -238,7 +239,8 @@ class _Builder:
             frames = max(self.points // 2, 1)
             return patrol(views, markers.p_body, middle, frames, self.fps, start, rng, where, self.stopping)
         box = self.scenario.box
-        return scatter(views, markers.p_body, box, middle, self.points, self.burst, start, rng, where)
+        drive_tour = meander if self.scenario.meanders else scatter
+        return drive_tour(views, markers.p_body, box, middle, self.points, self.burst, start, rng, where)
 
     def _place(self, tour: Tour, time: float) -> None:
         """Put every robot where it is at the beginning."""

@@ -9,6 +9,7 @@ from coloc_graph.simulation import (
     Imperfections,
     build_world,
     hallway,
+    meander,
     observe,
     reference_team,
     simulate,
@@ -71,14 +72,24 @@ def test_observers_stand_still_where_the_scenario_puts_them():
 
 def test_a_robot_neither_drives_nor_turns_faster_than_it_can():
     world = build_world(hallway(3), points=60)
-    for path in world.paths.values():
+    for robot, path in world.paths.items():
+        speed, turn_rate = (meander.SPEED, meander.TURN_RATE) if robot == "C" else (SPEED, TURN_RATE)
         gone = np.diff(path.times) > 0
         step = np.diff(path.knots, axis=0)[gone] / np.diff(path.times)[gone, None]
-        assert np.hypot(step[:, 0], step[:, 1]).max() <= SPEED * (1 + 1e-4)
-        assert np.abs(step[:, 2]).max() <= TURN_RATE * (1 + 1e-4)
+        assert np.hypot(step[:, 0], step[:, 1]).max() <= speed * (1 + 1e-4)
+        assert np.abs(step[:, 2]).max() <= turn_rate * (1 + 1e-4)
         assert np.diff(path.times).min() >= 0
         jump = np.diff(path.knots, axis=0)[~gone]
         assert np.abs(jump).max(initial=0) < 1e-6
+
+
+def test_the_hallway_is_a_mission_of_at_most_20_minutes_with_its_points_spread_over_the_view():
+    world = build_world(hallway(40), seed=3)
+    assert 15 * 60 < world.stances[-1].end - world.stances[0].start < 20 * 60
+    for k in range(0, 40, 13):
+        for tracks in observe(world, k):
+            assert tracks.seen.sum() == 100
+            assert (tracks.uv[tracks.seen].std(axis=0) > (50, 10)).all()
 
 
 def test_driving_reaches_every_pose_and_goes_where_it_faces():
