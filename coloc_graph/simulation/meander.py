@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from coloc_graph.simulation.paths import Array, Leg
@@ -146,7 +147,9 @@ def _driven(knots: Array, start: float) -> Leg:
     return Leg(start + np.concatenate([[0.0], np.cumsum(taken)]), knots)
 
 
-def _recorded(views: tuple[View, View], markers: Array, leg: Leg, instants: Array, low: Array, high: Array) -> Array:
+def _recorded(
+    views: tuple[View, View], markers: Array, leg: Leg, instants: Array, low: Array, high: Array
+) -> NDArray[np.bool_]:
     """Markers (n, m) that both cameras see within the box at instants (n,)."""
     x, y, yaw = (np.interp(instants, leg.times, column) for column in leg.knots.T)
     c, s = np.cos(yaw), np.sin(yaw)
