@@ -118,7 +118,7 @@ def parse_toml(path: Path, text: str, *, error: type[InputError] = InputError) -
     except RecursionError as why:
         raise error(f"{path}: is nested too deep; write tables and lists of a few levels") from why
     except ValueError as why:  # that of TOML, of a date that is none, of a number with too many digits
-        raise error(f"{path}: is not TOML: {_short(why)}") from why
+        raise error(f"{path}: is not TOML: {shortened(why)}") from why
     _require_numbers(path, found, error)
     return found
 
@@ -135,7 +135,7 @@ def convert(path: Path, fields: Any, kind: type[T], remedy: str, *, error: type[
     try:
         return msgspec.convert(fields, kind, builtin_types=dates, str_keys=True)
     except (msgspec.ValidationError, RecursionError, OverflowError) as why:
-        raise error(f"{path}: {_short(why)}; {remedy}") from why
+        raise error(f"{path}: {shortened(why)}; {remedy}") from why
 
 
 def _require_numbers(path: Path, found: dict[str, Any], error: type[InputError]) -> None:
@@ -162,9 +162,10 @@ def read_json(path: Path, remedy: str, *, error: type[InputError] = InputError) 
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as why:
-        raise error(f"{path}: is damaged ({_short(why)}); {remedy}") from why
+        raise error(f"{path}: is damaged ({shortened(why)}); {remedy}") from why
 
 
-def _short(why: Exception) -> str:
-    text = str(why)
+def shortened(why: Exception) -> str:
+    """Reason that another library gives, on one line, cut where it is long."""
+    text = " ".join(str(why).split())
     return text if len(text) <= MAX_REASON else f"{text[: MAX_REASON // 2]} ... {text[-MAX_REASON // 2 :]}"

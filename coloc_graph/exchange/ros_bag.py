@@ -5,14 +5,15 @@ bag brings are not needed, and those of messages that nobody asks for do no harm
 """
 
 import struct
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coloc_graph.errors import BagError, ColocError
-from coloc_graph.run import is_mcap
+from coloc_graph.exchange.ros_files import open_reader
+from coloc_graph.input_file import shortened
 from coloc_graph.run.schemas import to_seconds
 
 if TYPE_CHECKING:
@@ -51,15 +52,20 @@ class BagMessage:
     data: bytes
 
 
+def full_name(topic: str) -> str:
+    """Name of a topic with one slash before it, as ROS resolves one without a namespace."""
+    return "/" + topic.lstrip("/")
+
+
 class Bag:
     """A bag that is open; `open_bag` gives one."""
 
-    def __init__(self, path: Path, reader: Any, store: "Typestore", *, ros2: bool) -> None:
-        self.path, self.ros2 = path, ros2
+    def __init__(self, path: Path, reader: Any, store: "Typestore", *, ros2: bool, notes: Sequence[str] = ()) -> None:
+        self.path, self.ros2, self.notes = path, ros2, tuple(notes)
         self._reader, self._store = reader, store
         by_name: dict[str, list[Any]] = {}
         for connection in reader.connections:
-            by_name.setdefault(connection.topic, []).append(connection)
+            by_name.setdefault(full_name(connection.topic), []).append(connection)
         self.topics: Mapping[str, Topic] = {
             name: Topic(name, tuple(sorted({one.msgtype for one in every})), sum(one.msgcount for one in every))
             for name, every in sorted(by_name.items())
@@ -67,7 +73,7 @@ class Bag:
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
         """The messages of some topics, in the order in which the bag received them."""
-        wanted = [one for one in self._reader.connections if one.topic in topics]
+        wanted = [one for one in self._reader.connections if full_name(one.topic) in topics]
         for one in wanted:
             self._require_standard(one)
         if not wanted:
@@ -80,7 +86,7 @@ class Bag:
             if found is None:
                 return
             connection, received, data = found
-            last = BagMessage(connection.topic, connection.msgtype, received, bytes(data))
+            last = BagMessage(full_name(connection.topic), connection.msgtype, received, bytes(data))
             yield last
 
     def decode(self, message: BagMessage) -> Any:
@@ -90,7 +96,7 @@ class Bag:
         try:
             return read(message.data, kind)
         except Exception as error:  # of a damaged message rosbags raises whatever it stumbles over
-            raise self.error(message, f"is not a {message.type} ({error}); record the bag again") from error
+            raise self.error(message, f"is not a {message.type} ({shortened(error)}); record the bag again") from error
 
     def stamp(self, message: BagMessage) -> int:
         """The header's stamp of a message that begins with one [ns]; 0 where it is not set."""
@@ -127,28 +133,13 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
     """A bag to read from; `BagError` where there is none, or it was cut off, or rosbags is not installed."""
     path = Path(path)
     try:
-        from rosbags import rosbag1, rosbag2
+        import rosbags  # noqa: F401
     except ImportError as error:
         raise BagError(NOT_INSTALLED) from error
-    if not path.exists():
-        raise BagError(f"{path}: there is no such bag; give a ROS 1 .bag, a ROS 2 folder, or an .mcap")
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        raise BagError(
-            f"{path}: is a folder without metadata.yaml, so no ROS 2 bag that was closed; give an .mcap within it, "
-            "or mend it with `ros2 bag reindex`"
-        )
-    ros2 = path.suffix != ".bag" or path.is_dir()
-    if ros2 and path.is_file() and path.suffix not in (".mcap", ".db3"):
-        raise BagError(f"{path}: is no bag by its name; give a ROS 1 .bag, a ROS 2 folder, or an .mcap")
-    if path.is_file() and is_mcap(path) and not _profile(path).startswith("ros2"):
-        raise BagError(
-            f"{path}: is an MCAP file, and not of ROS 2 (its profile is `{_profile(path)}`); give a bag, a run as it is"
-        )
     with _understood(path):
-        reader: Any = rosbag2.Reader(path) if ros2 else rosbag1.Reader(path)
-        reader.open()
+        reader, ros2, notes = open_reader(path)
     try:
-        yield Bag(path, reader, _standard_types(ros2=ros2), ros2=ros2)
+        yield Bag(path, reader, _standard_types(ros2=ros2), ros2=ros2, notes=notes)
     finally:
         reader.close()
 
@@ -163,14 +154,6 @@ def _standard_types(*, ros2: bool) -> "Typestore":
     return store
 
 
-def _profile(path: Path) -> str:
-    """The profile that an MCAP file says it has; `ros2` where it was cut off before, which is for rosbags to say."""
-    with path.open("rb") as file:
-        start = file.read(4096)
-    (size,) = struct.unpack_from("<I", start.ljust(21, b"\0"), 17)  # after magic, opcode, and the record's length
-    return start[21 : 21 + size].decode(errors="replace") if len(start) >= 21 + size else "ros2"
-
-
 @contextmanager
 def _understood(path: Path, where: str = "") -> Iterator[None]:
     """Whatever rosbags stumbles over in a damaged bag is one sentence."""
@@ -182,7 +165,7 @@ def _understood(path: Path, where: str = "") -> Iterator[None]:
         raise
     except Exception as error:  # struct, lz4, sqlite, assertions: it raises what it stumbles over
         remedy = REMEDIES.get(path.suffix, "`ros2 bag reindex`")
-        what = str(error).rstrip(".") or type(error).__name__
+        what = shortened(error).rstrip(".") or type(error).__name__
         raise BagError(
             f"{path}: cannot be read as a ROS bag{where} ({what}); a bag that was cut off is mended by {remedy}"
         ) from error

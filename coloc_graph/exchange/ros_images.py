@@ -69,8 +69,8 @@ def image_of(bag: Bag, message: BagMessage, robot: str, time: float, camera: Cam
             )
         _require_size(bag, message, pixels.shape, camera)
         return EncodedImage(robot, time, image_format, data)
-    _require_size(bag, message, (int(found.height), int(found.width)), camera)
     pixels = _pixels(bag, message, found)
+    _require_size(bag, message, pixels.shape, camera)
     return Image(robot, time, pixels)
 
 

@@ -104,6 +104,7 @@ def import_ros(
         "true poses": sum(map(len, truth.values())),
     }
     warnings = [
+        *bag.notes,
         *recording.notes,
         *warnings,
         *of_motion(bag, the_map, recording, moves),

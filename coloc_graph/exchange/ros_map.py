@@ -7,6 +7,7 @@ from typing import Literal
 import msgspec
 
 from coloc_graph.errors import BagError
+from coloc_graph.exchange.ros_bag import full_name
 from coloc_graph.exchange.stances import MotionThresholds
 from coloc_graph.input_file import convert, read_toml
 from coloc_graph.team import Team, read_team
@@ -98,11 +99,21 @@ class RosMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
                 used[topic] = f"{kind} of {robot.name}"
 
 
+def _with_full_names(robot: RobotTopics) -> RobotTopics:
+    return msgspec.structs.replace(robot, **{kind: full_name(topic) for kind, topic in robot.topics.items()})
+
+
 def read_map(path: str | Path) -> tuple[RosMap, Team]:
     """The map in a TOML file, and its team; `BagError` (`TeamError` for the team) names the file and the path in it."""
     path = Path(path)
     fields = read_toml(path, "give the path of a map, see docs/ros.md", error=BagError)
     found = convert(path, fields, RosMap, "see docs/ros.md for the fields", error=BagError)
+    try:
+        found = msgspec.structs.replace(found, robots=tuple(map(_with_full_names, found.robots)))
+    except ValueError as error:
+        raise BagError(f"{path}: {error}; see docs/ros.md for the fields") from error
+    if "\0" in found.team:
+        raise BagError(f"{path}: `team` is no path; give the path of a team.toml")
     team = read_team(path.parent / found.team)
     for number, robot in enumerate(found.robots):
         if robot.name not in team.names:

@@ -131,6 +131,12 @@ def read_recording(bag: Bag, the_map: RosMap, told: Callable[[int], None]) -> Re
         received[message.topic].append(message.received)
         if kinds[message.topic] != "image":
             values[message.topic].append(_READ[kinds[message.topic]](bag, message))
+    for topic, every in received.items():
+        if not every:
+            raise BagError(
+                f"{bag.path}: says that it has {bag.topics[topic].count} messages of {topic}, and none was found; "
+                "record the bag again, or leave the topic out of the map"
+            )
     by_bag = {topic for topic in kinds if the_map.time == "bag" or not any(stamps[topic])}
     times = {topic: received[topic] if topic in by_bag else stamps[topic] for topic in kinds}
     _require_stamped(bag, times)

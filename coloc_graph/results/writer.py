@@ -29,7 +29,7 @@ from coloc_graph._version import __version__
 from coloc_graph.errors import InputError
 from coloc_graph.evaluation import Accuracy, accuracy_json, align, evaluate, usual_alignment
 from coloc_graph.exchange.dot import to_dot
-from coloc_graph.exchange.g2o import write_g2o
+from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.exchange.landmarks import landmark_rows, landmarks_csv, map_row
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.geometry.trajectory import Trajectory

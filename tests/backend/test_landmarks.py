@@ -12,7 +12,8 @@ from coloc_graph.backend import Estimator, PoseGraph, chain, diagnose, joint, sm
 from coloc_graph.backend.landmarks import MAP, Placed, landmarks_of, map_of
 from coloc_graph.errors import MeasurementError
 from coloc_graph.exchange.dot import to_dot
-from coloc_graph.exchange.g2o import read_g2o, write_g2o
+from coloc_graph.exchange.g2o import read_g2o
+from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.frontend import Track, plane_from_mount, sight
 from coloc_graph.frontend.sighting import Marked
 from coloc_graph.geometry.lie import floor_pose, se3_exp, se3_inverse

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coloc_graph.errors import InputError
-from coloc_graph.exchange.g2o import write_g2o
+from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.exchange.tum import COVARIANCE_HEADER, read_tum, write_tum
 from coloc_graph.geometry.lie import se3, so3_exp
 from coloc_graph.geometry.trajectory import Trajectory

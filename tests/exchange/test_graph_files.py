@@ -15,7 +15,8 @@ from coloc_graph.backend.solver import optimise
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
 from coloc_graph.exchange.dot import to_dot
-from coloc_graph.exchange.g2o import read_g2o, write_g2o
+from coloc_graph.exchange.g2o import read_g2o
+from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.exchange.tum import read_tum
 from coloc_graph.team import Slip
 
@@ -71,10 +72,20 @@ E3 = "EDGE_SE3:QUAT {} {} 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 
         (["VERTEX_SE2 0 0 0"], r"line 1: `VERTEX_SE2` has 3 numbers; 4"),
         (["VERTEX_SE2 0 0 0 nan"], "all finite"),
         (["VERTEX_SE2 0 0 0 zero"], "holds what is no number"),
-        (["VERTEX_SE2 0.5 0 0 0"], "0.5 is no id"),
-        (["VERTEX_SE2 -1 0 0 0"], "-1 is no id"),
+        (["VERTEX_SE2 0.5 0 0 0"], "`0.5` is no id"),
+        (["VERTEX_SE2 -1 0 0 0"], "`-1` is no id"),
+        (["VERTEX_SE2 1e3 0 0 0"], "`1e3` is no id"),
+        ([f"VERTEX_SE2 {2**64} 0 0 0"], "is no id; ids are whole numbers from 0 to 18446744073709551615"),
+        ([f"VERTEX_SE2 {'1' * 5000} 0 0 0"], "line 1: `1111.*` is no id"),
+        (["VERTEX_SE2 0 1e300 0 0"], "all finite"),
+        ([V2.format(0), "FIX"], "line 2: `FIX` has no id"),
+        ([V2.format(0), E2.format(0, 0)], "line 2: the edge is from vertex 0 to itself"),
         (["VERTEX_SE3:QUAT 0 0 0 0 0 0 0 2"], "not of unit length"),
-        ([V2.format(0), V2.format(1), "EDGE_SE2 0 1 1 0 0 1 0 0 -1 0 1"], "line 3: .*not positive definite"),
+        (
+            [V2.format(0), V2.format(1), "EDGE_SE2 0 1 1 0 0 1 0 0 -1 0 1"],
+            "3: .*not positive definite, as in 1 of 1",
+        ),
+        ([V2.format(0), V2.format(1), "EDGE_SE2 0 1 1 0 0 1 1 0 1 0 1"], "line 3: .*as in 1 of 1 edges.*--lenient"),
         ([], "holds no vertex"),
     ],
 )
@@ -84,6 +95,32 @@ def test_a_bad_g2o_is_named_by_its_line(tmp_path, lines, words):
     with pytest.raises(InputError, match=words) as refusal:
         read_g2o(path)
     assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_ids_of_64_bits_comments_marks_and_windows_line_ends_are_read(tmp_path):
+    a, b = gtsam.symbol("a", 0), gtsam.symbol("b", 2**40)
+    path = tmp_path / "two.g2o"
+    lines = [V3.format(a) + " # the first", "  # of another program", V3.format(b), "", E3.format(a, b), f"FIX {a} {b}"]
+    lines += [f"# {'9' * 5000} is A@0", f"# 1 is A@{'9' * 5000}", f"# STAY_PUT A {'9' * 5000} 1"]
+    path.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(lines).encode())
+    read = read_g2o(path)
+    assert sorted(read.values.keys()) == sorted([a, b]) and read.fixed == (a, b)
+    assert read.factors.size() == 3 and not read.names and not read.stay_puts and not read.planar
+    assert list(read.factors.at(2).keys()) == [a, b]
+
+
+def test_lenient_projects_information_that_is_not_positive_definite_and_counts(tmp_path):
+    path = tmp_path / "odd.g2o"
+    negative, zero = "EDGE_SE2 0 1 1 0 0 4 0 0 -1 0 1", "EDGE_SE2 1 2 1 0 0 0 0 0 0 0 0"
+    half = "EDGE_SE2 1 2 1 0 0 1 0 0 1 0 0"  # it knows nothing of the heading
+    path.write_text("\n".join([*map(V2.format, range(3)), E2.format(1, 2), negative, zero, half]))
+    with pytest.raises(InputError, match=r"line 5: .* as in 3 of 4 edges; correct them, or .* --lenient"):
+        read_g2o(path)
+    read = read_g2o(path, lenient=True)
+    assert (read.projected, read.left_out, read.factors.size()) == (2, 1, 4)
+    np.testing.assert_allclose(np.diag(read.factors.at(2).noiseModel().information()), [4, 4e-9, 1], rtol=1e-6)
+    values, _ = optimise(read.factors, read.values)
+    np.testing.assert_allclose(values.atPose2(2).translation(), [2, 0], atol=1e-6)
 
 
 def test_a_g2o_that_is_not_there_is_one_sentence(tmp_path):

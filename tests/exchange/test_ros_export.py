@@ -184,4 +184,4 @@ def test_cameras_are_as_the_estimate_found_them_or_else_as_they_were_stated(shor
     (copy / "team.toml").unlink()
     (copy / "config.toml").write_text("[options]\n")
     assert main(["export", "ros2", str(copy), "--out", str(tmp_path / "x.mcap")]) == 2
-    assert "config.toml: is damaged" in capsys.readouterr().err
+    assert "config.toml: Expected `object`, got `null`; solve the run again" in capsys.readouterr().err
