@@ -19,10 +19,10 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 TOKEN_BYTES = 16  # random bytes in a token
-#: A Host header: a name, an IPv4 address or an IPv6 address in brackets, and a port.
+# a Host header: a name, an IPv4 address or an IPv6 address in brackets, and a port
 HOST_HEADER = re.compile(r"(?:\[(?P<ipv6>[0-9a-f:.]+)\]|(?P<name>[a-z0-9._-]+))(?::\d{1,5})?", re.ASCII)
 REFUSED = "Open the viewer by the complete address that coloc printed; it holds a token.\n"
-#: Headers of each page: the address, which holds the token, is neither passed on nor stored.
+# headers of each page: its address, which holds the token, is neither passed on nor stored
 PAGE_HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",

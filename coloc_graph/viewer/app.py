@@ -148,12 +148,12 @@ class Viewer:
         return self._inbox.idle.wait(timeout)
 
     def html(self) -> str:
-        """What is shown, stance by stance, as one HTML page that plays without a server."""
+        """Make one HTML page of what is shown, which plays stance by stance without a server."""
         self.wait_idle()
         return page_of(self.scene, self._renderer.state(rests=True))
 
     def export(self, path: str | Path) -> None:
-        """Write that page."""
+        """Write this page to a file."""
         Path(path).write_text(self.html(), encoding="utf-8")
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:

@@ -20,18 +20,15 @@ from coloc_graph.viewer.app import Viewer
 from coloc_graph.viewer.panel import WIDTH
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-#: Without a window or a graphics card, and without the network.
+# without a window, a graphics card, and the network
 ARGUMENTS = (
     "--no-sandbox", "--disable-dev-shm-usage", "--use-gl=angle", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
 )  # fmt: skip
-#: The page has drawn its floor; viser's own name for it.
+# true once the page has drawn its floor; by viser's own names
 DRAWN = "window.__viserMutable?.nodeRefFromName?.['/floor'] != null"
-#: The browser fades in, and decodes fonts and textures, and does not say when it is done: a picture counts that stays
-#: the same for so long [s].
-SETTLED = 2.0
-#: Room beside the scene for the panel, which is cut off [px].
-BESIDE = WIDTH + 8
+SETTLED = 2.0  # s without a change until a picture counts: fonts and textures come late, and nothing tells
+BESIDE = WIDTH + 8  # px beside the scene for the panel, which is cut off
 _HIDE = (
     "document.head.appendChild(Object.assign(document.createElement('style'), "
     "{textContent: '.mantine-Notifications-root{display:none!important}'}))"
@@ -134,7 +131,7 @@ def _call(page: Connection, method: str, parameters: dict[str, Any], until: floa
 
 
 def _require_time(until: float) -> float:
-    """What is left of the time [s]; `TimeoutError` where nothing is."""
+    """Return the time left [s]; raises `TimeoutError` if there is none."""
     left = until - time.monotonic()
     if left <= 0:
         raise TimeoutError("it takes too long")

@@ -27,7 +27,7 @@ class Cameras:
         self._followed: tuple[str, NDArray[np.float64]] | None = None
 
     def on_size_change(self, current: Callable[[], float], wake: Callable[[], None]) -> None:
-        """Call `wake` when a camera has moved so far that robots are drawn at another size than the current."""
+        """Call `wake` when a camera has moved and robots are drawn at another size than the current."""
 
         @self._server.on_client_connect
         def _(client: viser.ClientHandle) -> None:

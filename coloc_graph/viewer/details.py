@@ -87,7 +87,7 @@ class Details:
                 self._measured.clear()
             self._measured[stance.index, *pair] = one
             measured.append(one)
-        return inspect.marker_ways(scene, row, measured, dark)
+        return inspect.marker_trajectories(scene, row, measured, dark)
 
 
 def _image_in_a_tuple(run: Run, robot: str, time: float) -> tuple[Image | None]:

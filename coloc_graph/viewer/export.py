@@ -16,35 +16,31 @@ from coloc_graph.viewer.panel import legend
 from coloc_graph.viewer.scene import Scene
 from coloc_graph.viewer.server import open_listener, start_server, stop_server
 
-#: A stance takes so long, in a long run less, for all to take no more than so long; the last one is held; it moves in
-#: steps of so long [s].
-STANCE_SECONDS = 1.0
-MOST_SECONDS = 60.0
-HELD_SECONDS = 3.0
-STEP_SECONDS = 0.1
-#: So many stances are played at most; of no more than so many each has its images and its robots' trails in each step.
-MOST_STANCES = 240
-IN_FULL = 80
-#: The stance is written so high over the team [m], or at such a share of the distance it is seen from: over the names.
-CAPTION_HEIGHT = 0.9
-CAPTION_SHARE = 0.1
+STANCE_SECONDS = 1.0  # s for a stance, less in a long run
+MAX_SECONDS = 60.0  # s for all of them
+HELD_SECONDS = 3.0  # s for which the last stance is held
+STEP_SECONDS = 0.1  # s between steps of the animation
+MAX_STANCES = 240  # stances that are played; of more a selection
+MAX_STANCES_IN_FULL = 80  # stances up to which each has its images, and trails in each step
+CAPTION_HEIGHT = 0.9  # m over the team, of the stance's number
+CAPTION_SHARE = 0.1  # share of the camera's distance that it is at least over the team
 
 
 def page_of(scene: Scene, state: ViewState) -> str:
-    """The page: what `state` says is shown, from the first stance to the last.
+    """Make the page of a scene, from the first stance to the last, with the contents that `state` switches on.
 
-    Clicks, switches, plots and marker ways need a server, and are not in it.
+    Clicks, switches, plots and marker trajectories need a server, and are not in it.
     """
-    rows = thinned_rows(len(scene) - 1, MOST_STANCES)
-    full = len(rows) <= IN_FULL
+    rows = thinned_rows(len(scene) - 1, MAX_STANCES)
+    full = len(rows) <= MAX_STANCES_IN_FULL
     state = replace(state, picked=None, rests=full)
     bare = replace(state, shown=frozenset(), ellipses=False, wedges=False, edges=False, stays=False)
-    each = min(STANCE_SECONDS, MOST_SECONDS / max(len(rows), 1))
+    each = min(STANCE_SECONDS, MAX_SECONDS / max(len(rows), 1))
     steps = max(round(each / STEP_SECONDS), 2)
     server = start_server("127.0.0.1", open_listener(port=0), scene.title)
     try:
         view = GraphView(server, scene, state.dark)
-        view.dress(scene, state.dark, state.aside)
+        view.fit_floor(scene, state.dark, state.aside)
         initial_camera(server, scene, state.aside)
         eye, at = camera_on(scene, state.aside)
         distance = float(np.linalg.norm(eye - at))
@@ -76,7 +72,7 @@ def page_of(scene: Scene, state: ViewState) -> str:
         stop_server(server)
     played = f"{len(rows)} of {len(scene):,} stances are played" if len(rows) < len(scene) else ""
     enlarged = f"robots are drawn {view.size:.0f} times as large as they are" if view.size > 1 else ""
-    return _dressed(page, scene, state, [played, frame.note.partition(";")[0], enlarged])
+    return _with_legend(page, scene, state, [played, frame.note.partition(";")[0], enlarged])
 
 
 def _images(scene: Scene, row: int) -> dict[str, Image | None]:
@@ -92,7 +88,7 @@ def _images(scene: Scene, row: int) -> dict[str, Image | None]:
 
 
 def _caption(scene: Scene, frame: Frame, height: float) -> tuple[str, tuple[float, float, float]]:
-    """Which stance it is, and where that is written: over the middle of the team."""
+    """Caption with the number of the stance, and its position over the middle of the team."""
     there = frame.poses[np.isfinite(frame.poses).all(axis=1), :2]
     if frame.row < 0 or not len(there):
         return "", (0.0, 0.0, height)
@@ -100,8 +96,8 @@ def _caption(scene: Scene, frame: Frame, height: float) -> tuple[str, tuple[floa
     return f"stance {scene.stances[frame.row].index}", (float(x), float(y), height)
 
 
-def _dressed(page: str, scene: Scene, state: ViewState, notes: Sequence[str]) -> str:
-    """The page with its title, and a legend that folds away."""
+def _with_legend(page: str, scene: Scene, state: ViewState, notes: Sequence[str]) -> str:
+    """Add title and a folding legend to a page."""
     title = html.escape(scene.title or "coloc-graph")
     ink, paper = (f"rgb({r},{g},{b})" for r, g, b in (palette.ink(state.dark), palette.paper(state.dark)))
     lines = (f"ellipses and wedges: {state.k_sigma:g} sigma", *notes)

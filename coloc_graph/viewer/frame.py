@@ -1,4 +1,4 @@
-"""One picture of a scene, as arrays: what the handles are given, computed before they are touched."""
+"""One frame of a scene as arrays, computed before any handle is touched."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,31 +14,28 @@ from coloc_graph.viewer.prepared import (
     Z_SIGHTING,
     Float32,
     about_z,
-    doubts_of,
+    covariance_shapes,
     edges_of,
     ellipse_axes,
     links_of,
 )
 from coloc_graph.viewer.scene import TRUE, Array, Edges, Index, Landmarks, Layer, Links, Mask, Scene
 
-#: So many poses are drawn at most: while time moves, and once it rests.
-MOVING = 1_800
-RESTING = 9_000
-#: Heights [m] over the floor: ellipses, rings, wedges, trajectories.
-Z_ELLIPSE = 0.004
-Z_RING = 0.006
-Z_WEDGE = 0.008
-Z_WAY = 0.010
-#: Dashes and gaps of what is refused, and of what is chained, are so long [m]; so many at most.
-DASH = 0.06
-MOST_DASHES = 4_000
-WEDGE_REACH = 0.3
-ROBOT_REACH = 0.2
+MAX_POSES_MOVING = 1_800  # poses drawn while time moves
+MAX_POSES_AT_REST = 9_000  # poses drawn at rest
+Z_ELLIPSE = 0.004  # m over the floor
+Z_RING = 0.006  # m over the floor
+Z_WEDGE = 0.008  # m over the floor
+Z_TRAJECTORY = 0.010  # m over the floor
+DASH = 0.06  # m, length of a dash and of a gap
+MAX_DASHES = 4_000  # dashes of one set of lines; of more they are drawn through
+WEDGE_REACH = 0.3  # m, length of a heading wedge
+ROBOT_REACH = 0.2  # m, radius in which a click meets a robot
 
 
 @dataclass(frozen=True)
 class ViewState:
-    """What the GUI asks for. `aside` [m] is how far another result is moved to the side, `rests` whether time does."""
+    """State of the controls: `aside` [m] offsets another result to the side; `rests` is false while time moves."""
 
     time: float = 0.0
     shown: frozenset[str] = frozenset()
@@ -73,18 +70,18 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Everything at one moment. `poses` (r, 4) are x, y, z, heading of the robots, NaN where a robot is nowhere.
+    """All that is drawn at one instant. `poses` (r, 4) are x, y, z, heading of the robots, NaN if there is none.
 
-    `edge_ids` (m,) number the edges that are drawn, `edge_points` (m, 2, 3) are where; `note` says what was left out.
+    `edge_ids` (m,) number the edges drawn at `edge_points` (m, 2, 3) [m]; `note` is a sentence on what was thinned out.
     """
 
     row: int
     poses: Array
     roles: tuple[str, ...]
-    ways: dict[str, Lines]
+    trajectories: dict[str, Lines]
     edges: Lines
     edges_now: Lines
-    refused: Lines
+    rejected: Lines
     picked: Lines
     sightings: Lines
     odometry: Lines
@@ -103,11 +100,11 @@ NO_BATCH = Batch(
 
 
 def frame_of(scene: Scene, state: ViewState) -> Frame:
-    """The picture of a scene in a state."""
+    """Compute the frame of a scene for a state of the controls."""
     row, dark = scene.row_at(state.time), state.dark
     colours = palette.robot_colours(len(scene.robots), dark)
     shown = [layer for layer in scene.layers if layer.name in state.shown]
-    most = (RESTING if state.rests else MOVING) // max(len(scene.robots) * (len(shown) + 1), 1)
+    most = (MAX_POSES_AT_REST if state.rests else MAX_POSES_MOVING) // max(len(scene.robots) * (len(shown) + 1), 1)
     rows = thinned_rows(row, most)
     base = scene.layers[0] if scene.layers else None
     poses = np.full((len(scene.robots), 4), np.nan)
@@ -116,24 +113,24 @@ def frame_of(scene: Scene, state: ViewState) -> Frame:
         poses = np.concatenate([pose_at(scene, base, n, np.array([state.time])) for n in range(len(scene.robots))])
         for depth, layer in enumerate(scene.layers):
             if layer in shown:
-                parts.ways[layer.name] = _way(scene, layer, rows, colours, state, depth)
-        # the poses that the robots stand at are doubted whether or not their way is shown
+                parts.trajectories[layer.name] = _trajectory(scene, layer, rows, colours, state, depth)
+        # the covariances of the poses are drawn even if their trajectory is not
         drawn = [(base, scene.edges, 0)]
         if scene.other is not None and scene.other in shown:
             drawn.append((scene.other, scene.other_edges, len(scene.edges)))
         for layer, edges, first in drawn:
             if state.ellipses or state.wedges:
-                parts.doubt(layer, rows, colours, state)
+                parts.add_covariances(layer, rows, colours, state)
             if state.edges:
-                parts.tie(layer, edges, first, row, most, state)
+                parts.add_edges(layer, edges, first, row, most, state)
         if state.ellipses and len(scene.landmarks):
-            parts.ellipses.append(_doubts_of_landmarks(scene.landmarks, state))
+            parts.ellipses.append(_landmark_ellipses(scene.landmarks, state))
         if state.stays:
             parts.rings = _rings(scene, base, row, most, colours)
         if state.sightings:
             parts.lines["sightings"] = [_linked(base, scene.sightings, Z_SIGHTING, palette.SIGHTING, row, most, dark)]
             if len(scene.landmarks):
-                parts.lines["sightings"].append(_of_landmarks(base, scene.landmarks, row, most, dark))
+                parts.lines["sightings"].append(_landmark_sightings(base, scene.landmarks, row, most, dark))
         if state.odometry:
             parts.lines["odometry"] = [_linked(base, scene.odometry, Z_ODOMETRY, palette.ODOMETRY, row, most, dark)]
     count = row + 1
@@ -145,7 +142,7 @@ def frame_of(scene: Scene, state: ViewState) -> Frame:
         row=row,
         poses=poses,
         roles=tuple(scene.roles(row, robot) for robot in scene.robots),
-        ways=parts.ways,
+        trajectories=parts.trajectories,
         **{name: joined(lines) for name, lines in parts.lines.items()},
         ellipses=_batch(parts.ellipses) if state.ellipses else NO_BATCH,
         wedges=_batch(parts.wedges) if state.wedges else NO_BATCH,
@@ -157,7 +154,7 @@ def frame_of(scene: Scene, state: ViewState) -> Frame:
 
 
 def thinned_rows(row: int, most: int) -> Index:
-    """Of the rows 0 to `row` at most so many, ascending: the last half of them each, those before evenly."""
+    """At most `most` of the rows 0 to `row`, ascending: the last half complete, those before it evenly spaced."""
     if row + 1 <= most:
         return np.arange(row + 1)
     recent = max(most // 2, 1)
@@ -167,14 +164,14 @@ def thinned_rows(row: int, most: int) -> Index:
     return np.asarray(rows[np.append(True, np.diff(rows) > 0)])
 
 
-def _way(scene: Scene, layer: Layer, rows: Index, colours: Colours, state: ViewState, depth: int) -> Lines:
+def _trajectory(scene: Scene, layer: Layer, rows: Index, colours: Colours, state: ViewState, depth: int) -> Lines:
     xyz, there = layer.xyz[:, rows], layer.there[:, rows]
     before = np.maximum.accumulate(np.where(there, np.arange(len(rows)), -1), axis=1)[:, :-1]
     number, at = np.nonzero(there[:, 1:] & (before >= 0))
     a, b = xyz[number, before[number, at]], xyz[number, at + 1]
     moved = (a != b).any(axis=1)
     number, segments = number[moved], np.stack([a[moved], b[moved]], axis=1)
-    if depth == 0 and len(rows) and state.time > (start := scene.middle(int(rows[-1]))):  # and the way it is on now
+    if depth == 0 and len(rows) and state.time > (start := scene.middle(int(rows[-1]))):  # and the part up to now
         steps = np.linspace(start, state.time, 24)
         for one in range(len(scene.robots)):
             now = pose_at(scene, layer, one, steps)[:, :3]
@@ -191,17 +188,17 @@ def _way(scene: Scene, layer: Layer, rows: Index, colours: Colours, state: ViewS
         points, which = dashed(segments)
         tint = tint[which]
     raised = points.astype(np.float32)
-    raised[..., 2] = Z_WAY + 0.001 * depth
+    raised[..., 2] = Z_TRAJECTORY + 0.001 * depth
     if layer.aside:
         raised[..., 1] += state.aside
     return Lines(raised, np.repeat(tint[:, None], 2, axis=1))
 
 
 def dashed(segments: Array | Float32) -> tuple[Array | Float32, Index]:
-    """Segments (n, 2, 3) cut into dashes, and of which each is one; as they are where that would be too many."""
+    """Cut segments (n, 2, 3) into dashes, and number the segment of each; too many are left whole."""
     length = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     count = np.maximum(np.ceil(length / (2 * DASH)).astype(int), 1)
-    if not len(segments) or count.sum() > MOST_DASHES:
+    if not len(segments) or count.sum() > MAX_DASHES:
         return segments, np.arange(len(segments))
     which = np.repeat(np.arange(len(segments)), count)
     step = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
@@ -212,12 +209,12 @@ def dashed(segments: Array | Float32) -> tuple[Array | Float32, Index]:
 
 
 class _Parts:
-    """A frame while it is put together, of one result or of two."""
+    """Parts of a frame, of one result or of two."""
 
     def __init__(self) -> None:
-        self.ways: dict[str, Lines] = {}
+        self.trajectories: dict[str, Lines] = {}
         self.lines: dict[str, list[Lines]] = {
-            name: [] for name in ("edges", "edges_now", "refused", "picked", "sightings", "odometry")
+            name: [] for name in ("edges", "edges_now", "rejected", "picked", "sightings", "odometry")
         }
         self.ellipses: list[Batch] = []
         self.wedges: list[Batch] = []
@@ -225,9 +222,9 @@ class _Parts:
         self.edge_ids: list[Index] = []
         self.edge_points: list[Float32] = []
 
-    def doubt(self, layer: Layer, rows: Index, colours: Colours, state: ViewState) -> None:
-        """Ellipses of x, y and wedges of the heading at all places of a layer."""
-        drawn = doubts_of(layer)
+    def add_covariances(self, layer: Layer, rows: Index, colours: Colours, state: ViewState) -> None:
+        """Add ellipses of x, y and wedges of the heading at all poses of a layer."""
+        drawn = covariance_shapes(layer)
         number, at = np.nonzero(drawn.known[:, rows])
         at = rows[at]
         places = layer.xyz[number, at].astype(np.float32)
@@ -237,11 +234,11 @@ class _Parts:
         half = np.tan(np.minimum(state.k_sigma * layer.yaw_sigma[number, at], 1.2))
         axes[1, :, 0], axes[1, :, 1] = WEDGE_REACH, WEDGE_REACH * np.maximum(half, 0.01)
         colour = palette.faded(colours, state.dark, 0.5 if layer.aside else 0.0)[number]
-        self.ellipses.append(Batch(drawn.of_place[number, at], _raised(places, Z_ELLIPSE), axes[0], colour))
-        self.wedges.append(Batch(drawn.of_heading[number, at], _raised(places, Z_WEDGE), axes[1], colour))
+        self.ellipses.append(Batch(drawn.position_wxyz[number, at], _raised(places, Z_ELLIPSE), axes[0], colour))
+        self.wedges.append(Batch(drawn.heading_wxyz[number, at], _raised(places, Z_WEDGE), axes[1], colour))
 
-    def tie(self, layer: Layer, edges: Edges, first: int, row: int, most: int, state: ViewState) -> None:
-        """Edges so far, those of this stance, the refused ones dashed, and the one that is picked."""
+    def add_edges(self, layer: Layer, edges: Edges, first: int, row: int, most: int, state: ViewState) -> None:
+        """Add edges up to a row: those of its stance, earlier ones, rejected ones as dashes, and the picked one."""
         drawn = edges_of(layer, edges, state.dark)
         ids = thinned_rows(int(np.searchsorted(edges.rows, row, side="right")) - 1, most)
         ids = ids[drawn.there[ids]]
@@ -252,7 +249,7 @@ class _Parts:
         self._add("edges", ends, drawn.past[ids], used & ~now, dashes=layer.aside and not state.aside)
         self._add("edges_now", ends, drawn.now[ids], used & now, dashes=layer.aside and not state.aside)
         grey = np.broadcast_to(palette.grey(state.dark), (len(ids), 3))
-        self._add("refused", ends, grey, ~used, dashes=True)
+        self._add("rejected", ends, grey, ~used, dashes=True)
         picked = ids == (-1 if state.picked is None else state.picked - first)
         self._add("picked", ends, np.broadcast_to(palette.PICKED, (len(ids), 3)), picked)
         self.edge_ids.append(ids + first)
@@ -270,15 +267,15 @@ class _Parts:
 
 
 def _linked(layer: Layer, links: Links, z: float, colour: Colours, row: int, most: int, dark: bool) -> Lines:
-    """Links so far, thinned as all else."""
+    """Links up to a row, thinned like the poses."""
     ids = thinned_rows(int(np.searchsorted(links.rows_j, row, side="right")) - 1, most)
     ends = links_of(layer, links, z)[ids]
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
     return Lines(ends, np.broadcast_to(palette.seen_on(colour, dark), (len(ends), 2, 3)))
 
 
-def _of_landmarks(layer: Layer, landmarks: Landmarks, row: int, most: int, dark: bool) -> Lines:
-    """Who sighted which landmark so far, thinned as all else."""
+def _landmark_sightings(layer: Layer, landmarks: Landmarks, row: int, most: int, dark: bool) -> Lines:
+    """Sightings of landmarks up to a row, thinned like the poses."""
     links = landmarks.sightings
     ids = thinned_rows(int(np.searchsorted(links.rows_j, row, side="right")) - 1, most)
     ends = np.zeros((len(ids), 2, 3), np.float32)
@@ -289,8 +286,8 @@ def _of_landmarks(layer: Layer, landmarks: Landmarks, row: int, most: int, dark:
     return Lines(ends, np.broadcast_to(palette.seen_on(palette.SIGHTING, dark), (len(ends), 2, 3)))
 
 
-def _doubts_of_landmarks(landmarks: Landmarks, state: ViewState) -> Batch:
-    """The ellipses of their places."""
+def _landmark_ellipses(landmarks: Landmarks, state: ViewState) -> Batch:
+    """Ellipses of the landmarks' positions."""
     axes, direction = ellipse_axes(landmarks.covariance)
     scales = np.ones((len(landmarks), 3), np.float32)
     scales[:, :2] = np.maximum(state.k_sigma * axes, 1e-5)
@@ -301,7 +298,7 @@ def _doubts_of_landmarks(landmarks: Landmarks, state: ViewState) -> Batch:
 
 
 def _rings(scene: Scene, layer: Layer, row: int, most: int, colours: Colours) -> Batch:
-    """A ring wherever a robot stayed put from one stance to the next, so far."""
+    """Rings at the poses that a robot kept from one stance to the next, up to a row."""
     count = int(np.searchsorted(scene.stayed[:, 1], row, side="right"))
     number, at = scene.stayed[thinned_rows(count - 1, most)].T
     there = layer.there[number, at]
@@ -313,7 +310,7 @@ def _rings(scene: Scene, layer: Layer, row: int, most: int, colours: Colours) ->
 
 
 def joined(parts: Sequence[Lines]) -> Lines:
-    """Lines of several in one."""
+    """Concatenate lines."""
     return parts[0] if len(parts) == 1 else Lines(*map(np.concatenate, zip(NO_LINES, *parts, strict=True)))
 
 
@@ -330,9 +327,9 @@ def _raised(places: Float32, z: float) -> Float32:
 def pick(
     frame: Frame, origin: Sequence[float], direction: Sequence[float], most_deg: float = 1.5, size: float = 1.0
 ) -> tuple[str, int] | None:
-    """What a ray from the eye meets: ("robot", number) or ("edge", its number in the scene); None for nothing.
+    """Find the robot or edge that a ray from the camera meets: ("robot", number), ("edge", its number) or None.
 
-    An edge is met within so many degrees at the eye, a robot within its body, `size` times as large as it is.
+    An edge is met within `most_deg` at the camera, a robot within its body, drawn `size` times as large as it is.
     """
     o, d = np.asarray(origin, float), np.asarray(direction, float)
     d = d / np.linalg.norm(d)
@@ -347,7 +344,7 @@ def pick(
 
 
 def nearest_segment(segments: Array | Float32, origin: Array, direction: Array, most_deg: float) -> int | None:
-    """The segment (of n, 2, 3) that a ray with unit direction passes closest to, by the angle at its origin."""
+    """Number of the segment (n, 2, 3) nearest to a ray with unit direction, by the angle at its origin, or None."""
     if not len(segments):
         return None
     a = segments[:, 0] - origin

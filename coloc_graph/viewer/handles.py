@@ -1,4 +1,4 @@
-"""The handles of a scene in a viser server: made once, few whatever the graph's size, updated in place."""
+"""Handles of a scene in a viser server: made once, few for any size of the graph, and updated in place."""
 
 from collections.abc import Mapping
 
@@ -7,33 +7,28 @@ import viser
 from numpy.typing import NDArray
 
 from coloc_graph.geometry.lie import quaternion
-from coloc_graph.viewer import meshes as bodies
-from coloc_graph.viewer import palette, still
+from coloc_graph.viewer import meshes, palette, still
 from coloc_graph.viewer.frame import NO_LINES, Batch, Frame, Lines, ViewState
 from coloc_graph.viewer.motion import extent
 from coloc_graph.viewer.prepared import about_z
 from coloc_graph.viewer.scene import TRUE, Scene
 
-#: Room about the data [m], and the largest floor that has lines every half metre.
-MARGIN = 2.0
-FINE = 60.0
-#: How large a frustum is drawn [m].
-FRUSTUM = 0.14
-#: Of teams that are larger nobody's name is written; robots that are drawn larger than this have one label for all.
-MOST_NAMES = 16
-APART = 8.0
-#: Widths of trajectories [px].
-ESTIMATE_PX = 5.0
-OTHER_PX = 2.0
-TRUTH_PX = 1.3
+FLOOR_MARGIN = 2.0  # m of floor around the data
+FINE_GRID_LIMIT = 60.0  # m, side of the largest floor with lines every half metre
+FRUSTUM = 0.14  # m, depth of a camera's frustum
+MAX_NAMES = 16  # robots; of larger teams no names are written
+ONE_LABEL_SIZE = 8.0  # factor above which enlarged robots share one label
+ESTIMATE_PX = 5.0  # px, width of the estimated trajectory
+OTHER_PX = 2.0  # px, width of other methods' trajectories
+TRUTH_PX = 1.3  # px, width of the true trajectory
 
 Image = NDArray[np.uint8]
 
 
 class GraphView:
-    """Owns every handle of a scene. Touched by one thread alone, which calls `apply`.
+    """Owner of every handle of a scene, used by the render thread alone.
 
-    `images` of `apply` are by robot, None for one that sees nothing; what is the same as before is not sent again.
+    Unchanged values are not sent again.
     """
 
     def __init__(self, server: viser.ViserServer, scene: Scene, dark: bool = False) -> None:
@@ -51,32 +46,32 @@ class GraphView:
             self._make_robots(scene)
             self._make_graph()
             self.adopt(scene)
-        self.dress(scene, dark)
+        self.fit_floor(scene, dark)
 
     def _make_robots(self, scene: Scene) -> None:
         add = self.server.scene
         self.robots, self._frustums, self._names, self._anchors, self._bodies = [], {}, [], [], []
         self.size = 1.0
-        self._stills: dict[str, tuple[viser.FrameHandle, viser.MeshHandle | viser.GlbHandle, viser.LabelHandle]] = {}
+        self._landmarks: dict[str, tuple[viser.FrameHandle, viser.MeshHandle | viser.GlbHandle, viser.LabelHandle]] = {}
         for name, colour in zip(scene.robots, palette.robot_colours(len(scene.robots)), strict=True):
             robot = scene.team[name] if scene.team is not None else None
             path, tint = f"/robots/{name}", np.asarray(colour)
             self.robots.append(add.add_frame(path, show_axes=False, visible=False))
             self._bodies.append(
-                add.add_mesh_trimesh(f"{path}/body", bodies.robot_mesh(robot, colour), receive_shadow=False)
+                add.add_mesh_trimesh(f"{path}/body", meshes.robot_mesh(robot, colour), receive_shadow=False)
             )
-            vertices, faces = bodies.ring(0.19, 0.215)
+            vertices, faces = meshes.ring(0.19, 0.215)
             self._anchors.append(
                 add.add_mesh_simple(
                     f"{path}/anchor", vertices, faces, color=palette.flat(colour), position=(0, 0, 0.007),
                     visible=False, side="double", cast_shadow=False, receive_shadow=False,
                 )
             )  # fmt: skip
-            top = bodies.T_body_camera(robot)[2, 3]
+            top = meshes.T_body_camera(robot)[2, 3]
             self._names.append(
                 add.add_label(
                     f"{path}/name", name, position=(0, 0, max(top, 0.2) + 0.1), anchor="bottom-center",
-                    visible=len(scene.robots) <= MOST_NAMES,
+                    visible=len(scene.robots) <= MAX_NAMES,
                 )
             )  # fmt: skip
             if robot is not None and robot.camera_if_any is not None:
@@ -91,8 +86,9 @@ class GraphView:
     def _make_graph(self) -> None:
         add, none = self.server.scene, NO_LINES
         self._lines: dict[str, viser.LineSegmentsHandle] = {}
-        for name, thickness in (("edges", 2.0), ("edges_now", 4.0), ("refused", 2.0), ("picked", 7.0),
-                                ("sightings", 1.5), ("odometry", 1.5), ("seen", 1.2), ("driven", 2.5)):  # fmt: skip
+        for name, thickness in (("edges", 2.0), ("edges_now", 4.0), ("rejected", 2.0), ("picked", 7.0),
+                                ("sightings", 1.5), ("odometry", 1.5), ("markers_observed", 1.2),
+                                ("markers_estimated", 2.5)):  # fmt: skip
             self._lines[name] = add.add_line_segments(
                 f"/{name}", none.points, none.colours, thickness=thickness, thickness_units="screen"
             )
@@ -104,46 +100,46 @@ class GraphView:
                 cast_shadow=False, receive_shadow=False,
             )
             for name, mesh, opacity in (
-                ("ellipses", bodies.disc(), 0.5),
-                ("wedges", bodies.wedge(), 0.45),
-                ("rings", bodies.ring(0.178, 0.186), 0.9),
+                ("ellipses", meshes.disc(), 0.5),
+                ("wedges", meshes.wedge(), 0.45),
+                ("rings", meshes.ring(0.178, 0.186), 0.9),
             )
         }  # fmt: skip
 
     def adopt(self, scene: Scene) -> None:
-        """Make ready for the layers of a scene of the same robots."""
+        """Add handles for new layers and landmarks of a scene of the same robots."""
         for name in (layer.name for layer in scene.layers):
             if name not in self.names:
-                self._lines[f"way {name}"] = self.server.scene.add_line_segments(
-                    f"/ways/{len(self.names)}", NO_LINES.points, NO_LINES.colours,
+                self._lines[f"trajectory {name}"] = self.server.scene.add_line_segments(
+                    f"/trajectories/{len(self.names)}", NO_LINES.points, NO_LINES.colours,
                     thickness=TRUTH_PX if name == TRUE else OTHER_PX if self.names else ESTIMATE_PX,
                     thickness_units="screen",
                 )  # fmt: skip
                 self.names += (name,)
         for number, name in enumerate(scene.landmarks.names):
-            if name not in self._stills:
+            if name not in self._landmarks:
                 self._add_landmark(scene, name)
             x, y = scene.landmarks.xy[number].tolist()
-            self._stills[name][0].position = (x, y, 0.0)
-            self._stills[name][0].wxyz = about_z(scene.landmarks.yaw[number])
+            self._landmarks[name][0].position = (x, y, 0.0)
+            self._landmarks[name][0].wxyz = about_z(scene.landmarks.yaw[number])
 
     def _add_landmark(self, scene: Scene, name: str) -> None:
         add, path = self.server.scene, f"/landmarks/{name}"
         landmark = still.landmark_of(scene.team, name)
         body = add.add_mesh_trimesh(f"{path}/body", still.landmark_mesh(landmark), receive_shadow=False)
         label = add.add_label(f"{path}/name", name, position=(0, 0, 0.4), anchor="bottom-center")
-        self._stills[name] = add.add_frame(path, show_axes=False), body, label
+        self._landmarks[name] = add.add_frame(path, show_axes=False), body, label
 
-    def dress(self, scene: Scene, dark: bool, aside: float = 0.0) -> None:
-        """The floor beneath a scene, as large as it with what is moved `aside` [m], and in light or dark."""
+    def fit_floor(self, scene: Scene, dark: bool, aside: float = 0.0) -> None:
+        """Fit the floor to a scene, with another result moved `aside` [m], in light or dark colours."""
         low, high = extent(scene)
         high = high + np.array([0.0, aside])
-        size = high - low + 2 * MARGIN
+        size = high - low + 2 * FLOOR_MARGIN
         if dark == self._dark and size.max() <= self._reach:
             return
         self._dark, self._reach = dark, float(size.max()) * 1.3  # room to grow, so that it rarely grows
         middle = (low + high) / 2
-        fine = size.max() < FINE
+        fine = size.max() < FINE_GRID_LIMIT
         cell = 0.5 if fine else float(10 ** np.floor(np.log10(size.max() / 20)))
         sides = np.ceil(np.maximum(size, self._reach * (0.5 if fine else 1.0)) / (2 * cell)) * 2 * cell
         corner = np.round(middle / cell) * cell
@@ -175,14 +171,15 @@ class GraphView:
         frame: Frame,
         state: ViewState,
         images: Mapping[str, Image | None] | None = None,
-        seen: Lines = NO_LINES,
-        driven: Lines = NO_LINES,
+        markers_observed: Lines = NO_LINES,
+        markers_estimated: Lines = NO_LINES,
     ) -> None:
-        """Show a frame."""
-        ways = {f"way {name}": frame.ways.get(name, NO_LINES) for name in self.names}
-        lines = ways | {
-            "edges": frame.edges, "edges_now": frame.edges_now, "refused": frame.refused, "picked": frame.picked,
-            "sightings": frame.sightings, "odometry": frame.odometry, "seen": seen, "driven": driven,
+        """Show a frame; `images` are by robot, None for a robot that sees nothing."""
+        trajectories = {f"trajectory {name}": frame.trajectories.get(name, NO_LINES) for name in self.names}
+        lines = trajectories | {
+            "edges": frame.edges, "edges_now": frame.edges_now, "rejected": frame.rejected, "picked": frame.picked,
+            "sightings": frame.sightings, "odometry": frame.odometry,
+            "markers_observed": markers_observed, "markers_estimated": markers_estimated,
         }  # fmt: skip
         converted = {name: (one.points, palette.linear(one.colours)) for name, one in lines.items()}
         batches = {"ellipses": frame.ellipses, "wedges": frame.wedges, "rings": frame.rings}
@@ -194,9 +191,9 @@ class GraphView:
                 role = frame.roles[number]
                 self._show(self._anchors[number], role == "anchor" and state.stays)
                 text = handle.name.rsplit("/", 1)[1] + (f"  {role}" if role else "")
-                if together := self.size > APART:
+                if together := self.size > ONE_LABEL_SIZE:
                     text = ", ".join(one.name.rsplit("/", 1)[1] for one in self.robots)
-                self._show(self._names[number], len(self.robots) <= MOST_NAMES and (number == first or not together))
+                self._show(self._names[number], len(self.robots) <= MAX_NAMES and (number == first or not together))
                 if self._labels.get(handle.name) != text:
                     self._names[number].text = self._labels[handle.name] = text
             for name, image in (images or {}).items():
@@ -207,7 +204,7 @@ class GraphView:
                 self._assign_batch(name, one, tints[name])
 
     def enlarge(self, size: float) -> None:
-        """Draw the robots so many times as large as they are."""
+        """Draw the robots `size` times as large as they are."""
         if size == self.size:
             return
         share, self.size = size / self.size, size
@@ -215,13 +212,13 @@ class GraphView:
             for body, anchor, name in zip(self._bodies, self._anchors, self._names, strict=True):
                 body.scale = anchor.scale = size
                 name.position = share * name.position
-            for _, standing, name in self._stills.values():
+            for _, standing, name in self._landmarks.values():
                 standing.scale, name.position = size, share * name.position
             for frustum in self._frustums.values():
                 frustum.scale, frustum.position = FRUSTUM * size, share * frustum.position
 
     def place(self, poses: NDArray[np.float64]) -> None:
-        """Show the robots at poses (r, 4) of x, y, z, heading, and not at all where these are NaN."""
+        """Show the robots at poses (r, 4) of x, y, z, heading; hide those with NaN."""
         turned = about_z(np.nan_to_num(poses[:, 3]))
         for number, (handle, pose) in enumerate(zip(self.robots, poses, strict=True)):
             there = bool(np.isfinite(pose).all())
@@ -251,7 +248,7 @@ class GraphView:
             )  # fmt: skip
 
     def _send(self, handle: viser.SceneNodeHandle, name: str, **parts: NDArray[np.generic]) -> None:
-        """Assign what is not as it was; to compare costs a tenth of sending."""
+        """Assign changed arrays; comparing costs a tenth of sending."""
         for part, value in parts.items():
             key = f"{name} {part}"
             before = self._sent.get(key)

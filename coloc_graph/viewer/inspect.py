@@ -1,4 +1,4 @@
-"""What is behind one edge and one robot: measured again, decomposed both ways, and drawn."""
+"""Inspection of one edge and one robot: the pair measured again, both decompositions, pictures, and reports."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -24,29 +24,25 @@ from coloc_graph.viewer.scene import Array, Layer, Scene
 
 Image = NDArray[np.uint8]
 
-#: An image this far from an instant is of it, and a track that pauses for longer is none there [s].
-NEAR = 0.3
-#: Or for so many times as long as it does mostly.
-PAUSE = 5.0
-#: Images are enlarged by so much for the picture.
-ENLARGED = 2
-#: So many points are drawn in it.
-MOST_POINTS = 60
+IMAGE_TOLERANCE = 0.3  # s between an instant and its image, and between joined samples of a track, at most
+GAP_FACTOR = 5.0  # times the median interval between samples of a track, above which they are not joined
+PICTURE_SCALE = 2  # factor by which images are enlarged
+MAX_POINTS = 60  # points drawn in a picture
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """One decomposition of a homography: `T_cj_ci` [m] as turn [deg] and way (3,), and its normal's error [deg]."""
+    """Decomposition of a homography: rotation [deg], translation (3,) [m] of `T_cj_ci`, error of the normal [deg]."""
 
-    turn_deg: float
-    way: Array
+    rotation_deg: float
+    translation: Array
     normal_error_deg: float
-    taken: bool
+    chosen: bool
 
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What is known of one edge: the measurement made again, both its decompositions, and a picture."""
+    """One edge in detail: the measurement made again, both its decompositions, and a picture."""
 
     measured: PairMeasurement
     solutions: tuple[Solution, ...]
@@ -54,10 +50,10 @@ class Inspection:
 
 
 def examine(scene: Scene, edge: int) -> Inspection:
-    """Measure the pair of an edge once more and look at it closely; `InputError` where there is no run to look at."""
+    """Measure the pair of an edge again, decompose and draw it; raises `InputError` without a run."""
     run, row = scene.run, int(scene.edges.rows[edge])
     if run is None:
-        raise InputError("there is no run to measure this pair in again; open the run, or a result that lies beside it")
+        raise InputError("there is no run to measure this pair in: open the run, or a result that lies beside it")
     stance = scene.stances[row]
     robot_i, robot_j = (scene.robots[int(n)] for n in (scene.edges.i[edge], scene.edges.j[edge]))
     measured = measure_pair(run, stance, robot_i, robot_j, scene.frontend)
@@ -77,22 +73,29 @@ def _solutions(run: Run, measured: PairMeasurement) -> tuple[Solution, ...]:
 
 
 def camera_image(run: Run, robot: str, time: float) -> Image | None:
-    """What a robot's camera showed at an instant, RGB; None if nothing.
+    """Image of a robot's camera at an instant, RGB; None if there is none.
 
-    Where there are no images, its detections of the stance are drawn, those of the instant bright.
+    Without images its detections of the stance are drawn, those of the instant bright.
     """
     camera = run.team[robot].camera_if_any
     if camera is None:
         return None
     if run.has_images(robot):
-        image = min(run.images(robot, time - NEAR, time + NEAR), key=lambda one: abs(one.time - time), default=None)
+        image = min(
+            run.images(robot, time - IMAGE_TOLERANCE, time + IMAGE_TOLERANCE),
+            key=lambda one: abs(one.time - time),
+            default=None,
+        )
         if image is None:
             return None
         pixels = image.pixels
         return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB if pixels.ndim == 2 else cv2.COLOR_BGR2RGB), np.uint8)
     if not run.has_detections(robot):
         return None
-    of = next((stance for stance in run.stances if stance.start - NEAR <= time <= stance.end + NEAR), None)
+    of = next(
+        (stance for stance in run.stances if stance.start - IMAGE_TOLERANCE <= time <= stance.end + IMAGE_TOLERANCE),
+        None,
+    )
     seen = [] if of is None else list(run.detections(robot, of.start, of.end))
     if not seen:
         return None
@@ -107,14 +110,14 @@ def camera_image(run: Run, robot: str, time: float) -> Image | None:
 
 
 def _picture(run: Run, time: float, robots: tuple[str, str], measured: PairMeasurement) -> Image:
-    """Both images side by side with their tracks, and the points of i warped by H onto j."""
+    """Draw both images side by side with their tracks, and the points of i mapped by H onto j."""
     halves: list[Image] = []
     for number, robot in enumerate(robots):
         camera = run.team[robot].camera
         image = camera_image(run, robot, time)
         if image is None or not run.has_images(robot):
             image = np.full((camera.height, camera.width, 3), 26, np.uint8)
-        large = cv2.resize(image, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_AREA)
+        large = cv2.resize(image, None, fx=PICTURE_SCALE, fy=PICTURE_SCALE, interpolation=cv2.INTER_AREA)
         half: Image = (large * 0.6).astype(np.uint8)  # so that what is drawn stands out
         if measured.tracks is not None:
             _draw_tracks(half, measured.tracks[number])
@@ -130,39 +133,39 @@ def _picture(run: Run, time: float, robots: tuple[str, str], measured: PairMeasu
 def _draw_tracks(half: Image, tracks: Sequence[Track]) -> None:
     for number, track in enumerate(tracks):
         colour = tuple(int(value) for value in palette.ROBOTS[(number + 4) % len(palette.ROBOTS)])
-        points = np.round(8 * (ENLARGED * (track.uv + 0.5) - 0.5)).astype(np.int32)
+        points = np.round(8 * (PICTURE_SCALE * (track.uv + 0.5) - 0.5)).astype(np.int32)
         # a pause in a track is no line across the image
         for part in np.split(points, np.flatnonzero(np.diff(track.times) > longest_gap(track.times)) + 1):
             cv2.polylines(half, [part], False, colour, 1, cv2.LINE_AA, 3)
 
 
 def _draw_points(run: Run, halves: list[Image], robots: tuple[str, str], measured: PairMeasurement) -> None:
-    """Some of the points in both images, and in j where H puts those of i."""
+    """Draw some of the points in both images, and in j the points of i mapped by H."""
     found, h = measured.correspondences, measured.homography
     if found is None or not len(found):
         return
-    some = np.unique(np.linspace(0, len(found) - 1, MOST_POINTS).round().astype(int))
+    some = np.unique(np.linspace(0, len(found) - 1, MAX_POINTS).round().astype(int))
     good = np.zeros(len(found), bool)
     if h.unusable is None:
         good = squared_residuals(h.H_j_i, found.pairs) < INLIER_GATE
-        some = np.union1d(some, np.flatnonzero(~good)[:MOST_POINTS])  # what does not fit is what one looks for
+        some = np.union1d(some, np.flatnonzero(~good)[:MAX_POINTS])  # what does not fit is what one looks for
     for half, points in zip(halves, (found.uv_i, found.uv_j), strict=True):
         for uv, fits in zip(points[some], good[some], strict=True):
-            cv2.circle(half, _pixel(ENLARGED * uv), 5, (255, 255, 255) if fits else (240, 120, 20), 1, cv2.LINE_AA)
+            cv2.circle(half, _pixel(PICTURE_SCALE * uv), 5, (255, 255, 255) if fits else (240, 120, 20), 1, cv2.LINE_AA)
     if h.unusable is None:
         warped = warp(h.H_j_i, run.team[robots[0]].camera.normalise(found.uv_i[some]), run.team[robots[1]].camera)
         for uv in warped[np.isfinite(warped).all(axis=1)]:
-            at = _pixel(ENLARGED * uv)
+            at = _pixel(PICTURE_SCALE * uv)
             cv2.drawMarker(halves[1], at, (86, 180, 233), cv2.MARKER_TILTED_CROSS, 9, 1, cv2.LINE_AA)
 
 
 def longest_gap(times: Array) -> float:
-    """How far apart in time [s] two samples of a way are at most that are joined."""
-    return max(NEAR, PAUSE * float(np.median(np.diff(times)))) if len(times) > 1 else NEAR
+    """Longest interval between two samples of a track that are joined [s]."""
+    return max(IMAGE_TOLERANCE, GAP_FACTOR * float(np.median(np.diff(times)))) if len(times) > 1 else IMAGE_TOLERANCE
 
 
 def warp(H: Array, x: Array, camera: Camera) -> Array:
-    """Pixels (n, 2) of camera j where H puts normalised points (n, 2) of camera i; NaN behind it."""
+    """Map normalised points (n, 2) of camera i by H to pixels (n, 2) of camera j; NaN behind it."""
     y = np.concatenate([x, np.ones((len(x), 1))], axis=1) @ H.T
     return camera.project(y * np.sign(np.linalg.det(H)))[0]
 
@@ -171,11 +174,11 @@ def _pixel(uv: Array) -> tuple[int, int]:
     return round(float(uv[0])), round(float(uv[1]))
 
 
-def marker_ways(scene: Scene, row: int, measured: Sequence[PairMeasurement], dark: bool) -> tuple[Lines, Lines]:
-    """The markers' ways in a stance, on their plane: as each observer sees them, and as they are estimated.
+def marker_trajectories(scene: Scene, row: int, measured: Sequence[PairMeasurement], dark: bool) -> tuple[Lines, Lines]:
+    """Trajectories of the markers in a stance, on the marker plane: as observed, and as estimated.
 
-    As seen: through the mount that is stated, in the observer's colour. As estimated: through mounts as they turned
-    out, the mean of both observers, in the colour of who drives. Both from where the observers are estimated to stand.
+    Observed: with the stated mount of each observer, in its colour. Estimated: with the calibrated mounts, the mean of
+    both observers, in the mover's colour. Both from the estimated poses of the observers.
     """
     if scene.run is None or scene.team is None or not scene.layers:
         return _joined([]), _joined([])
@@ -229,7 +232,7 @@ def _with_team(run: Run, team: Team) -> Run:
 
 
 def _joined(parts: Sequence[tuple[Array, Array, palette.Colours]]) -> Lines:
-    """Ways as segments: consecutive points, near in time, and not out of sight."""
+    """Trajectories as segments between finite points that are consecutive in time."""
     points, colours = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3), np.uint8)]
     for times, places, colour in parts:
         good = (
@@ -238,14 +241,14 @@ def _joined(parts: Sequence[tuple[Array, Array, palette.Colours]]) -> Lines:
             & np.isfinite(places[1:]).all(axis=1)
         )
         segments = np.stack([places[:-1], places[1:]], axis=1)[good]
-        segments[..., 2] = 0.012  # on the floor, where the ways of the robots are
+        segments[..., 2] = 0.012  # on the floor, like the robots' trajectories
         points.append(segments)
         colours.append(np.broadcast_to(colour, segments.shape))
     return Lines(np.concatenate(points).astype(np.float32), np.concatenate(colours).astype(np.uint8))
 
 
 def edge_report(scene: Scene, edge: int, found: Inspection | None) -> str:
-    """An edge in words and numbers, as markdown; with `found`, what measuring it again shows."""
+    """Report on an edge as markdown; with `found`, including the pair measured again."""
     return "\n\n".join(_edge_lines(scene, edge, found))
 
 
@@ -254,7 +257,7 @@ def _edge_lines(scene: Scene, edge: int, found: Inspection | None) -> Iterator[s
     i, j = (scene.robots[int(n)] for n in (edges.i[edge], edges.j[edge]))
     yield f"### {i} - {j}, stance {scene.stances[int(edges.rows[edge])].index}"
     if edges.why_not[edge]:
-        yield f"**Not used:** {edges.why_not[edge]}"
+        yield f"**Rejected:** {edges.why_not[edge]}"
     if np.isfinite(edges.sigmas[edge]):
         yield f"residual **{edges.sigmas[edge]:.2f} sigma** ({edges.of_what})"
     if found is None:
@@ -263,18 +266,18 @@ def _edge_lines(scene: Scene, edge: int, found: Inspection | None) -> Iterator[s
     rows = [("points", f"{h.points}"), ("inliers", f"{h.inliers}")]
     if h.unusable is None:
         rows += [
-            ("residual of the points", f"{h.residual:.2f} sigma"),
+            ("point residual", f"{h.residual:.2f} sigma"),
             ("overlap in image i", f"{h.overlap_px:.0f} px"),
             (
-                "clock of j ahead of i",
+                "clock offset, j - i",
                 f"{1000 * h.time_offset:.2f} ± {1000 * h.time_offset_sigma:.2f} ms"
                 if h.time_offset_sigma
-                else "said to agree",
+                else "stated as equal",
             ),
         ]
     if pose is not None:
         rows.append(("distance", f"{np.linalg.norm(pose.T_i_j[:3, 3]):.4f} m"))
-    yield _table(("measured again", ""), rows)
+    yield _table(("pair measured again", ""), rows)
     if h.warning:
         yield f"_{h.warning}_"
     if h.unusable is None:
@@ -283,18 +286,21 @@ def _edge_lines(scene: Scene, edge: int, found: Inspection | None) -> Iterator[s
         yield _table(
             ("decomposition", "1", "2"),
             [
-                ("normal's error", *(f"{one.normal_error_deg:.2f} deg" for one in found.solutions)),
-                ("turn", *(f"{one.turn_deg:.2f} deg" for one in found.solutions)),
-                ("way [m]", *(", ".join(f"{value:.3f}" for value in one.way) for one in found.solutions)),
-                ("", *("**taken**" if one.taken else "" for one in found.solutions)),
+                ("error of normal", *(f"{one.normal_error_deg:.2f} deg" for one in found.solutions)),
+                ("rotation", *(f"{one.rotation_deg:.2f} deg" for one in found.solutions)),
+                (
+                    "translation [m]",
+                    *(", ".join(f"{value:.3f}" for value in one.translation) for one in found.solutions),
+                ),
+                ("", *("**chosen**" if one.chosen else "" for one in found.solutions)),
             ],
         )
     if h.unusable is None:
-        yield "White: points (orange: outliers). Blue crosses in j: the points of i by H."
+        yield "White: points, orange: outliers. Blue crosses in j: points of i mapped by H."
 
 
 def robot_report(scene: Scene, number: int, row: int) -> str:
-    """A robot at a stance in words and numbers, as markdown: pose, covariance, mount."""
+    """Report on a robot at a stance as markdown: pose, covariance, mount."""
     return "\n\n".join(_robot_lines(scene, number, row))
 
 
@@ -302,7 +308,7 @@ def _robot_lines(scene: Scene, number: int, row: int) -> Iterator[str]:
     robot = scene.robots[number]
     yield f"### Robot {robot}, stance {scene.stances[row].index if row >= 0 else '-'}"
     if row < 0 or not scene.layers or not scene.layers[0].there[number, row]:
-        yield "It has no pose here: nothing ties it to the reference."
+        yield "It has no pose at this stance: it is disconnected from the reference."
         return
     for layer in (scene.layers[0], scene.other):
         if layer is not None and layer.there[number, row]:
@@ -312,7 +318,7 @@ def _robot_lines(scene: Scene, number: int, row: int) -> Iterator[str]:
     stated = scene.team[robot].mount
     found = scene.calibrated[robot].mount if scene.calibrated is not None else None
     yield _table(
-        ("mount", "stated", *(("found",) if found else ())),
+        ("mount", "stated", *(("estimated",) if found else ())),
         [
             (
                 name,
@@ -344,7 +350,7 @@ def _pose_rows(scene: Scene, base: Layer, number: int, row: int) -> list[tuple[s
         ]
     off = scene.errors(base)[number, row]
     if np.isfinite(off):
-        rows.append(("off the truth", f"{1000 * off:.2f} mm"))
+        rows.append(("error (truth known)", f"{1000 * off:.2f} mm"))
     return rows
 
 

@@ -1,4 +1,4 @@
-"""A scene that grows: what an estimator says after each stance, put together in the viewer's thread."""
+"""A scene that grows by the estimates after each stance."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,10 +16,8 @@ from coloc_graph.viewer.scene import Array, Scene, layer_of
 from coloc_graph.viewer.sources import as_edges, stayed
 from coloc_graph.viewer.still import landmarks_in, sighted_in
 
-#: What the layer is called where the scene it starts from has none.
-LIVE = "live"
-#: What live residuals are of.
-OF_THEN = "of the measurement in the estimate when it came in"
+LIVE = "live"  # name of the layer if the first scene has none
+RESIDUAL_AT_INSERTION = "of the measurement in the estimate when it came in"
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +35,9 @@ class LiveStance:
 
 @dataclass(frozen=True, eq=False)
 class LivePoses:
-    """Where robots are at a `time` [s], between stances too: `T_world_body` (4, 4) [m] by robot.
+    """Poses of robots at a `time` [s], between stances too: `T_world_body` (4, 4) [m] by robot.
 
-    `note` says what goes on. Robots that are not named are shown where their last stance has them.
+    `note` is shown with them. Robots that are not named stay at the pose of their last stance.
     """
 
     time: float
@@ -55,8 +53,8 @@ class LivePoses:
                 out[number, :3], out[number, 3] = T[:3, 3], np.arctan2(T[1, 0], T[0, 0])
         return out
 
-    def unfit(self, robots: Sequence[str]) -> str:
-        """What of it cannot be shown, in words; "" where all can."""
+    def problems(self, robots: Sequence[str]) -> str:
+        """Sentence that names the poses that cannot be shown; "" if all can."""
         strangers = sorted(set(self.T_world_body) - set(robots))
         broken = [robot for robot, T in self.T_world_body.items() if not _is_transform(T)]
         return "; ".join(
@@ -108,7 +106,7 @@ class LiveScene:
         ]
 
     def scene(self) -> Scene:
-        """Everything so far."""
+        """Make the scene of all stances that were added."""
         robots = self._start.robots
         stances = tuple(self._stances[index] for index in sorted(self._stances))
         trajectories = {}
@@ -129,7 +127,7 @@ class LiveScene:
             self._start,
             stances=stances,
             layers=(layer_of(self._name, robots, stances, trajectories),) if stances else (),
-            edges=as_edges(found, robots, stances, OF_THEN),
+            edges=as_edges(found, robots, stances, RESIDUAL_AT_INSERTION),
             stayed=stayed(robots, stances, held),
             landmarks=landmarks_in(rows, sighted, robots, stances),
         )

@@ -11,15 +11,13 @@ from coloc_graph.viewer.palette import Colours
 
 Array = NDArray[np.float64]
 
-#: Height of a body [m], of its colour's band, and radius of a marker as drawn.
-BODY_HEIGHT = 0.09
-BAND = 0.03
-LED_RADIUS = 0.014
+BODY_HEIGHT = 0.09  # m, height of a robot's body
+BAND = 0.03  # m, height of the band in the robot's colour
+LED_RADIUS = 0.014  # m, radius of a marker as drawn
 _DARK = (46, 50, 57)
 _PLATE = (226, 229, 233)
 LED = (255, 244, 190)
-#: Where a robot has no description.
-PLAIN_CAMERA_HEIGHT = 0.25
+PLAIN_CAMERA_HEIGHT = 0.25  # m, of a robot that is not described
 
 
 def robot_mesh(robot: Robot | None, colour: Colours) -> trimesh.Trimesh:
@@ -49,7 +47,7 @@ def robot_mesh(robot: Robot | None, colour: Colours) -> trimesh.Trimesh:
 
 
 def T_body_camera(robot: Robot | None) -> Array:
-    """Where a robot's camera is on its body, (4, 4); ahead and a little up where that is not known."""
+    """Extrinsics of a robot's camera, (4, 4); ahead and a little up if they are not known."""
     if robot is not None and robot.mount_if_any is not None:
         return robot.mount_if_any.T_body_camera
     T = np.eye(4)

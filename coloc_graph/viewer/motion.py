@@ -1,4 +1,4 @@
-"""Where a robot is between two of its poses: by its wheels where there is odometry, else straight."""
+"""Pose of a robot between two stances: by wheel odometry if there is any, else interpolated."""
 
 from functools import lru_cache
 
@@ -9,8 +9,7 @@ from coloc_graph.viewer.scene import Layer, Scene
 
 Array = NDArray[np.float64]
 
-#: So far before an observer is what it watches [m].
-AHEAD = 1.5
+AHEAD = 1.5  # m, distance from an observer to the markers that it watches
 
 
 def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:

@@ -21,11 +21,11 @@ def rgb(code: str) -> tuple[int, int, int]:
 
 
 ROBOTS: Colours = np.array([rgb(code) for code in COLOURS], np.uint8)
-#: Residuals of 0, 0.5, ... and 3 or more sigmas: noise is blue, and what is not turns over amber to red; nowhere grey.
+# residuals of 0, 0.5, ... 3 sigma: noise is blue, from there over amber to red
 RESIDUAL_STOPS = ("#2c7bb6", "#2c7bb6", "#2c7bb6", "#2aa198", "#e6a019", "#dd5f2c", "#c51b3a")
 _STOPS = np.array([rgb(code) for code in RESIDUAL_STOPS], float)
-STOPS_A_SIGMA = 2
-MOST_SIGMAS = (len(_STOPS) - 1) / STOPS_A_SIGMA
+STOPS_PER_SIGMA = 2  # stops of the residual scale in one sigma
+MAX_SIGMA = (len(_STOPS) - 1) / STOPS_PER_SIGMA
 PICKED: Colours = np.array([255, 0, 170], np.uint8)
 SIGHTING: Colours = np.array(rgb("#7b5ea7"), np.uint8)
 LANDMARK: Colours = np.array(rgb("#d6a01e"), np.uint8)
@@ -43,28 +43,28 @@ def seen_on(colours: Colours, dark: bool) -> Colours:
 
 
 def ink(dark: bool) -> Colours:
-    """Text and truth."""
+    """Colour of text and truth."""
     return np.array((235, 238, 242) if dark else rgb(INK), np.uint8)
 
 
 def grey(dark: bool) -> Colours:
-    """What is refused, or not known."""
+    """Colour of rejected and of unknown measurements."""
     return np.array((150, 158, 168) if dark else rgb(GREY), np.uint8)
 
 
 def paper(dark: bool) -> Colours:
-    """What everything is drawn on."""
+    """Colour of the background."""
     return np.array((30, 33, 38) if dark else (255, 255, 255), np.uint8)
 
 
 def faded(colours: Colours, dark: bool, share: float) -> Colours:
-    """Colours (..., 3) with so much of the paper in them."""
+    """Mix colours (..., 3) with a share of the background."""
     return np.asarray(np.rint((1 - share) * colours.astype(float) + share * paper(dark)), np.uint8)
 
 
-def of_residuals(sigmas: NDArray[np.float64], dark: bool) -> Colours:
+def residual_colours(sigmas: NDArray[np.float64], dark: bool) -> Colours:
     """Colours (n, 3) of residuals (n,) [sigma]; grey where they are not known."""
-    at = STOPS_A_SIGMA * np.clip(np.nan_to_num(sigmas), 0, MOST_SIGMAS)
+    at = STOPS_PER_SIGMA * np.clip(np.nan_to_num(sigmas), 0, MAX_SIGMA)
     low = np.minimum(at.astype(int), len(_STOPS) - 2)
     share = (at - low)[:, None]
     colours = np.rint(_STOPS[low] * (1 - share) + _STOPS[low + 1] * share).astype(np.uint8)

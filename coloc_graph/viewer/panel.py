@@ -1,4 +1,4 @@
-"""The viewer's controls: sliders, switches, plots, legend, and the panel of what was clicked."""
+"""Controls of the viewer: sliders, switches, plots, legend, and the panel of the clicked edge or robot."""
 
 import html
 import time
@@ -20,20 +20,19 @@ HELP = "Click an edge or a robot. Space plays, arrow keys step."
 WIDTH = 330
 INSPECTOR_WIDTH = 480
 
-#: A slider is left to whoever moves it for so long; keys that move it while it has the focus do nothing else [s].
-HANDS_OFF = 0.25
+HOLD_SECONDS = 0.25  # s for which a slider is left to the user who moves it, and its keys do nothing else
 
-#: Called with what was asked for: ("stance", row), ("time", seconds), ("step", rows), ("play", 0), ("changed", 0).
+# called with a request: ("stance", row), ("time", seconds), ("step", rows), ("play", 0), ("changed", 0)
 Ask = Callable[[str, float], None]
 
 
 class Panel:
-    """Owns every GUI handle. Its callbacks only pass on what was asked for; all else is for the render thread."""
+    """Owner of every GUI handle; its callbacks only pass on requests, all else is called by the render thread."""
 
     def __init__(self, server: viser.ViserServer, scene: Scene, ask: Ask, k_sigma: float, *, compares: bool) -> None:
         self._gui, self._ask = server.gui, ask
         self._clicked = False
-        self._touched_at = -HANDS_OFF
+        self._touched_at = -HOLD_SECONDS
         self._led: dict[str, float] = {}
         gui = server.gui
         gui.configure_theme(brand_color=palette.rgb("#0072B2"), show_share_button=False, show_logo=False)
@@ -44,19 +43,21 @@ class Panel:
             self.stance = gui.add_slider("Stance", 0, 1, 1, 0)
             self.time = gui.add_slider("Time [s]", 0.0, 1.0, 0.1, 0.0)
             self.play = gui.add_checkbox("Play", False, hint="space; arrow keys step")
-            self.speed = gui.add_slider("Speed", 1, 100, 1, 10, hint="seconds a second")
+            self.speed = gui.add_slider("Speed", 1, 100, 1, 10, hint="seconds of the run per second")
             self.follow = gui.add_dropdown("Follow", (NOBODY, *scene.robots))
         with gui.add_folder("Show"):
             self._layers: dict[str, viser.GuiCheckboxHandle] = {}
             self._layer_folder = gui.add_folder("Trajectories")
-            self.k_sigma = gui.add_slider("Ellipses [sigma]", 1, 100, 1, int(k_sigma))
-            self.ellipses = gui.add_checkbox("Ellipses", True)
-            self.wedges = gui.add_checkbox("Headings", True, hint="wedges of so many sigmas")
-            self.edges = gui.add_checkbox("Edges", True)
-            self.stays = gui.add_checkbox("Stay-put rings", True)
-            self.markers = gui.add_checkbox("Marker ways", True)
-            self.sightings = gui.add_checkbox("Sightings", False, hint="where a robot was seen by another")
-            self.odometry = gui.add_checkbox("Odometry", False, hint="where wheels lead from pose to pose")
+            self.k_sigma = gui.add_slider("Scale [sigma]", 1, 100, 1, int(k_sigma), hint="size of ellipses and wedges")
+            self.ellipses = gui.add_checkbox("Ellipses", True, hint="covariances of the positions")
+            self.wedges = gui.add_checkbox("Wedges", True, hint="standard deviations of the headings")
+            self.edges = gui.add_checkbox("Edges", True, hint="measurements of pairs of observers")
+            self.stays = gui.add_checkbox("Rings", True, hint="poses kept from one stance to the next")
+            self.markers = gui.add_checkbox(
+                "Markers", True, hint="trajectories of the markers, as observed and as estimated"
+            )
+            self.sightings = gui.add_checkbox("Sightings", False, hint="robots and landmarks seen by observers")
+            self.odometry = gui.add_checkbox("Odometry", False, hint="wheel odometry from pose to pose")
             self.beside = gui.add_checkbox("Side by side", False, visible=compares)
             self.dark = gui.add_checkbox("Dark", False)
         with gui.add_folder("Plots"):
@@ -87,7 +88,7 @@ class Panel:
         for slider, what in (
             (self.stance, "stance"), (self.time, "time"), (self.speed, "changed"), (self.k_sigma, "changed"),
         ):  # fmt: skip
-            slider.on_update(lambda event, what=what: self._slid(event, what))  # type: ignore[misc]
+            slider.on_update(lambda event, what=what: self._on_slider(event, what))  # type: ignore[misc]
         for handle in (
             self.play, self.ellipses, self.wedges, self.edges, self.stays, self.markers, self.sightings,
             self.odometry, self.beside, self.dark, self.follow,
@@ -99,29 +100,29 @@ class Panel:
             ("Last stance", "end", "step", 1 << 40),
         ):  # fmt: skip
             command = self._gui.add_command(label, hotkey=hotkey)  # type: ignore[arg-type]
-            command.on_trigger(lambda _, what=what, value=value: self._struck(what, value))  # type: ignore[misc]
+            command.on_trigger(lambda _, what=what, value=value: self._on_hotkey(what, value))  # type: ignore[misc]
 
-    def _slid(self, event: viser.GuiEvent[viser.GuiSliderHandle[Any]], what: str) -> None:
+    def _on_slider(self, event: viser.GuiEvent[viser.GuiSliderHandle[Any]], what: str) -> None:
         if event.client is not None:
             self._touched_at = time.monotonic()
         if event.client is not None or what == "changed":
             self._ask(what, event.target.value)
 
-    def _struck(self, what: str, value: float) -> None:
-        """A key: an arrow that moves the slider which has the focus comes as a command too."""
-        if what != "step" or time.monotonic() - self._touched_at > HANDS_OFF:
+    def _on_hotkey(self, what: str, value: float) -> None:
+        """Pass on a key; an arrow that moves the slider with the focus comes as a command too, and is dropped."""
+        if what != "step" or time.monotonic() - self._touched_at > HOLD_SECONDS:
             self._ask(what, value)
 
     def _lead(self, slider: viser.GuiSliderHandle[Any], what: str, value: float, tolerance: float) -> None:
-        """Move a slider along with the picture, but do not take it out of anybody's hand."""
-        if self._led.get(what) == value or time.monotonic() - self._touched_at < HANDS_OFF:
+        """Move a slider along with the frame unless a user holds it."""
+        if self._led.get(what) == value or time.monotonic() - self._touched_at < HOLD_SECONDS:
             return
         self._led[what] = value
         if abs(slider.value - value) > tolerance:
             set_value(slider, value)
 
     def adopt(self, scene: Scene) -> None:
-        """Sliders and switches for a scene of the same robots: as long as it, a switch a trajectory."""
+        """Fit sliders and switches to a scene of the same robots."""
         last = max(len(scene) - 1, 1)
         length = max(round(float(scene.ends.max() - scene.starts[0]), 1), 0.1) if len(scene) else 1.0
         if self.stance.max != last:
@@ -141,18 +142,18 @@ class Panel:
 
     @property
     def shown(self) -> frozenset[str]:
-        """The trajectories that are switched on."""
+        """Names of the trajectories that are switched on."""
         return frozenset(name for name, box in self._layers.items() if box.value)
 
-    def tell(self, scene: Scene, frame: Frame, moment: float, notes: Sequence[str]) -> None:
-        """Sliders and the sentence at the top with the `notes` there are, as the picture is."""
+    def show_status(self, scene: Scene, frame: Frame, moment: float, notes: Sequence[str]) -> None:
+        """Bring sliders and the sentence at the top, with its `notes`, up to date with a frame."""
         if not len(scene):
             self._say(f"**{scene.title}** no poses yet", notes)
             return
         stance = scene.stances[frame.row]
         drivers = ", ".join(stance.movers) or "nobody"
         anchors = ", ".join(stance.anchors) or "nobody"
-        said = f"**Stance {stance.index}** of {len(scene)}: {drivers} drives, {anchors} stayed put"
+        said = f"**Stance {stance.index}** of {len(scene)}: {drivers} moves, {anchors} kept its pose"
         if not stance.observers:  # of a drive
             said = f"**Moment {stance.index}** of {len(scene)}: {drivers} drive, nobody stands and watches"
         self._say(said, notes)
@@ -166,7 +167,7 @@ class Panel:
             self.status.content = text
 
     def plot(self, scene: Scene, row: int) -> None:
-        """The curves, their cursor at a row."""
+        """Show the curves with the cursor at a row."""
         if len(scene):
             (x, residual), (x_error, errors) = self._curves
             at = float(scene.stances[row].index)
@@ -174,7 +175,7 @@ class Panel:
             self._error.data = with_cursor(x_error, errors, at)
 
     def inspect(self, text: str, picture: NDArray[np.uint8] | None) -> None:
-        """Open the panel of what was clicked; with an empty text, close it."""
+        """Open the panel of the clicked edge or robot; close it with an empty text."""
         if bool(text) != self._clicked:
             self._clicked = bool(text)
             self._inspector.visible = self._clicked
@@ -187,8 +188,8 @@ class Panel:
         if self._picture.visible != visible:
             self._picture.visible = visible
 
-    def dress(self, dark: bool) -> None:
-        """Light or dark."""
+    def set_theme(self, *, dark: bool) -> None:
+        """Set light or dark colours of the controls."""
         self._gui.configure_theme(
             brand_color=palette.rgb("#0072B2"), show_share_button=False, show_logo=False, dark_mode=dark
         )
@@ -218,7 +219,7 @@ def set_value(handle: object, value: float | bool) -> None:
 
 
 def legend(scene: Scene) -> str:
-    """What colours and strokes mean, as HTML."""
+    """Legend of colours and strokes as HTML."""
     robots = "".join(
         f'<span style="color:{_hex(colour)};font-weight:600;margin-right:.7em">&#9679; {html.escape(name)}</span>'
         for name, colour in zip(scene.robots, palette.robot_colours(len(scene.robots)), strict=True)
@@ -230,17 +231,17 @@ def legend(scene: Scene) -> str:
     lines = [
         robots,
         f'edges <span style="display:inline-block;width:90px;height:8px;border-radius:4px;'
-        f'background:linear-gradient(90deg,{stops})"></span> 0 to {palette.MOST_SIGMAS:.0f} sigma'
-        f"<br><small>{html.escape(of_what)}; grey dashes: refused</small>",
-        "thick: estimate, pale: other methods (chained is dashed), black or white: truth",
-        "ring: a robot stayed put there; bold ring: it is the anchor now",
-        "discs and wedges: place and heading to so many sigmas",
+        f'background:linear-gradient(90deg,{stops})"></span> 0 to {palette.MAX_SIGMA:.0f} sigma'
+        f"<br><small>{html.escape(of_what)}; grey dashes: rejected</small>",
+        "trajectories: thick: estimate, pale: other methods (chained: dashed), black or white: truth",
+        "ring: pose kept from one stance to the next; bold ring: anchor of this stance",
+        "ellipses, wedges: covariance of position and heading, as large as the slider says",
         f'<span style="color:{_hex(palette.SIGHTING)}">&#8212; sightings</span>, '
         f'<span style="color:{_hex(palette.ODOMETRY)}">&#8212; odometry</span> (where switched on)',
     ]
     if len(scene.landmarks):
         lines.insert(1, f'<span style="color:{_hex(palette.LANDMARK)}">&#9733;</span> '
-                     f"{len(scene.landmarks)} landmarks that were sighted")  # fmt: skip
+                     f"{len(scene.landmarks)} landmarks")  # fmt: skip
     if scene.other is not None:
         lines.append(f"dashed, or at the side, and pale: {html.escape(scene.other.name)}; its curves are dashed")
     body = "".join(f'<div style="margin:.25em 0">{line}</div>' for line in lines)

@@ -4,8 +4,7 @@ import numpy as np
 
 from coloc_graph.viewer.scene import Array, Scene
 
-#: So many points a curve at most.
-MOST_POINTS = 400
+MAX_POINTS = 400  # points of a curve
 
 
 def residual_curves(scene: Scene) -> tuple[Array, Array]:
@@ -23,7 +22,7 @@ def residual_curves(scene: Scene) -> tuple[Array, Array]:
 
 
 def error_curves(scene: Scene) -> tuple[Array, Array]:
-    """Stance numbers (n,) and what each robot is off the truth, (r, n) [mm]; without truth, its sigma.
+    """Stance numbers (n,) and position error of each robot, (r, n) [mm]; without truth, its sigma.
 
     In a comparison (2 r, n): those of the other result follow.
     """
@@ -65,8 +64,8 @@ def _numbers(scene: Scene) -> Array:
 
 
 def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
-    """At most `MOST_POINTS`, the largest of each stretch."""
-    if len(x) <= MOST_POINTS:
+    """At most `MAX_POINTS`, the largest of each stretch."""
+    if len(x) <= MAX_POINTS:
         return x, y
-    edges = np.linspace(0, len(x), MOST_POINTS + 1).astype(int)[:-1]
+    edges = np.linspace(0, len(x), MAX_POINTS + 1).astype(int)[:-1]
     return x[edges], np.maximum.reduceat(y, edges, axis=-1)

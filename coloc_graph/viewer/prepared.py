@@ -1,4 +1,4 @@
-"""What of a layer looks the same at any time: made once, so that a moment is picked out of it and not computed anew."""
+"""Shapes of a layer that are the same at any time, computed once; a frame selects from them."""
 
 from functools import lru_cache
 
@@ -10,17 +10,22 @@ from coloc_graph.viewer.scene import Array, Edges, Index, Layer, Links, Mask, Sc
 
 Float32 = NDArray[np.float32]
 
-#: Heights [m] over the floor of edges, of sightings, and of odometry.
-Z_EDGE = 0.13
-Z_SIGHTING = 0.15
-Z_ODOMETRY = 0.05
+Z_EDGE = 0.13  # m over the floor
+Z_SIGHTING = 0.15  # m over the floor
+Z_ODOMETRY = 0.05  # m over the floor
 
 
-class Doubts:
-    """The ellipses and wedges of a layer for one sigma.
+class CovarianceShapes:
+    """Ellipses and wedges of a layer for one sigma.
 
-    Where there are some, `known` (r, s); quaternions `of_place` and `of_heading` (r, s, 4); semi-axes `axes` (r, s, 2)
-    [m].
+    Attributes
+    ----------
+    known
+        (r, s), True for a pose with a covariance that differs from the pose before.
+    axes
+        (r, s, 2), semi-axes of the ellipses [m].
+    position_wxyz, heading_wxyz
+        (r, s, 4), quaternions of ellipses and wedges, w first.
     """
 
     def __init__(self, layer: Layer) -> None:
@@ -29,34 +34,34 @@ class Doubts:
         covariance = np.where(finite[..., None, None], layer.covariance, 0.0)
         axes, direction = ellipse_axes(covariance)
         self.axes = axes.astype(np.float32)
-        self.of_place, self.of_heading = about_z(direction), about_z(np.nan_to_num(layer.yaw))
+        self.position_wxyz, self.heading_wxyz = about_z(direction), about_z(np.nan_to_num(layer.yaw))
 
 
 class DrawnEdges:
-    """Edges between the poses of a layer: `ends` (m, 2, 3) [m], whether both are `there` (m,), colours (m, 3)."""
+    """Edges between the poses of a layer: `ends` (m, 2, 3) [m], `there` (m,) if both exist, colours (m, 3)."""
 
     def __init__(self, layer: Layer, edges: Edges, dark: bool) -> None:
         self.ends = _ends(layer, edges.i, edges.rows, edges.j, edges.rows, Z_EDGE)
         self.there: Mask = np.asarray(np.isfinite(self.ends).all(axis=(1, 2)))
-        self.now = palette.of_residuals(edges.sigmas, dark)
+        self.now = palette.residual_colours(edges.sigmas, dark)
         self.past = palette.faded(self.now, dark, 0.25)
 
 
 @lru_cache(maxsize=8)
-def doubts_of(layer: Layer) -> Doubts:
-    """Those of a layer."""
-    return Doubts(layer)
+def covariance_shapes(layer: Layer) -> CovarianceShapes:
+    """Ellipses and wedges of a layer."""
+    return CovarianceShapes(layer)
 
 
 @lru_cache(maxsize=8)
 def edges_of(layer: Layer, edges: Edges, dark: bool) -> DrawnEdges:
-    """Edges as they are drawn."""
+    """Ends and colours of edges."""
     return DrawnEdges(layer, edges, dark)
 
 
 @lru_cache(maxsize=8)
 def links_of(layer: Layer, links: Links, z: float) -> Float32:
-    """The ends (m, 2, 3) [m] of links, NaN where one has no pose."""
+    """Ends (m, 2, 3) [m] of links, NaN for a robot without a pose."""
     return _ends(layer, links.i, links.rows_i, links.j, links.rows_j, z)
 
 

@@ -10,7 +10,7 @@ from coloc_graph.errors import ColocError
 from coloc_graph.viewer.cameras import Cameras, initial_camera
 from coloc_graph.viewer.details import Details, Picked
 from coloc_graph.viewer.frame import NO_LINES, Frame, ViewState, frame_of
-from coloc_graph.viewer.handles import MOST_NAMES, GraphView
+from coloc_graph.viewer.handles import MAX_NAMES, GraphView
 from coloc_graph.viewer.inbox import Inbox, Work
 from coloc_graph.viewer.live import LiveScene
 from coloc_graph.viewer.notes import Notifications, left_out
@@ -25,7 +25,7 @@ PLOT_INTERVAL = 0.15  # s between plots while time moves, at least; they are pus
 
 
 class Renderer:
-    """What is shown, and the loop that keeps it up to date.
+    """The frame that is shown, and the loop that keeps it up to date.
 
     Attributes
     ----------
@@ -140,8 +140,8 @@ class Renderer:
         live, scene = self._inbox.live_poses, self.scene
         if live is None or frame.row != len(scene) - 1 or self._panel.play.value:
             return frame
-        if unfit := live.unfit(scene.robots):
-            self.notifications.show_once("Not all can be shown", unfit)
+        if problems := live.problems(scene.robots):
+            self.notifications.show_once("Not all can be shown", problems)
         return replace(frame, poses=live.over(scene.robots, frame.poses))
 
     def _tell(self, frame: Frame) -> None:
@@ -151,10 +151,10 @@ class Renderer:
             live.note if live is not None else "",
             frame.note,
             f"robots are drawn {size:.0f} times as large as they are, to be seen from afar" if size > 1 else "",
-            f"of more than {MOST_NAMES} robots no name is written: click one" if len(frame.roles) > MOST_NAMES else "",
+            f"of more than {MAX_NAMES} robots no name is written: click one" if len(frame.roles) > MAX_NAMES else "",
             self._note,
         )
-        self._panel.tell(self.scene, frame, self._playback.time, notes)
+        self._panel.show_status(self.scene, frame, self._playback.time, notes)
 
     def _report(self, frame: Frame) -> bool:
         """Bring the panel of what was clicked up to date; True while it is being made."""
@@ -172,12 +172,12 @@ class Renderer:
         scene, panel = self.scene, self._panel
         if panel.dark.value != self._dark:
             self._dark = panel.dark.value
-            panel.dress(self._dark)
-            self.view.dress(scene, self._dark, self._aside)
+            panel.set_theme(dark=self._dark)
+            self.view.fit_floor(scene, self._dark, self._aside)
         if panel.beside.value != bool(self._aside):
             low, high = scene.bounds
             self._aside = float(high[1] - low[1] + 1.0) if panel.beside.value else 0.0
-            self.view.dress(scene, self._dark, self._aside)
+            self.view.fit_floor(scene, self._dark, self._aside)
             self.cameras.frame_all(scene, self._aside)
 
     def _grow(self) -> None:
@@ -200,7 +200,7 @@ class Renderer:
             self.notifications.show("A stance cannot be shown", str(error))
             return
         self.view.adopt(scene)
-        self.view.dress(scene, self._dark, self._aside)
+        self.view.fit_floor(scene, self._dark, self._aside)
         self._panel.adopt(scene)
         if was_at_end:
             self._playback.time = scene.middle(len(scene) - 1)

@@ -1,4 +1,4 @@
-"""What the viewer shows, as arrays: robots by stances, one row a robot, NaN where a robot has no pose."""
+"""Scene of the viewer as arrays: robots by stances, one row a robot, NaN for a robot without a pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class Layer:
 
     @cached_property
     def there(self) -> Mask:
-        """Where there is a pose, (r, s)."""
+        """(r, s), True for a pose."""
         return np.isfinite(self.yaw)
 
     @cached_property
@@ -50,7 +50,7 @@ class Layer:
 
     @cached_property
     def arrived(self) -> Mask:
-        """Where a robot stands elsewhere than at the stance before, (r, s): each place once."""
+        """(r, s), True for a pose that differs from the one at the stance before."""
         new = self.there.copy()
         with np.errstate(invalid="ignore"):
             new[:, 1:] &= ~((self.xyz[:, 1:] == self.xyz[:, :-1]).all(axis=2) & (self.yaw[:, 1:] == self.yaw[:, :-1]))
@@ -99,10 +99,10 @@ def layer_of(
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """What pairs of observers measured: `rows` (m,) of the stances, robots `i` and `j` (m,) by number.
+    """Measurements of pairs of observers: `rows` (m,) of the stances, robots `i` and `j` (m,) by number.
 
-    `sigmas` (m,) is the residual of each, RMS in units of its noise, NaN where it is not known; `of_what` says of what
-    it is the residual. `why_not` says why a measurement is not used, "" where it is.
+    `sigmas` (m,) is the residual of each, RMS in units of its noise, NaN if unknown; `of_what` names the quantity.
+    `why_not` is the reason to reject a measurement, "" for one that is used.
     """
 
     rows: Index
@@ -117,13 +117,13 @@ class Edges:
 
     @cached_property
     def used(self) -> Mask:
-        """Which are in the estimate, (m,)."""
+        """(m,), True for a measurement in the estimate."""
         return np.array([not why for why in self.why_not], bool)
 
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """What else ties poses: robots `i` at `rows_i` with robots `j` at `rows_j` (m,) each, in the order of `rows_j`."""
+    """Sightings or odometry: robots `i` at `rows_i` with robots `j` at `rows_j` (m,) each, in the order of `rows_j`."""
 
     i: Index
     rows_i: Index
@@ -163,10 +163,10 @@ class Scene:
     """All that is shown of a run and its estimates; immutable.
 
     `layers` are the estimates, the first being the one whose poses the robots stand at. `stayed` are the stay-put
-    constraints (q, 2): robot by number, row of the later stance. `sightings` (who sees, who is seen) and `odometry` are
-    what else ties poses, and `landmarks` are where they came out. `beside` is the scene of another result, in a
-    comparison: its first layer is `aside`, and its edges are numbered on from `edges`. `team` is as stated and
-    `calibrated` as it turned out. `notes` say what there is none of, and why.
+    constraints (q, 2): robot by number, row of the later stance. `sightings` (observer, seen) and `odometry` are the
+    other measurements, `landmarks` the estimated ones. `beside` is the scene of another result, in a comparison: its
+    first layer is `aside`, and its edges are numbered on from `edges`. `team` is as stated, `calibrated` as estimated.
+    `notes` are sentences on what is missing, and why.
     Without a `run` there are no images, marker tracks and inspections.
     """
 
@@ -192,16 +192,16 @@ class Scene:
 
     @cached_property
     def starts(self) -> Array:
-        """When the stances begin, (s,) [s]."""
+        """Starts of the stances, (s,) [s]."""
         return np.array([stance.start for stance in self.stances], float)
 
     @cached_property
     def ends(self) -> Array:
-        """When they end, (s,) [s]."""
+        """Ends of the stances, (s,) [s]."""
         return np.array([stance.end for stance in self.stances], float)
 
     def row_at(self, time: float) -> int:
-        """The stance that has begun last at a time; the first before it, -1 without any."""
+        """Row of the last stance that began before a time; the first one if none did, -1 without stances."""
         return min(max(int(np.searchsorted(self.starts, time, side="right")) - 1, 0), len(self) - 1)
 
     def middle(self, row: int) -> float:
@@ -209,19 +209,19 @@ class Scene:
         return float(self.starts[row] + self.ends[row]) / 2 if 0 <= row < len(self) else 0.0
 
     def roles(self, row: int, robot: str) -> str:
-        """What a robot does in a stance, in a word or two."""
+        """Role of a robot in a stance."""
         if not 0 <= row < len(self):
             return ""
         stance = self.stances[row]
         if robot in stance.movers:
-            return "drives"
+            return "mover"
         if robot in stance.observers:
-            return "anchor" if robot in stance.anchors else "watches"
-        return "stands by"
+            return "anchor" if robot in stance.anchors else "observer"
+        return "standby"
 
     @cached_property
     def standing(self) -> Mask:
-        """Who stands still in which stance, (r, s)."""
+        """(r, s), True for a robot that does not move in a stance."""
         out = np.ones((len(self.robots), len(self)), bool)
         number = {robot: n for n, robot in enumerate(self.robots)}
         for row, stance in enumerate(self.stances):
@@ -240,7 +240,7 @@ class Scene:
         return self.beside.edges if self.beside is not None else NO_EDGES
 
     def edge(self, number: int) -> tuple["Scene", int] | None:
-        """Of an edge by its number the scene that it is of, and its number there; None where there is none."""
+        """Scene that an edge is of, and its number there; None if there is no such edge."""
         if 0 <= number < len(self.edges):
             return self, number
         number -= len(self.edges)
@@ -252,7 +252,7 @@ class Scene:
         return next((layer for layer in self.layers if layer.name == TRUE), None)
 
     def errors(self, layer: Layer) -> Array:
-        """How far each pose of a layer is from the truth, (r, s) [m]; NaN where it is not known."""
+        """Distance of each pose of a layer from the truth, (r, s) [m]; NaN if it is not known."""
         if self.true is None:
             return np.full(layer.yaw.shape, np.nan)
         return np.asarray(np.linalg.norm(layer.xyz[..., :2] - self.true.xyz[..., :2], axis=2))

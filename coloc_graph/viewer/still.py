@@ -1,4 +1,4 @@
-"""Landmarks as the viewer shows them: bodies of their own look, their doubt, and who sighted them."""
+"""Landmarks in the viewer: their meshes, covariances and sightings."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -13,11 +13,10 @@ from coloc_graph.viewer.meshes import LED, LED_RADIUS, cylinder, painted
 from coloc_graph.viewer.scene import NO_LANDMARKS, Landmarks
 from coloc_graph.viewer.ties import links_of
 
-#: A post, its foot and a tag's board: radius and thickness [m]; and what the post of a bare point is tall [m].
-POST = 0.012
-FOOT = 0.07
-BOARD = 0.012
-TALL = 0.2
+POST = 0.012  # m, radius of a post
+FOOT = 0.07  # m, radius of its foot
+BOARD = 0.012  # m, thickness of a tag's board
+TALL = 0.2  # m, height of the post of a point landmark
 _STEEL = (120, 126, 134)
 _AMBER = (214, 160, 30)
 _WHITE = (244, 244, 244)

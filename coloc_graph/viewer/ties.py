@@ -1,4 +1,4 @@
-"""What ties poses besides pairs of observers: who was sighted by whom, and the wheels' word; of a graph, or on disk."""
+"""Sightings and odometry as links between poses, of a graph or of a result on disk."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ from coloc_graph.measurements import Measurement, Node, Odometry, Sighting
 from coloc_graph.run import Run, Stance
 from coloc_graph.viewer.scene import Links
 
-#: Sightings, and odometry.
+# sightings, and odometry
 Ties = tuple[Links, Links]
 
 
@@ -73,7 +73,7 @@ def links_of(
 
 
 def wheels_of(run: Run | None) -> dict[str, WheelTrack]:
-    """What the wheels of each robot say, of those that say anything."""
+    """Wheel odometry of the robots that have any."""
     if run is None:
         return {}
     tracks = {robot: WheelTrack(robot, list(run.odometry(robot))) for robot in run.team.names}

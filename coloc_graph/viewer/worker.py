@@ -1,4 +1,4 @@
-"""Slow answers, made beside the render thread: only the newest question of each kind is worked on."""
+"""A thread beside the render thread that answers slow questions, only the newest of each kind."""
 
 import threading
 import traceback
@@ -9,19 +9,18 @@ from typing import Any
 
 from coloc_graph.errors import ColocError
 
-#: So many answers are kept.
-KEPT = 96
+MAX_ANSWERS = 96  # answers that are kept
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Why there is no answer, in words."""
+    """Reason for which there is no answer."""
 
     why: str
 
 
 class Worker:
-    """One thread that answers questions. `ask` gives what is known at once; `wake` is called when more is."""
+    """One thread that answers questions; `wake` is called at each answer."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
@@ -33,7 +32,7 @@ class Worker:
         self._thread.start()
 
     def ask(self, kind: str, key: Hashable, make: Callable[[], Any]) -> Any:
-        """The answer, a `Failure`, or None: not yet. A newer question of the same kind replaces one that waits."""
+        """Return the answer, a `Failure`, or None: not yet. A newer question of a kind replaces one that waits."""
         with self._changed:
             if (kind, key) in self._known:
                 self._known.move_to_end((kind, key))
@@ -43,7 +42,7 @@ class Worker:
             return None
 
     def close(self) -> None:
-        """End the thread; what it is at is finished first."""
+        """End the thread after the question at hand."""
         with self._changed:
             self._ending = True
             self._changed.notify()
@@ -67,6 +66,6 @@ class Worker:
                 answer = Failure(f"{type(error).__name__}: {error}")
             with self._changed:
                 self._known[kind, key] = answer
-                while len(self._known) > KEPT:
+                while len(self._known) > MAX_ANSWERS:
                     self._known.popitem(last=False)
             self._wake()

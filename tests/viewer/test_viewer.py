@@ -39,10 +39,10 @@ from coloc_graph.viewer import (
     with_other,
 )
 from coloc_graph.viewer.cameras import seen_size
-from coloc_graph.viewer.frame import MOVING, ViewState, dashed, frame_of, pick, thinned_rows
+from coloc_graph.viewer.frame import MAX_POSES_MOVING, ViewState, dashed, frame_of, pick, thinned_rows
 from coloc_graph.viewer.live import LiveScene
 from coloc_graph.viewer.motion import extent, pose_at
-from coloc_graph.viewer.panel import HANDS_OFF, set_value
+from coloc_graph.viewer.panel import HOLD_SECONDS, set_value
 from coloc_graph.viewer.plots import error_curves, residual_curves, with_cursor
 from coloc_graph.viewer.prepared import ellipse_axes
 from coloc_graph.viewer.scene import layer_of
@@ -103,7 +103,7 @@ def test_a_wrong_measurement_is_a_refused_edge_with_its_reason():
     wrong = {one for one in drawn.edges.why_not if one}
     assert len(estimate.refused) == (~drawn.edges.used).sum() > 0 and all("contradicted" in why for why in wrong)
     frame = shown(drawn)
-    assert len(frame.refused.points) > (~drawn.edges.used).sum()  # dashes
+    assert len(frame.rejected.points) > (~drawn.edges.used).sum()  # dashes
 
 
 def test_nan_in_a_pose_names_robot_and_stance():
@@ -168,7 +168,7 @@ def test_a_frame_shows_no_more_than_what_was(scene):
     assert len(frames[0].rings.wxyz) == 0 < len(frames[-1].rings.wxyz)
     assert all(not frame.note for frame in frames)
     assert frames[3].roles == tuple(scene.roles(3, robot) for robot in scene.robots)
-    assert set(frames[3].roles) == {"anchor", "watches", "drives"}
+    assert set(frames[3].roles) == {"anchor", "observer", "mover"}
 
 
 def test_ellipses_have_the_axes_of_their_covariances(rng):
@@ -216,7 +216,7 @@ def huge(stances):
 def test_a_huge_scene_is_thinned_while_it_moves_and_says_so():
     drawn = huge(20_000)
     moving, resting = shown(drawn, rests=False), shown(drawn)
-    assert len(moving.ellipses.wxyz) < MOVING < len(resting.ways["joint"].points)
+    assert len(moving.ellipses.wxyz) < MAX_POSES_MOVING < len(resting.trajectories["joint"].points)
     assert "of 20,000 stances are drawn" in moving.note and "more when time rests" in moving.note
     seconds = min(timed(lambda: shown(drawn, rests=False)) for _ in range(5))
     assert seconds < 0.05  # 3 ms on a machine that does nothing else
@@ -282,13 +282,13 @@ def test_an_edge_is_measured_again_and_decomposed_both_ways(scene, solutions):
     measured = solutions["joint"].measurements[2]
     found = inspect.examine(scene, 2)
     assert np.allclose(found.measured.homography.H_j_i, measured.homography.H_j_i)
-    taken = [n for n, one in enumerate(found.solutions) if one.taken]
+    taken = [n for n, one in enumerate(found.solutions) if one.chosen]
     assert taken == [measured.relative_pose.solution]
     assert found.solutions[taken[0]].normal_error_deg < found.solutions[1 - taken[0]].normal_error_deg
     assert np.isclose(np.deg2rad(found.solutions[taken[0]].normal_error_deg), measured.relative_pose.normal_error)
     assert found.picture.ndim == 3 and found.picture.std() > 5
     text = inspect.edge_report(scene, 2, found)
-    for word in ("inliers", "overlap", "clock", "decomposition", "**taken**", f"{measured.homography.points}"):
+    for word in ("inliers", "overlap", "clock", "decomposition", "**chosen**", f"{measured.homography.points}"):
         assert word in text
 
 
@@ -302,7 +302,7 @@ def test_points_warped_by_the_homography_are_where_the_other_camera_sees_them(sc
 def test_marker_ways_of_both_observers_lie_on_each_other_and_where_the_driver_was(scene):
     row = 3
     found = [inspect.examine(scene, n).measured for n in np.flatnonzero(scene.edges.rows == row)]
-    seen, estimated = inspect.marker_ways(scene, row, found, dark=False)
+    seen, estimated = inspect.marker_trajectories(scene, row, found, dark=False)
     driver = scene.robots.index(scene.stances[row].movers[0])
     way = pose_at(scene, scene.layers[0], driver, np.linspace(scene.starts[row], scene.ends[row], 500))
     for lines in (seen, estimated):
@@ -319,7 +319,7 @@ def test_a_camera_shows_its_detections_where_there_are_no_images(scene):
 
 def test_a_robot_is_told_in_numbers(scene):
     text = inspect.robot_report(scene, 1, 4)
-    for word in ("Robot B, stance 4", "heading", "sigma x, y", "off the truth", "mount", "tilt"):
+    for word in ("Robot B, stance 4", "heading", "sigma x, y", "error (truth known)", "mount", "tilt"):
         assert word in text
 
 
@@ -363,7 +363,7 @@ def test_stances_are_shown_while_the_run_is_solved_and_what_cannot_be_used_too(s
 
         solve(run, SolveOptions(incremental=True), entered=entered)
         assert rows == [(1, 1, 1), (2, 2, 1), (3, 3, 2)]
-        assert "line" in viewer.scene.edges.why_not[1] and len(viewer.frame.refused.points)
+        assert "line" in viewer.scene.edges.why_not[1] and len(viewer.frame.rejected.points)
 
 
 def test_publishing_costs_the_estimator_less_than_a_millisecond(short_solution):
@@ -429,7 +429,7 @@ def test_live_poses_cost_the_caller_nothing_and_only_the_newest_is_shown(short_s
 def test_live_poses_that_cannot_be_shown_are_named_and_the_others_shown(short_solution):
     robots = short_solution.run.team.names
     poses = LivePoses(0.0, {"A": at(1.0, 0.0, 0.0), "B": np.full((4, 4), np.nan), "Z": np.eye(4), "C": np.eye(3)})
-    words = poses.unfit(robots)
+    words = poses.problems(robots)
     assert "no robot Z" in words and "robot B is no finite" in words and "robot C is no finite" in words
     shown = poses.over(robots, np.zeros((3, 4)))
     assert np.allclose(shown[0, :2], (1, 0)) and not shown[1:].any()
@@ -446,11 +446,11 @@ def test_an_arrow_key_that_moves_the_slider_which_has_the_focus_steps_once(scene
         viewer.go(0)
         assert viewer.wait_idle() and viewer.frame.row == 0
         set_value(panel.stance, 1)
-        panel._slid(somebody, "stance")
-        panel._struck("step", 1)
+        panel._on_slider(somebody, "stance")
+        panel._on_hotkey("step", 1)
         assert viewer.wait_idle() and viewer.frame.row == 1
-        time.sleep(HANDS_OFF)
-        panel._struck("step", 1)
+        time.sleep(HOLD_SECONDS)
+        panel._on_hotkey("step", 1)
         assert viewer.wait_idle() and viewer.frame.row == 2 == panel.stance.value
 
 
@@ -552,9 +552,13 @@ def test_another_result_is_compared_and_one_of_another_run_refused(scene, result
     beside, over = shown(both, aside=2.0), shown(both)
     name = both.layers[-1].name
     assert np.isclose(
-        beside.ways[name].points[..., 1].mean() - shown(both).ways["joint"].points[..., 1].mean(), 2, atol=0.5
+        beside.trajectories[name].points[..., 1].mean() - shown(both).trajectories["joint"].points[..., 1].mean(),
+        2,
+        atol=0.5,
     )
-    assert len(over.ways[name].points) > len(beside.ways[name].points)  # dashed where it lies over the first
+    assert len(over.trajectories[name].points) > len(
+        beside.trajectories[name].points
+    )  # dashed where it lies over the first
     # edges and ellipses of both
     alone = shown(scene)
     assert len(beside.edge_ids) == 2 * len(alone.edge_ids) and len(over.ellipses.wxyz) == 2 * len(alone.ellipses.wxyz)
@@ -630,7 +634,7 @@ def test_without_a_browser_a_png_is_refused_with_the_way_out(result, tmp_path, m
 
 
 def test_residuals_are_told_apart_and_unknown_ones_are_grey():
-    colours = palette.of_residuals(np.array([0.0, 2.0, 3.0, 50.0, np.nan]), dark=False)
+    colours = palette.residual_colours(np.array([0.0, 2.0, 3.0, 50.0, np.nan]), dark=False)
     assert (colours[2] == colours[3]).all() and (colours[4] == palette.grey(False)).all()
     assert np.abs(np.diff(colours[:3].astype(int), axis=0)).sum(axis=1).min() > 100
 

@@ -116,17 +116,17 @@ def test_slider_click_and_keys(scene, page_of):
         why = "contradicted by all others"
         edge = clear_edge(viewer, client)[0]
         doubtful = replace(scene.edges, why_not=tuple(why if n == edge else "" for n in range(len(scene.edges))))
-        assert segments_of(page, "/refused") == 0
+        assert segments_of(page, "/rejected") == 0
         viewer.pick(None)
         viewer.publish(replace(scene, edges=doubtful))
-        assert until(lambda: segments_of(page, "/refused") == len(viewer.frame.refused.points) > 1)
+        assert until(lambda: segments_of(page, "/rejected") == len(viewer.frame.rejected.points) > 1)
         assert until(lambda: not page.get_by_text("height [m]").first.is_visible())
         click(page, pixel_of(client, middle_of(viewer, edge)))
         assert until(lambda: viewer.picked == ("edge", edge))
         assert until(lambda: page.get_by_text(why).first.is_visible())
         viewer.pick(None)
         viewer.publish(scene)
-        assert until(lambda: segments_of(page, "/refused") == 0)
+        assert until(lambda: segments_of(page, "/rejected") == 0)
 
         # and one on any other opens what was measured
         edge, uv = clear_edge(viewer, client)
@@ -237,7 +237,7 @@ def test_a_page_opens_from_its_file_and_plays(scene, page_of, tmp_path):
         time.sleep(0.2)
         return np.allclose(place_of(page, "/robots/A"), base.xyz[number, row], atol=1e-3)
 
-    assert until(lambda: page.get_by_text("it is the anchor now").is_visible())
+    assert until(lambda: page.get_by_text("anchor of this stance").is_visible())
     played = page.get_by_role("textbox").first
     assert until(lambda: float(played.input_value()) > 0.2)  # by itself
     assert until(lambda: stands_at(len(scene) - 1))

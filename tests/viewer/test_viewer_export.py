@@ -59,13 +59,13 @@ def test_every_stance_is_played_at_its_time(scene):
 def test_titles_are_text_and_the_legend_is_in_the_page(scene):
     page = export.page_of(replace(scene, title="<script>alert(1)</script>"), state_of(scene, k_sigma=30))
     assert "<script>alert(1)" not in page and "&lt;script&gt;alert(1)" in page
-    assert "ellipses and wedges: 30 sigma" in page and "it is the anchor now" in page
+    assert "ellipses and wedges: 30 sigma" in page and "anchor of this stance" in page
 
 
 def test_of_a_long_run_some_stances_are_played_and_the_page_says_so(scene, monkeypatch):
     assert "stances are played" not in export.page_of(scene, state_of(scene))
-    monkeypatch.setattr(export, "MOST_STANCES", 4)
-    monkeypatch.setattr(export, "IN_FULL", 3)
+    monkeypatch.setattr(export, "MAX_STANCES", 4)
+    monkeypatch.setattr(export, "MAX_STANCES_IN_FULL", 3)
     page = export.page_of(scene, state_of(scene))
     seconds, messages = recorded(page)
     assert f"4 of {len(scene)} stances are played" in page and np.isclose(seconds, 3 + export.HELD_SECONDS)
