@@ -10,12 +10,15 @@ import sys
 import threading
 import time
 
+import cv2
+import numpy as np
 import pytest
-from fake_robots import fake_team
+from fake_robots import FakeRobot, fake_team
 
 from coloc_graph.cli.nonblocking_log import CAPACITY, NonBlockingHandler
 from coloc_graph.errors import InputError
 from coloc_graph.online.mission_folder import MissionFolder
+from coloc_graph.robot_io.link.messages import Capture
 from coloc_graph.run import open_run
 from coloc_graph.simulation.simulated_team import field_team, free_address
 from coloc_graph.team import write_team
@@ -94,14 +97,11 @@ def test_a_mission_goes_on_while_nobody_reads_its_output(mission):
     mission.wait_for("looking")
 
 
-@pytest.mark.parametrize("elsewhere", [False, True], ids=["same port", "other port"])
-def test_a_second_coordinator_of_the_same_folder_is_refused_and_changes_nothing(mission, elsewhere):
+def test_a_second_coordinator_of_the_same_folder_is_refused_and_changes_nothing(mission):
     mission.wait_for("looking")
     folder = mission.folder / "mission"
     before = {path.name: path.stat().st_ino for path in folder.iterdir()}
-    second = mission.start(
-        "--resume", address=free_address() if elsewhere else None, stderr=subprocess.PIPE, stdout=subprocess.PIPE
-    )
+    second = mission.start("--resume", address=free_address(), stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     out, err = second.communicate(timeout=30.0)
     assert second.returncode == 2 and out == b"" and err.count(b"\n") == 1
     assert b"is being written by another command" in err
@@ -117,9 +117,29 @@ def test_a_taken_port_is_refused_before_a_record_is_touched(mission, tmp_path):
     (earlier / "run.mcap").write_bytes(b"a record")
     for more in ([str(tmp_path / "new")], [str(earlier), "--resume"]):
         done = subprocess.run([*command, *more], capture_output=True, timeout=30.0, check=False)
-        assert done.returncode == 2 and b"cannot be opened" in done.stderr and b"Traceback" not in done.stderr
+        assert done.returncode == 2 and done.stderr.count(b"\n") == 1
+        assert b"cannot open the link" in done.stderr and b"in use" in done.stderr and b".rs" not in done.stderr
     assert not (tmp_path / "new").exists()
     assert (earlier / "run.mcap").read_bytes() == b"a record" and not list(earlier.glob("run.*.mcap"))
+
+
+def test_a_second_program_of_a_robot_is_told_and_ends_and_one_after_it_is_admitted(mission, tmp_path):
+    mission.wait_for("looking")
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((240, 320), np.uint8))
+    command = [sys.executable, "-m", "coloc_graph.cli", "robot", "A", str(mission.folder / "team.toml")]
+    command += ["--out", str(tmp_path), "--connect", mission.address, "--camera", f"video:{tmp_path}"]
+    done = subprocess.run(command, capture_output=True, timeout=30.0, check=False)
+    assert done.returncode == 2 and b"Traceback" not in done.stderr
+    assert done.stderr.splitlines()[-1].startswith(b"coloc: another program runs as robot A already")
+    first = mission.robots["A"]
+    sessions = [row["session"] for row in mission.rows() if row["what"] == "session" and row["robot"] == "A"]
+    assert sessions == [first.session] and first.link.refused is None
+    first.__exit__()  # its program ends: the next one is welcome
+    with FakeRobot("A", mission.address) as second:
+        until = time.monotonic() + 30.0
+        while not any(isinstance(body, Capture) for body in second.bodies):
+            assert time.monotonic() < until and second.link.refused is None
+            time.sleep(0.05)
 
 
 def test_a_signal_ends_a_mission_of_which_nobody_reads_the_output(mission):
@@ -130,20 +150,17 @@ def test_a_signal_ends_a_mission_of_which_nobody_reads_the_output(mission):
     assert not run.warnings and sum(1 for _ in run.odometry("A")) > 10
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_a_mission_that_waits_for_its_robots(tmp_path, number):
+def test_a_signal_ends_a_mission_that_waits_for_its_robots(tmp_path):
     one = Mission(tmp_path)
     try:
         until = time.monotonic() + 60
         while not (tmp_path / "mission" / "mission.jsonl").exists():
             assert time.monotonic() < until and one.process.poll() is None
             time.sleep(0.05)
-        if number == signal.SIGHUP:  # under nohup it is not for us
-            one.process.send_signal(number)
-            time.sleep(0.5)
-            assert one.process.poll() is None
-            number = signal.SIGTERM
-        seconds, code = one.end(number)
+        one.process.send_signal(signal.SIGHUP)  # it was started under nohup: that is not for it
+        time.sleep(0.5)
+        assert one.process.poll() is None
+        seconds, code = one.end(signal.SIGTERM)
         assert code == 1 and seconds < 8.0
     finally:
         one.close()

@@ -6,6 +6,7 @@ has coloc/coordinator/alive.
 """
 
 import contextlib
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -36,7 +37,8 @@ class LinkSession:
         try:
             self.zenoh = zenoh.open(config)
         except zenoh.ZError as error:
-            raise RobotError(f"cannot open the link at {address} ({error}): give another address") from error
+            reason = re.sub(r" at /\S+", "", str(error))  # paths of zenoh's own source files
+            raise RobotError(f"cannot open the link at {address} ({reason}): give another address") from error
         self._declared: list[Any] = []
 
     def keep(self, declared: Any) -> Any:
