@@ -1,7 +1,7 @@
-"""Devices of a robot: cameras, wheels, clocks, messages, coordination (knows devices; no graph).
+"""Devices of a robot (no graph): wheels (docs/wheels.md), cameras (docs/cameras.md), the link (docs/link.md).
 
-`Create` drives wheels, and sees to it that they stop; docs/wheels.md. Its emulator is in `create_emulator`.
-`open_camera` opens cameras; docs/cameras.md.
+`create` has the driver `Create`, its watchdog and an emulator; `camera` has `open_camera`; `link` has the two ends of
+the link, `CoordinatorLink` and `RobotLink`.
 """
 
 from coloc_graph.robot_io.camera.open import open_camera

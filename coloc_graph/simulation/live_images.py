@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.robot_io.camera.simulated import ANSWER, HEADER, LONGEST_LINE
+from coloc_graph.robot_io.camera.simulated import ANSWER, HEADER, MAX_LINE
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.rendering import Field, Sensor
 from coloc_graph.simulation.scenery import RobotInView, Scenery, backdrop, draw
@@ -138,9 +138,9 @@ class ImageServer:
         """The robot whose camera a client asks for, and what is wrong with that."""
         line = b""
         while not line.endswith(b"\n"):
-            data = connection.recv(LONGEST_LINE)
+            data = connection.recv(MAX_LINE)
             line += data
-            if not data or len(line) > LONGEST_LINE:
+            if not data or len(line) > MAX_LINE:
                 return "", "the request is none: send one line of JSON that names the robot"
         try:
             robot = str(json.loads(line)["robot"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coloc_graph.errors import RobotError
-from coloc_graph.robot_io.link.clock import LEAST, ClockFilter
+from coloc_graph.robot_io.link.clock import MIN_EXCHANGES, ClockFilter
 
 MS = 1_000_000
 
@@ -57,7 +57,7 @@ def test_the_error_is_as_large_as_it_is_said_to_be(name):
         for i, exchange in enumerate(network.exchanges(rng, 300)):
             clock.add(*exchange)
             now = exchange[3] + 50 * MS
-            if i >= LEAST:
+            if i >= MIN_EXCHANGES:
                 known = clock.estimate(now)
                 errors.append(network.robot(now) - now - known.offset)
                 z.append(errors[-1] / known.sigma)
@@ -86,12 +86,12 @@ def test_instants_go_to_the_other_clock_and_back():
 def test_nothing_is_known_before_the_first_exchange_and_little_after_it():
     clock = ClockFilter()
     assert not clock.known and clock.estimate(0) is None and not clock.synchronised(0)
-    with pytest.raises(RobotError, match="nothing is known of the robot's clock yet"):
+    with pytest.raises(RobotError, match="robot's clock is not known yet"):
         clock.to_coordinator(0)
     network, rng = Network(1e5, 1e5, 1e5, ahead=10**12), np.random.default_rng(0)
-    for n, exchange in enumerate(network.exchanges(rng, LEAST), 1):
+    for n, exchange in enumerate(network.exchanges(rng, MIN_EXCHANGES), 1):
         clock.add(*exchange)
-        assert clock.known and clock.synchronised(exchange[3]) == (n == LEAST)
+        assert clock.known and clock.synchronised(exchange[3]) == (n == MIN_EXCHANGES)
     assert abs(clock.to_robot(0) - 10**12) < MS
     assert not clock.synchronised(exchange[3] + 6 * 10**9)  # nothing was heard for long
 
@@ -106,13 +106,13 @@ def test_a_clock_that_jumps_is_noticed_at_once_and_found_again(by):
     for n, exchange in enumerate(network.exchanges(rng, 40, start=100)):
         clock.add(*exchange)
         assert clock.jumps == 1
-        assert clock.synchronised(exchange[3]) == (n >= LEAST - 1)
+        assert clock.synchronised(exchange[3]) == (n >= MIN_EXCHANGES - 1)
     assert abs(clock.estimate(exchange[3]).offset - network.ahead) < 0.2 * MS
 
 
 def test_what_cannot_have_been_is_refused():
     clock = ClockFilter()
     for wrong in [(10, 0, 0, 5), (0, 10, 5, 20), (0, 0, 100, 50)]:
-        with pytest.raises(ValueError, match="answer came before its question"):
+        with pytest.raises(ValueError, match="answer was received before its question"):
             clock.add(*wrong)
     assert not clock.known

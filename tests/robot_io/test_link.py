@@ -18,7 +18,7 @@ from tcp_relay import Relay
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError, RobotError
 from coloc_graph.robot_io.link.certificates import make_certificates
-from coloc_graph.robot_io.link.coordinator_link import NEWEST_PERIOD, RECOVERY_PERIOD, CoordinatorLink
+from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
 from coloc_graph.robot_io.link.messages import (
     MAX_MESSAGE_BYTES,
     Capture,
@@ -35,6 +35,7 @@ from coloc_graph.robot_io.link.messages import (
     decode,
     encode,
 )
+from coloc_graph.robot_io.link.recovery import NEWEST_PERIOD, RECOVERY_PERIOD
 from coloc_graph.robot_io.link.robot_link import RobotLink
 from coloc_graph.robot_io.link.zenoh_config import Tls, config_of, tls_of
 from coloc_graph.simulation import reference_team
@@ -324,12 +325,15 @@ def test_a_request_that_fails_is_no_answer(pair, monkeypatch):
     heard, robot = pair
     robot.put_event("0")
     assert until(lambda: len(heard.events) == 1)
-    assert not heard.link._request("B", Event, "_sn=0..9")  # nobody is there to answer
-    assert not heard.link._request("A", Sample, "_sn=0..9")  # nothing was ever sent
-    assert heard.link._request("A", Event, "_sn=5..9") and heard.link._request("A", Event, "_max=1")
+    assert not heard.link._recoveries["B"].request(Event, "_sn=0..9")  # nobody is there to answer
+    assert not heard.link._recoveries["A"].request(Sample, "_sn=0..9")  # nothing was ever sent
+    assert heard.link._recoveries["A"].request(Event, "_sn=5..9") and heard.link._recoveries["A"].request(
+        Event, "_max=1"
+    )
     failing = [True]
-    request = heard.link._request
-    monkeypatch.setattr(heard.link, "_request", lambda *one: not failing[0] and request(*one))
+    recovery = heard.link._recoveries["A"]
+    request = recovery.request
+    monkeypatch.setattr(recovery, "request", lambda *one: not failing[0] and request(*one))
     gap = msgspec.structs.replace(heard.events[0][1], number=2)
     heard.link._receiver(Event)(_Like("coloc/A/events", encode(gap)))
     time.sleep(5 * RECOVERY_PERIOD)
@@ -347,7 +351,7 @@ def test_a_reply_that_is_an_error_is_no_answer(pair):
     with outsider(heard.address) as other:
         other.declare_queryable("coloc/C/events/@adv/pub/x/y/_", fail)
         assert until(lambda: any(other.info.peers_zid()))
-        asked = [heard.link._request("C", Event, "_max=1") for _ in range(5) if time.sleep(0.1) is None]
+        asked = [heard.link._recoveries["C"].request(Event, "_max=1") for _ in range(5) if time.sleep(0.1) is None]
         assert asked == [False] * 5
 
 
@@ -454,6 +458,7 @@ def test_what_is_measured_waits_for_the_clock():
 
 ROBOT = """
 import sys, time
+from coloc_graph.robot_io.link.recovery import NEWEST_PERIOD, RECOVERY_PERIOD
 from coloc_graph.robot_io.link.robot_link import RobotLink
 from coloc_graph.robot_io.link.messages import Event
 with RobotLink("A", connect=sys.argv[1], handler=lambda body: "", session=sys.argv[2]) as link:
@@ -551,13 +556,15 @@ def test_of_a_command_whose_answer_is_lost_the_answer_comes_again():
 
 @pytest.mark.parametrize("address", ["127.0.0.1:7447", "tcp/127.0.0.1", "udp/127.0.0.1:7447", "tcp/localhost:port"])
 def test_an_address_that_is_none_is_refused(address):
-    with pytest.raises(InputError, match="is no address of a link"):
+    with pytest.raises(InputError, match="is not a valid address of a link"):
         Robot("A", address)
 
 
 def test_others_are_let_in_without_certificates_only_where_that_is_said(caplog):
     port = free_port()
-    with pytest.raises(InputError, match=r"is reached by others, who could steer the robots: .*--exposed"):
+    with pytest.raises(
+        InputError, match=r"can be reached from other machines, which could steer the robots: .*--exposed"
+    ):
         config_of(listen=f"tcp/0.0.0.0:{port}")
     with caplog.at_level(logging.WARNING):
         config_of(listen=f"tcp/0.0.0.0:{port}", exposed=True)
@@ -583,11 +590,11 @@ def test_certificates_are_made_once_for_their_owner_alone(tmp_path, capsys):
         assert stat.S_IMODE((folder / f"{name}.key").stat().st_mode) == 0o600
     before = (folder / "ca.key").read_bytes()
     assert main(["certificates", str(folder), str(tmp_path / "team.toml")]) == 2
-    assert "is there already, and is not replaced" in capsys.readouterr().err
+    assert "exists already and is not replaced" in capsys.readouterr().err
     assert (folder / "ca.key").read_bytes() == before
     with pytest.raises(InputError, match="a robot cannot be called `coordinator`"):
         make_certificates(tmp_path / "other", ["A", "coordinator"])
-    with pytest.raises(InputError, match=r"D\.pem is not there: make certificates"):
+    with pytest.raises(InputError, match=r"D\.pem does not exist: make certificates"):
         config_of(connect="tls/127.0.0.1:7447", tls=tls_of(folder, "D"))
     with pytest.raises(InputError, match="belong together"):
         config_of(connect="tcp/127.0.0.1:7447", tls=tls_of(folder, "A"))

@@ -1,4 +1,4 @@
-"""Cameras: `open_camera` opens a device, a video or the camera of a simulated robot; docs/cameras.md."""
+"""Opening of cameras: a device, a video, or the camera of a simulated robot; `open_camera`, docs/cameras.md."""
 
 import time
 
@@ -6,7 +6,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.robot_io.camera.source import CameraSource, Clock, Device
 from coloc_graph.team import Camera
 
-#: What a camera may be given as, by the word before the colon.
+#: Kinds of camera specifications, by the word before the colon.
 KINDS = {
     "v4l2": "v4l2:/dev/video0",
     "video": "video:FILE or video:FOLDER of images",
@@ -15,18 +15,38 @@ KINDS = {
 
 
 def open_camera(spec: str, camera: Camera, robot: str, clock: Clock = time.monotonic_ns) -> CameraSource:
-    """The open camera of a robot: `spec` is one of `KINDS`, `camera` what the team says of it.
+    """Open a robot's camera.
 
-    Frames are stamped by `clock` [ns]. Raises `InputError` where the spec is none, `CameraError` where the camera
-    does not open.
+    Parameters
+    ----------
+    spec
+        One of `KINDS`.
+    camera
+        The team's description of the camera.
+    robot
+        Name of the robot.
+    clock
+        Clock of the time stamps [ns].
+
+    Returns
+    -------
+    CameraSource
+        The open camera.
+
+    Raises
+    ------
+    InputError
+        If the specification is not valid.
+    CameraError
+        If the camera does not open.
     """
     kind, _, where = spec.partition(":")
     if kind not in KINDS or not where:
-        raise InputError(f"`{spec}` is no camera for robot {robot}; use {', '.join(KINDS.values())}")
+        raise InputError(f"`{spec}` is not a camera for robot {robot}; use {', '.join(KINDS.values())}")
     name = f"the camera of robot {robot} ({spec})"
 
     def connect() -> Device:
-        # imported here: who has no such camera needs none of it
+        # imported here, since other cameras do not need it
         if kind == "v4l2":
             from coloc_graph.robot_io.camera.v4l2 import V4l2Camera
 

@@ -17,15 +17,13 @@ from coloc_graph.robot_io.camera.source import WAIT, Clock, Frame, clock_ahead
 
 #: Stamp [ns], height, width [px].
 HEADER = struct.Struct("<qII")
-#: No image is larger [px]; the first lines are no longer [bytes].
-MOST_PIXELS = 1 << 24
-LONGEST_LINE = 4096
-#: The world answers within this [s].
-ANSWER = 2.0
+MAX_PIXELS = 1 << 24  # px of an image
+MAX_LINE = 4096  # bytes of the first line in either direction
+ANSWER = 2.0  # s that the world may take to answer
 
 
 class WorldCamera:
-    """One robot's camera in the live world at the Unix socket `address`. `CameraError` where it has none."""
+    """A robot's camera in the live world at a Unix socket. Raises `CameraError` if there is none."""
 
     def __init__(self, name: str, address: str, robot: str, clock: Clock) -> None:
         self._name, self._clock = name, clock
@@ -35,7 +33,7 @@ class WorldCamera:
             self._socket.settimeout(ANSWER)
             self._socket.connect(address)
             self._socket.sendall(json.dumps({"robot": robot}).encode() + b"\n")
-            while b"\n" not in self._buffer and len(self._buffer) < LONGEST_LINE:
+            while b"\n" not in self._buffer and len(self._buffer) < MAX_LINE:
                 self._receive()
             line, _, rest = bytes(self._buffer).partition(b"\n")
             self._buffer = bytearray(rest)
@@ -52,13 +50,13 @@ class WorldCamera:
         self._socket.settimeout(WAIT)
 
     def grab(self) -> Frame | None:
-        """The next frame that has come."""
+        """Return the next frame, None if none comes for `WAIT`."""
         try:
             while len(self._buffer) < HEADER.size:
                 self._receive()
             stamp, height, width = HEADER.unpack_from(self._buffer)
-            if height * width > MOST_PIXELS:
-                raise CameraError(f"{self._name} sent no image ({width} x {height} px): is the world of our version?")
+            if height * width > MAX_PIXELS:
+                raise CameraError(f"{self._name} sent an image of {width} x {height} px: use a world of this version")
             while len(self._buffer) < HEADER.size + height * width:
                 self._receive()
         except TimeoutError:
@@ -73,10 +71,10 @@ class WorldCamera:
     def _receive(self) -> None:
         data = self._socket.recv(1 << 17)
         if not data:
-            raise CameraError(f"{self._name} is lost: the simulated world closed the connection; open it anew")
+            raise CameraError(f"{self._name} is lost: the simulated world closed the connection; open it again")
         self._buffer += data
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection."""
         with contextlib.suppress(OSError):
             self._socket.close()

@@ -1,4 +1,4 @@
-"""An open camera: `CameraSource` gives its newest frame, within a time, or says why there is none."""
+"""An open camera that returns its newest frame within a timeout; `CameraSource`."""
 
 import threading
 import time
@@ -15,20 +15,23 @@ from coloc_graph.team import Camera
 #: A clock [ns].
 Clock = Callable[[], int]
 
-#: How long a camera may take to open, and its thread to end [s].
-OPENING = 5.0
-ENDING = 1.0
-#: A device waits so long for a frame before it looks whether it is to end [s].
-WAIT = 0.1
-#: A frame that came longer ago is not given any more [s]: its camera may have stopped since.
-STALE = 0.5
+OPENING = 5.0  # s that a camera may take to open
+ENDING = 1.0  # s that its thread may take to end
+WAIT = 0.1  # s that a device waits for a frame before it checks for its end
+STALE = 0.5  # s after which a frame is not returned any more: its camera may have stopped since
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image: `pixels` (height, width), grey, uint8, and when it was taken by the clock of who opened the camera.
+    """One image.
 
-    `stamp_ns` is in the middle of the exposure where the source knows it; docs/cameras.md says what each source does.
+    Attributes
+    ----------
+    stamp_ns
+        Time [ns] by the clock that was given at opening: the middle of the exposure if the source knows it
+        (docs/cameras.md).
+    pixels
+        Grey values (height, width), uint8.
     """
 
     stamp_ns: int
@@ -36,21 +39,36 @@ class Frame:
 
 
 class Device(Protocol):
-    """What frames come from: it is opened, read and closed in one thread."""
+    """A source of frames that is opened, read and closed in one thread."""
 
     def grab(self) -> Frame | None:
-        """The next frame; None where none came for about `WAIT`. `CameraError` where none will come."""
+        """Return the next frame, None if none comes for about `WAIT`. Raises `CameraError` if none will come."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the device."""
 
 
 class CameraSource:
     """Frames of one camera, read in a thread of its own; a context manager.
 
-    `name` is the camera's in messages, `connect` opens its device. Only the newest frame is kept: `dropped` counts
-    those that nobody read. After a `CameraError`, `read` may work again where frames come again, and `reopen` begins
-    anew. One thread may read while another closes it.
+    Only the newest frame is kept. After a `CameraError`, `read` works again if frames come again; `reopen` opens the
+    camera again. One thread may read while another closes it.
+
+    Parameters
+    ----------
+    name
+        Name of the camera in messages.
+    camera
+        The team's description of the camera.
+    connect
+        Opens the device.
+    opening
+        Time that the camera may take to open [s].
+
+    Raises
+    ------
+    CameraError
+        If the camera does not open.
     """
 
     def __init__(self, name: str, camera: Camera, connect: Callable[[], Device], *, opening: float = OPENING) -> None:
@@ -67,33 +85,33 @@ class CameraSource:
         self.close()
 
     def read(self, timeout: float = 1.0) -> Frame:
-        """The newest frame that was not given yet; `CameraError` where none comes within `timeout` [s]."""
+        """Return the newest unread frame. Raises `CameraError` if none comes within `timeout` [s]."""
         return self._feed.read(timeout)
 
     @property
     def dropped(self) -> int:
-        """How many frames came and were not read."""
+        """Count of frames that were not read."""
         return self._dropped + self._feed.dropped
 
     @property
     def fault(self) -> str | None:
-        """Why no frame will come until it is opened anew; None where nothing is known against it."""
+        """Reason for which no frame will come until the camera is opened again; None if there is none."""
         return self._feed.lost
 
     def reopen(self) -> None:
-        """Close it and open it anew. `CameraError` where it does not open."""
+        """Close the camera and open it again. Raises `CameraError` if it does not open."""
         self.close()
         self._dropped += self._feed.dropped
         self._feed = _Feed(self.name, self.camera, self._connect)
         self._feed.open(self._opening)
 
     def close(self) -> None:
-        """Let go of the camera; returns in `ENDING` at the latest, whatever the device does."""
+        """Close the camera, within `ENDING` even if the device hangs."""
         self._feed.close()
 
 
 class _Feed:
-    """The frames from one opening to its end: a device that hangs cannot harm the next opening."""
+    """Frames from one opening to its end, so that a device that hangs cannot disturb the next opening."""
 
     def __init__(self, name: str, camera: Camera, connect: Callable[[], Device]) -> None:
         self.name, self._shape, self._connect = name, (camera.height, camera.width), connect
@@ -128,7 +146,7 @@ class _Feed:
                 raise CameraError(self.lost)
         raise CameraError(
             f"{self.name} has delivered no image for {timeout:g} s: check that it is plugged in and running, or open it"
-            " anew"
+            " again"
         )
 
     def _fresh(self) -> Frame | None:
@@ -139,7 +157,7 @@ class _Feed:
 
     def close(self) -> None:
         self._ended.set()
-        self._end(f"{self.name} is closed: open it anew")
+        self._end(f"{self.name} is closed: open it again")
         if self._thread is not threading.current_thread():
             self._thread.join(ENDING)
 
@@ -156,8 +174,8 @@ class _Feed:
                     self._put(frame)
         except ColocError as error:
             self._end(str(error))
-        except Exception as error:  # whoever reads is to hear of it
-            self._end(f"{self.name}: its reader failed ({error!r}); open it anew")
+        except Exception as error:  # the reader must learn of it
+            self._end(f"{self.name}: its reader failed ({error!r}); open it again")
         finally:
             if device is not None:
                 device.close()
@@ -181,7 +199,7 @@ class _Feed:
 
 
 def clock_ahead(clock: Clock) -> int:
-    """By how much a clock is ahead of CLOCK_MONOTONIC now [ns]."""
+    """Offset of a clock from CLOCK_MONOTONIC now [ns]."""
     if clock is time.monotonic_ns:
         return 0
     best = None

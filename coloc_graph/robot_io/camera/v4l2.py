@@ -1,7 +1,7 @@
-"""A camera on Linux, through OpenCV: raw YUYV at the team's size and rate, of which Y is taken.
+"""A camera on Linux through OpenCV: raw YUYV at the team's size and rate, of which Y is used.
 
-Exposure and gain are set by hand with V4L2's own calls: OpenCV knows no automatic gain, and not the exposure of the PS3
-Eye's driver. Source: Linux, "V4L2 API", VIDIOC_S_CTRL; drivers/media/usb/gspca/ov534.c; OpenCV, cap_v4l.cpp.
+Exposure and gain are set with V4L2's own calls: OpenCV supports neither automatic gain nor the exposure control of the
+PS3 Eye's driver. Source: Linux, "V4L2 API", VIDIOC_S_CTRL; drivers/media/usb/gspca/ov534.c; OpenCV, cap_v4l.cpp.
 """
 
 import contextlib
@@ -31,26 +31,43 @@ EXPOSURE_AUTO = 0x009A0901
 EXPOSURE_ABSOLUTE = 0x009A0902
 EXPOSURE_MANUAL = 1
 
-#: A kernel's stamp lies so far back when the first frame is read [s], or it is not of CLOCK_MONOTONIC.
-YOUNGEST = -1e-3
-OLDEST = 1.0
+MIN_STAMP_AGE = -1e-3  # s, least age of a kernel's time stamp, when it is read, that can be of CLOCK_MONOTONIC
+MAX_STAMP_AGE = 1.0  # s, largest such age
 
 log = logging.getLogger(__name__)
 
 
 class V4l2Camera:
-    """The camera at `path`, which may end with its settings: /dev/video0?exposure=60&gain=10, in the driver's units.
+    """A V4L2 camera.
 
-    Frames are stamped by the kernel where it stamps by CLOCK_MONOTONIC, else when they are read, with a warning.
+    Frames have the kernel's time stamps if those are of CLOCK_MONOTONIC, else the time of reading, with a warning.
+
+    Parameters
+    ----------
+    name
+        Name of the camera in messages.
+    path
+        Device, with settings in the driver's units if any: /dev/video0?exposure=60&gain=10.
+    camera
+        The team's description of the camera.
+    clock
+        Clock of the time stamps [ns].
+
+    Raises
+    ------
+    CameraError
+        If it cannot be opened, or does not deliver the format.
+    InputError
+        If a setting is not valid.
     """
 
     def __init__(self, name: str, path: str, camera: Camera, clock: Clock) -> None:
         self._name, self._camera, self._clock = name, camera, clock
         self._path, _, query = path.partition("?")
         settings = _settings(name, query)
-        self._stamped: bool | None = None  # not known before the first frame
+        self._stamped: bool | None = None  # unknown before the first frame
         _check_device(name, self._path)
-        # OpenCV waits so long for a frame [s], 10 by default, and only then the device can be closed
+        # s that OpenCV waits for a frame, 10 by default; the device can only be closed after that
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
         self._capture = cv2.VideoCapture(self._path, cv2.CAP_V4L2)
         if not self._capture.isOpened():
@@ -76,18 +93,18 @@ class V4l2Camera:
         for option, value, words in wanted:
             if int(self._capture.get(option)) != value:
                 raise CameraError(
-                    f"{self._name} does not deliver {words}: list what it does with v4l2-ctl --list-formats-ext, and "
-                    "set team.toml to that"
+                    f"{self._name} does not deliver {words}: list its formats with v4l2-ctl --list-formats-ext, and "
+                    "set team.toml to one of them"
                 )
         fps = self._capture.get(cv2.CAP_PROP_FPS)
         if abs(fps - self._camera.fps) > 0.5:
-            log.warning("%s delivers %g images a second, the team says %g", self._name, fps, self._camera.fps)
+            log.warning("%s delivers %g images a second, team.toml says %g", self._name, fps, self._camera.fps)
 
     def grab(self) -> Frame | None:
-        """The next frame."""
+        """Return the next frame, None if there is none."""
         if not self._capture.grab():
             if not Path(self._path).exists():
-                raise CameraError(f"{self._name} was unplugged: plug it in and open it anew")
+                raise CameraError(f"{self._name} was unplugged: plug it in and open it again")
             time.sleep(WAIT / 10)  # it may have failed at once
             return None
         read = time.monotonic_ns()
@@ -96,23 +113,23 @@ class V4l2Camera:
         if not there:
             return None
         if self._stamped is None:
-            self._stamped = YOUNGEST <= (read - stamp) * 1e-9 <= OLDEST
+            self._stamped = MIN_STAMP_AGE <= (read - stamp) * 1e-9 <= MAX_STAMP_AGE
             if not self._stamped:
                 log.warning(
-                    "%s: its kernel's time stamps are not of CLOCK_MONOTONIC; images are stamped when they are read, "
-                    "which is later and less even",
+                    "%s: the kernel's time stamps are not of CLOCK_MONOTONIC; the time of reading is used, which is "
+                    "later and less regular",
                     self._name,
                 )
         pixels = luma(self._name, np.asarray(raw, np.uint8), self._camera)
         return Frame((stamp if self._stamped else read) + clock_ahead(self._clock), pixels)
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Close the device."""
         self._capture.release()
 
 
 def luma(name: str, raw: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
-    """Y (height, width) of the bytes of one YUYV image, in whatever shape OpenCV has them."""
+    """Extract Y (height, width) from one YUYV image of any shape. Raises `CameraError` for a wrong size."""
     if raw.size != 2 * camera.width * camera.height:
         raise CameraError(
             f"{name} delivers {raw.size} bytes an image, but {camera.width} x {camera.height} px in YUYV have "
@@ -125,7 +142,7 @@ def _settings(name: str, query: str) -> dict[str, int]:
     settings = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in ("exposure", "gain") or not value.isdecimal():
-            raise InputError(f"{name}: `{key}={value}` is no setting; use exposure=NUMBER and gain=NUMBER")
+            raise InputError(f"{name}: `{key}={value}` is not a setting; use exposure=NUMBER and gain=NUMBER")
         settings[key] = int(value)
     return settings
 
@@ -136,13 +153,13 @@ def _check_device(name: str, path: str) -> None:
     except OSError as error:
         raise CameraError(f"{name} cannot be opened ({error.strerror}): is it plugged in?") from error
     if not is_device:
-        raise CameraError(f"{name} cannot be opened: {path} is no device; use video:{path} for a recorded video")
+        raise CameraError(f"{name} cannot be opened: {path} is not a device; use video:{path} for a recorded video")
     if not os.access(path, os.R_OK | os.W_OK):
-        raise CameraError(f"{name} cannot be opened: {path} is not yours to use; join its group (`video` on Debian)")
+        raise CameraError(f"{name} cannot be opened: no permission for {path}; join its group (`video` on Debian)")
 
 
 def _set_controls(name: str, path: str, settings: dict[str, int]) -> None:
-    """Exposure and gain by hand, as they are or as they are set; a warning where the driver refuses."""
+    """Switch automatic exposure and gain off and apply the settings; warn if the driver refuses."""
     with Path(path).open("rb", buffering=0) as device:
 
         def set_control(control: int, value: int) -> bool:
@@ -152,11 +169,11 @@ def _set_controls(name: str, path: str, settings: dict[str, int]) -> None:
             return False
 
         if not set_control(EXPOSURE_AUTO, EXPOSURE_MANUAL):
-            log.warning("%s: its exposure cannot be set by hand; it may change while the team measures", name)
-        set_control(AUTOGAIN, 0)  # many have none
+            log.warning("%s: automatic exposure cannot be switched off; it may change while the team measures", name)
+        set_control(AUTOGAIN, 0)  # many cameras have none
         if "exposure" in settings and not any(
             set_control(control, settings["exposure"]) for control in (EXPOSURE, EXPOSURE_ABSOLUTE)
         ):
-            log.warning("%s does not take exposure=%d", name, settings["exposure"])
+            log.warning("%s refuses exposure=%d", name, settings["exposure"])
         if "gain" in settings and not set_control(GAIN, settings["gain"]):
-            log.warning("%s does not take gain=%d", name, settings["gain"])
+            log.warning("%s refuses gain=%d", name, settings["gain"])

@@ -1,8 +1,8 @@
-"""A Create 1 or 2 that is not there: it speaks the Open Interface on a pseudo-terminal, and its wheels have physics.
+"""Emulator of a Create 1 or 2: it speaks the Open Interface on a pseudo-terminal, and its wheels have physics.
 
     python -m coloc_graph.robot_io.create.emulator --model 2      prints the port to open
 
-Like the real one it has no watchdog: the last drive command goes on, also when nobody holds the port any more.
+Like the real robot it has no command timeout: the last drive command holds, also when the port is closed.
 """
 
 import argparse
@@ -30,10 +30,29 @@ _BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name
 
 
 class CreateEmulator:
-    """An emulated robot; a context manager. `port` is what a driver opens.
+    """An emulated robot; a context manager.
 
-    `encoders` are the counts (left, right) at the start. `mute` holds back everything it would send; `corruption`
-    is the share of the bytes it sends that are changed or lost. `received` keeps all bytes that came.
+    Parameters
+    ----------
+    model
+        1 or 2.
+    physics
+        Parameters of the body.
+    encoders
+        Encoder counts (left, right) at the start.
+    clock
+        Clock of the physics [s].
+
+    Attributes
+    ----------
+    port
+        Serial port for a driver to open.
+    mute
+        If True, nothing is sent.
+    corruption
+        Fraction of the sent bytes that are changed or lost.
+    received
+        All bytes that came.
     """
 
     def __init__(
@@ -68,13 +87,13 @@ class CreateEmulator:
         self.close()
 
     def close(self) -> None:
-        """End it, the line first."""
+        """Close the line and end the emulation."""
         self.hang_up()
         self._ended = True
         self._thread.join(timeout=2.0)
 
     def hang_up(self) -> None:
-        """The line breaks; the robot goes on as it was told last."""
+        """Break the line; the robot keeps its last command."""
         with self._lock:
             if self._wired:
                 self._wired = False
@@ -82,7 +101,7 @@ class CreateEmulator:
                 os.close(self._master)
 
     def plug_in(self) -> None:
-        """A line, and with it a new `port`, as at the start or after `hang_up`."""
+        """Connect a line with a new `port`, as at the start or after `hang_up`."""
         with self._lock:
             self.hang_up()
             self._master, self._slave = os.openpty()  # the far end stays open here: a driver may come and go
@@ -92,64 +111,64 @@ class CreateEmulator:
 
     @property
     def wired(self) -> bool:
-        """Whether its line is plugged in."""
+        """True if the line is connected."""
         with self._lock:
             return self._wired
 
     @property
     def pose(self) -> NDArray[np.float64]:
-        """Where it truly is: x [m], y [m], yaw [rad]."""
+        """True pose: x [m], y [m], yaw [rad]."""
         with self._lock:
             return np.array([self._body.x, self._body.y, self._body.yaw])
 
     @property
     def speeds(self) -> tuple[float, float]:
-        """How fast the left and the right wheel truly turn [m/s]."""
+        """True speeds of the left and the right wheel [m/s]."""
         with self._lock:
             return self._body.speeds[0], self._body.speeds[1]
 
     @property
     def still_since(self) -> float | None:
-        """The instant [s, by its clock] since which both wheels have stood still; None while one turns."""
+        """Time since which both wheels have stood [s, emulator's clock]; None while one turns."""
         with self._lock:
             return self._body.still_since
 
     def trace(self) -> NDArray[np.float64]:
-        """The truth over the last minutes (n, 6): time [s, by its clock], x, y [m], yaw [rad], left, right [m/s]."""
+        """True states of the last minutes (n, 6): time [s, its clock], x, y [m], yaw [rad], left, right [m/s]."""
         with self._lock:
             return np.array(self._body.trace)
 
     def poses_at(self, times: ArrayLike) -> NDArray[np.float64]:
-        """Where it truly was at instants (n,) of the last minutes [s, by its clock]: (n, 3), yaw unwrapped.
+        """True poses (n, 3) at times (n,) of the last minutes [s, emulator's clock], yaw unwrapped.
 
-        What it does in the last step of its physics is not known yet.
+        The last step of the physics is not included.
         """
         with self._lock:
             self._body.advance(self._clock())
             return self._body.poses_at(times)
 
     def push(self, dx: float, dy: float, dyaw: float) -> None:
-        """Somebody bumps into it: it moves by so much in the world [m], [rad], and its encoders count nothing."""
+        """Displace the robot in the world [m], [rad], as by a bump; the encoders count nothing."""
         with self._lock:
             self._body.push(dx, dy, dyaw)
 
     def cliff(self, where: str, there: bool = True) -> None:
-        """A cliff under "left", "front left", "front right" or "right"."""
+        """Put a cliff under the sensor "left", "front left", "front right" or "right", or take it away."""
         with self._lock:
             _mark(self._cliffs, CLIFFS.values(), where, there)
 
     def wheel_drop(self, where: str, there: bool = True) -> None:
-        """The "left" or "right" wheel, or the "caster" (Create 1), hangs in the air."""
+        """Drop the "left" or "right" wheel or the "caster" (Create 1), or raise it."""
         with self._lock:
             _mark(self._drops, DROPS.values(), where, there)
 
     def dock(self, there: bool = True) -> None:
-        """On the charger, or off it."""
+        """Put the robot on the charger, or take it off."""
         with self._lock:
             self._docked = there
 
     def restart(self) -> None:
-        """A flat battery or its button: it forgets mode, stream and speed."""
+        """Restart the robot as after a flat battery: mode, stream and speed are lost."""
         with self._lock:
             self.mode, self._streaming, self._body.wanted = Mode.OFF, False, (0.0, 0.0)
 
@@ -168,7 +187,7 @@ class CreateEmulator:
                 self._tick()
 
     def _tick(self) -> None:
-        """Physics up to now, what the robot does by itself, and a frame if one is due."""
+        """Advance the physics, react as the robot does by itself, and send a frame if one is due."""
         now = self._clock()
         self._body.advance(now)
         forward = max(self._body.wanted) > 0
@@ -299,10 +318,10 @@ def _of_radius(speed: int, radius: int, base: float) -> tuple[int, int]:
 
 
 def main() -> None:
-    """Play with an emulated robot: print its port, then where it stands, until Ctrl-C."""
+    """Run an emulated robot: print its port, then its pose, until Ctrl-C."""
     parser = argparse.ArgumentParser(description="An emulated iRobot Create on a pseudo-terminal.")
-    parser.add_argument("--model", type=int, choices=(1, 2), default=2, help="Create 1 or 2 (default 2)")
-    parser.add_argument("--seed", type=int, default=0, help="of slip and encoder noise")
+    parser.add_argument("--model", type=int, choices=(1, 2), default=2, help="Create 1 or 2 (default: 2)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of slip and encoder noise (default: 0)")
     options = parser.parse_args()
     with CreateEmulator(options.model, Physics(seed=options.seed)) as robot, contextlib.suppress(KeyboardInterrupt):
         print(robot.port, flush=True)

@@ -1,8 +1,8 @@
-"""What moves is stopped when its process ends: at exit, and on SIGTERM, SIGINT and SIGHUP.
+"""Exit hooks that stop devices when their process ends: at exit, and on SIGTERM, SIGINT and SIGHUP.
 
-The user's own signal handlers are kept: ours stops what moves, then calls the one that was there before, or lets
-the signal do what it does by default. Nothing in a process can act on SIGKILL or SIGSTOP: that
-is what `stopper.py` is for. Nothing acts on a lost computer.
+The user's own signal handlers are kept: the hook stops the devices, then calls the earlier handler, or lets the signal
+have its default effect. A signal that is ignored (`nohup`, a background job of a script) stays ignored. Nothing in a
+process can act on SIGKILL or SIGSTOP: see `watchdog.py`. Nothing acts when the computer itself fails.
 """
 
 import atexit
@@ -21,13 +21,13 @@ SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 class Stoppable(Protocol):
-    """A device that moves."""
+    """A device that moves and can be stopped."""
 
     def emergency_stop(self, reason: str) -> None:
-        """Stop at once and refuse to go on; never raises, never waits long, may be called in a signal handler."""
+        """Stop at once and refuse to go on. Never raises, never waits long; may be called in a signal handler."""
 
     def close(self) -> None:
-        """Stop and let go of the device."""
+        """Stop and close the device."""
 
 
 _guarded: "weakref.WeakSet[Stoppable]" = weakref.WeakSet()
@@ -36,7 +36,13 @@ _process = 0
 
 
 def guard(device: Stoppable) -> bool:
-    """Stop this device when the process ends. False where signals cannot be caught, as outside the main thread."""
+    """Stop this device when the process ends.
+
+    Returns
+    -------
+    bool
+        False if signals cannot be caught, as outside the main thread.
+    """
     global _process
     if _process != os.getpid():  # the first here; a forked child has no business with its parent's robots
         _process = os.getpid()
@@ -45,7 +51,7 @@ def guard(device: Stoppable) -> bool:
     _guarded.add(device)
     if threading.current_thread() is not threading.main_thread():
         if not _before:
-            log.warning("opened outside the main thread: signals will not stop what moves, the lease and the exit will")
+            log.warning("opened outside the main thread: signals will not stop the wheels, the lease and the exit will")
         return bool(_before)
     for number in SIGNALS:
         handler = signal.getsignal(number)
@@ -56,7 +62,7 @@ def guard(device: Stoppable) -> bool:
 
 
 def release(device: Stoppable) -> None:
-    """Guard it no more; after the last one the earlier signal handlers are back, where ours are still the last."""
+    """Stop guarding a device. After the last one the earlier signal handlers are restored, unless replaced since."""
     _guarded.discard(device)
     if _guarded or threading.current_thread() is not threading.main_thread():
         return

@@ -1,4 +1,4 @@
-"""What a Create's frames amount to: the newest state, and odometry; `SensorFeed`."""
+"""Sensor feed: the newest state and the odometry from a Create's frames; `SensorFeed`."""
 
 import math
 import threading
@@ -12,22 +12,25 @@ from coloc_graph.run.messages import OdometrySample
 
 
 class SensorFeed:
-    """Made of frames by one thread with `take`, read by others. Times are UTC, the monotonic clock's steps."""
+    """State and odometry, made from frames by one thread with `take` and read by others.
+
+    Times are UTC [s], continued by the monotonic clock.
+    """
 
     def __init__(self, model: int, robot: str, period: float, epoch: float | None = None) -> None:
         self.state: CreateState | None = None
         self.sample: OdometrySample | None = None
-        #: When the newest frame came [s, monotonic].
+        #: Time of the newest frame [s, monotonic].
         self.last = time.monotonic()
         self._epoch = time.time() - self.last if epoch is None else epoch
-        # a Create 1 tells its way seldom, and each time all of it
+        # a Create 1 reports its distance seldom, and then all of it
         self._odometer = Odometer(robot, period) if model == 2 else Odometer(robot, period, math.inf)
         self._way = EncoderWay() if model == 2 else DeltaWay()
         self._samples: deque[OdometrySample] = deque(maxlen=20_000)
         self._fresh = threading.Condition()
 
     def take(self, values: Mapping[int, int]) -> CreateState | None:
-        """The state in a frame that has just come; None where it is damaged with a checksum that fits by chance."""
+        """Take in a frame that has just come; return its state, None if it is damaged though its checksum fits."""
         now = time.monotonic()
         try:
             state = read_state(values, self._epoch + now)
@@ -43,19 +46,25 @@ class SensorFeed:
         return state
 
     def notify(self) -> None:
-        """What came of the frame is settled: wake those who wait."""
+        """Wake those who wait for a frame, once all that follows from it is done."""
         with self._fresh:
             self._fresh.notify_all()
 
     def take_samples(self) -> list[OdometrySample]:
-        """The samples since this was last called."""
+        """Return the samples since the last call."""
         with self._fresh:
             taken = list(self._samples)
             self._samples.clear()
         return taken
 
     def wait(self, met: Callable[[], bool], given_up: Callable[[], bool], timeout: float) -> bool:
-        """Whether a frame that comes within `timeout` [s] makes it so."""
+        """Wait for a frame that meets a condition.
+
+        Returns
+        -------
+        bool
+            True if the condition is met within `timeout` [s], False if not, or if it was given up.
+        """
         until = time.monotonic() + timeout
         with self._fresh:
             while not met():
@@ -67,17 +76,17 @@ class SensorFeed:
 
     @property
     def age(self) -> float:
-        """Of the newest frame [s]."""
+        """Age of the newest frame [s]."""
         return time.monotonic() - self.last
 
     @property
     def told_to_move(self) -> bool:
-        """Whether the robot says that it has a speed to keep."""
+        """True if the robot reports a requested speed other than 0."""
         return self.state is not None and any(self.state.requested)
 
     @property
     def because(self) -> str:
-        """The hazards that are there, as the end of a sentence."""
+        """Present hazards as the end of a sentence, empty if there are none."""
         if self.state is None or self.age > 0.3:
             return " because no sensor data come"
         why = " and ".join(self.state.hazards().values())

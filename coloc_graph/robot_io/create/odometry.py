@@ -1,8 +1,8 @@
-"""What the wheels of a Create say of its way: counts to pose increments, with covariances.
+"""Odometry of a Create: from encoder counts to pose increments with covariances.
 
-Create 2 has encoders that count on and wrap. Create 1 only tells the way and the turn since it was last asked, in
-whole millimetres and degrees, and loses what is left over (AutonomyLab/create_robot#28: asked every 15 ms, a turn
-slower than 67 deg/s reads as none); it is therefore asked seldom, and in between its requested speeds are believed.
+A Create 2 has encoders that count on and wrap. A Create 1 only reports distance and angle since the last request, in
+whole millimetres and degrees, and loses the remainder (AutonomyLab/create_robot#28: requested every 15 ms, a turn
+slower than 67 deg/s reads as 0). It is therefore asked seldom, and in between its requested speeds are integrated.
 """
 
 from collections.abc import Mapping
@@ -17,23 +17,19 @@ from coloc_graph.run.messages import OdometrySample
 
 Array = NDArray[np.float64]
 
-#: Slip of one wheel and noise of its encoder: sigma [m] after a metre rolled, growing with the root of the way.
-SLIP = 0.008
-ENCODER = 0.006
-#: No increment is believed better than this [m], [rad].
-FLOOR_METRES = 1e-5
-FLOOR_RADIANS = 1e-5
-#: How far a Create 1 keeps to the speed that it was asked for: share of the way, and time that it is late [s].
-REQUEST_SHARE = 0.03
-REQUEST_LATE = 0.05
-#: A frame that comes later than this after the one before was held up, and so may the next ones be for a while [s].
-LATE = 0.1
-HELD_UP = 1.0
+SLIP = 0.008  # m, standard deviation of a wheel's slip after one metre, growing with the root of the distance
+ENCODER = 0.006  # m, the same of the encoder's noise
+FLOOR_METRES = 1e-5  # m, least standard deviation of an increment's position
+FLOOR_RADIANS = 1e-5  # rad, least standard deviation of an increment's heading
+REQUEST_SHARE = 0.03  # standard deviation of a Create 1's speed, as a fraction of the requested one
+REQUEST_LATE = 0.05  # s, delay with which a Create 1 takes a requested speed
+LATE = 0.1  # s between two frames above which the second one was held up
+HELD_UP = 1.0  # s after such a gap during which further frames may have been held up too
 
 
 @dataclass(frozen=True)
 class Wheels:
-    """Measures of a model: `base` between the wheels [m], `metres` rolled a tick [m], `baud` of its serial line."""
+    """Dimensions of a model: wheel `base` [m], distance a tick `metres` [m], `baud` rate of its serial line."""
 
     base: float
     metres: float
@@ -44,19 +40,19 @@ WHEELS = {1: Wheels(0.258, 1e-3, 57600), 2: Wheels(0.235, pi * 0.072 / 508.8, 11
 
 
 def ticks_between(before: int, after: int) -> int:
-    """How far a uint16 counter went, the short way round: -32768 ... 32767."""
+    """Difference of two readings of a uint16 counter, the short way round: -32768 to 32767."""
     return (after - before + 0x8000) % 0x10000 - 0x8000
 
 
 def arc(left: float, right: float, base: float) -> tuple[float, float, float]:
-    """The way (x [m], y [m], yaw [rad]) in the body where it began, of wheels that rolled so far [m] in step."""
+    """Pose increment (x [m], y [m], yaw [rad], start's body frame) of wheels that rolled `left` and `right` [m]."""
     forward, turned = (left + right) / 2, (right - left) / base
     chord = forward * (sin(turned / 2) / (turned / 2) if abs(turned) > 1e-9 else 1.0)
     return chord * cos(turned / 2), chord * sin(turned / 2), turned
 
 
 def arc_covariance(left: float, right: float, base: float) -> Array:
-    """Covariance (3, 3) of `arc` in x [m], y [m], yaw [rad]: each wheel errs by itself, by `SLIP` and `ENCODER`."""
+    """Covariance (3, 3) of `arc`, with independent errors `SLIP` and `ENCODER` of each wheel."""
     per_metre = SLIP**2 + ENCODER**2
     var_left, var_right = per_metre * abs(left), per_metre * abs(right)
     forward, turned = (left + right) / 2, (right - left) / base
@@ -76,21 +72,29 @@ def arc_covariance(left: float, right: float, base: float) -> Array:
 
 
 def compose(pose: Array, way: tuple[float, float, float]) -> Array:
-    """The pose (x, y, yaw) at the end of a way in the body; yaw within +-pi."""
+    """Compose a pose (x, y, yaw) with an increment in its body frame; yaw is within +-pi."""
     c, s = cos(pose[2]), sin(pose[2])
     yaw = (pose[2] + way[2] + pi) % (2 * pi) - pi
     return np.array([pose[0] + c * way[0] - s * way[1], pose[1] + s * way[0] + c * way[1], yaw])
 
 
 class Odometer:
-    """Adds increments up to samples: one every `period` [s] while moving, one every second at rest.
+    """Sums increments to samples: one every `period` while moving, one every `REST` while standing.
 
-    The pose is in its own frame, the body at the first increment. Before a movement begins, the rest is closed
-    with a sample, so that who interpolates between samples sees the robot stand until then. What comes at once after
-    a gap, longer than `late` [s], belongs into the gap: no sample ends amid it.
+    The pose is in the odometry frame, the body at the first increment. A sample is closed before a movement begins, so
+    that interpolation between samples shows the robot standing until then. No sample ends within a gap.
+
+    Parameters
+    ----------
+    robot
+        Name of the robot.
+    period
+        Time between two samples while moving [s].
+    late
+        Time between two increments from which it is a gap [s].
     """
 
-    REST = 1.0
+    REST = 1.0  # s between two samples while standing
 
     def __init__(self, robot: str, period: float = 0.05, late: float = LATE) -> None:
         self.robot, self.period, self.late = robot, period, late
@@ -101,7 +105,7 @@ class Odometer:
         self._last = self._open_until = 0.0
 
     def add(self, time: float, way: tuple[float, float, float], covariance: Array) -> list[OdometrySample]:
-        """The samples that this increment, which ends at `time` [UTC s], completes."""
+        """Add an increment that ends at `time` [UTC s]; return the samples that it completes."""
         moved = any(way)
         if self._opened is None:
             self._opened = time - 1e-3
@@ -140,8 +144,8 @@ class Odometer:
 class EncoderWay:
     """Increments of a Create 2 from its encoders (packets 43, 44).
 
-    Counts that no wheel can have reached are those of a damaged frame whose checksum fits by chance, and are left
-    out; three in a row are a robot that began to count anew, of whose way nothing is known but its bounds.
+    Counts that no wheel can have reached are ignored: those of a damaged frame whose checksum fits by chance. After
+    three in a row the encoders have restarted, and the increment is only known to be within its bounds.
     """
 
     def __init__(self) -> None:
@@ -150,7 +154,7 @@ class EncoderWay:
         self._left_out = 0
 
     def step(self, frame: Mapping[int, int], elapsed: float) -> tuple[tuple[float, float, float], Array] | None:
-        """The way since the last frame and its covariance, None where the counts are impossible. `elapsed` [s]."""
+        """Return the increment of the last `elapsed` [s] and its covariance; None if the counts are impossible."""
         after = frame[Packet.LEFT_TICKS], frame[Packet.RIGHT_TICKS]
         wheels, before = WHEELS[2], self._before or after
         self._elapsed += elapsed
@@ -172,9 +176,9 @@ class EncoderWay:
 
 
 class DeltaWay:
-    """Increments of a Create 1: its requested speeds, held to what packets 19 and 20 allow when they come.
+    """Increments of a Create 1: its requested speeds, bounded by packets 19 and 20 when they come.
 
-    A packet says so many whole units (mm, deg); the true way is up to one unit longer, the remainder is lost.
+    A packet counts whole units (mm, deg); the true distance is up to one unit longer, the remainder is lost.
     """
 
     def __init__(self) -> None:
@@ -182,7 +186,7 @@ class DeltaWay:
         self._asked = False
 
     def step(self, frame: Mapping[int, int], elapsed: float) -> tuple[tuple[float, float, float], Array] | None:
-        """The way since packets 19 and 20 last came, None in a frame that is without them. `elapsed` [s]."""
+        """Return the increment since packets 19 and 20 last came; None for a frame without them. `elapsed` [s]."""
         base = WHEELS[1].base
         left, right = (frame[i] * 1e-3 * elapsed for i in (Packet.REQUESTED_LEFT, Packet.REQUESTED_RIGHT))
         self._forward += (left + right) / 2
@@ -206,7 +210,7 @@ class DeltaWay:
 
 
 def _held(requested: float, units: int, unit: float) -> tuple[float, float]:
-    """The way and its sigma: the requested one where a truncated count allows it, else the middle of what it allows."""
+    """Distance and its sigma: as requested if the truncated count allows it, else the middle of what it allows."""
     low, high = sorted((units * unit, (units + copysign(1, units)) * unit)) if units else (-unit, unit)
     if not low <= requested <= high:
         return (low + high) / 2, (high - low) / 12**0.5

@@ -1,4 +1,4 @@
-"""The body of an emulated Create: two wheels with inertia, slip and noisy encoders, walls, and what can befall it."""
+"""Physics of an emulated Create: two wheels with inertia, slip and noisy encoders, walls, pushes."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.robot_io.create.odometry import ENCODER, SLIP, WHEELS
+from coloc_graph.robot_io.deadlines import DECELERATION
 
 Array = NDArray[np.float64]
 
-#: Radius of the body [m].
-RADIUS = 0.17
+RADIUS = 0.17  # m, of the body
 
 
 @dataclass(frozen=True)
 class Wall:
-    """A rectangle in the world [m] that nothing goes through."""
+    """A solid rectangle in the world [m]."""
 
     x_low: float
     y_low: float
@@ -29,13 +29,25 @@ class Wall:
 
 @dataclass(frozen=True)
 class Physics:
-    """How the emulated body behaves.
+    """Parameters of the emulated body.
 
-    `acceleration` of a wheel [m/s^2]; `slip` and `encoder` are sigmas [m] after a metre rolled, growing with the
-    root of the way; `step` [s]; `seed` of all noise.
+    Attributes
+    ----------
+    acceleration
+        Acceleration and deceleration of a wheel [m/s^2].
+    slip, encoder
+        Standard deviations [m] after one metre rolled, growing with the square root of the distance.
+    step
+        Time step [s].
+    seed
+        Seed of all noise.
+    walls
+        Solid rectangles.
+    start
+        x [m], y [m], yaw [rad] at the start.
     """
 
-    acceleration: float = 2.0
+    acceleration: float = DECELERATION
     slip: float = SLIP
     encoder: float = ENCODER
     step: float = 0.0025
@@ -46,9 +58,12 @@ class Physics:
 
 @dataclass
 class Body:
-    """The true state; `advance` moves it on. Wheels are (left, right).
+    """True state of the robot; wheels are (left, right).
 
-    `trace` holds the last minutes as (time, x, y, yaw, left speed, right speed), one row a step.
+    Attributes
+    ----------
+    trace
+        The last minutes, one row a step: time [s], x, y [m], yaw [rad], left and right speed [m/s].
     """
 
     model: int
@@ -63,9 +78,9 @@ class Body:
         self.base = WHEELS[self.model].base
         self.x, self.y, self.yaw = self.physics.start
         self.speeds = [0.0, 0.0]
-        #: What the encoders have counted since the start [m].
+        #: Distance that the encoders have counted since the start [m].
         self.counted = [0.0, 0.0]
-        #: Since when both wheels have been still, None while one turns [s].
+        #: Time since which both wheels have stood [s]; None while one turns.
         self.still_since: float | None = self.time
         self._rng = np.random.default_rng(self.physics.seed)
         self._noise: list[float] = []
@@ -73,12 +88,12 @@ class Body:
         self._record()
 
     def advance(self, to: float) -> None:
-        """On to the instant `to` in whole steps."""
+        """Advance to the time `to` [s] in whole steps."""
         while self.time + self.physics.step <= to:
             self._step(self.physics.step)
 
     def poses_at(self, times: ArrayLike) -> Array:
-        """Where it was at instants (n,) [s] of the last minutes: x, y [m], yaw [rad, unwrapped], (n, 3)."""
+        """True poses (n, 3) at times (n,) [s] of the last minutes: x, y [m], yaw [rad, unwrapped]."""
         times = np.asarray(times, float)
         back = int((self.time - times.min(initial=self.time)) / self.physics.step) + self._pushes + 2
         rows = np.array(list(islice(reversed(self.trace), back)))[::-1]
@@ -86,7 +101,7 @@ class Body:
         return np.stack([np.interp(times, rows[:, 0], column) for column in columns], axis=1)
 
     def push(self, dx: float, dy: float, dyaw: float) -> None:
-        """Move it at once by so much in the world [m], [rad]: no wheel turns, no encoder counts."""
+        """Displace the body in the world [m], [rad]; the encoders count nothing."""
         self.x, self.y, self.yaw = self.x + dx, self.y + dy, (self.yaw + dyaw + pi) % (2 * pi) - pi
         self._pushes += 1
         self._record()
@@ -120,7 +135,7 @@ class Body:
         return self._noise.pop()
 
     def _move(self, x: float, y: float) -> None:
-        """Unless a wall is in the way; then the wheels slip where it stands, and the bumper is pressed."""
+        """Move unless a wall is in the way; then the wheels slip and the bumper is pressed."""
         self.bump_left = self.bump_right = blocked = False
         for wall in self.physics.walls:
             dx = min(max(x, wall.x_low), wall.x_high) - x

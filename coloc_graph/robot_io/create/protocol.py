@@ -1,7 +1,7 @@
-"""The bytes of the iRobot Create 1 and 2: commands, sensor packets, the stream and its decoder; no I/O.
+"""Open Interface of the iRobot Create 1 and 2: commands, sensor packets, stream decoder; no I/O.
 
 Source: "iRobot Create Open Interface" (Create 1, 2006) and "iRobot Create 2 Open Interface specification" (2015).
-Integers are big-endian; speeds in bytes are millimetres a second.
+Integers are big-endian; speeds are in mm/s.
 """
 
 import struct
@@ -22,14 +22,11 @@ POWER = 133
 STOP_INTERFACE = 173
 RESET = 7
 
-#: First byte of every stream frame.
-HEADER = 19
-#: The robot sends a frame every 15 ms.
-STREAM_PERIOD = 0.015
-#: Largest speed of a wheel that the robot takes [mm/s].
-MAX_WHEEL_SPEED = 500
+HEADER = 19  # first byte of a stream frame
+STREAM_PERIOD = 0.015  # s between two stream frames
+MAX_WHEEL_SPEED = 500  # mm/s, bound of a wheel's speed
 
-#: How many bytes follow an opcode (both models; one that is not here has none). Lists are in `split_command`.
+#: Number of bytes that follow an opcode, for both models; 0 if it is not listed. Lists are in `split_command`.
 ARGUMENTS = {
     129: 1, 136: 1, 137: 4, 138: 1, 139: 3, 141: 1, 142: 1, 144: 3, 145: 4, 146: 4, 147: 1, 150: 1, 151: 1, 155: 1,
     156: 2, 157: 2, 158: 1, 162: 2, 163: 4, 164: 4, 165: 1, 167: 15, 168: 3,
@@ -37,7 +34,7 @@ ARGUMENTS = {
 
 
 class Mode(IntEnum):
-    """What the robot lets be done to it (packet 35); wheels turn in safe and full."""
+    """Mode of the Open Interface (packet 35); the wheels can be driven in safe and full mode."""
 
     OFF = 0
     PASSIVE = 1
@@ -46,7 +43,7 @@ class Mode(IntEnum):
 
 
 class Packet(IntEnum):
-    """The sensor packets that this package uses."""
+    """Sensor packets that this package uses."""
 
     BUMPS_DROPS = 7
     CLIFF_LEFT = 9
@@ -79,7 +76,7 @@ class BumpDrop(IntFlag):
 
 @dataclass(frozen=True)
 class Layout:
-    """How one packet is laid out: `size` [bytes] and whether it has a sign."""
+    """Layout of a packet: `size` [bytes], and `signed` for a signed integer."""
 
     size: int
     signed: bool = False
@@ -89,7 +86,7 @@ _BYTE = Layout(1)
 _WORD = Layout(2)
 _SIGNED_WORD = Layout(2, signed=True)
 
-#: Every single packet of the two models. Encoder counts (43, 44) wrap at 65536 and are read without a sign.
+#: Single packets of both models. Encoder counts (43, 44) wrap at 65536 and are read as unsigned.
 PACKETS: dict[int, Layout] = (
     dict.fromkeys((*range(7, 19), 21, 32, 34, 35, 36, 37, 38, 45, 52, 53, 58), _BYTE)
     | dict.fromkeys((22, 25, 26, *range(27, 32), 33, 43, 44, *range(46, 52)), _WORD)
@@ -97,49 +94,49 @@ PACKETS: dict[int, Layout] = (
     | {24: Layout(1, signed=True)}
 )
 
-#: Packets that stand for a range of others (first, last); a Create 1 knows 0 to 6 alone.
+#: Group packets: the first and last packet of each; a Create 1 knows 0 to 6 only.
 GROUPS: dict[int, tuple[int, int]] = {
     0: (7, 26), 1: (7, 16), 2: (17, 20), 3: (21, 26), 4: (27, 34), 5: (35, 42), 6: (7, 42),
     100: (7, 58), 101: (43, 58), 106: (46, 51), 107: (54, 58),
 }  # fmt: skip
 
-#: The last single packet that each model knows.
+#: Number of the last single packet of each model.
 LAST_PACKET = {1: 42, 2: 58}
 
 
 def drive_direct(right: int, left: int) -> bytes:
-    """The command that sets both wheels [mm/s]; the right one comes first. `ValueError` beyond +-500."""
+    """Command that sets the speeds of both wheels [mm/s], right first. Raises `ValueError` beyond +-500."""
     if not max(abs(right), abs(left)) <= MAX_WHEEL_SPEED:
         raise ValueError(f"wheel speeds are within +-{MAX_WHEEL_SPEED} mm/s, not {right} and {left}")
     return struct.pack(">Bhh", DRIVE_DIRECT, right, left)
 
 
-#: Both wheels to a standstill; the mode stays as it is.
+#: Command that stops both wheels; the mode stays as it is.
 HALT = drive_direct(0, 0)
 
 
 def stream(packets: Sequence[int]) -> bytes:
-    """The command that has these packets sent every 15 ms, in this order; it replaces an earlier list."""
+    """Command that starts a stream of these packets, in this order; it replaces an earlier stream."""
     return bytes([STREAM, len(packets), *packets])
 
 
 def pause_stream() -> bytes:
-    """The command that ends the stream, until `resume_stream` or another `stream`."""
+    """Command that pauses the stream until `resume_stream` or another `stream`."""
     return bytes([PAUSE_RESUME, 0])
 
 
 def resume_stream() -> bytes:
-    """The command that takes the stream up again."""
+    """Command that resumes the stream."""
     return bytes([PAUSE_RESUME, 1])
 
 
 def query(packets: Sequence[int]) -> bytes:
-    """The command that asks for these packets once; the answer is their bare values, `decode_values` reads it."""
+    """Command that requests these packets once; `decode_values` reads the answer, their bare values."""
     return bytes([SENSORS, packets[0]]) if len(packets) == 1 else bytes([QUERY_LIST, len(packets), *packets])
 
 
 def expand(packets: Sequence[int]) -> tuple[int, ...]:
-    """Groups replaced by the packets that they stand for. `KeyError` for a packet that is none."""
+    """Replace groups by their packets. Raises `KeyError` for an unknown packet."""
     singles: list[int] = []
     for one in packets:
         first, last = GROUPS.get(one, (one, one))
@@ -150,7 +147,7 @@ def expand(packets: Sequence[int]) -> tuple[int, ...]:
 
 
 def decode_values(packets: Sequence[int], data: bytes) -> dict[int, int]:
-    """The values of single packets that stand one after the other. `ValueError` where the length differs."""
+    """Decode values of single packets, one after the other. Raises `ValueError` if the length differs."""
     if len(data) != sum(PACKETS[i].size for i in packets):
         raise ValueError(f"{len(data)} bytes are not the packets {list(packets)}")
     values, at = {}, 0
@@ -162,7 +159,7 @@ def decode_values(packets: Sequence[int], data: bytes) -> dict[int, int]:
 
 
 def encode_value(packet: int, value: int) -> bytes:
-    """One packet's value as the robot sends it; what is without a sign wraps, what has one is capped."""
+    """Encode a packet's value as the robot sends it: an unsigned value wraps, a signed one is clipped."""
     size, signed = PACKETS[packet].size, PACKETS[packet].signed
     top = 1 << (8 * size)
     value = max(-top // 2, min(top // 2 - 1, value)) if signed else value % top
@@ -170,14 +167,14 @@ def encode_value(packet: int, value: int) -> bytes:
 
 
 def encode_frame(values: Mapping[int, int], *, header_counts: bool) -> bytes:
-    """A stream frame `[19][n][id value ...][checksum]`; the checksum counts the 19 in (Create 2) or not (Create 1)."""
+    """Encode a stream frame `[19][n][id value ...][checksum]`; the checksum includes the 19 on a Create 2 only."""
     body = b"".join(bytes([i]) + encode_value(i, value) for i, value in values.items())
     frame = bytes([HEADER, len(body)]) + body
     return frame + bytes([-sum(frame if header_counts else frame[1:]) & 0xFF])
 
 
 def split_command(buffer: bytes) -> tuple[bytes | None, bytes]:
-    """The first whole command in a buffer and what follows it; (None, buffer) while it is not complete."""
+    """Split the first complete command from a buffer; (None, buffer) if there is none."""
     if not buffer:
         return None, buffer
     length = 1 + ARGUMENTS.get(buffer[0], 0)
@@ -189,10 +186,19 @@ def split_command(buffer: bytes) -> tuple[bytes | None, bytes]:
 
 
 class StreamDecoder:
-    """Finds stream frames in bytes that come in any pieces, and finds its way back after bytes that are none.
+    """Decoder of stream frames from bytes in any pieces; it resynchronises after damaged bytes.
 
-    `layouts` are the lists of single packets that were asked for; a frame of another list is bad.
-    `header_counts` says which checksum the robot uses, None until two frames in a row agree on it.
+    Parameters
+    ----------
+    layouts
+        Lists of single packets that were requested; frames of other lists are invalid.
+
+    Attributes
+    ----------
+    header_counts
+        True if the checksum includes the header, None until two frames in a row agree on it.
+    good, bad
+        Counts of valid frames, and of damaged ones: stretches of invalid bytes, in lengths of the longest frame.
     """
 
     def __init__(self, *layouts: Sequence[int]) -> None:
@@ -203,11 +209,10 @@ class StreamDecoder:
         self._last: bool | None = None
         self.header_counts: bool | None = None
         self.good = 0
-        #: Frames that were damaged: stretches of bytes that are no frame, in lengths of the longest.
         self.bad = 0
 
     def feed(self, data: bytes) -> list[dict[int, int]]:
-        """The frames that these bytes complete, each as packet -> value, in the order in which they came."""
+        """Return the frames that these bytes complete, each as packet -> value, in order."""
         self._buffer += data
         frames = []
         while self._buffer:
@@ -225,7 +230,7 @@ class StreamDecoder:
         return frames
 
     def _length(self) -> int | None:
-        """Of the frame that may begin here; 0 where none can, None while it has not come whole."""
+        """Length of the frame at the buffer's start; 0 if there can be none, None while it is incomplete."""
         if self._buffer[0] != HEADER or (len(self._buffer) > 1 and self._buffer[1] not in self._layouts):
             return 0
         if len(self._buffer) < 2 or len(self._buffer) < self._buffer[1] + 3:
@@ -233,7 +238,7 @@ class StreamDecoder:
         return self._buffer[1] + 3
 
     def _skip(self) -> None:
-        """One byte that begins no frame."""
+        """Skip one byte that begins no frame."""
         del self._buffer[0]
         self.bad += self._stretch % self._longest == 0
         self._stretch += 1
@@ -253,6 +258,6 @@ class StreamDecoder:
 
 
 def _struct(packets: Sequence[int]) -> struct.Struct:
-    """Of a frame's body: each packet's number, then its value."""
+    """Binary format of a frame's body: each packet's number, then its value."""
     kinds = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h"}
     return struct.Struct(">" + "".join("B" + kinds[PACKETS[i].size, PACKETS[i].signed] for i in packets))

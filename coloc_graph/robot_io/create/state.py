@@ -1,11 +1,11 @@
-"""What a Create's sensors say, in words and SI units: `CreateState`."""
+"""Sensor data of a Create in words and SI units; `CreateState`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from coloc_graph.robot_io.create.protocol import BumpDrop, Mode, Packet
 
-#: Where cliffs, dropped wheels and bumps may be.
+#: Positions of cliffs, dropped wheels and bumps.
 CLIFFS = {
     Packet.CLIFF_LEFT: "left",
     Packet.CLIFF_FRONT_LEFT: "front left",
@@ -15,7 +15,7 @@ CLIFFS = {
 DROPS = {BumpDrop.DROP_LEFT: "left", BumpDrop.DROP_RIGHT: "right", BumpDrop.DROP_CASTER: "caster"}
 _BUMPS = {BumpDrop.BUMP_LEFT: "left", BumpDrop.BUMP_RIGHT: "right"}
 
-#: What the driver streams from each model; a Create 1 is asked for `DELTAS` only now and then.
+#: Packets of the stream of each model; a Create 1 is asked for `DELTAS` only every `DELTA_PERIOD`.
 DELTAS = (Packet.DISTANCE, Packet.ANGLE)
 _COMMON = (
     Packet.BUMPS_DROPS, *CLIFFS, Packet.CHARGERS, Packet.MODE, Packet.CHARGING_STATE, Packet.VOLTAGE, Packet.CHARGE,
@@ -23,17 +23,34 @@ _COMMON = (
 )  # fmt: skip
 STREAMED: dict[int, tuple[Packet, ...]] = {1: _COMMON, 2: (*_COMMON, Packet.LEFT_TICKS, Packet.RIGHT_TICKS)}
 
-#: What a driver may be told to stop on.
+#: Hazards that a driver may be told to stop on.
 HAZARDS = ("bump", "cliff", "wheel_drop", "charger")
 
 
 @dataclass(frozen=True)
 class CreateState:
-    """One frame of the stream.
+    """Sensor data of one frame.
 
-    `time` [UTC s]; `bumps`, `cliffs` and `wheel_drops` name where ("left", "front right", "caster"); `charger` is
-    "home base", "internal" or None; `voltage` [V]; `charge` and `capacity` of the battery [Ah]; `requested` are the
-    speeds (left, right) that the robot last took [m/s]; `ticks` its encoder counts (left, right), None on a Create 1.
+    Attributes
+    ----------
+    time
+        Time of the frame [UTC s].
+    mode
+        Mode of the Open Interface.
+    bumps, cliffs, wheel_drops
+        Their positions: "left", "front right", "caster" and so on.
+    charger
+        "home base", "internal" or None.
+    charging
+        True while the battery charges.
+    voltage
+        Battery voltage [V].
+    charge, capacity
+        Charge and capacity of the battery [Ah].
+    requested
+        Speeds (left, right) of the last command that the robot took [m/s].
+    ticks
+        Encoder counts (left, right), None on a Create 1.
     """
 
     time: float
@@ -50,7 +67,7 @@ class CreateState:
     ticks: tuple[int, int] | None
 
     def hazards(self) -> dict[str, str]:
-        """Those of `HAZARDS` that are there, each with its words."""
+        """Present hazards: a description of each, by its name in `HAZARDS`."""
         words = {
             "bump": self.bumps and f"a bump on the {' and '.join(sorted(self.bumps))}",
             "cliff": self.cliffs and f"a cliff at the {' and '.join(sorted(self.cliffs))}",
@@ -61,7 +78,7 @@ class CreateState:
 
 
 def read_state(values: Mapping[int, int], time: float) -> CreateState:
-    """The state in the packets of one frame that came at `time` [UTC s]. `ValueError` for a mode that is none."""
+    """Read the state from the packets of a frame at `time` [UTC s]. Raises `ValueError` for an unknown mode."""
     bits, chargers = values[Packet.BUMPS_DROPS], values[Packet.CHARGERS]
     ticks = (values[Packet.LEFT_TICKS], values[Packet.RIGHT_TICKS]) if Packet.LEFT_TICKS in values else None
     return CreateState(

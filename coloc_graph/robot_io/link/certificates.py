@@ -1,6 +1,6 @@
-"""Certificates for a team's link: an authority of its own, and one certificate for the coordinator and each robot.
+"""Certificates for a team's link: an authority, and certificates of the coordinator and each robot.
 
-A set to begin with. Who runs an authority already has it sign certificates whose common names are the robots' names.
+With an authority of your own, have it sign certificates whose common names are the robots' names.
 """
 
 import datetime
@@ -16,27 +16,44 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from coloc_graph.errors import InputError
 from coloc_graph.robot_io.link.zenoh_config import COORDINATOR
 
-#: So long certificates are good for [days].
-GOOD_FOR = 365
+VALID_DAYS = 365  # days for which certificates are valid
 
 
-def make_certificates(folder: str | Path, robots: Sequence[str], days: int = GOOD_FOR) -> tuple[Path, ...]:
-    """Write ca.pem and, for the coordinator and each robot, NAME.pem and NAME.key into a folder; their paths.
+def make_certificates(folder: str | Path, robots: Sequence[str], days: int = VALID_DAYS) -> tuple[Path, ...]:
+    """Write the authority's ca.pem and ca.key, and NAME.pem and NAME.key of the coordinator and each robot.
 
-    The authority's own key is ca.key. Keys are readable by their owner only. Raises `InputError` where any of the files
-    is there already, or a robot is called as something else is.
+    Keys are readable by their owner only.
+
+    Parameters
+    ----------
+    folder
+        Folder to write into.
+    robots
+        Names of the robots.
+    days
+        Validity [days].
+
+    Returns
+    -------
+    tuple of Path
+        The files.
+
+    Raises
+    ------
+    InputError
+        If a file exists already, or a robot's name is reserved.
     """
     if taken := {"ca", COORDINATOR} & set(robots):
         raise InputError(f"a robot cannot be called `{min(taken)}`: give it another name in the team's description")
     if not 1 <= days <= 20 * 365:
-        raise InputError(f"certificates are good for a day to twenty years, not for {days} days")
+        raise InputError(f"certificates are valid for 1 to {20 * 365} days, not for {days}: give another --days")
     folder = Path(folder)
     names = (COORDINATOR, *robots)
     paths = tuple(folder / f"{name}.{kind}" for name in ("ca", *names) for kind in ("pem", "key"))
     if there := [path for path in paths if path.exists()]:
-        raise InputError(f"{there[0]} is there already, and is not replaced: give another folder, or remove it")
+        raise InputError(f"{there[0]} exists already and is not replaced: give another folder, or remove it")
     folder.mkdir(parents=True, exist_ok=True)
-    begin = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=1)  # for clocks that are a little late
+    begin = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=1)  # for clocks that are slightly behind
     end = begin + datetime.timedelta(days=days)
     ca_key = ec.generate_private_key(ec.SECP256R1())
     authority = _named("coloc-graph authority of a team")
@@ -67,7 +84,7 @@ def _begun(
     begin: datetime.datetime,
     end: datetime.datetime,
 ) -> x509.CertificateBuilder:
-    """What every certificate says."""
+    """Start a certificate with what all have in common."""
     return (
         x509.CertificateBuilder(issuer, subject, key.public_key(), x509.random_serial_number(), begin, end)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
@@ -99,5 +116,5 @@ def _write_pair(
 
 
 def _write_new(path: Path, data: bytes, mode: int) -> None:
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:  # never open to others
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:  # never readable by others
         file.write(data)

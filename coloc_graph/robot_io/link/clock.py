@@ -1,4 +1,4 @@
-"""How far a robot's clock is ahead of the coordinator's: four timestamps, bounds that hold for certain, and drift."""
+"""Offset of a robot's clock from the coordinator's: four timestamps, guaranteed bounds, drift; `ClockFilter`."""
 
 import math
 import threading
@@ -9,24 +9,28 @@ import numpy as np
 
 from coloc_graph.errors import RobotError
 
-#: So many exchanges are kept; fewer than `LEAST` do not synchronise.
-KEPT = 64
-LEAST = 8
-#: Drift of a quartz from one that is right (one sigma), before it is measured.
-QUARTZ = 40e-6
-#: What cannot be seen of an asymmetry: this share of the least round trip, and no less than this [ns].
-ASYMMETRY = 0.1
-FLOOR = 20_000.0
-#: An exchange that contradicts what is known by more than this [ns] is of a clock that jumped.
-JUMP = 1_000_000.0
-#: What was found holds for so long without a new exchange [ns].
-HOLDS = 5_000_000_000
+MAX_EXCHANGES = 64  # exchanges that are kept
+MIN_EXCHANGES = 8  # exchanges that are needed to be synchronised
+QUARTZ_DRIFT = 40e-6  # standard deviation of a quartz's drift [s/s], before it is measured
+ASYMMETRY = 0.1  # standard deviation of the network's unobservable asymmetry, as a fraction of the least round trip
+FLOOR = 20_000.0  # ns, least standard deviation of the offset
+JUMP = 1_000_000.0  # ns by which an exchange contradicts the estimate if the clock has jumped
+VALIDITY = 5_000_000_000  # ns for which the estimate holds without a new exchange
 
 
 @dataclass(frozen=True)
 class ClockEstimate:
-    """A robot's clock at an instant: `offset` [ns] that it is ahead of the coordinator's, `drift` (seconds a second),
-    and the standard deviation of the offset [ns]."""
+    """Estimate of a robot's clock at one time.
+
+    Attributes
+    ----------
+    offset
+        Robot's clock minus the coordinator's [ns].
+    drift
+        Rate of change of the offset [s/s].
+    sigma
+        Standard deviation of the offset [ns].
+    """
 
     offset: float
     drift: float
@@ -35,7 +39,7 @@ class ClockEstimate:
 
 @dataclass(frozen=True)
 class _Exchange:
-    """At `at` [ns, coordinator] the robot was ahead by at least `least` and at most `most` [ns]."""
+    """Bounds `least` and `most` of the offset [ns] at the time `at` [ns, coordinator]."""
 
     at: int
     least: int
@@ -44,7 +48,7 @@ class _Exchange:
 
 @dataclass(frozen=True)
 class _Fit:
-    """At `at` [ns, coordinator] the robot was ahead by `base + offset` [ns], with a drift; one sigma of each."""
+    """Offset `base + offset` [ns] at the time `at` [ns, coordinator], drift, and one sigma of each."""
 
     at: int
     base: int
@@ -61,24 +65,26 @@ class _Fit:
 
 
 class ClockFilter:
-    """What is known of one robot's clock; for several threads.
+    """Estimator of one robot's clock offset; for several threads.
 
-    An exchange is: the coordinator asked at t1 and heard at t4, the robot heard at t2 and answered at t3, each by its
-    own clock [ns]. The robot is ahead by no less than t3 - t4 and no more than t2 - t1, whatever the network does: of
-    many exchanges the narrowest of these bounds hold, moved by the drift to the newest, and the offset is halfway
-    between them. A clock that leaves the bounds has jumped, and what was known of it is void.
+    Notes
+    -----
+    In an exchange the coordinator asks at t1 and receives the answer at t4, the robot receives at t2 and answers at t3,
+    each by its own clock [ns]. The offset is at least t3 - t4 and at most t2 - t1, whatever the network does. Of many
+    exchanges the narrowest bounds hold, moved by the drift to the newest, and the offset is halfway between them. If an
+    exchange contradicts the bounds, the clock has jumped, and earlier exchanges are discarded.
     """
 
     def __init__(self) -> None:
-        self._kept: deque[_Exchange] = deque(maxlen=KEPT)
+        self._kept: deque[_Exchange] = deque(maxlen=MAX_EXCHANGES)
         self._fit: _Fit | None = None
         self._jumps = 0
         self._lock = threading.Lock()
 
     def add(self, t1: int, t2: int, t3: int, t4: int) -> None:
-        """Take in an exchange. `ValueError` for one that cannot have been."""
+        """Add an exchange [ns]. Raises `ValueError` if it is impossible."""
         if t4 < t1 or t3 < t2 or (t4 - t1) < (t3 - t2):
-            raise ValueError("an exchange whose answer came before its question")
+            raise ValueError("an answer was received before its question was sent")
         one = _Exchange((t1 + t4) // 2, least=t3 - t4, most=t2 - t1)
         with self._lock:
             if self._kept and one.at < self._kept[-1].at:
@@ -94,38 +100,38 @@ class ClockFilter:
 
     @property
     def jumps(self) -> int:
-        """How often the clock jumped."""
+        """Number of times that the clock jumped."""
         return self._jumps
 
     @property
     def known(self) -> bool:
-        """Whether anything is known of it, though not how well."""
+        """True after the first exchange, however uncertain the offset is."""
         return self._fit is not None
 
     def estimate(self, at: int) -> ClockEstimate | None:
-        """How far it is ahead at an instant of the coordinator's clock [ns]; None where nothing is known."""
+        """Estimate at a time of the coordinator's clock [ns]; None before the first exchange."""
         fit = self._fit
         return None if fit is None else fit.estimate(at)
 
     def synchronised(self, at: int, limit: float = 1e-3) -> bool:
-        """Whether it is known to `limit` [s] (one sigma) at an instant of the coordinator's clock [ns]."""
+        """Return whether the offset is known to `limit` [s, one sigma] at a time of the coordinator's clock [ns]."""
         with self._lock:
-            fit, enough = self._fit, len(self._kept) >= LEAST
-        return fit is not None and enough and at - fit.at < HOLDS and fit.estimate(at).sigma <= 1e9 * limit
+            fit, enough = self._fit, len(self._kept) >= MIN_EXCHANGES
+        return fit is not None and enough and at - fit.at < VALIDITY and fit.estimate(at).sigma <= 1e9 * limit
 
     def to_coordinator(self, stamp: int) -> int:
-        """An instant of the robot's clock by the coordinator's [ns]; `RobotError` before the first exchange."""
+        """Convert a robot's time to the coordinator's [ns]. Raises `RobotError` before the first exchange."""
         fit = self._known_fit()
         return fit.at + round((stamp - fit.at - fit.base - fit.offset) / (1 + fit.drift))
 
     def to_robot(self, instant: int) -> int:
-        """An instant of the coordinator's clock by the robot's [ns]; `RobotError` before the first exchange."""
+        """Convert a coordinator's time to the robot's [ns]. Raises `RobotError` before the first exchange."""
         fit = self._known_fit()
         return instant + fit.base + round(fit.offset + fit.drift * (instant - fit.at))
 
     def _known_fit(self) -> _Fit:
         if self._fit is None:
-            raise RobotError("nothing is known of the robot's clock yet: wait until its link is up")
+            raise RobotError("the robot's clock is not known yet: wait until its link is up")
         return self._fit
 
 
@@ -143,16 +149,16 @@ def _fitted(kept: list[_Exchange]) -> _Fit:
     sixth = min(5, len(kept) - 1)
     blunt = math.hypot(least[0] - least[sixth], most[sixth] - most[0]) / 4
     sigma = math.hypot(FLOOR, ASYMMETRY * width, blunt)
-    if len(kept) < LEAST or width < 0:
+    if len(kept) < MIN_EXCHANGES or width < 0:
         sigma = max(sigma, abs(width) / 2)
     return _Fit(last, base, float(least[0] + most[0]) / 2, drift, sigma, drift_sigma)
 
 
 def _drift(age: np.ndarray, middle: np.ndarray, trip: np.ndarray) -> tuple[float, float]:
-    """The slope of a line through all exchanges, each weighed by what it may be off; all in ns, one sigma."""
+    """Slope [s/s] and its sigma of a line through all exchanges, weighted by their possible errors [ns]."""
     sigma = FLOOR + (trip - trip.min()) / 2  # what a trip was longer by, it may have been one way
     A = np.column_stack([np.ones_like(age), -age]) / sigma[:, None]
     near = middle[np.argmin(trip)]
-    information = A.T @ A + np.diag([0.0, 1 / QUARTZ**2])
+    information = A.T @ A + np.diag([0.0, 1 / QUARTZ_DRIFT**2])
     covariance = np.linalg.inv(information)
     return float((covariance @ (A.T @ ((middle - near) / sigma)))[1]), float(math.sqrt(covariance[1, 1]))

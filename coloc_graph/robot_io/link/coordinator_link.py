@@ -38,6 +38,7 @@ from coloc_graph.robot_io.link.messages import (
     encode,
     is_session,
 )
+from coloc_graph.robot_io.link.recovery import Recovery
 from coloc_graph.robot_io.link.robot_inbox import RobotInbox
 from coloc_graph.robot_io.link.session import KEPT_KINDS, URGENT, LinkSession, on_receiving_thread, robot_of, session_of
 from coloc_graph.robot_io.link.zenoh_config import Tls, config_of
@@ -47,9 +48,6 @@ M = TypeVar("M", bound=msgspec.Struct)
 Clock = Callable[[], int]
 
 CLOCK_PERIOD = 0.1  # s between two comparisons of a robot's clock with ours
-RECOVERY_PERIOD = 0.2  # s between two requests for missing messages
-NEWEST_PERIOD = 1.0  # s without a message of a kind after which the newest one is requested
-RECOVERY_TIMEOUT = 5.0  # s that a request for missing messages may take
 COMMAND_PERIOD = 0.25  # s, at least, until a command that is not answered is sent again
 SESSION_PERIOD = 0.02  # s, the same while the robot's session is not known, or nobody answers its key
 WAITING_PERIOD = 0.02  # s, at most, between two calls of `waiting` while answers are awaited
@@ -136,13 +134,14 @@ class CoordinatorLink:
         except BaseException:
             self._session.close()
             raise
-        self._threads = [threading.Thread(target=self._compare_clocks, name="clocks", daemon=True)]
-        self._threads += [
-            threading.Thread(target=self._recover, args=(name,), name=f"recovery of {name}", daemon=True)
-            for name in team.names
-        ]
-        for thread in self._threads:
-            thread.start()
+        self._clock_thread = threading.Thread(target=self._compare_clocks, name="clocks", daemon=True)
+        self._clock_thread.start()
+        receivers: dict[type, Callable[[zenoh.Sample], None]] = {
+            type_: self._receiver(type_, requested=True) for type_ in KEPT_KINDS.values()
+        }
+        self._recoveries = {
+            name: Recovery(name, inbox, self._lock, session, receivers) for name, inbox in self._inboxes.items()
+        }
 
     def __enter__(self) -> Self:
         return self
@@ -156,8 +155,9 @@ class CoordinatorLink:
         """Close the link."""
         self._ended.set()
         until = time.monotonic() + 2.0
-        for thread in self._threads:
-            thread.join(max(until - time.monotonic(), 0.0))
+        self._clock_thread.join(2.0)
+        for recovery in self._recoveries.values():
+            recovery.end(max(until - time.monotonic(), 0.0))
         self._session.close()
 
     @property
@@ -295,61 +295,6 @@ class CoordinatorLink:
                     self._counter.add("unknown")
 
         return take
-
-    def _recover(self, robot: str) -> None:
-        """Thread that requests a robot's missing messages until they have come or are lost."""
-        inbox = self._inboxes[robot]
-        while not self._ended.wait(0.0 if self._recovered(robot) else RECOVERY_PERIOD):
-            # where the last message of a kind was lost no later one tells of the gap: the newest is requested
-            for type_ in KEPT_KINDS.values():
-                quiet = time.monotonic() - inbox.last_taken.get(type_, 0.0) > NEWEST_PERIOD
-                if quiet and inbox.present and inbox.session == inbox.in_charge is not None:
-                    self._request(robot, type_, "_max=1")
-                    inbox.last_taken[type_] = time.monotonic()
-
-    def _recovered(self, robot: str) -> bool:
-        """Request each gap once; return True if a gap has become smaller, and something is still missing."""
-        inbox = self._inboxes[robot]
-        with self._lock:
-            session, gaps = inbox.session, inbox.missing()
-        more = False
-        for type_, first, last in gaps:
-            if session is None or not inbox.present:
-                break
-            answered = self._request(robot, type_, f"_sn={first}..{last}")
-            with self._lock:
-                if answered and inbox.present:
-                    inbox.answered(session, type_, first, last)
-                left = [one for kind, one, _ in inbox.missing() if kind is type_]
-                more |= bool(left) and left[0] != first
-        return more
-
-    def _request(self, robot: str, type_: type[M], which: str) -> bool:
-        """Have a robot send some of its kept messages again.
-
-        Returns
-        -------
-        bool
-            True if the robot answered. No message at all is an answer only if its newest message comes on request:
-            a robot that cannot be reached sends none either.
-        """
-        kind = next(kind for kind, one in KEPT_KINDS.items() if one is type_)
-        take, count = self._receiver(type_, requested=True), 0
-        try:
-            replies = self._session.zenoh.get(
-                f"coloc/{robot}/{kind}/@adv/pub/**?{which}",
-                timeout=RECOVERY_TIMEOUT,
-                accept_replies=zenoh.ReplyKeyExpr.ANY,
-                consolidation=zenoh.ConsolidationMode.NONE,
-            )
-            for one in replies:
-                if one.ok is None:
-                    return False
-                take(one.ok)
-                count += 1
-        except zenoh.ZError:
-            return False
-        return count > 0 or (which != "_max=1" and self._request(robot, type_, "_max=1"))
 
     def _take_presence(self, sample: zenoh.Sample) -> None:
         robot, session = robot_of(sample), session_of(sample)

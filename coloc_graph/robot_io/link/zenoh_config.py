@@ -1,4 +1,4 @@
-"""How zenoh is set up: peers without scouting, one that listens, TLS with certificates and rules of who may what."""
+"""Configuration of zenoh: peers without scouting, TLS with certificates, access rules; `config_of`."""
 
 import ipaddress
 import json
@@ -14,17 +14,15 @@ from coloc_graph.errors import InputError
 
 log = logging.getLogger(__name__)
 
-#: The coordinator's name, as robots have theirs.
-COORDINATOR = "coordinator"
-#: A link that is silent for so long is lost [ms]; one that is lost is dialled again after [ms].
-LEASE = 2000
-REDIAL = 200
-REDIAL_AT_MOST = 1000
+COORDINATOR = "coordinator"  # the coordinator's name in keys and certificates
+LEASE = 2000  # ms of silence after which a link is lost
+REDIAL = 200  # ms until a lost link is dialled again for the first time
+MAX_REDIAL = 1000  # ms, at most, between two attempts
 
 
 @dataclass(frozen=True)
 class Tls:
-    """Files of one end: the team's certificate authority, its own certificate and private key (PEM)."""
+    """PEM files of one end: the team's certificate authority, its own certificate and private key."""
 
     ca: Path
     certificate: Path
@@ -32,7 +30,7 @@ class Tls:
 
 
 def tls_of(folder: str | Path, name: str) -> Tls:
-    """The certificates of one end in a folder that `coloc certificates` made."""
+    """Certificates of one end in a folder made by `coloc certificates`."""
     folder = Path(folder)
     return Tls(folder / "ca.pem", folder / f"{name}.pem", folder / f"{name}.key")
 
@@ -45,9 +43,25 @@ def config_of(
     robots: Sequence[str] = (),
     exposed: bool = False,
 ) -> zenoh.Config:
-    """The configuration of the end that listens, to the team's `robots`, or of a robot's, which connects.
+    """Configuration of zenoh for one end of the link.
 
-    Raises `InputError` for an address that is none, or that others reach without certificates, unless `exposed`.
+    Parameters
+    ----------
+    listen
+        Address that the coordinator listens on.
+    connect
+        Address that a robot connects to.
+    tls
+        Certificates of this end.
+    robots
+        Names of the team's robots, for the coordinator's access rules.
+    exposed
+        Accept connections from other machines without certificates.
+
+    Raises
+    ------
+    InputError
+        If the address is not valid, or other machines could connect without certificates.
     """
     address = listen or connect
     if address is None:
@@ -58,10 +72,10 @@ def config_of(
     if listen is not None and tls is None and not _is_loopback(listen):
         if not exposed:
             raise InputError(
-                f"{listen} is reached by others, who could steer the robots: make certificates with `coloc "
-                "certificates` and give them with --tls, or say --exposed on a network that you trust"
+                f"{listen} can be reached from other machines, which could steer the robots: make certificates with "
+                "`coloc certificates` and give them with --tls, or say --exposed on a network that you trust"
             )
-        log.warning("whoever reaches %s can see and steer the robots: it has no certificates", listen)
+        log.warning("anyone who reaches %s can see and steer the robots: it has no certificates", listen)
     settings: dict[str, Any] = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
@@ -73,7 +87,7 @@ def config_of(
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
         "connect/retry": {
-            "period_init_ms": REDIAL, "period_max_ms": REDIAL_AT_MOST, "period_increase_factor": 1.5,
+            "period_init_ms": REDIAL, "period_max_ms": MAX_REDIAL, "period_increase_factor": 1.5,
         },
     }  # fmt: skip
     if tls is not None:
@@ -85,18 +99,18 @@ def config_of(
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
-            raise InputError(f"{address} is no address of a link ({error}); give tcp/HOST:PORT") from error
+            raise InputError(f"{address} is not a valid address of a link ({error}); give tcp/HOST:PORT") from error
     return config
 
 
 def _tls_settings(tls: Tls) -> dict[str, Any]:
     for file in (tls.ca, tls.certificate, tls.key):
         if not file.is_file():
-            raise InputError(f"{file} is not there: make certificates with `coloc certificates`")
+            raise InputError(f"{file} does not exist: make certificates with `coloc certificates`")
     settings: dict[str, Any] = {
         "transport/link/tls/root_ca_certificate": str(tls.ca),
         "transport/link/tls/enable_mtls": True,
-        # who it is is told by the certificate's common name, in the rules below, not by an address
+        # an end is identified by its certificate's common name, in the rules below, not by its address
         "transport/link/tls/verify_name_on_connect": False,
         "transport/link/tls/close_link_on_expiration": True,
     }
@@ -107,7 +121,7 @@ def _tls_settings(tls: Tls) -> dict[str, Any]:
 
 
 def _keys(who: str) -> list[str]:
-    """All keys below, with those of caches and heartbeats, which wildcards leave out."""
+    """All keys below a name, with those of caches and heartbeats, which wildcards do not match."""
     return [f"coloc/{who}/**", f"coloc/{who}/**/@adv/**"]
 
 
@@ -117,13 +131,13 @@ def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) ->
     }  # fmt: skip
 
 
-#: What who has something to say sends, and what who wants to know sends.
+#: Kinds of zenoh messages that publish, and that subscribe.
 _TELLS = ("put", "delete", "declare_queryable", "reply", "liveliness_token")
 _ASKS = ("declare_subscriber", "query", "liveliness_query", "declare_liveliness_subscriber")
 
 
 def _rules_of_coordinator(robots: Sequence[str]) -> dict[str, Any]:
-    """A robot, by its certificate's common name, may publish and answer only as itself, and hears what is for it."""
+    """Access rules: a robot, by its certificate's common name, publishes, answers and hears under its own keys."""
     rules: list[dict[str, Any]] = []
     policies = []
     asks = [*_ASKS[:1], *_ASKS[2:]]
@@ -149,7 +163,7 @@ def _rules_of_coordinator(robots: Sequence[str]) -> dict[str, Any]:
 
 _SAID_TO_ALL = ("the coordinator asks", "the coordinator is there")
 
-#: Only who has the coordinator's certificate is obeyed, and told anything.
+#: A robot accepts messages from, and sends messages to, the coordinator's certificate only.
 _RULES_OF_ROBOT = {
     "enabled": True,
     "default_permission": "deny",
@@ -163,7 +177,9 @@ def _require_address(address: str, tls: Tls | None) -> None:
     protocol, _, place = address.partition("/")
     host, _, port = place.rpartition(":")
     if protocol not in ("tcp", "tls") or not host or not port.isdecimal() or int(port) > 65535:
-        raise InputError(f"`{address}` is no address of a link; give tcp/HOST:PORT, or tls/HOST:PORT with certificates")
+        raise InputError(
+            f"`{address}` is not a valid address of a link; give tcp/HOST:PORT, or tls/HOST:PORT with certificates"
+        )
     if (protocol == "tls") != (tls is not None):
         raise InputError(f"{address} and certificates belong together: give tls/HOST:PORT with --tls, or neither")
 
