@@ -1,6 +1,5 @@
 """Corners of a board in images, to a fraction of a pixel."""
 
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,13 +11,12 @@ from numpy.typing import NDArray
 
 from coloc_graph.calibration.board import Board, charuco_board
 from coloc_graph.errors import InputError
-from coloc_graph.input_file import read_bytes
-from coloc_graph.run.image_header import read_image_header, too_large
+from coloc_graph.image_file import image_paths as image_paths
+from coloc_graph.image_file import range_of, read_image, to_8_bits, to_grey
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-KINDS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 #: A corner is sought in a window of this part of the way to its neighbour, at most so many pixels to each side: a
 #: larger one sees the neighbour's edges (11 px on squares of 13 px: 0.58 px RMS instead of 0.16).
 WINDOW = 0.45
@@ -53,27 +51,6 @@ class Views:
         return len(self.views) + len(self.missed)
 
 
-def image_paths(given: Sequence[str | Path]) -> list[Path]:
-    """Image files, and those in folders, by name with numbers as numbers; `InputError` where there are none."""
-    paths: list[Path] = []
-    for one in map(Path, given):
-        if one.is_dir():
-            inside = sorted((p for p in one.iterdir() if p.suffix.lower() in KINDS), key=_natural)
-            if not inside:
-                raise InputError(f"{one} holds no images ({' '.join(KINDS)}); give the folder of the images, or files")
-            paths += inside
-        elif not one.is_file():
-            raise InputError(f"{one}: there is no such image; give image files, or a folder of them")
-        else:
-            paths.append(one)
-    known: set[Path] = set()
-    for path in paths:
-        if path.resolve() in known:
-            raise InputError(f"{path} is given twice, and would count twice; give each image once")
-        known.add(path.resolve())
-    return paths
-
-
 def find_boards(
     paths: Sequence[Path], board: Board, progress: Callable[[int, int], None] | None = None
 ) -> tuple[Views, Board]:
@@ -81,7 +58,8 @@ def find_boards(
 
     Raises `InputError` where an image cannot be read, where sizes differ, and where no image shows the board.
     """
-    images = [(path, read_image(path)) for path in paths]
+    values = range_of(paths, read_image(paths[0]))
+    images = [(path, to_grey(to_8_bits(read_image(path), values))) for path in paths]
     height, width = images[0][1].shape
     for path, image in images:
         if image.shape != (height, width):
@@ -148,24 +126,6 @@ def _refined(image: Image, points: Array, uv: NDArray[np.float32], square: float
     return np.asarray(cv2.cornerSubPix(smooth, uv[:, None].copy(), (half, half), (-1, -1), until), float).reshape(-1, 2)
 
 
-def read_image(path: Path) -> Image:
-    """The grey values of an image file; `InputError` where it is none."""
-    # a camera's pixels are where its sensor has them, whatever a file says about how to hold it
-    data = read_bytes(path, "leave it out, or give it anew")
-    header = read_image_header(data)
-    why = too_large(header, data) if header is not None else None
-    if why is not None:
-        raise InputError(f"{path}: {why}; leave it out, or make it smaller")
-    try:
-        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except (cv2.error, MemoryError):
-        image = None
-    if image is None:
-        raise InputError(f"{path}: cannot be read as an image; leave it out, or give it anew")
-    return np.asarray(image, np.uint8)
-
-
 def _remedy(images: Sequence[Image], board: Board) -> str:
     """What to try where a board is not found: another size that is seen, or the usual."""
     for other in _others(board):
@@ -194,7 +154,3 @@ def _others(board: Board) -> Iterator[Board]:
     for columns, rows in ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1)):
         if min(board.columns + columns, board.rows + rows) >= 3:
             yield replace(board, columns=board.columns + columns, rows=board.rows + rows)
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    return [(int(word), "") if word.isdigit() else (-1, word) for word in re.split(r"(\d+)", path.name)]

@@ -1,4 +1,4 @@
-"""coloc import tracks TEAM.toml TRACKS.csv, mrclam DIR or ros BAG MAP.toml --out RUN."""
+"""coloc import images TEAM.toml A=SOURCE B=SOURCE, tracks TEAM.toml TRACKS.csv, mrclam DIR or ros BAG MAP.toml."""
 
 import argparse
 
@@ -30,6 +30,29 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     ros.add_argument("--json", action="store_true")
     add_out(ros)
     ros.set_defaults(run=run_ros)
+    images = kinds.add_parser("images", help="your own recording: a folder, a glob or a video of images a robot")
+    images.add_argument("team", metavar="TEAM.toml")
+    images.add_argument(
+        "sources", nargs="+", metavar="ROBOT=SOURCE", help="as A=images/A B='images/*/B/*.png' or A=a.mp4"
+    )
+    images.add_argument("--times", metavar="CSV", help="time of each image [UTC s]: robot,file,time")
+    images.add_argument("--fps", type=float, help="images a second (default of a video: its container's times)")
+    images.add_argument(
+        "--time-pattern", metavar="NAME", help="time in the images' names, as 'frame_{ms}': s, ms, us, ns"
+    )
+    images.add_argument(
+        "--stances",
+        metavar="CSV",
+        help="stance,start,end,observers,movers,anchors (default: found by whose background is still)",
+    )
+    images.add_argument(
+        "--image-format",
+        choices=("jpeg", "png", "raw"),
+        default="png",
+        help="of images that cannot be kept as they are (default: png)",
+    )
+    add_out(images)
+    images.set_defaults(run=run_images)
 
 
 def run_mrclam(args: argparse.Namespace) -> int:
@@ -83,4 +106,35 @@ def run_ros(args: argparse.Namespace) -> int:
     print(f"{args.out}: {counts}; {counted(summary.stances, 'stance')}, observers {', '.join(summary.observers)}")
     for robot, (stood, known) in summary.stood.items():
         print(f"{robot} stood {stood:.1f} of {known:.1f} s")
+    return 0
+
+
+def run_images(args: argparse.Namespace) -> int:
+    """Import images and print what was found."""
+    from coloc_graph.cli.printing import counted, progress
+    from coloc_graph.exchange.images import import_images
+
+    require_run_place(args.out, force=args.force)
+    with progress("images imported") as report:
+        summary = import_images(
+            args.team,
+            args.sources,
+            args.out,
+            times=args.times,
+            fps=args.fps,
+            time_pattern=args.time_pattern,
+            stances=args.stances,
+            image_format=args.image_format,
+            progress=report,
+        )
+    images = ", ".join(f"{count} of {robot}" for robot, count in summary.images.items())
+    print(f"{args.out}: images {images}; {counted(len(summary.stances), 'stance')}")
+    for robot, (stood, known) in summary.stood.items():
+        print(f"{robot} stood {stood:.1f} of {known:.1f} s")
+    for one in summary.stances:
+        anchors = f", {' '.join(one.anchors)} stayed" if one.anchors else ""
+        print(
+            f"stance {one.index}: {one.start:.2f} to {one.end:.2f} s, {' '.join(one.observers)} watch "
+            f"{' '.join(one.movers)}{anchors}"
+        )
     return 0

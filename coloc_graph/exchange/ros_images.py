@@ -8,7 +8,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.errors import InputError
 from coloc_graph.exchange.ros_bag import COMPRESSED_IMAGE, Bag, BagMessage
+from coloc_graph.image_file import decode_image, to_8_bits
 from coloc_graph.input_file import quoted
 from coloc_graph.run import EncodedImage, Image
 from coloc_graph.run.image_header import read_image_header, too_large
@@ -58,16 +60,17 @@ def image_of(bag: Bag, message: BagMessage, robot: str, time: float, camera: Cam
         if why := too_large(header, data):
             raise bag.error(message, f"{why}; record smaller images")
         try:
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except (cv2.error, MemoryError):
-            pixels = None
-        if pixels is None:
-            raise bag.error(message, f"is a {image_format} that is damaged; record the bag again")
-        if pixels.dtype != np.uint8 or not (pixels.ndim == 2 or pixels.shape[2] == 3):
+            decoded = decode_image(data, image_format)
+        except InputError:
+            raise bag.error(message, f"is a {image_format} that is damaged; record the bag again") from None
+        pixels = decoded.pixels
+        if pixels.dtype != np.uint8:  # of how many bits the sensor is one message does not tell
             raise bag.error(
                 message, f"is a {image_format} of {pixels.dtype} {pixels.shape}; record 8 bits, grey or colour"
             )
         _require_size(bag, message, pixels.shape, camera)
+        if not decoded.unchanged:
+            return Image(robot, time, to_8_bits(decoded))
         return EncodedImage(robot, time, image_format, data)
     pixels = _pixels(bag, message, found)
     _require_size(bag, message, pixels.shape, camera)

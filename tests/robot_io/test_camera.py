@@ -124,7 +124,7 @@ def test_what_is_no_video_is_refused(tmp_path, make, words):
 def test_an_image_that_cannot_be_read_is_named(tmp_path):
     cv2.imwrite(str(tmp_path / "0.png"), picture(0))
     (tmp_path / "1.png").write_bytes(b"not a PNG")
-    with open_camera(f"video:{tmp_path}", CAMERA, "A") as source, pytest.raises(CameraError, match=r"1\.png cannot"):
+    with open_camera(f"video:{tmp_path}", CAMERA, "A") as source, pytest.raises(CameraError, match=r"1\.png: cannot"):
         for _ in range(2):
             source.read()
 

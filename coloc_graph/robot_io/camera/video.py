@@ -8,12 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.errors import CameraError
+from coloc_graph.errors import CameraError, InputError
+from coloc_graph.image_file import images_in, range_of, read_image, to_8_bits, to_grey
 from coloc_graph.robot_io.camera.source import WAIT, Clock, Frame
 from coloc_graph.team import Camera
-
-#: What a folder's images end with.
-IMAGES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff")
 
 
 class Video:
@@ -32,16 +30,18 @@ class Video:
         self._began, self._number = time.monotonic(), 0
 
     def _of_folder(self, folder: Path) -> Iterator[NDArray[np.uint8]]:
-        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
-        if not paths:
-            raise CameraError(f"{self._name} cannot be opened: {folder} holds no images ({', '.join(IMAGES)})")
+        try:
+            paths = images_in(folder)
+            values = range_of(paths, read_image(paths[0]))
+        except InputError as error:
+            raise CameraError(f"{self._name} cannot be opened: {error}") from error
 
         def images() -> Iterator[NDArray[np.uint8]]:
             for path in paths:
-                image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-                if image is None:
-                    raise CameraError(f"{self._name}: {path} cannot be read as an image; take it out of the folder")
-                yield np.asarray(image, np.uint8)
+                try:
+                    yield to_grey(to_8_bits(read_image(path), values))
+                except InputError as error:
+                    raise CameraError(f"{self._name}: {error}") from error
 
         return images()
 
@@ -56,7 +56,7 @@ class Video:
                 there, image = capture.read()
                 if not there:
                     return
-                yield np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image, np.uint8)
+                yield to_grey(np.asarray(image, np.uint8))
 
         return images()
 
