@@ -102,7 +102,7 @@ def measured(fps: float, speed: float, width: int, seed: int) -> dict[str, objec
                               "within": one.within, "unusable": made.homography.unusable}  # fmt: skip
     if made.relative_pose is not None:
         T_i_j = np.linalg.inv(floor_pose(*POSES[0])) @ floor_pose(*POSES[1])
-        off = np.linalg.inv(T_i_j) @ made.relative_pose.T_i_j.matrix()
+        off = np.linalg.inv(T_i_j) @ made.relative_pose.T_i_j
         row["error_m"] = float(np.linalg.norm(off[:2, 3]))
         row["error_deg"] = float(np.rad2deg(abs(np.arctan2(off[1, 0], off[0, 0]))))
     return row

@@ -99,7 +99,7 @@ def test_a_stance_that_the_causal_tracker_cannot_follow_is_measured():
     assert measured.homography.unusable is None
     assert measured.homography.inliers > 70
     T_i_j = np.linalg.inv(floor_pose(*POSES[0])) @ floor_pose(*POSES[1])
-    off = np.linalg.inv(T_i_j) @ measured.relative_pose.T_i_j.matrix()
+    off = np.linalg.inv(T_i_j) @ measured.relative_pose.T_i_j
     assert np.linalg.norm(off[:2, 3]) < 0.015
     assert {track.mover for side in measured.tracks for track in side} == {"C"}
 
