@@ -14,8 +14,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.geometry.lie import hat, rotation_x, rotation_y, rotation_z, sl3_vee
-from coloc_graph.team import R_BODY_OPTICAL, Markers, Mount
+from coloc_graph.geometry.lie import hat, sl3_vee
+from coloc_graph.geometry.mounting import camera_rotation, roll_axis, tilt_axis
+from coloc_graph.team import Markers, Mount
 
 Array = NDArray[np.float64]
 
@@ -58,34 +59,33 @@ class Mounts:
     """`T_body_camera` of n mounts that are off by (n, 3) of height, tilt, roll, and what these do to the cameras."""
 
     def __init__(self, mounts: Sequence[Mount]) -> None:
-        yaw, self._tilt, self._roll = np.deg2rad([[m.yaw_deg, m.tilt_deg, m.roll_deg] for m in mounts]).T
-        self._R_yaw = rotation_z(yaw)
+        self._yaw, self._tilt, self._roll = np.deg2rad([[m.yaw_deg, m.tilt_deg, m.roll_deg] for m in mounts]).T
         self._t: Array = np.array([(m.x, m.y, m.height) for m in mounts])
 
     def at(self, errors: Array) -> "MountedCameras":
         """The cameras of mounts that are off by `errors` (n, 3)."""
-        R_ro = rotation_x(self._roll + errors[:, 2]) @ R_BODY_OPTICAL
+        tilt, roll = self._tilt + errors[:, 1], self._roll + errors[:, 2]
         t = self._t.copy()
         t[:, 2] += errors[:, 0]
-        return MountedCameras(self._R_yaw @ rotation_y(self._tilt + errors[:, 1]) @ R_ro, t, R_ro)
+        return MountedCameras(camera_rotation(self._yaw, tilt, roll), t, tilt_axis(roll))
 
 
 @dataclass(frozen=True, eq=False)
 class MountedCameras:
-    """Where cameras are in their bodies: `R` (n, 3, 3) and `t` (n, 3) [m] of T_body_camera, `R_ro` that of roll and
-    optics."""
+    """Cameras in their bodies: `R` (n, 3, 3) and `t` (n, 3) [m] of T_body_camera, and the axis of tilt in the camera
+    frame, `tilt_axis` (n, 3)."""
 
     R: Array
     t: Array
-    R_ro: Array
+    tilt_axis: Array
 
     @property
     def by_errors(self) -> Array:
         """The cameras' tangents (n, 6, 3) by the mounts' errors."""
         out = np.zeros((len(self.t), 6, 3))
         out[:, 3:, 0] = self.R[:, 2]
-        out[:, :3, 1] = self.R_ro[:, 1]
-        out[:, :3, 2] = R_BODY_OPTICAL[0]
+        out[:, :3, 1] = self.tilt_axis
+        out[:, :3, 2] = roll_axis()
         return out
 
     @property

@@ -21,7 +21,8 @@ from coloc_graph.calibration.fusion import Said, disagreement, fuse, fuse_scaled
 from coloc_graph.calibration.residuals import noise_and_shared
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.geometry.lie import so3_exp
-from coloc_graph.team import R_BODY_OPTICAL, Camera, Floor, Mount
+from coloc_graph.geometry.mounting import tilt_and_roll
+from coloc_graph.team import Camera, Floor, Mount
 
 Array = NDArray[np.float64]
 
@@ -206,11 +207,7 @@ def _height_tilt_roll(R: Array, t: Array, thickness: float) -> Array:
     distance = float(up @ -t)
     if distance < 0:  # a board's z is up or down as its corners are counted; the camera is above it
         up, distance = -up, -distance
-    # R_body_camera.T @ z for the order tilt, roll is (-sin t, sin r cos t, cos r cos t) in axes of the body
-    x, y, z = R_BODY_OPTICAL @ up
-    if z <= 0:
-        raise ValueError("upside down")
-    return np.array([distance + thickness, math.asin(-x), math.atan2(y, z)])
+    return np.array([distance + thickness, *tilt_and_roll(up)])
 
 
 def _derivative(of: Callable[[Array], Array], size: int) -> Array:

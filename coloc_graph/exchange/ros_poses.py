@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from coloc_graph.errors import BagError
 from coloc_graph.exchange.ros_map import OdometrySigmas
 from coloc_graph.geometry.lie import se3
+from coloc_graph.geometry.se2 import wrap
 
 Array = NDArray[np.float64]
 
@@ -54,7 +55,7 @@ def stated_increments(poses: ArrayLike, sigmas: OdometrySigmas) -> Array:
     sample is zero.
     """
     steps = np.diff(np.asarray(poses, float), axis=0, prepend=np.asarray(poses, float)[:1])
-    way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(np.remainder(steps[:, 2] + np.pi, 2 * np.pi) - np.pi)
+    way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(wrap(steps[:, 2]))
     variances = np.stack(
         [sigmas.along**2 * way, sigmas.across**2 * way, sigmas.turned**2 * turn + sigmas.veer**2 * way], axis=1
     )

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.geometry.se2 import wrap
+
 Array = NDArray[np.float64]
 
 LONGEST_DELAY = 3.0  # delays are looked for up to this [s]
@@ -60,7 +62,7 @@ def sensor_delay(
         world = before[:, :2] + np.stack([c * point[:, 0] - s * point[:, 1], s * point[:, 0] + c * point[:, 1]], axis=1)
         off = world - after[:, :2]
         expected = np.arctan2(off[:, 1], off[:, 0]) - after[:, 2]
-        residuals.append(np.remainder(bearings[second] - expected + np.pi, 2 * np.pi) - np.pi)
+        residuals.append(wrap(bearings[second] - expected))
         turns.append(np.abs(after[:, 2] - before[:, 2]))
     turning = np.max(turns, axis=0) > LEAST_TURN
     if turning.sum() < FEWEST_PAIRS:

@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.frontend.homography.eq2_pose import mounted, turned_normal
+from coloc_graph.frontend.homography.eq2_pose import turned_normal
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.correspondence import pair_by_time
 from coloc_graph.frontend.tracks.marker_pairs import couple_of
 from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.geometry.lie import across, floor_pose, so3_exp
+from coloc_graph.geometry.se2 import wrap
 from coloc_graph.measurements import Plane, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.team import Markers, Robot
@@ -152,7 +153,7 @@ def _on_floor(observer: Robot, plane: Plane, uv: Array, errors: Array = _NO_ERRO
     height, tilt, roll.
     """
     n, m, _ = uv.shape
-    T_body_camera = mounted(observer.mount, errors[:, 3:])
+    T_body_camera = observer.mount.off_by(errors[:, 3:])
     N = turned_normal(plane, observer.mount, T_body_camera)
     sides = across(plane.N)
     N = (so3_exp(errors[:, :2] @ sides) @ N[..., None])[..., 0]
@@ -193,7 +194,7 @@ def _pose(observer: Robot, markers: Markers, plane: Plane, uv: Array, noise: Arr
     mx, my = model.mean(axis=0)
     xy = places.mean(axis=1) - np.stack([c * mx - s * my, s * mx + c * my], axis=1)
     # differences in the tangent of the first pose: heading, then x and y in its own axes
-    turned = (heading - heading[0] + np.pi) % (2 * np.pi) - np.pi
+    turned = wrap(heading - heading[0])
     off = xy - xy[0]
     xi = np.stack([turned, c[0] * off[:, 0] + s[0] * off[:, 1], -s[0] * off[:, 0] + c[0] * off[:, 1]], axis=1)
     columns = (xi[1:11] - xi[11:]) / (2 * step)

@@ -4,8 +4,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 from coloc_graph.backend import Bump
-from coloc_graph.online.formation import Planar
-from coloc_graph.online.pose_tracker import compose
+from coloc_graph.geometry.se2 import Planar, compose, wrap
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.visibility import InView
 
@@ -24,7 +23,7 @@ def displaced(registry: RobotRegistry, view: InView, mover: Planar) -> Iterator[
     for robot, place in view.displaced(mover).items():
         before = registry[robot].tracker.pose()
         registry.displace(robot, place)
-        far, turned = math.dist(place[:2], before[:2]), abs(math.remainder(place[2] - before[2], 2 * math.pi))
+        far, turned = math.dist(place[:2], before[:2]), abs(wrap(place[2] - before[2]))
         yield (
             robot,
             (

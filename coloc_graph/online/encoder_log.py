@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from coloc_graph.online.formation import Planar
+from coloc_graph.geometry.se2 import Planar
 from coloc_graph.robot_io.create.odometry import WHEELS, arc, ticks_between
 from coloc_graph.run.atomic_file import write_whole
 

@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
+from coloc_graph.geometry.se2 import Planar
 from coloc_graph.team.shared_view import View, places_in_view
 
 Array = NDArray[np.float64]
-
-#: x [m], y [m], yaw [rad] on the floor of the world.
-Planar = tuple[float, float, float]
 
 #: The paper's formation: neighbours so far apart [m], their cameras turned towards each other by so much [rad].
 APART = 0.8

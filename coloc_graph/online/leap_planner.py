@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.online.formation import STAGGER, Formation, Planar
+from coloc_graph.geometry.se2 import Planar
+from coloc_graph.online.formation import STAGGER, Formation
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.visibility import InView
 from coloc_graph.run import Stance

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.online.formation import STAGGER, Course, Formation, Planar
-from coloc_graph.online.pose_tracker import compose, inverse
+from coloc_graph.geometry.se2 import Planar, compose, inverse
+from coloc_graph.online.formation import STAGGER, Course, Formation
 from coloc_graph.pipeline.incremental import SolveOptions
 from coloc_graph.team import Team
 

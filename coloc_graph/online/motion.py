@@ -5,6 +5,8 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from coloc_graph.geometry.se2 import wrap
+
 #: Nearer than this a place is reached [m], and a heading [rad].
 NEAR = 0.01
 ALIGNED = 0.02
@@ -57,16 +59,16 @@ class Follower:
                 self._places.popleft()
                 self._going, self._from = False, None
                 continue
-            off = _wrap(math.atan2(to[1] - y, to[0] - x) - yaw)
+            off = wrap(math.atan2(to[1] - y, to[0] - x) - yaw)
             ahead = 1.0
             if self._backwards and abs(off) > math.pi / 2:
-                off, ahead = _wrap(off + math.pi), -1.0
+                off, ahead = wrap(off + math.pi), -1.0
             if not self._going and abs(off) > SET_OFF:
                 return Twist(0.0, self._turning(off))
             self._going = True
             v = min(self._speed, max(BRAKE * away, LEAST_SPEED)) * max(math.cos(2 * off), 0.0)
             return Twist(ahead * v, max(-self._turn, min(self._turn, STEER * off)) if away > 3 * NEAR else 0.0)
-        if self._yaw is not None and abs(off := _wrap(self._yaw - yaw)) > ALIGNED:
+        if self._yaw is not None and abs(off := wrap(self._yaw - yaw)) > ALIGNED:
             return Twist(0.0, self._turning(off))
         return None
 
@@ -77,7 +79,3 @@ class Follower:
 
     def _turning(self, off: float) -> float:
         return math.copysign(min(self._turn, max(STEER * abs(off), LEAST_TURN)), off)
-
-
-def _wrap(angle: float) -> float:
-    return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -1,12 +1,11 @@
 """Odometry that begins anew, after a restart or on a new line, joined to what was before."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
-from coloc_graph.online.formation import Planar
-from coloc_graph.online.pose_tracker import CARRIED, compose, inverse
+from coloc_graph.geometry.se2 import Planar, compose, inverse, wrap
+from coloc_graph.online.pose_tracker import CARRIED
 from coloc_graph.run import OdometrySample
 
 #: Where a robot may have gone while nobody counted: one that stood, one that drove [m], [m], [rad].
@@ -48,5 +47,5 @@ class JoinedOdometry:
             sample = replace(sample, covariance=np.diag(np.square(self._unsure)))
             self._unsure = None
         self._last = compose(self._T, (x, y, yaw))
-        turned = math.remainder(self._last[2], 2 * math.pi)
+        turned = wrap(self._last[2])
         return replace(sample, pose=np.array([*self._last[:2], turned]))

@@ -6,7 +6,7 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.online.formation import Planar
+from coloc_graph.geometry.se2 import Planar, compose, inverse, wrap
 from coloc_graph.run import OdometrySample
 
 Array = NDArray[np.float64]
@@ -15,18 +15,6 @@ STILL = 2e-3  # a robot whose odometry changed by less has not moved [m]
 STILL_TURN = 4e-3  # the same for its heading [rad]
 CARRIED = (0.5, 0.5, 1.0)  # sigmas of the pose of a robot that was pushed or carried [m], [m], [rad]
 MEMORY = 600.0  # odometry that is kept [s]
-
-
-def compose(a: Planar, b: Planar) -> Planar:
-    """Compose two planar poses: `T_world_b = compose(T_world_a, T_a_b)`."""
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]
-
-
-def inverse(a: Planar) -> Planar:
-    """Invert a planar pose."""
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return -c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]
 
 
 class PoseTracker:
@@ -76,7 +64,7 @@ class PoseTracker:
             return self._poses[max(n - 1, 0)]
         (t0, a), (t1, b) = ((self._times[i], self._poses[i]) for i in (n - 1, n))
         share = (time - t0) / (t1 - t0) if t1 > t0 else 1.0
-        turn = (b[2] - a[2] + math.pi) % (2 * math.pi) - math.pi
+        turn = wrap(b[2] - a[2])
         return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * turn
 
     @property
@@ -111,7 +99,6 @@ class PoseTracker:
         then = self.odometry_at(time)
         first = bisect_right(self._times, time)
         return any(
-            math.dist(pose[:2], then[:2]) > STILL
-            or abs((pose[2] - then[2] + math.pi) % (2 * math.pi) - math.pi) > STILL_TURN
+            math.dist(pose[:2], then[:2]) > STILL or abs(wrap(pose[2] - then[2])) > STILL_TURN
             for pose in self._poses[first:]
         )

@@ -13,10 +13,10 @@ from typing import Self
 
 from coloc_graph.errors import CameraError, ColocError, InputError, RobotError
 from coloc_graph.frontend import detector_for
+from coloc_graph.geometry.se2 import compose
 from coloc_graph.online.encoder_log import Counted, Ledger, way_since
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_restart import JoinedOdometry
-from coloc_graph.online.pose_tracker import compose
 from coloc_graph.online.record import Record
 from coloc_graph.robot_io.camera.open import open_camera
 from coloc_graph.robot_io.camera.source import CameraSource, Frame, clock_ahead

@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from coloc_graph.geometry.se2 import Planar
 from coloc_graph.measurements import Sighting
-from coloc_graph.online.formation import Planar
 from coloc_graph.online.odometry_restart import DROVE, JoinedOdometry
 from coloc_graph.online.pose_tracker import PoseTracker
 from coloc_graph.online.record import Record

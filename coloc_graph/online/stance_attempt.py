@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.online.formation import Planar
+from coloc_graph.geometry.se2 import Planar
 from coloc_graph.online.pose_tracker import PoseTracker
 from coloc_graph.online.visibility import InView, Precision
 from coloc_graph.run import Detections, Stance

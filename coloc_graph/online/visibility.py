@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from coloc_graph.frontend import FrontendOptions, StanceTracks, measure_pair
 from coloc_graph.geometry.lie import floor_pose
-from coloc_graph.online.formation import Planar
+from coloc_graph.geometry.se2 import Planar, compose, inverse, wrap
 from coloc_graph.online.mission import MissionOptions
-from coloc_graph.online.pose_tracker import compose, inverse
 from coloc_graph.run import Detections, Image, OdometrySample, Planes, Recorded, Stance
 from coloc_graph.team import Team
 from coloc_graph.team.shared_view import View
@@ -86,7 +85,7 @@ class InView:
         arms, middles = np.concatenate([arms, -arms]), np.concatenate([middles, middles])
         along = model[1] - model[0]
         yaw = np.arctan2(arms[:, 1], arms[:, 0]) - math.atan2(along[1], along[0])
-        off = (yaw - expected[2] + np.pi) % (2 * np.pi) - np.pi
+        off = wrap(yaw - expected[2])
         c, s, (mx, my) = np.cos(yaw), np.sin(yaw), model.mean(axis=0)
         xy = middles - np.stack([c * mx - s * my, s * mx + c * my], axis=1)
         away = np.hypot(*(xy - expected[:2]).T)
@@ -126,7 +125,7 @@ class InView:
 
 def _apart(a: Planar, b: Planar) -> float:
     """How far two places are from each other, a radian as much as 0.3 m [m]."""
-    return math.dist(a[:2], b[:2]) + 0.3 * abs(math.remainder(a[2] - b[2], 2 * math.pi))
+    return math.dist(a[:2], b[:2]) + 0.3 * abs(wrap(a[2] - b[2]))
 
 
 def _on_plane(view: View, uv: Array, height: float) -> Array:

@@ -17,6 +17,7 @@ from matplotlib.ticker import NullFormatter, ScalarFormatter
 from coloc_graph.errors import InputError
 from coloc_graph.evaluation import Accuracy, Alignment
 from coloc_graph.geometry.lie import yaw
+from coloc_graph.geometry.se2 import wrap
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.report.drawing import COLOURS, GREY, INK, MARKERS, Array, Truth, styled, world_covariances
 
@@ -153,7 +154,7 @@ def _errors(
         position, rotation = world_covariances(one)
         offs = 100 * (one.positions - true[robot][:, :3, 3])
         turned = yaw(one.T_world_body) - yaw(true[robot])
-        values = [*offs.T[: len(columns) - 1], np.rad2deg((turned + np.pi) % (2 * np.pi) - np.pi)]
+        values = [*offs.T[: len(columns) - 1], np.rad2deg(wrap(turned))]
         sigmas = [100 * np.sqrt(position[:, i, i].clip(min=0)) for i in range(len(columns) - 1)]
         sigmas.append(np.rad2deg(np.sqrt(rotation[:, 2, 2].clip(min=0))))
         for axes, value, sigma in zip(grid[place], values, sigmas, strict=True):

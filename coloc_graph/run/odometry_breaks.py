@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from coloc_graph.geometry.se2 import wrap
+
 Array = NDArray[np.float64]
 
 SPEED_FACTOR = 3.0  # a jump is faster than the robot's usual top speed by this factor
@@ -59,7 +61,7 @@ def find_breaks(times: ArrayLike, poses: ArrayLike) -> list[OdometryBreak]:
     if len(t) < 2:
         return []
     steps = np.diff(p, axis=0)
-    way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(np.remainder(steps[:, 2] + np.pi, 2 * np.pi) - np.pi)
+    way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(wrap(steps[:, 2]))
     # two samples that come at once have not driven for no time
     lasted = np.maximum(np.diff(t), np.median(np.diff(t)))
     speed, rate = way / lasted, turn / lasted
@@ -102,5 +104,5 @@ def joined(poses: ArrayLike, breaks: Sequence[OdometryBreak]) -> Array:
         off = p[one.index :, :2] - first[:2]
         p[one.index :, 0] = before[0] + c * off[:, 0] - s * off[:, 1]
         p[one.index :, 1] = before[1] + s * off[:, 0] + c * off[:, 1]
-        p[one.index :, 2] = np.remainder(p[one.index :, 2] + turned + np.pi, 2 * np.pi) - np.pi
+        p[one.index :, 2] = wrap(p[one.index :, 2] + turned)
     return p

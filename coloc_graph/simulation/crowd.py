@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from coloc_graph.geometry.se2 import wrap
 from coloc_graph.run.messages import Detections, Flag
 from coloc_graph.simulation.blinking import Blinking
-from coloc_graph.simulation.paths import SPEED, TURN_RATE, Array, wrap
+from coloc_graph.simulation.paths import SPEED, TURN_RATE, Array
 from coloc_graph.team.shared_view import View
 
 #: Robots keep so far from each other, middle to middle [m], and step so often [s].

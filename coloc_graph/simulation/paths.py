@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.se2 import wrap
 
 Array = NDArray[np.float64]
 
@@ -70,12 +71,6 @@ def tilt_rotation(roll: ArrayLike, pitch: ArrayLike) -> Array:
     zero = np.zeros_like(cr)
     rows = [[cp, sp * sr, sp * cr], [zero, cr, -sr], [-sp, cp * sr, cp * cr]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def wrap(angle: ArrayLike, period: float = 2 * np.pi) -> Array:
-    """Angles brought to within half a period of 0."""
-    angle = np.asarray(angle, float)
-    return np.asarray(angle - period * np.round(angle / period))
 
 
 def drive(poses: ArrayLike, start: float, reverse: bool = False) -> tuple[Leg, NDArray[np.int64]]:

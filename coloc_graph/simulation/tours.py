@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.simulation.paths import SPEED, Array, Leg, drive, stop_and_go, travel, wrap
+from coloc_graph.geometry.se2 import wrap
+from coloc_graph.simulation.paths import SPEED, Array, Leg, drive, stop_and_go, travel
 from coloc_graph.simulation.scenarios import Box
 from coloc_graph.team.shared_view import View, places_in_view
 

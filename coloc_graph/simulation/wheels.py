@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from coloc_graph.geometry.se2 import wrap
 from coloc_graph.run.messages import OdometrySample
-from coloc_graph.simulation.paths import Array, Path, wrap
+from coloc_graph.simulation.paths import Array, Path
 
 #: Samples and true poses a second while a robot moves.
 RATE = 10.0

@@ -6,13 +6,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.geometry.lie import rotation_x, rotation_y, rotation_z
+from coloc_graph.geometry.lie import se3
+from coloc_graph.geometry.mounting import camera_rotation
 from coloc_graph.team.checks import require_finite, require_not_negative
 
 Array = NDArray[np.float64]
-
-#: Camera axes in a body whose camera looks along body x: z forward, x right, y down.
-R_BODY_OPTICAL: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -39,15 +37,18 @@ class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     @property
     def R_body_camera(self) -> Array:
         """Rotation of the optical camera frame in the body, (3, 3)."""
-        yaw, tilt, roll = np.deg2rad([self.yaw_deg, self.tilt_deg, self.roll_deg])
-        return rotation_z(yaw) @ rotation_y(tilt) @ rotation_x(roll) @ R_BODY_OPTICAL
+        return camera_rotation(*np.deg2rad([self.yaw_deg, self.tilt_deg, self.roll_deg]))
 
     @property
     def T_body_camera(self) -> Array:
         """Pose of the optical camera frame in the body, (4, 4), metres."""
-        T = np.eye(4)
-        T[:3, :3] = self.R_body_camera
-        T[:3, 3] = self.x, self.y, self.height
+        return se3(self.R_body_camera, (self.x, self.y, self.height))
+
+    def off_by(self, errors: Array) -> Array:
+        """`T_body_camera` (m, 4, 4) with errors (m, 3) of height [m], tilt and roll [rad]."""
+        yaw, tilt, roll = np.deg2rad([self.yaw_deg, self.tilt_deg, self.roll_deg])
+        T = se3(camera_rotation(yaw, tilt + errors[:, 1], roll + errors[:, 2]), (self.x, self.y, self.height))
+        T[:, 2, 3] += errors[:, 0]
         return T
 
 

@@ -5,6 +5,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.geometry.se2 import wrap
 from coloc_graph.viewer.scene import Layer, Scene
 
 Array = NDArray[np.float64]
@@ -31,7 +32,7 @@ def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
         out[:] = a
         return out
     share = np.clip(since / np.where(gap > 0, gap, 1.0), 0, 1)
-    turn = _wrapped(b[:, 3] - a[:, 3])
+    turn = wrap(b[:, 3] - a[:, 3])
     out[:, :3] = a[:, :3] + share[:, None] * (b[:, :3] - a[:, :3])
     out[:, 3] = a[:, 3] + share * turn
     wheels = scene.wheels.get(scene.robots[number])
@@ -42,7 +43,7 @@ def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
     a, b, s = a[moving], b[moving], share[moving, None]
     now, end = _ahead(a, way[0], way[1]), _ahead(a, way[0], way[2])
     miss = b[:, [0, 1, 3]] - end
-    miss[:, 2] = _wrapped(miss[:, 2])
+    miss[:, 2] = wrap(miss[:, 2])
     bent = now + s * miss
     if np.isfinite(bent).all():
         out[np.ix_(moving, [0, 1, 3])] = bent
@@ -86,7 +87,3 @@ def _ahead(pose: Array, before: Array, after: Array) -> Array:
     c, s = np.cos(turn), np.sin(turn)
     x, y = (after[:, :2] - before[:, :2]).T
     return np.stack([pose[:, 0] + c * x - s * y, pose[:, 1] + s * x + c * y, after[:, 2] + turn], axis=1)
-
-
-def _wrapped(angle: Array) -> Array:
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -9,13 +9,14 @@ import pytest
 
 from coloc_graph.errors import InputError, RobotError, RunError
 from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.se2 import compose, inverse
 from coloc_graph.online.encoder_log import Counted, Ledger, way_since
 from coloc_graph.online.estimation_worker import EstimationWorker
 from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Course, Formation
 from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateMachine, as_dot
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_restart import DROVE, STOOD, JoinedOdometry
-from coloc_graph.online.pose_tracker import PoseTracker, compose, inverse
+from coloc_graph.online.pose_tracker import PoseTracker
 from coloc_graph.online.record import Record, continued
 from coloc_graph.online.visibility import InView
 from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver

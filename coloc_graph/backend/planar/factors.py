@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.planar.estimate import Errors
 from coloc_graph.backend.planar.filter import Models
-from coloc_graph.backend.planar.model import RANGING, WHEELS, wrapped
+from coloc_graph.backend.planar.model import RANGING, WHEELS
+from coloc_graph.geometry.se2 import wrap
 from coloc_graph.measurements import Drive
 
 Array = NDArray[np.float64]
@@ -125,7 +126,7 @@ class DriveFactors:
             # in units of what the wheels say: with the noise fixed in metres, a smaller world would have less of it
             p, q = 1 / (model.wheels.scale + errors[robot, 0]), 1 / (model.wheels.turn_scale + errors[robot, 1])
             units[own] = p, p, q
-        off = units * np.stack([x - said[:, 0], y - said[:, 1], wrapped(b[:, 2] - a[:, 2] - said[:, 2])], axis=-1)
+        off = units * np.stack([x - said[:, 0], y - said[:, 1], wrap(b[:, 2] - a[:, 2] - said[:, 2])], axis=-1)
         J = np.zeros((len(poses), 3, 10))
         J[:, 0, 0], J[:, 0, 1], J[:, 0, 2] = -c, -s, y
         J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = s, -c, -x
@@ -163,7 +164,7 @@ class DriveFactors:
         J[:, :, 2] = expected.by_xy[:, :, 0] * xy[:, None, 1] - expected.by_xy[:, :, 1] * xy[:, None, 0]
         J[:, :, 5:-1] = expected.by_errors
         J[:, 0, -1] = expected.values[:, 0] - m.range[index]
-        J[:, 1, -1] = wrapped(expected.values[:, 1] - m.bearing[index])
+        J[:, 1, -1] = wrap(expected.values[:, 1] - m.bearing[index])
         J *= (np.sqrt(m.share[index]) / (self._sigmas_measured[index] * self.noise[robots]))[:, :, None]
         target = np.where(of_robot, 3 * seen, self._shared(self._marks + 2 * landmark))
         errors = self._shared(self._ranging + RANGING * robots[:, None] + np.arange(RANGING))

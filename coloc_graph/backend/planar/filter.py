@@ -18,11 +18,9 @@ from coloc_graph.backend.planar.model import (
     Pose,
     Sensors,
     WheelsModel,
-    between,
-    compose,
-    wrapped,
 )
 from coloc_graph.backend.planar.placing import Placing
+from coloc_graph.geometry.se2 import between, compose, wrap
 from coloc_graph.measurements import Drive
 from coloc_graph.team import Ranging, Team, Wheels
 
@@ -242,7 +240,7 @@ class Filter:
         sigmas = sensors.sigmas(one, np.array([range_]))[0]
         S = H @ PH[columns] + np.diag(np.square(sigmas) / share)
         off = np.array([range_, bearing]) - expected.values[0]
-        off[1] = wrapped(off[1])
+        off[1] = wrap(off[1])
         gain = np.linalg.solve(S, PH.T).T
         if off @ np.linalg.solve(S, off) > GATE:
             return False

@@ -13,9 +13,9 @@ from coloc_graph.backend.planar.batch import found_landmarks, pose_covariances, 
 from coloc_graph.backend.planar.estimate import DriveEstimate, Errors, trajectory
 from coloc_graph.backend.planar.factors import DriveFactors, State, robust
 from coloc_graph.backend.planar.filter import Filter
-from coloc_graph.backend.planar.model import compose
 from coloc_graph.backend.planar.slices import Slices, Summary, slices_of
 from coloc_graph.backend.planar.summary import Found, summed_up
+from coloc_graph.geometry.se2 import compose
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Drive
 from coloc_graph.team import Team

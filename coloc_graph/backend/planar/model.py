@@ -11,11 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.geometry.se2 import Planar
 from coloc_graph.measurements import Steps
 from coloc_graph.team import Ranging, Wheels
 
 Array = NDArray[np.float64]
-Pose = tuple[float, float, float]
+Pose = Planar
 
 #: How many errors wheels have, and a sensor.
 WHEELS = 3
@@ -24,24 +25,6 @@ RANGING = 7
 STRAIGHT = 1e-6
 #: A depth is at least this part of the distance: what is beside a camera is not seen by it.
 LEAST_PART = 0.1
-
-
-def wrapped(angles: Array) -> Array:
-    """The same angles [rad] from -pi to pi."""
-    return (angles + np.pi) % (2 * np.pi) - np.pi
-
-
-def compose(a: Pose, b: Pose) -> Pose:
-    """The pose of c in the frame of a, of that of b in a and of c in b."""
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]
-
-
-def between(a: Pose, b: Pose) -> Pose:
-    """The pose of b in a, both in one frame; its heading is not wrapped."""
-    c, s = math.cos(a[2]), math.sin(a[2])
-    x, y = b[0] - a[0], b[1] - a[1]
-    return c * x + s * y, -s * x + c * y, b[2] - a[2]
 
 
 class WheelsModel:

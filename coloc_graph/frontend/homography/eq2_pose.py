@@ -14,9 +14,6 @@ from coloc_graph.frontend.homography.decomposition import (
 )
 from coloc_graph.geometry.lie import (
     across,
-    rotation_x,
-    rotation_y,
-    rotation_z,
     se3,
     se3_inverse,
     sl3_exp,
@@ -24,7 +21,7 @@ from coloc_graph.geometry.lie import (
     so3_log,
 )
 from coloc_graph.measurements import HomographyMeasurement, Plane, RelativePose
-from coloc_graph.team import R_BODY_OPTICAL, Mount
+from coloc_graph.team import Mount
 
 Array = NDArray[np.float64]
 
@@ -115,7 +112,7 @@ def _root_covariance(measurement: HomographyMeasurement, mount_i: Mount, mount_j
 
 def _poses(unknowns: Array, H: Array, mount_i: Mount, mount_j: Mount, plane: Plane) -> tuple[Array, Array]:
     """T_i_j and T_ci_cj, (m, 4, 4) each, for errors (m, 17) of the unknowns."""
-    T_bi_ci, T_bj_cj = mounted(mount_i, unknowns[:, _MOUNT_I]), mounted(mount_j, unknowns[:, _MOUNT_J])
+    T_bi_ci, T_bj_cj = mount_i.off_by(unknowns[:, _MOUNT_I]), mount_j.off_by(unknowns[:, _MOUNT_J])
     N = turned_normal(plane, mount_i, T_bi_ci)
     sides = across(plane.N)
     N = (so3_exp(unknowns[:, _NORMAL] @ sides) @ N[..., None])[..., 0]
@@ -133,14 +130,3 @@ def turned_normal(plane: Plane, mount: Mount, T_body_camera: Array) -> Array:
     if not plane.normal_from_mount:
         return np.broadcast_to(plane.N, (len(T_body_camera), 3))
     return np.asarray(T_body_camera[:, :3, :3].mT @ mount.R_body_camera @ plane.N)
-
-
-def mounted(mount: Mount, errors: Array) -> Array:
-    """T_body_camera (m, 4, 4) for errors (m, 3) of height, tilt, roll."""
-    R_tilt = rotation_y(np.deg2rad(mount.tilt_deg) + errors[:, 1])
-    R_roll = rotation_x(np.deg2rad(mount.roll_deg) + errors[:, 2])
-    T = se3(
-        rotation_z(np.deg2rad(mount.yaw_deg)) @ R_tilt @ (R_roll @ R_BODY_OPTICAL), (mount.x, mount.y, mount.height)
-    )
-    T[:, 2, 3] += errors[:, 0]
-    return T

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend.homography.eq2_pose import eq2_pose, mounted, turned_normal
+from coloc_graph.frontend.homography.eq2_pose import eq2_pose, turned_normal
 from coloc_graph.geometry.lie import (
     across,
     floor_pose,
@@ -129,7 +129,7 @@ def _free(start: RelativePose, mount_i: Mount, mount_j: Mount, plane: Plane) -> 
 
     def build(u: Array) -> tuple[Array, Array, Array, Array]:
         T_i_j = T_start @ se3_exp(u[:, :6])
-        T_bi_ci, T_bj_cj = mounted(mount_i, u[:, 9:12]), mounted(mount_j, u[:, 12:15])
+        T_bi_ci, T_bj_cj = mount_i.off_by(u[:, 9:12]), mount_j.off_by(u[:, 12:15])
         N = turned_normal(plane, mount_i, T_bi_ci)
         N = (so3_exp(u[:, 6:8] @ sides) @ N[..., None])[..., 0]
         d = plane.d + u[:, 8] + (u[:, 9] if plane.d_from_mount else 0.0)
@@ -154,7 +154,7 @@ def _on_floor(start: RelativePose, mount_i: Mount, mount_j: Mount, plane: Plane,
         T_fi_fj[:, 2, 3] = u[:, 7]
         T_fi_bi, T_fj_bj = tilt(u[:, 3:5]), tilt(u[:, 5:7])
         T_i_j = se3_inverse(T_fi_bi) @ T_fi_fj @ T_fj_bj
-        T_bi_ci, T_bj_cj = mounted(mount_i, u[:, 9:12]), mounted(mount_j, u[:, 12:15])
+        T_bi_ci, T_bj_cj = mount_i.off_by(u[:, 9:12]), mount_j.off_by(u[:, 12:15])
         N = (T_fi_bi @ T_bi_ci)[:, :3, :3].mT @ down
         d = plane.d + u[:, 8] + (u[:, 9] if plane.d_from_mount else 0.0)
         return T_i_j, se3_inverse(T_bi_ci) @ T_i_j @ T_bj_cj, N, d

@@ -12,6 +12,7 @@ from math import copysign, cos, hypot, pi, radians, sin
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.geometry.se2 import compose, wrap
 from coloc_graph.robot_io.create.protocol import MAX_WHEEL_SPEED, Packet
 from coloc_graph.run.messages import OdometrySample
 
@@ -71,13 +72,6 @@ def arc_covariance(left: float, right: float, base: float) -> Array:
     return covariance
 
 
-def compose(pose: Array, way: tuple[float, float, float]) -> Array:
-    """Compose a pose (x, y, yaw) with an increment in its body frame; yaw is within +-pi."""
-    c, s = cos(pose[2]), sin(pose[2])
-    yaw = (pose[2] + way[2] + pi) % (2 * pi) - pi
-    return np.array([pose[0] + c * way[0] - s * way[1], pose[1] + s * way[0] + c * way[1], yaw])
-
-
 class Odometer:
     """Sums increments to samples: one every `period` while moving, one every `REST` while standing.
 
@@ -118,7 +112,8 @@ class Odometer:
             samples.append(self._close(self._last))
         if late:
             self._open_until = time + self.period
-        self.pose = compose(self.pose, way)
+        x, y, yaw = compose((float(self.pose[0]), float(self.pose[1]), float(self.pose[2])), way)
+        self.pose = np.array([x, y, wrap(yaw)])
         if moved or covariance.any():
             # an error in heading at the end of the way so far swings what follows
             c, s = cos(self._way[2]), sin(self._way[2])
