@@ -88,7 +88,9 @@ def solved(world: World, options: SolveOptions) -> tuple[Solution, Accuracy]:
 
 
 def over_seeds(work: Callable[[int], T], seeds: Sequence[int], processes: int = 2) -> list[T]:
-    """`work` of each seed, in the order of the seeds, on several processes."""
+    """`work` of each seed, in the order of the seeds, on several processes; of one seed in this process."""
+    if len(seeds) == 1:
+        return [work(seeds[0])]
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         return list(pool.map(work, seeds))
 

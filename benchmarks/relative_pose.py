@@ -21,8 +21,8 @@ from monte_carlo import anees_interval, over_seeds, simulated
 from scipy.stats import chi2
 
 from coloc_graph.frontend import PointPairs, fit_homography, plane_from_mount
-from coloc_graph.frontend.homography import eq2_pose as relative_pose
-from coloc_graph.frontend.homography import ml_pose as most_likely_pose
+from coloc_graph.frontend.homography.eq2_pose import relative_pose
+from coloc_graph.frontend.homography.ml_pose import most_likely_pose
 from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.measurements import HomographyMeasurement, RelativePose
 from coloc_graph.simulation.world import World
@@ -120,10 +120,11 @@ def main() -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=1000)
+    parser.add_argument("--cells", type=int, default=len(CELLS), help="first cells only (default: all)")
     parser.add_argument("--outliers", action="store_true")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
-    rows = over_seeds(partial(one_cell, runs=args.runs, outliers=args.outliers), range(len(CELLS)))
+    rows = over_seeds(partial(one_cell, runs=args.runs, outliers=args.outliers), range(args.cells))
     if args.json:
         print(json.dumps(rows, indent=2))
         return 0

@@ -24,6 +24,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from coloc_graph.backend import Method
 from coloc_graph.exchange.tracks import import_tracks
 from coloc_graph.frontend import FrontendOptions, PairMeasurement
 from coloc_graph.geometry.lie import se3, se3_inverse, so3_log
@@ -234,7 +235,7 @@ def bring_in(stereo: Stereo, sigma: float, folder: Path, bias: float | None = No
     return open_run(folder / "RUN.mcap")
 
 
-def solve(run: Run, method: pipeline.Method, options: FrontendOptions) -> pipeline.Solution:
+def solve(run: Run, method: Method, options: FrontendOptions) -> pipeline.Solution:
     """The whole road, with one front end."""
     return pipeline.solve(run, pipeline.SolveOptions(method, options))
 

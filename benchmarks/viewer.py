@@ -45,7 +45,7 @@ def leapfrog(robots: int, stances: int) -> Scene:
         k, np.zeros(stances, int), np.ones(stances, int), np.abs(rng.normal(1, 0.3, stances)), ("",) * stances
     )
     stayed = np.stack([k[1:] % 2, k[1:]], axis=1)
-    return Scene(names, made, tuple(layers), edges, stayed, title=f"{stances} stances")
+    return Scene(names, made, tuple(layers), edges, stayed=stayed, title=f"{stances} stances")
 
 
 def calibration() -> float:
