@@ -3,7 +3,8 @@
     python benchmarks/stop_times.py [--cases CASE ...] [--tries SPEED:TRIES ...] [--json]
 
 `coloc robot` drives an emulated Create (2 m/s^2 at each wheel) with the permission of a coordinator's link, which
-reaches it through a TCP relay. In each try the wheels turn at the full speed when the fault happens; the time until
+reaches it through a TCP relay; for faults of the coordinator it is the mover of a mission, whose observers only answer.
+In each try the wheels turn at the full speed when the fault happens; the time until
 both stand is measured by the emulator. The limit is 0.5 s.
 """
 
@@ -22,10 +23,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import cv2
+import msgspec
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 
+from fake_robots import FakeRobot
 from tcp_relay import Relay
 
 from coloc_graph.errors import RobotError
@@ -36,8 +39,12 @@ from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
 from coloc_graph.robot_io.link.messages import Drive, Recover
 from coloc_graph.simulation.simulated_team import field_team, free_address
 from coloc_graph.team import write_team
+from coloc_graph.team.body import Devices
 
 NAME = "C"  # the robot that drives
+FPS = 5.0  # rate of the images of a mission's camera [1/s]
+LONGEST = 900.0  # duration of these images [s]
+FAR = 1000.0  # way to the mover's first waypoint [m]
 START = 60.0  # s that a program may take to start
 WATCH = 1.5  # s for which the wheels are watched after a fault
 
@@ -155,6 +162,106 @@ def cut(rig: Rig) -> Callable[[], None]:
     return lambda: rig.relay.mend()
 
 
+class MissionRig:
+    """A mission's coordinator, two fake robots that stand, and the program of a real one that drives for ever."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.address = folder, free_address()
+        team = field_team(fps=FPS)
+        # the mover believes that it starts far behind its first waypoint
+        far = msgspec.json.decode(json.dumps({"start": [-FAR, 0.0, 0.0]}), type=Devices)
+        robots = [msgspec.structs.replace(one, devices=far) if one.name == NAME else one for one in team.robots]
+        team = msgspec.structs.replace(team, robots=tuple(robots))
+        write_team(team, folder / "team.toml")
+        (folder / "images").mkdir()
+        camera = team[NAME].camera
+        first = folder / "images" / f"{0:06}.png"
+        cv2.imwrite(str(first), np.zeros((camera.height, camera.width), np.uint8))
+        for number in range(1, round(FPS * LONGEST)):
+            (folder / "images" / f"{number:06}.png").hardlink_to(first)
+        self.wheels = CreateEmulator(2, Physics(seed=1))
+        self.coordinator: subprocess.Popen[bytes] | None = None
+        self.program: subprocess.Popen[bytes] | None = None
+        self._missions = 0
+        self._observers = [FakeRobot(name, self.address) for name in team.names if name != NAME]
+
+    def __enter__(self) -> Self:
+        command = [sys.executable, "-m", "coloc_graph.cli", "robot", NAME, str(self.folder / "team.toml")]
+        command += ["--out", str(self.folder / "out"), "--connect", self.address, "--model", "2"]
+        command += ["--camera", f"video:{self.folder / 'images'}", "--wheels", self.wheels.port]
+        with (self.folder / "robot.log").open("ab") as log:
+            self.program = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for one in (self.coordinator, self.program):
+            if one is not None:
+                one.send_signal(signal.SIGCONT)
+                one.terminate()
+                one.wait(20)
+        for robot in self._observers:
+            robot.__exit__()
+        self.wheels.close()
+
+    def drive(self, speed: float) -> None:
+        """Have the wheels turn at a speed [m/s] on the way of a mission."""
+        if self.coordinator is None or self.coordinator.poll() is not None or self._speed != speed:
+            if self.coordinator is not None:
+                self.coordinator.terminate()
+                self.coordinator.wait(20)
+            self._missions, self._speed = self._missions + 1, speed
+            command = [sys.executable, str(Path(__file__).with_name("hanging_coordinator.py"))]
+            command += [str(self.folder / "team.toml"), str(self.folder / f"mission-{self._missions}")]
+            with (self.folder / "coordinator.log").open("ab") as log:
+                self.coordinator = subprocess.Popen(
+                    [*command, self.address, str(speed)], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log
+                )
+        until, since = time.monotonic() + START, None
+        while time.monotonic() < until:
+            fast = min(map(abs, self.wheels.speeds)) > 0.97 * speed
+            since = (since or time.monotonic()) if fast else None
+            if since is not None and time.monotonic() - since > random.uniform(0.1, 0.3):
+                return
+            time.sleep(0.01)
+        raise SystemExit("\n".join((self.folder / f"{n}.log").read_text()[-2000:] for n in ("robot", "coordinator")))
+
+    def fault(self, number: int) -> float:
+        """Send the coordinator a signal; the time of the fault [s, monotonic clock] comes back."""
+        assert self.coordinator is not None and self.coordinator.stdout is not None
+        since = time.monotonic()
+        self.coordinator.send_signal(number)
+        if number in (signal.SIGUSR1, signal.SIGUSR2):
+            since = float(self.coordinator.stdout.readline())
+        return since
+
+    def time_to_stand(self, since: float) -> float:
+        """Time from an instant until both wheels stand [s]; infinite if they still turn at the end."""
+        until = since + 1.1  # a hang ends, and the robot is sent on
+        while time.monotonic() < until:
+            stood = self.wheels.still_since
+            if stood is not None:
+                return max(stood - since, 0.0)
+            time.sleep(0.002)
+        return float("inf")
+
+    def mend(self, number: int) -> None:
+        """Let a stopped coordinator go on."""
+        assert self.coordinator is not None
+        if number == signal.SIGSTOP:
+            self.coordinator.send_signal(signal.SIGCONT)
+        elif number == signal.SIGKILL:
+            self.coordinator.wait()
+        time.sleep(0.2)
+
+
+#: Faults of the coordinator: the signal that causes each.
+COORDINATOR_CASES: dict[str, int] = {
+    "coordinator, main loop hangs": signal.SIGUSR1,
+    "coordinator, hangs in an ask": signal.SIGUSR2,
+    "coordinator, SIGSTOP": signal.SIGSTOP,
+    "coordinator, SIGKILL": signal.SIGKILL,
+}
+
 #: What happens; each returns what undoes it.
 CASES: dict[str, Callable[[Rig], Callable[[], None]]] = {
     "robot's program, SIGKILL": signalled(signal.SIGKILL, to_watchdog=False),
@@ -168,6 +275,14 @@ CASES: dict[str, Callable[[Rig], Callable[[], None]]] = {
 def measure(case: str, tries: dict[float, int]) -> dict[float, list[float]]:
     """Stop times [s] of one case, by speed [m/s]."""
     times: dict[float, list[float]] = {speed: [] for speed in tries}
+    if (fault := COORDINATOR_CASES.get(case)) is not None:
+        with tempfile.TemporaryDirectory() as folder, MissionRig(Path(folder)) as mission:
+            for speed, number in tries.items():
+                for _ in range(number):
+                    mission.drive(speed)
+                    times[speed].append(mission.time_to_stand(mission.fault(fault)))
+                    mission.mend(fault)
+        return times
     with tempfile.TemporaryDirectory() as folder, Rig(Path(folder)) as rig:
         for speed, number in tries.items():
             for _ in range(number):
@@ -182,7 +297,8 @@ def measure(case: str, tries: dict[float, int]) -> dict[float, list[float]]:
 def main() -> None:
     """Measure, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), metavar="CASE", help="(default: all)")
+    cases = [*CASES, *COORDINATOR_CASES]
+    parser.add_argument("--cases", nargs="+", choices=cases, default=cases, metavar="CASE", help="(default: all)")
     parser.add_argument("--tries", nargs="+", default=["0.45:30", "0.2:10"], help="SPEED:TRIES (0.45:30 0.2:10)")
     parser.add_argument("--json", action="store_true", help="print JSON with all times")
     options = parser.parse_args()

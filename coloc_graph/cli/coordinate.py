@@ -4,51 +4,66 @@ import argparse
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """The command's arguments."""
+    """Add the command's arguments."""
     command = commands.add_parser(
         "coordinate",
-        help="lead a team of robots along its way, and estimate where all are",
-        description="Run once, where all robots can reach it. It waits for their programs (`coloc robot`), leads the "
-        "leap-frog, and estimates where all are while they drive. Ctrl-C stops all of them.",
+        help="lead a team of robots, and estimate their poses online",
+        description="Coordinate a mission: wait for the robots' programs (`coloc robot`), lead the leap-frog, and "
+        "estimate all poses online. Run it once, where all robots can reach it. Ctrl-C stops all robots.",
     )
     command.add_argument("team", metavar="TEAM.toml")
-    command.add_argument("--out", metavar="DIR", help="folder for the record and the result")
+    command.add_argument("--out", metavar="DIR", help="folder of the mission: record, log and result")
     command.add_argument(
         "--goal",
         action="append",
-        type=_place,
+        type=_waypoint,
         metavar="X,Y",
-        help="where the team's middle is to go [m], x ahead, y left of where it begins; more than once for a way with "
-        "corners (default 7.2,0)",
+        help="waypoint of the middle of the observers [m], x ahead and y left of its start; repeat it for a path with "
+        "corners (default: 7.2,0)",
     )
-    command.add_argument("--stances", type=int, help="end after so many, wherever that is")
-    command.add_argument("--mover", metavar="NAME", help="the robot that drives before the others (default: the last)")
-    command.add_argument("--speed", type=float, default=0.3, help="of the robots [m/s] (0.3)")
-    command.add_argument("--longest", type=float, default=40.0, help="a stance ends after so many seconds (40)")
-    command.add_argument("--clock-limit", type=float, default=1.0, metavar="MS", help="how well clocks are known (1)")
-    command.add_argument("--listen", default="tcp/127.0.0.1:7447", help="tcp/ADDRESS:PORT, or tls/ADDRESS:PORT")
-    command.add_argument("--tls", metavar="DIR", help="folder with its certificate, of `coloc certificates`")
+    command.add_argument("--stances", type=int, metavar="N", help="end after N stances (default: at the goal)")
     command.add_argument(
-        "--exposed", action="store_true", help="listen for others than this machine without certificates"
+        "--mover", metavar="NAME", help="robot that drives before the others' cameras (default: the last)"
     )
-    command.add_argument("--resume", action="store_true", help="go on with what is in --out")
-    command.add_argument("--view", action="store_true", help="see it in the browser while it goes on")
+    command.add_argument(
+        "--speed", type=float, default=0.3, metavar="V", help="speed of the robots [m/s] (default: 0.3)"
+    )
+    command.add_argument(
+        "--longest", type=float, default=40.0, metavar="S", help="longest duration of a stance [s] (default: 40)"
+    )
+    command.add_argument(
+        "--clock-limit",
+        type=float,
+        default=1.0,
+        metavar="MS",
+        help="largest sigma of a robot's clock [ms] (default: 1)",
+    )
+    command.add_argument(
+        "--listen",
+        default="tcp/127.0.0.1:7447",
+        metavar="ADDRESS",
+        help="tcp/HOST:PORT, or tls/HOST:PORT (default: %(default)s)",
+    )
+    command.add_argument("--tls", metavar="DIR", help="folder with its certificate, from `coloc certificates`")
+    command.add_argument("--exposed", action="store_true", help="accept other machines without certificates")
+    command.add_argument("--resume", action="store_true", help="continue the mission in --out")
+    command.add_argument("--view", action="store_true", help="show the mission in a browser")
     command.add_argument("--port", type=int, help="port of --view (default: 8080, or the first free one after it)")
-    command.add_argument("--no-browser", action="store_true", help="with --view, do not open a browser")
-    command.add_argument("--draw", action="store_true", help="print the phases as a Graphviz drawing, and end")
+    command.add_argument("--no-browser", action="store_true", help="with --view: do not open a browser")
+    command.add_argument("--draw", action="store_true", help="print the states as a Graphviz graph, and end")
     command.set_defaults(run=run)
 
 
-def _place(text: str) -> tuple[float, float]:
+def _waypoint(text: str) -> tuple[float, float]:
     try:
         x, y = map(float, text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"`{text}` is no place; give X,Y in metres, as in 7.2,0") from None
+        raise argparse.ArgumentTypeError(f"`{text}` is not a waypoint; give X,Y in metres, as in 7.2,0") from None
     return x, y
 
 
 def run(args: argparse.Namespace) -> int:
-    """Lead the team; then solve the record once more in batch, and print."""
+    """Lead the team, then solve the record and print the result."""
     from pathlib import Path
 
     from coloc_graph.cli.mission import report, watched
@@ -64,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         print(as_dot())
         return 0
     if args.out is None:
-        raise InputError("a mission is recorded: give a folder with --out")
+        raise InputError("a mission needs a folder: give one with --out")
     if not 0 < args.speed <= 0.5:
         raise InputError(f"a Create drives at up to 0.5 m/s, not at {args.speed}: give --speed between 0 and 0.5")
     team = read_team(args.team)

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def online(args: argparse.Namespace) -> int:
-    """Have a simulated team lead itself down the hallway, watch it, print."""
+    """Lead a simulated team down the hallway, and print the result."""
     import time
     from pathlib import Path
 
@@ -82,7 +82,7 @@ def online(args: argparse.Namespace) -> int:
 
     out = Path(args.out) / "online"
     if out.exists():
-        raise InputError(f"{out} is there already: remove it, or give another folder with --out")
+        raise InputError(f"{out} exists: remove it, or give another folder with --out")
     team, address = field_team(), free_address()
     options = MissionOptions(goals=((100.0, 0.0),), stances=args.stances, speed=0.4)
     with (

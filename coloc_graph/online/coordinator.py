@@ -87,7 +87,9 @@ class Coordinator:
             undo.enter_context(record)
             # UTC when a mission begins; the record's time does not run backwards where the system's clock was set back
             epoch = max(time.time_ns(), to_ns(record.newest())) - time.monotonic_ns()
-            self._registry = RobotRegistry(record, starts, lambda name: link.clocks[name].to_coordinator, epoch)
+            self._registry = RobotRegistry(
+                record, starts, lambda name: link.clocks[name].to_coordinator, epoch, self._inbox.status_times
+            )
             self._log = undo.enter_context(MissionLog(held.log_path, self._registry.utc))
             worker = EstimationWorker(record, self._solver)
             undo.callback(worker.end)

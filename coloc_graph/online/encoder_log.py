@@ -1,7 +1,6 @@
-"""What a robot's program writes down of its wheels, so that the next one goes on counting.
+"""Encoder counts that a robot's program leaves for the next one, which continues its odometry; `EncoderLog`.
 
-A program that is killed stops nobody: a Create drives on until somebody opens its line. Its encoders count by
-themselves, and tell how far.
+The encoders go on counting while no program runs, and tell how far the robot has driven meanwhile.
 """
 
 import contextlib
@@ -14,12 +13,10 @@ from coloc_graph.geometry.se2 import Planar
 from coloc_graph.robot_io.create.odometry import WHEELS, arc, ticks_between
 from coloc_graph.run.atomic_file import write_whole
 
-#: Nobody counted for less than such a way [m]: more is a robot that was carried, or began to count anew.
-FURTHEST = 5.0
-#: Where the robot is after a way that only its ends were counted of: a share of the way, and no less [m], [rad].
-SHARE = 0.1
-LEAST = 0.01
-LEAST_TURN = 0.02
+FURTHEST = 5.0  # a longer distance means that the robot was carried, or its counters were reset [m]
+SHARE = 0.1  # sigma of a motion of which only the end is known, as a share of its length
+LEAST = 0.01  # its least value [m]
+LEAST_TURN = 0.02  # its least value of the heading [rad]
 
 
 class Counted(msgspec.Struct, frozen=True):
@@ -30,14 +27,14 @@ class Counted(msgspec.Struct, frozen=True):
     pose: Planar
 
 
-class Ledger:
+class EncoderLog:
     """The file of one robot."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def read(self) -> Counted | None:
-        """What was written last; None where there is nothing, or nothing whole."""
+        """Return the counts written last; None if there are none, or they are not valid."""
         try:
             counted = msgspec.json.decode(self._path.read_bytes(), type=Counted)
         except (OSError, msgspec.MsgspecError):
@@ -45,13 +42,13 @@ class Ledger:
         return counted if all(map(math.isfinite, counted.pose)) else None
 
     def write(self, counted: Counted) -> None:
-        """Write it, whole or not at all; a disk that refuses does not stop a robot."""
+        """Write counts atomically; a disk that refuses does not stop a robot."""
         with contextlib.suppress(OSError):
             write_whole(self._path, msgspec.json.encode(counted))
 
 
 def way_since(counted: Counted, ticks: tuple[int, int]) -> tuple[Planar, tuple[float, float, float]] | None:
-    """The way of a Create 2 since, as one arc, and sigmas of its end [m], [m], [rad]; None for one that cannot be."""
+    """Return the motion of a Create 2 since, as one arc, and its sigmas [m], [m], [rad]; None if it is not possible."""
     wheels = WHEELS[2]
     left, right = (ticks_between(b, a) * wheels.metres for b, a in zip(counted.ticks, ticks, strict=True))
     if max(abs(left), abs(right)) > FURTHEST:

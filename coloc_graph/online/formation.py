@@ -1,4 +1,4 @@
-"""Who stands where next: the course of a team, the paper's formation along it, and where the mover drives."""
+"""Course of a team, the paper's formation along it, and the mover's waypoints; `Course`, `Formation`."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,21 +13,17 @@ from coloc_graph.team.shared_view import View, places_in_view
 
 Array = NDArray[np.float64]
 
-#: The paper's formation: neighbours so far apart [m], their cameras turned towards each other by so much [rad].
-APART = 0.8
-BETWEEN = math.radians(34.0)
-#: The front observer stands so far ahead of the next [m]; one that leaps goes twice as far.
-STAGGER = 0.185
-#: Where the mover drives, ahead of the front observer [m]; it keeps clear of whoever leaps to the front.
-NEAR = 0.65
-FAR = 1.9
-#: Markers stay this far from the border of the images [px].
-MARGIN = 12.0
+APART = 0.8  # distance between neighbouring observers, as in the paper [m]
+BETWEEN = math.radians(34.0)  # angle between their cameras, which are turned towards each other [rad]
+STAGGER = 0.185  # the front observer stands this far ahead of the next; a leap is twice as long [m]
+NEAR = 0.65  # the mover drives from this far ahead of the front observer, clear of one that leaps [m]
+FAR = 1.9  # and up to this far [m]
+MARGIN = 12.0  # distance of markers from the borders of images [px]
 
 
 @dataclass(frozen=True)
 class Course:
-    """The way of the team: a polyline (n, 2) [m] on the floor of the world, followed by its middle."""
+    """Path of the team: a polyline (n, 2) [m] on the floor of the world, followed by the middle of the observers."""
 
     points: tuple[tuple[float, float], ...]
 
@@ -38,11 +34,11 @@ class Course:
 
     @property
     def length(self) -> float:
-        """Its length [m]."""
+        """Length of the path [m]."""
         return sum(math.dist(a, b) for a, b in zip(self.points, self.points[1:], strict=False))
 
     def at(self, way: float) -> Planar:
-        """The place and heading after so much `way` [m]; beyond its ends it goes straight on."""
+        """Return the pose after a distance `way` [m] along the path, which goes straight on beyond its ends."""
         last = len(self.points) - 2
         for n, (a, b) in enumerate(zip(self.points, self.points[1:], strict=False)):
             step = math.dist(a, b)
@@ -53,7 +49,7 @@ class Course:
         raise AssertionError("a course has a step")
 
     def way_of(self, place: Sequence[float]) -> float:
-        """How much way is behind the point of the course that is nearest to a place [m]."""
+        """Return the distance along the path of its point nearest to a place x, y [m]."""
         best, behind = (math.inf, 0.0), 0.0
         steps = list(zip(self.points, self.points[1:], strict=False))
         for n, (a, b) in enumerate(steps):
@@ -69,42 +65,63 @@ class Course:
 
 @dataclass(frozen=True)
 class Formation:
-    """How the observers stand: each in a lane of its own, in the team's order left and right of the course."""
+    """Formation of the observers: each in a lane of its own, in the team's order left and right of the course."""
 
     course: Course
     observers: tuple[str, ...]
 
     def lane(self, robot: str) -> tuple[float, float]:
-        """How far left of the course a robot stands [m], and how its camera is turned from the course [rad]."""
+        """Return a robot's offset to the left of the course [m] and its heading relative to the course [rad]."""
         n = self.observers.index(robot)
         side = -1.0 if n % 2 else 1.0
         across = math.sqrt(APART**2 - STAGGER**2)
         return side * across * (0.5 + n // 2), -side * BETWEEN * (0.5 + n // 2)
 
     def place(self, robot: str, way: float) -> Planar:
-        """Where a robot stands when it has so much way behind it."""
+        """Return the pose of a robot at a distance `way` [m] along the course."""
         x, y, heading = self.course.at(way)
         left, turn = self.lane(robot)
         return x - left * math.sin(heading), y + left * math.cos(heading), heading + turn
 
     def ways(self, places: Mapping[str, Planar]) -> dict[str, float]:
-        """How much way each observer has behind it."""
+        """Return the distance of each observer along the course [m]."""
         return {robot: self.course.way_of(places[robot]) for robot in self.observers}
 
     def next_leap(self, places: Mapping[str, Planar]) -> tuple[str, Planar]:
-        """Who leaps next, the one furthest behind, and where to: a stagger ahead of the front."""
+        """Return the observer furthest behind, which leaps next, and its target, a stagger ahead of the front."""
         ways = self.ways(places)
         robot = min(ways, key=lambda name: ways[name])
         return robot, self.place(robot, max(ways.values()) + STAGGER)
 
     def progress(self, places: Mapping[str, Planar]) -> float:
-        """How much way the observers have behind them in the mean [m]."""
+        """Return the mean distance of the observers along the course [m]."""
         ways = self.ways(places)
         return sum(ways.values()) / len(ways)
 
     def patrol(self, places: Mapping[str, Planar], views: Sequence[View], p_markers: Array, left: bool) -> Array:
-        """Places (n, 2) [m] through which the mover drives, spread widely over what all observers see, the last one in
-        the middle; with `left` the left far corner comes first. `InputError` where they see too little together."""
+        """Choose the mover's waypoints, spread over what all observers see.
+
+        Parameters
+        ----------
+        places
+            Poses of the observers.
+        views
+            Their views.
+        p_markers
+            Markers of the mover in its body (m, 3) [m].
+        left
+            Begin with the left far corner instead of the right one.
+
+        Returns
+        -------
+        ndarray
+            Waypoints (n, 2) [m] in the world, the last one in the middle.
+
+        Raises
+        ------
+        InputError
+            If the observers see too little of the floor together.
+        """
         front = max(self.ways(places).values())
         x, y, heading = self.course.at(front)
         for near in (NEAR, NEAR - 0.1):

@@ -18,9 +18,12 @@ class Inbox:
 
     def __init__(self) -> None:
         self._queue: queue.SimpleQueue[tuple[str, Message]] = queue.SimpleQueue()
+        self.status_times: dict[str, float] = {}  # when the newest status of each robot came [s, monotonic clock]
 
     def put(self, robot: str, message: Message) -> None:
         """Add a message of a robot; never waits."""
+        if isinstance(message, Status):
+            self.status_times[robot] = time.monotonic()
         self._queue.put((robot, message))
 
     def messages(self, seconds: float) -> Iterator[tuple[str, Message]]:

@@ -1,4 +1,4 @@
-"""A robot drives through places by its own odometry: turn, go straight, turn; one step of control at a time."""
+"""Control of a robot that drives through waypoints by its odometry: turn, drive straight, turn; `Follower`."""
 
 import math
 from collections import deque
@@ -7,31 +7,36 @@ from dataclasses import dataclass
 
 from coloc_graph.geometry.se2 import wrap
 
-#: Nearer than this a place is reached [m], and a heading [rad].
-NEAR = 0.01
-ALIGNED = 0.02
-#: It sets off when it heads at the place to within this [rad].
-SET_OFF = 0.06
-#: How hard it slows down before a place [1/s] and steers [1/s], the least that still moves [m/s], [rad/s].
-BRAKE = 2.0
-STEER = 2.5
-LEAST_SPEED = 0.02
-LEAST_TURN = 0.08
+NEAR = 0.01  # a waypoint is reached within this distance [m]
+ALIGNED = 0.02  # a heading is reached within this angle [rad]
+SET_OFF = 0.06  # the robot drives straight once it heads at the waypoint to within this [rad]
+BRAKE = 2.0  # speed per distance to the waypoint [1/s]
+STEER = 2.5  # turn rate per heading error [1/s]
+LEAST_SPEED = 0.02  # slowest speed [m/s]
+LEAST_TURN = 0.08  # slowest turn rate [rad/s]
 
 
 @dataclass(frozen=True)
 class Twist:
-    """Drive at `v` [m/s] and turn at `w` [rad/s]."""
+    """Speed ahead `v` [m/s] and turn rate to the left `w` [rad/s]."""
 
     v: float
     w: float
 
 
 class Follower:
-    """Drives through `places` (x, y) [m] of the odometry frame, then turns to `yaw` [rad], if there is one.
+    """Controller of one drive, to be asked ten times a second or more.
 
-    It goes backwards where that means less turning and `backwards` allows it. `step` is asked ten times a second or
-    more with where the robot is, and says how to drive; None when it is there.
+    Parameters
+    ----------
+    places
+        Waypoints (x, y) [m] in the odometry frame.
+    yaw
+        Heading at the end [rad]; None for any.
+    speed, turn
+        Largest speed [m/s] and turn rate [rad/s].
+    backwards
+        Drive backwards where that means less turning.
     """
 
     def __init__(
@@ -49,7 +54,7 @@ class Follower:
         self._from: tuple[float, float] | None = None
 
     def step(self, x: float, y: float, yaw: float) -> Twist | None:
-        """How to drive from a place [m] and heading [rad]."""
+        """Return the motion at a pose x, y [m], yaw [rad] in the odometry frame; None at the end."""
         while self._places:
             to = self._places[0]
             if self._from is None:
@@ -73,7 +78,7 @@ class Follower:
         return None
 
     def _passed(self, x: float, y: float) -> bool:
-        """Whether it has gone by the place that it drives to."""
+        """Return whether the robot has passed its waypoint."""
         (ax, ay), (bx, by) = self._from or (x, y), self._places[0]
         return (x - bx) * (bx - ax) + (y - by) * (by - ay) >= 0
 

@@ -1,4 +1,4 @@
-"""What the coordinator hears, in memory for the next stance and in a run on disk for good."""
+"""Record of a mission: the newest minutes in memory, everything in a run on disk; `Record`."""
 
 import threading
 from bisect import bisect_left, bisect_right
@@ -16,14 +16,13 @@ from coloc_graph.team import Team
 
 T = TypeVar("T", Detections, OdometrySample)
 
-#: So much of what is on disk is kept in memory too [s].
-MEMORY = 600.0
+MEMORY = 600.0  # newest part of the run that is kept in memory too [s]
 
 
 class Record:
-    """A run that is written while it is measured: `run.Recorded` of the newest minutes. A context manager.
+    """A run that is written while it is measured, and read as `run.Recorded`; a context manager.
 
-    What comes late is moved to the time of the last of its kind, since time does not run backwards in a run.
+    A late sample gets the time of the last one of its kind, since time does not run backwards in a run.
     """
 
     def __init__(self, path: str | Path, team: Team) -> None:
@@ -44,14 +43,14 @@ class Record:
         self._writer.__exit__(kind, error, trace)
 
     def take(self, one: Detections | OdometrySample) -> Detections | OdometrySample:
-        """Take in what a robot sent; it comes back as it will be read from the run."""
+        """Add a record; return it as it will be read from the run."""
         with self._lock:
             if isinstance(one, Detections):
                 return self._into(self._detections[one.robot], one)
             return self._into(self._odometry[one.robot], one)
 
     def moves(self, robot: str, time: float, moving: bool) -> None:
-        """Note whether a robot moves, where that is news."""
+        """Record whether a robot moves, if that has changed."""
         with self._lock:
             before = self._moving.get(robot)
             if before is None or before[0] != moving:
@@ -60,37 +59,37 @@ class Record:
                 self._writer.write(Motion(robot, time, moving))
 
     def complete(self, stance: Stance) -> None:
-        """A stance is over and in the estimate."""
+        """Add a stance that has entered the estimate."""
         self._writer.write(stance)
 
     def rounded(self, time: float) -> float:
-        """A time as it will be read from the run."""
+        """Round a time [UTC s] as it will be read from the run."""
         return to_seconds(to_ns(time))
 
     def last_odometry(self, robot: str) -> OdometrySample | None:
-        """The newest that is known of a robot's wheels."""
+        """Return the newest odometry sample of a robot; None if there is none."""
         return self._odometry[robot][-1] if self._odometry[robot] else None
 
     def newest(self) -> float:
-        """The time of the newest of all [UTC s]; 0 where there is nothing."""
+        """Return the time of the newest record [UTC s]; 0 if there is none."""
         seen = [kept[-1].time for kept in self._detections.values() if kept]
         rolled = [kept[-1].time for kept in self._odometry.values() if kept]
         return max([*seen, *rolled], default=0.0)
 
     def has_detections(self, robot: str) -> bool:
-        """A team in the field sends what it detected."""
+        """Return True: robots send detections."""
         return True
 
     def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
-        """The detections of a robot's camera in a time [UTC s]."""
+        """Return the detections of a robot's camera in a time span [UTC s]."""
         return iter(_between(self._detections[robot], start, end))
 
     def images(self, robot: str, start: float, end: float) -> Iterator[Image]:
-        """None: images stay on the robot."""
+        """Return no images: they stay on the robot."""
         return iter(())
 
     def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
-        """A robot's odometry in a time [UTC s]."""
+        """Return a robot's odometry in a time span [UTC s]."""
         return iter(_between(self._odometry[robot], start, end))
 
     def _into(self, kept: list[T], one: T) -> T:

@@ -1,4 +1,4 @@
-"""A robot's own program: it sees, counts its wheels, drives where it is told to, and stops by itself."""
+"""Program of one robot: it detects markers, counts its wheels, and drives on command; `RobotProgram`."""
 
 import contextlib
 import logging
@@ -14,7 +14,7 @@ from typing import Self
 from coloc_graph.errors import CameraError, ColocError, InputError, RobotError
 from coloc_graph.frontend import detector_for
 from coloc_graph.geometry.se2 import compose
-from coloc_graph.online.encoder_log import Counted, Ledger, way_since
+from coloc_graph.online.encoder_log import Counted, EncoderLog, way_since
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_restart import JoinedOdometry
 from coloc_graph.online.record import Record
@@ -42,19 +42,37 @@ from coloc_graph.team import Team
 
 log = logging.getLogger(__name__)
 
-#: Control of the motion, and word of how it is [s].
-CONTROL = 0.04
-REPORT = 0.1
-#: So long a camera may be without an image [s]; a lost one, or lost wheels, are opened again so often [s].
-NO_IMAGE = 1.0
-REOPEN = 1.0
+CONTROL_PERIOD = 0.04  # time between two steps of control [s]
+REPORT_PERIOD = 0.1  # time between two status messages [s]
+NO_IMAGE = 1.0  # a camera without an image for this time has a fault [s]
+REOPEN_PERIOD = 1.0  # time between two attempts to open a lost camera, or lost wheels [s]
 
 
 class RobotProgram:
-    """One robot of a team, for as long as `run` runs; a context manager, at whose end the wheels stand still.
+    """Program of one robot; a context manager, at whose end the wheels stand.
 
-    `camera` is a source of images, `wheels` a serial port (None: it only watches). What it sees and does is recorded
-    in `folder`, by its own clock. Raises `InputError`, `CameraError`, `RobotError` where it cannot begin.
+    Parameters
+    ----------
+    name, team
+        Name of the robot, and its team.
+    connect
+        Address of the coordinator.
+    folder
+        Folder for its own record, in the time of its own clock.
+    camera
+        Source of images; None for that of the team's description.
+    wheels, model
+        Serial port and model of its Create; None for those of the team's description. A robot without wheels only
+        observes.
+    tls
+        Its certificate.
+    clock
+        Its monotonic clock [ns].
+
+    Raises
+    ------
+    InputError, CameraError, RobotError
+        If it cannot begin.
     """
 
     def __init__(
@@ -88,14 +106,16 @@ class RobotProgram:
         self._still_since: int | None = clock()
         self._odometry, self._frame = JoinedOdometry(), self.session
         self._opening = False
-        self._ledger = Ledger(Path(folder) / f"{name}.wheels.json")
+        self._encoder_log = EncoderLog(Path(folder) / f"{name}.wheels.json")
         self._pose = (0.0, 0.0, 0.0)
         self._wheels_fault: str | None = None
         self._camera_fault: str | None = None
         colours = {robot.markers.hue_deg for robot in team.robots if robot.markers and robot.name != name}
         watched = next((robot.markers for robot in team.robots if robot.markers and robot.name != name), None)
         if len(colours) > 1:
-            raise InputError("the robots' markers are of several colours, and a robot's program looks for one")
+            raise InputError(
+                "the robots' markers have several colours, but a robot's program detects one: give all the same hue"
+            )
         self._detect = detector_for(watched, self.robot.camera)
         with contextlib.ExitStack() as undo:
             self._camera: CameraSource = undo.enter_context(open_camera(spec, self.robot.camera, name, clock))
@@ -129,20 +149,20 @@ class RobotProgram:
     def run(self, stop: threading.Event) -> None:
         """Control the wheels and report, until `stop` is set."""
         report, reopened = 0.0, 0.0
-        while not stop.wait(CONTROL):
+        while not stop.wait(CONTROL_PERIOD):
             if self._link.refused is not None:
                 raise RobotError(self._link.refused)
             self._roll()
             now = time.monotonic()
-            if self._wheels is not None and self._wheels_lost and now - reopened > REOPEN:
+            if self._wheels is not None and self._wheels_lost and now - reopened > REOPEN_PERIOD:
                 reopened = now
                 threading.Thread(target=self._reopen_wheels, name=f"wheels of {self.name}", daemon=True).start()
-            if now - report >= REPORT:
+            if now - report >= REPORT_PERIOD:
                 report = now
                 self._link.put(self._status())
 
     def _obey(self, body: Body) -> str:
-        """Carry out a command; what comes back is told the coordinator. Raises `RobotError` where it cannot."""
+        """Carry out a command and return the answer for the coordinator. Raises `RobotError` if it cannot."""
         with self._lock:
             match body:
                 case Capture(capture=capture):
@@ -183,7 +203,7 @@ class RobotProgram:
         return self._wheels is not None and self._wheels.lost
 
     def _reopen_wheels(self) -> None:
-        """After its line was lost: a new one, as soon as there is one."""
+        """Open the wheels' line again after it was lost."""
         wheels = self._wheels
         assert wheels is not None
         with contextlib.suppress(ColocError):
@@ -200,9 +220,9 @@ class RobotProgram:
         self._opening = False
 
     def _go_on_counting(self) -> None:
-        """Join the odometry of a line that has just been opened to what was counted before, by whatever program."""
+        """Join the odometry of a newly opened line to what was counted before, also by an earlier program."""
         assert self._wheels is not None
-        before, ticks = self._ledger.read(), self._wheels.state.ticks
+        before, ticks = self._encoder_log.read(), self._wheels.state.ticks
         since = way_since(before, ticks) if before is not None and ticks is not None else None
         if before is None or since is None:
             self._odometry, self._frame = JoinedOdometry(), uuid.uuid4().hex
@@ -211,7 +231,7 @@ class RobotProgram:
         self._odometry.go_on(compose(before.pose, since[0]), since[1])
 
     def _roll(self) -> None:
-        """One step of control: take what the wheels say, and steer or stop."""
+        """Do one step of control: take in odometry, then steer or stop."""
         wheels = self._wheels
         if wheels is None or self._opening:
             return
@@ -251,12 +271,12 @@ class RobotProgram:
         stamp = round(sample.time * 1e9) + clock_ahead(self._clock)
         self._link.put(Wheels.of(sample, session=self.session, number=self._rolled, stamp=stamp, frame=self._frame))
         if self._wheels is not None and not self._wheels.lost and (ticks := self._wheels.state.ticks) is not None:
-            self._ledger.write(Counted(self._frame, ticks, self._pose))
+            self._encoder_log.write(Counted(self._frame, ticks, self._pose))
         self._rolled += 1
         self._record.take(replace(sample, time=self._utc(stamp)))
 
     def _watch(self) -> None:
-        """The camera's thread: what is in each image while a stance is captured, and whether images come."""
+        """Camera's thread: detect markers in each image while a stance is captured, and watch for faults."""
         reopened = 0.0
         while not self._ended.is_set():
             try:
@@ -264,7 +284,7 @@ class RobotProgram:
                 self._camera_fault = None
             except CameraError as error:
                 self._camera_fault = str(error)
-                if self._camera.fault is not None and time.monotonic() - reopened > REOPEN:
+                if self._camera.fault is not None and time.monotonic() - reopened > REOPEN_PERIOD:
                     reopened = time.monotonic()
                     with contextlib.suppress(CameraError):
                         self._camera.reopen()
@@ -279,7 +299,7 @@ class RobotProgram:
                     self._ended.wait(NO_IMAGE)
 
     def _see(self, frame: Frame) -> None:
-        """Send and record what is in an image."""
+        """Send and record the markers in an image."""
         blobs, stamp = self._detect(frame.pixels), frame.stamp_ns
         seen = Detections(
             self.name, self._utc(stamp), blobs.uv, blobs.covariance, ("",) * len(blobs.uv),
@@ -323,6 +343,6 @@ class RobotProgram:
 
 
 def _new_file(folder: Path, name: str) -> Path:
-    """A file of the robot's that is not there yet: a program that begins anew never writes over what it recorded."""
+    """Return a path for the robot's record that does not exist yet: a restarted program overwrites nothing."""
     folder.mkdir(parents=True, exist_ok=True)
     return next(path for n in range(100_000) if not (path := folder / f"{name}-{n}.mcap").exists())

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from coloc_graph.geometry.se2 import Planar
@@ -31,14 +31,16 @@ class RobotState:
         Its pose in the world.
     to_coordinator
         Converts its stamps [ns] to the coordinator's clock [ns].
+    status_times
+        When the newest status of each robot came [s, monotonic clock], even where it has not been taken in yet.
     odometry
         Joins its odometry across restarts.
     frame
         Odometry frame of its newest sample.
     present
         True while its program is connected.
-    status, status_time, session
-        Newest status message, when it came [s, monotonic clock], and its program's session.
+    status, session
+        Newest status message, and its program's session.
     drive, arrived, interrupted
         Last drive command, whether it has been completed, and whether the robot stopped on the way.
     odometry_until, detections_until
@@ -48,11 +50,11 @@ class RobotState:
     name: str
     tracker: PoseTracker
     to_coordinator: Callable[[int], int]
+    status_times: Mapping[str, float]
     odometry: JoinedOdometry = field(default_factory=JoinedOdometry)
     frame: str | None = None
     present: bool = False
     status: Status | None = None
-    status_time: float = -math.inf
     session: str | None = None
     drive: Drive | None = None
     arrived: bool = True
@@ -64,8 +66,9 @@ class RobotState:
         """Describe what keeps the robot from taking part; None if nothing does. Hazards do not stop one that drives."""
         if not self.present or self.status is None:
             return f"{self.name} is not there: start its program, or check the network"
-        if time.monotonic() - self.status_time > SILENT:
-            return f"{self.name} has sent nothing for {time.monotonic() - self.status_time:.1f} s: check the network"
+        silent = time.monotonic() - self.status_times.get(self.name, -math.inf)
+        if silent > SILENT:
+            return f"{self.name} has sent nothing for {silent:.1f} s: check the network"
         if self.status.camera_fault:
             return f"{self.name}: {self.status.camera_fault}"
         if self.status.fault:
@@ -76,7 +79,7 @@ class RobotState:
 
     def take_status(self, status: Status) -> bool:
         """Take in a status message; return whether its session is a new one: the robot's program was restarted."""
-        self.status, self.status_time = status, time.monotonic()
+        self.status = status
         if status.session == self.session:
             return False
         self.session = status.session
@@ -106,6 +109,8 @@ class RobotRegistry:
         Returns the conversion of a robot's stamps to the coordinator's clock.
     epoch
         UTC minus the coordinator's monotonic clock [ns].
+    status_times
+        When the newest status of each robot came [s, monotonic clock].
     """
 
     def __init__(
@@ -114,9 +119,12 @@ class RobotRegistry:
         starts: dict[str, Planar],
         clock_of: Callable[[str], Callable[[int], int]],
         epoch: int,
+        status_times: Mapping[str, float],
     ) -> None:
         self.record, self.epoch = record, epoch
-        self.robots = {name: RobotState(name, PoseTracker(start), clock_of(name)) for name, start in starts.items()}
+        self.robots = {
+            name: RobotState(name, PoseTracker(start), clock_of(name), status_times) for name, start in starts.items()
+        }
 
     def __getitem__(self, name: str) -> RobotState:
         return self.robots[name]

@@ -1,4 +1,4 @@
-"""What the observers see of the mover while it drives: whether it is in their views, and whether it is enough."""
+"""The mover in the observers' views, and the precision of a stance so far; `InView`, `precision`."""
 
 import math
 from collections import defaultdict, deque
@@ -21,23 +21,26 @@ from coloc_graph.team.shared_view import View
 
 Array = NDArray[np.float64]
 
-#: A light this near to where a marker should be is taken for it [px]; places are known by wheels alone.
-GATE = 60.0
-#: The mover is in a view where so many of the images of this time [s] show all its markers.
-SHARE = 0.5
-LOOKED_AT = 0.7
-#: Two lights are a mover's whose distance is its markers' to this share, and that are so far from all who stand [m].
-ALIKE = 0.15
-CLEAR = 0.3
-#: A mover is no further from where its wheels have it than this [m], [rad].
-ASTRAY = 0.8
-TURNED = 1.3
-#: Two observers that have the mover further apart than this do not both stand where they should [m].
-DISPLACED = 0.1
+GATE = 60.0  # distance of a light from a marker's predicted pixel within which it is that marker's [px]
+SHARE = 0.5  # share of the newest images that must show all markers of the mover
+LOOKED_AT = 0.7  # duration of these images [s]
+ALIKE = 0.15  # relative difference between the distance of two lights and the mover's marker span
+CLEAR = 0.3  # distance of the mover from robots that stand [m]
+ASTRAY = 0.8  # largest distance of the mover from its tracked pose [m]
+TURNED = 1.3  # the same of its heading [rad]
+DISPLACED = 0.1  # two observers that see the mover further apart do not both stand where they should [m]
 
 
 class InView:
-    """Whether the observers' images show a mover's markers where they should be."""
+    """The mover in the images of observers that stand.
+
+    Parameters
+    ----------
+    team, mover
+        The team, and the name of the mover, which has markers.
+    observers
+        Poses of the observers in the world.
+    """
 
     def __init__(self, team: Team, mover: str, observers: Mapping[str, Planar]) -> None:
         markers = team[mover].markers
@@ -52,7 +55,7 @@ class InView:
         self._newest: dict[str, Detections] = {}
 
     def take(self, seen: Detections, mover: Planar) -> bool:
-        """Take in an image of one observer while the mover is thought to be there; whether it shows its markers."""
+        """Take in an image of an observer; return whether it shows the markers of the mover at its pose `mover`."""
         view = self.views.get(seen.robot)
         if view is None:
             return False
@@ -70,8 +73,13 @@ class InView:
         return shows
 
     def find(self, seen: Detections, expected: Planar) -> Planar | None:
-        """Where an image of one observer has the mover, not too far from where it is expected; None where it does not,
-        or leaves a choice. Two lights as far apart as its markers, and away from all who stand, are taken for it."""
+        """Find the mover in an image of an observer: two lights as far apart as its markers, clear of other robots.
+
+        Returns
+        -------
+        tuple or None
+            Its pose in the world near the `expected` one; None if there is none, or more than one.
+        """
         view = self.views.get(seen.robot)
         if view is None or len(self._p_markers) < 2 or len(seen.uv) < 2:
             return None
@@ -101,8 +109,15 @@ class InView:
         return float(xy[best, 0]), float(xy[best, 1]), expected[2] + float(off[best])
 
     def displaced(self, mover: Planar) -> dict[str, Planar]:
-        """Observers whose newest image shows the mover, which stands, plainly elsewhere than another's does, and where
-        they must be; the one that has it nearest to where it is thought to be, by its wheels, is taken at its word."""
+        """Find observers whose newest image shows the standing mover elsewhere than another's does.
+
+        The observer that sees it nearest to its tracked pose `mover` is taken to be right.
+
+        Returns
+        -------
+        dict
+            Corrected poses of the others in the world, by name.
+        """
         found = {name: self.find(seen, mover) for name, seen in self._newest.items()}
         places = {name: place for name, place in found.items() if place is not None}
         if len(places) < 2:
@@ -115,7 +130,7 @@ class InView:
         }
 
     def missing(self) -> list[str]:
-        """The observers whose newest images do not show the mover; those that have sent none are among them."""
+        """Return the observers whose newest images do not show the mover, or that have sent none."""
         return [
             name
             for name in self.views
@@ -124,12 +139,12 @@ class InView:
 
 
 def _apart(a: Planar, b: Planar) -> float:
-    """How far two places are from each other, a radian as much as 0.3 m [m]."""
+    """Distance between two poses [m], in which a radian counts as 0.3 m."""
     return math.dist(a[:2], b[:2]) + 0.3 * abs(wrap(a[2] - b[2]))
 
 
 def _on_plane(view: View, uv: Array, height: float) -> Array:
-    """Places (n, 2) [m] in the world of pixels (n, 2), at a height above the floor [m]; NaN where the ray never is."""
+    """Project pixels (n, 2) onto a plane at a height above the floor [m]: (n, 2) [m], NaN above the horizon."""
     rays = np.column_stack([view.camera.normalise(uv), np.ones(len(uv))]) @ view.T_world_camera[:3, :3].T
     down = np.where(rays[:, 2] < -1e-3, rays[:, 2], np.nan)
     reach = (height - view.T_world_camera[2, 3]) / down
@@ -138,8 +153,17 @@ def _on_plane(view: View, uv: Array, height: float) -> Array:
 
 @dataclass(frozen=True)
 class Precision:
-    """How well a stance, as it is so far, measures its pairs: points of the poorest, and standard deviations, with the
-    mounts taken as stated, of place [m] and heading [rad]; `why` where it does not measure them at all."""
+    """Precision of a stance so far, with mounts taken as stated.
+
+    Attributes
+    ----------
+    points
+        Number of correspondences of the pair that has fewest.
+    place, heading
+        Largest standard deviations of a pair's relative position [m] and heading [rad].
+    why
+        Reason for which a pair is not measured; empty if all are.
+    """
 
     points: int
     place: float
@@ -147,7 +171,7 @@ class Precision:
     why: str = ""
 
     def suffices(self, options: MissionOptions) -> bool:
-        """Whether a mission asks for no more."""
+        """Return whether the precision is what a mission asks for."""
         return (
             self.points >= options.least_points
             and self.place <= options.place_sigma
@@ -157,7 +181,7 @@ class Precision:
 
 @dataclass(frozen=True, eq=False)
 class _Exact:
-    """A record as of a team whose mounts and floor are exact: what is left is what the points leave open."""
+    """A record of a team whose mounts and floor are exact, so that only the points' noise is left."""
 
     record: Recorded
     team: Team
@@ -184,7 +208,7 @@ class _Exact:
 
 
 def exact(team: Team) -> Team:
-    """A team without tolerances."""
+    """Return a team without its tolerances."""
     new = msgspec.structs.replace
     robots = []
     for robot in team.robots:
@@ -198,7 +222,7 @@ def exact(team: Team) -> Team:
 def precision(
     record: Recorded, stance: Stance, options: FrontendOptions | None = None, tracks: StanceTracks | None = None
 ) -> Precision:
-    """What a stance that may go on measures so far."""
+    """Compute the precision of a stance from what is recorded so far."""
     source = _Exact(record, exact(record.team))
     points, place, heading, why = 10**9, 0.0, 0.0, ""
     for i, j in combinations(stance.observers, 2):

@@ -10,7 +10,7 @@ import pytest
 from coloc_graph.errors import InputError, RobotError, RunError
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.geometry.se2 import compose, inverse
-from coloc_graph.online.encoder_log import Counted, Ledger, way_since
+from coloc_graph.online.encoder_log import Counted, EncoderLog, way_since
 from coloc_graph.online.estimation_worker import EstimationWorker
 from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Course, Formation
 from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateMachine, as_dot
@@ -158,7 +158,7 @@ def test_odometry_goes_on_over_a_restart_and_admits_what_it_missed():
 
 
 def test_a_killed_program_s_wheels_are_counted_on_by_the_next(tmp_path):
-    ledger = Ledger(tmp_path / "A.wheels.json")
+    ledger = EncoderLog(tmp_path / "A.wheels.json")
     assert ledger.read() is None
     counted = Counted("one", (65_500, 10), (1.0, 2.0, math.pi / 2))
     ledger.write(counted)
