@@ -54,7 +54,9 @@ def main() -> None:
     signal.signal(signal.SIGUSR2, lambda *_: asks.set())
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    with Coordinator(read_team(team), folder, MissionOptions(speed=float(speed), attempts=1000), listen=address) as coordinator:
+    with Coordinator(
+        read_team(team), folder, MissionOptions(speed=float(speed), attempts=1000), listen=address
+    ) as coordinator:
         coordinator.run(stop)
 
 

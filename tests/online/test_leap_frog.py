@@ -1,0 +1,161 @@
+"""The states of a mission without a network: robots are a registry and a commander that records."""
+
+import math
+import threading
+import time
+
+import pytest
+
+from coloc_graph.errors import RobotError
+from coloc_graph.online.commands import Commander, Stopped
+from coloc_graph.online.estimation_worker import EstimationWorker
+from coloc_graph.online.formation import STAGGER, Course, Formation
+from coloc_graph.online.inbox import Inbox
+from coloc_graph.online.leap_frog import CALM, LeapFrog
+from coloc_graph.online.leap_planner import LeapPlanner
+from coloc_graph.online.mission import MissionOptions, in_world, roles
+from coloc_graph.online.mission_log import MissionLog
+from coloc_graph.online.mission_states import MissionState
+from coloc_graph.online.record import Record
+from coloc_graph.online.robot_registry import RobotRegistry
+from coloc_graph.pipeline.incremental import StanceSolver
+from coloc_graph.robot_io.link.messages import Capture, Drive, EndCapture, Event, Halt, Reply, Status, Wheels
+from coloc_graph.run import Stance
+from coloc_graph.simulation.simulated_team import field_team
+
+OPTIONS = MissionOptions(goals=((5.0, 0.0),))
+
+
+class Link:
+    """Answers every command, unless told otherwise, and counts permissions."""
+
+    def __init__(self):
+        self.asked, self.holds, self.answers = [], 0, {}
+
+    def hold(self):
+        self.holds += 1
+
+    def ask_each(self, bodies, timeout, waiting=lambda: None):
+        self.asked += bodies.items()
+        waiting()
+        return {name: self.answers.get(name, Reply(id="", ok=True)) for name in bodies}
+
+
+class Mission:
+    """A mission of robots that stand, none of which sees anything."""
+
+    def __init__(self, folder):
+        self.team, self.inbox, self.link = field_team(), Inbox(), Link()
+        self.record = Record(folder / "run.mcap", self.team)
+        starts, waypoints = in_world(self.team, "C", OPTIONS.goals)
+        self.registry = RobotRegistry(self.record, starts, lambda _: lambda stamp: stamp, 0, self.inbox.status_times)
+        self.worker = EstimationWorker(self.record, StanceSolver(self.team))
+        self.commander = Commander(self.link, self.registry, 0.3, lambda _: None)
+        self.log = MissionLog(folder / "mission.jsonl", self.registry.utc)
+        self.formation = Formation(Course(waypoints), roles(self.team, None)[1])
+        self.synchronised = True
+        self.leap_frog = LeapFrog(
+            self.team,
+            OPTIONS,
+            self.formation,
+            registry=self.registry,
+            commander=self.commander,
+            worker=self.worker,
+            log=self.log,
+            synchronised=lambda _: self.synchronised,
+        )
+
+    def report(self, name, fault=None):
+        now = time.monotonic_ns()
+        status = Status(session=name, stamp=now, phase="idle", capture=None, moving=False, still_since=0, fault=fault,
+                        camera_fault=None, hazards=[])  # fmt: skip
+        self.inbox.put(name, status)
+        robot = self.registry[name]
+        robot.present = True
+        robot.take_status(status)
+        if not robot.tracker.known:
+            wheels = Wheels(session=name, number=0, stamp=now, frame="f", pose=(0.0, 0.0, 0.0),
+                            covariance=(1e-8, 0.0, 0.0, 1e-8, 0.0, 1e-8))  # fmt: skip
+            self.registry.take_wheels(name, wheels)
+
+    def step(self, state):
+        """Step once from a state that has lasted for long."""
+        self.leap_frog.states.since -= CALM + 0.1
+        self.leap_frog.step()
+        assert self.leap_frog.states.now == state
+
+    def close(self):
+        self.worker.end()
+        self.log.__exit__(None, None, None)
+        self.record.__exit__(None, None, None)
+
+
+@pytest.fixture
+def mission(tmp_path):
+    one = Mission(tmp_path)
+    yield one
+    one.close()
+
+
+def test_a_mission_places_its_robots_looks_and_holds_when_one_has_gone(mission):
+    mission.step(MissionState.GATHERING)
+    for name in "ABC":
+        mission.report(name)
+    mission.step(MissionState.SYNCHRONISING)
+    mission.synchronised = False
+    mission.step(MissionState.SYNCHRONISING)
+    mission.synchronised = True
+    mission.step(MissionState.PLACING)
+    ((name, drive),) = mission.link.asked  # nobody leaps into the first stance
+    assert name == "C" and isinstance(drive, Drive)
+    mission.step(MissionState.PLACING)
+    mission.registry["C"].take_event(Event(session="C", number=0, stamp=0, kind="stopped", text=""))
+    mission.step(MissionState.PLACING)
+    assert mission.link.asked[-1] == ("C", drive)  # and is sent on
+    mission.registry["C"].take_event(Event(session="C", number=1, stamp=0, kind="arrived", text=str(drive.number)))
+    mission.step(MissionState.LOOKING)
+    assert {name for name, body in mission.link.asked if isinstance(body, Capture)} == {"A", "B"}
+    mission.registry["B"].present = False
+    mission.step(MissionState.HOLDING)
+    assert mission.link.asked[-4:] == [(n, body) for body in (Halt(), EndCapture()) for n in "AC"]
+    assert mission.leap_frog.describe() == "stance 0: holding"
+
+
+def test_an_ask_renews_the_permission_to_move_and_ends_when_the_mission_is_stopped(mission):
+    mission.commander.ask("A", Halt())
+    assert mission.link.holds == 1
+    mission.link.answers = {"A": None}
+    with pytest.raises(RobotError, match="A has not answered `Halt` within 1 s"):
+        mission.commander.ask("A", Halt())
+    mission.link.answers = {"A": Reply(id="", ok=False, text="no")}
+    with pytest.raises(RobotError, match="A refuses: no"):
+        mission.commander.ask("A", Halt())
+    mission.commander.stop = threading.Event()
+    mission.commander.stop.set()
+    with pytest.raises(Stopped):
+        mission.commander.ask("A", Halt())
+
+
+def test_a_robot_whose_messages_wait_is_not_called_silent(mission):
+    mission.report("A")
+    mission.inbox.status_times["A"] -= 1.2
+    assert "A has sent nothing for 1.2 s" in mission.registry["A"].trouble()
+    mission.inbox.put("A", mission.registry["A"].status)  # it came, but the main loop was held up
+    assert mission.registry["A"].trouble() is None
+
+
+def test_a_leap_that_was_planned_or_begun_is_kept(mission):
+    for name in "ABC":
+        mission.report(name)
+    planner = LeapPlanner(mission.team, "C", mission.formation, mission.registry)
+    first = planner.plan(0, None, 0)
+    assert first.leap is None and planner.drives("C") and not planner.drives("A")
+    before = Stance(0, 0.0, mission.registry.utc() + 1.0, ("A", "B"), ("C",))
+    plan = planner.plan(1, before, 0)
+    leaper, target = plan.leap
+    assert planner.drives(leaper) and planner.plan(1, before, 1).leap == plan.leap
+    way = mission.formation.course.way_of(target)
+    assert way == pytest.approx(max(mission.formation.ways(mission.registry.poses()).values()) + STAGGER)
+    other = "AB".replace(leaper, "")
+    mission.registry[other].tracker.displace(math.inf, mission.registry[other].tracker.pose())
+    assert planner.plan(2, before, 0).leap[0] == other  # it has set off already
