@@ -3,6 +3,8 @@
 # make bench  the benchmarks behind the figures in the README; DATA=DIR for that on the stereo pairs of a chessboard,
 #             GRAPHS=DIR for those on the pose graphs sphere2500 and M3500, MRCLAM=DIR for that on an MR.CLAM dataset
 
+# make fuzz   every parser by guided fuzzing: 20,000 inputs a target; ARGS="team g2o --runs 100000" for some of them
+
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -11,7 +13,7 @@ DATA ?=
 GRAPHS ?=
 MRCLAM ?=
 
-.PHONY: demo test lint types unit bench clean
+.PHONY: demo test lint types unit bench fuzz clean
 
 demo: $(VENV)/installed
 	$(BIN)/coloc demo $(ARGS)
@@ -64,6 +66,10 @@ ifneq ($(DATA),)
 else
 	@echo "benchmarks/stereo_board.py and calibration.py are left out: give the folder of their images with make bench DATA=DIR"
 endif
+
+fuzz: $(VENV)/installed-dev
+	$(BIN)/pip install --quiet --disable-pip-version-check 'atheris>=3'
+	$(BIN)/python -m fuzz.run $(ARGS)
 
 $(VENV)/made:
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 15) else \

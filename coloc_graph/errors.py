@@ -16,9 +16,21 @@ Messages are one sentence: what is wrong, where (file, line, stance, robot), and
 deep and caught once, in `cli`, which prints the sentence and ends with exit code 2.
 """
 
+import re
+
+_LINE_ENDS = re.compile(r"\s*[\n\r\v\f\x1c-\x1e\x85\u2028\u2029]+\s*")
+_NOT_PRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+
 
 class ColocError(Exception):
-    """Base of all errors that a user can cause."""
+    """Base of all errors that a user can cause.
+
+    The message is one line of printable text, whatever it quotes of a file: line ends become spaces, other control
+    characters, with which a file could write to the terminal, question marks.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(_NOT_PRINTABLE.sub("?", _LINE_ENDS.sub(" ", str(message))))
 
 
 class InputError(ColocError):

@@ -1,4 +1,4 @@
-"""coloc solve RUN|FOLDER --out DIR."""
+"""coloc solve RUN|FOLDER|GRAPH.g2o --out DIR."""
 
 import argparse
 import sys
@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """The command's arguments."""
     command = commands.add_parser("solve", help="estimate the poses of a run, or of each run in a folder")
-    command.add_argument("run_path", metavar="RUN|FOLDER", help="the run (.mcap), or a folder of runs")
+    command.add_argument(
+        "run_path", metavar="RUN|FOLDER|GRAPH", help="the run (.mcap), a folder of runs, or a pose graph (.g2o)"
+    )
     command.add_argument("--out", required=True, metavar="DIR", help="folder for the result, or for one of each run")
     command.add_argument(
         "--method",
@@ -45,6 +47,11 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     )
     command.add_argument("--processes", type=int, metavar="N", help="of a folder, so many at a time (one a core)")
     command.add_argument("--cluster", metavar="ADDRESS", help="of a folder, by the Dask scheduler at tcp://HOST:PORT")
+    command.add_argument(
+        "--lenient",
+        action="store_true",
+        help="of a pose graph: project information matrices that are not positive definite, and say how many",
+    )
     command.add_argument("--json", action="store_true", help="print the summary as JSON")
     command.set_defaults(run=run)
 
@@ -53,6 +60,10 @@ def run(args: argparse.Namespace) -> int:
     """Solve, write, print; with --view, show."""
     from contextlib import nullcontext
 
+    if Path(args.run_path).suffix.lower() == ".g2o":
+        from coloc_graph.cli.solve_graph import solve_graph
+
+        return solve_graph(args)
     from coloc_graph.cli.view import take_port
 
     with take_port(args.port) if args.view else nullcontext() as listener:  # before the work, not after it
@@ -80,6 +91,8 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
         frontend = options.resolved().frontend
         assert frontend is not None  # resolved
         options = replace(options, frontend=replace(frontend, scale=args.scale))
+    if args.lenient:
+        raise InputError(f"{args.run_path} is no pose graph (.g2o); --lenient is for one")
     if Path(args.run_path).is_dir():
         return solve_folder(args, options)
     if args.processes is not None or args.cluster is not None:

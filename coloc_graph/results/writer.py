@@ -265,6 +265,8 @@ def read_result(path: str | Path) -> Result:
     if not (path / SUMMARY).exists():
         raise InputError(f"{path} is not a result: it has no {SUMMARY}; give the folder that `coloc solve --out` wrote")
     summary = read_summary(path)
+    if summary.get("kind") == "pose graph":
+        raise InputError(f"{path} is a solved pose graph, without robots and times; take its graph.g2o")
     said = convert(path / SUMMARY, summary, _Said, "solve the run again")
     trajectories = {robot: read_tum(path / "trajectories" / f"{robot}.tum") for robot in said.robots}
     return Result(path, summary, trajectories, Path(os.path.normpath(path / said.run)), said.run_id)

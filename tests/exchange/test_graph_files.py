@@ -1,6 +1,7 @@
 """Pose graphs of other people, and ours for them: g2o in and out, dot, the export command."""
 
 import html
+import json
 import shutil
 import subprocess
 from pathlib import Path
@@ -198,3 +199,52 @@ def test_solve_incrementally_says_what_a_stance_costs(short, tmp_path, capsys):
     np.testing.assert_allclose(a.T_world_body, b.T_world_body, atol=1e-6)
     assert main(["solve", str(short), "--out", str(tmp_path / "c"), "--incremental", "--method", "chain"]) == 2
     assert "never incremental" in capsys.readouterr().err
+
+
+def square(corners, edges):
+    """A unit square as a planar graph; each edge turns by 90 degrees."""
+    turn = f"EDGE_SE2 {{}} {{}} 1 0 {np.pi / 2} 1 0 0 1 0 1"
+    near = ("0 0 0", "0.8 0.1 1.4", "1.2 0.9 3.0", "0.1 1.1 -1.5")
+    ids = [gtsam.symbol("a", k) for k in range(corners)]
+    vertices = [f"VERTEX_SE2 {key} {at}" for key, at in zip(ids, near, strict=False)]
+    return "\n".join([*vertices, *(turn.format(ids[i], ids[j]) for i, j in edges)])
+
+
+def test_solve_writes_the_optimum_of_a_pose_graph(tmp_path, capsys):
+    path, out = tmp_path / "square.g2o", tmp_path / "result"
+    path.write_text(square(4, [(0, 1), (1, 2), (2, 3), (3, 0)]).replace("\n", "\r\n"), newline="")
+    assert main(["solve", str(path), "--out", str(out)]) == 0
+    assert "4 poses in 2D, 4 edges: chi2 " in capsys.readouterr().out
+    solved = read_g2o(out / "graph.g2o")
+    corners = [solved.values.atPose2(gtsam.symbol("a", k)).translation() for k in range(4)]
+    np.testing.assert_allclose(corners, [[0, 0], [1, 0], [1, 1], [0, 1]], atol=1e-6)
+    assert main(["solve", str(path), "--out", str(out), "--json"]) == 0  # replaces it
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["chi2"] < 1e-9 < figures["chi2_before"] and figures["dof"] == 3
+    assert main(["export", "tum", str(out), "--out", str(tmp_path / "x")]) == 2
+    assert "is a solved pose graph" in capsys.readouterr().err
+
+
+def test_solve_of_a_pose_graph_in_3d_is_gtsams_optimum(tmp_path, capsys):
+    estimate = smooth(graph_of_team(team_of(4, 6, floor=None)))
+    write_g2o(estimate, tmp_path / "graph.g2o")
+    assert main(["solve", str(tmp_path / "graph.g2o"), "--out", str(tmp_path / "result"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["chi2"] == pytest.approx(estimate.chi2, rel=1e-6)
+    before, after = (read_g2o(one / "graph.g2o") for one in (tmp_path, tmp_path / "result"))
+    assert after.names == before.names and after.stay_puts == before.stay_puts
+
+
+def test_a_disconnected_graph_and_options_of_runs_are_refused(tmp_path, capsys):
+    path = tmp_path / "square.g2o"
+    path.write_text(square(4, [(0, 1), (2, 3)]))
+    assert main(["solve", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert "2 of 4 vertices, as " in (said := capsys.readouterr().err) and "are disconnected from vertex" in said
+    assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--incremental"]) == 2
+    assert "is a pose graph; --incremental is for runs" in capsys.readouterr().err
+    odd = square(2, [(0, 1)]).replace(" 1 0 0 1 0 1", " 1 0 0 1 0 0")
+    path.write_text(odd)
+    assert main(["solve", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert "as in 1 of 1 edges" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--lenient"]) == 0
+    assert "1 of 1 edges is not positive definite: 1 were projected" in capsys.readouterr().err

@@ -1,0 +1,44 @@
+"""coloc solve GRAPH.g2o --out DIR."""
+
+import argparse
+
+from coloc_graph.cli.printing import counted, print_json, warn
+
+
+def solve_graph(args: argparse.Namespace) -> int:
+    """Solve a pose graph, write it, print."""
+    from coloc_graph.errors import InputError
+    from coloc_graph.pipeline.pose_graph import solve_pose_graph
+    from coloc_graph.results.pose_graph import summarise_pose_graph, write_pose_graph_result
+    from coloc_graph.results.writer import require_place
+    from coloc_graph.run.output_lock import locked_output
+
+    given = [
+        name
+        for name in ("method", "scale", "incremental", "view", "without_odometry", "without_robots", "processes")
+        if getattr(args, name)
+    ]
+    if given:
+        raise InputError(f"{args.run_path} is a pose graph; --{given[0].replace('_', '-')} is for runs")
+    require_place(args.out)
+    with locked_output(args.out):
+        solution = solve_pose_graph(args.run_path, lenient=args.lenient)
+        write_pose_graph_result(solution, args.out)
+    graph = solution.graph
+    if graph.projected or graph.left_out:
+        edges = graph.factors.size() - len(graph.fixed) + graph.left_out
+        warn([
+            f"{args.run_path}: the information of {graph.projected + graph.left_out} of {edges} edges is not positive "
+            f"definite: {graph.projected} were projected, {graph.left_out} without any information left out"
+        ])  # fmt: skip
+    if args.json:
+        print_json(summarise_pose_graph(solution))
+        return 0
+    agreement = f", chi2/dof {solution.chi2 / solution.dof:.3f}" if solution.dof > 0 else ""
+    print(
+        f"{counted(graph.values.size(), 'pose')} in {'2D' if graph.planar else '3D'}, "
+        f"{counted(graph.factors.size() - len(graph.fixed), 'edge')}: chi2 {solution.chi2_before:.6g} before and "
+        f"{solution.chi2:.6g} after {counted(solution.iterations, 'iteration')}{agreement}; {solution.seconds:.1f} s; "
+        f"{args.out} holds graph.g2o and summary.json"
+    )
+    return 0

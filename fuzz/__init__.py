@@ -1,0 +1,1 @@
+"""Guided fuzzing of every parser: `make fuzz`."""
