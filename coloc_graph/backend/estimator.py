@@ -1,6 +1,6 @@
 """The estimate kept up to date while stances come in: ISAM2 with QR, and a log from which it can be rebuilt."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Set
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,8 +20,9 @@ from coloc_graph.backend.graph import (
     Link,
     PoseGraph,
     PoseKeys,
+    instants_of,
+    require_anchor,
     require_ends,
-    require_instant,
     require_reference,
     require_robots,
     slips_of,
@@ -31,7 +32,7 @@ from coloc_graph.backend.isam2_graph import Isam2Graph, rebuilt
 from coloc_graph.backend.landmarks import Placed, landmarks_of, map_of, of_seen
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError, MeasurementError
-from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
+from coloc_graph.measurements import Measurement, Node, RelativePose, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.team import Floor, Landmark, Robot, Slip, Team
 
@@ -92,6 +93,7 @@ class Estimator:
         }
         self._newly: set[int] = set()  # those rejected since the last stance came, it included
         self._loose: list[Link] = []  # what nothing ties to the reference
+        self._instants: dict[Node, float] = {}
         self._instants = self._checked(self._log)  # when moving robots were sighted
         self._live = Isam2Graph(self._new_factors())
         if base.stances:
@@ -306,20 +308,9 @@ class Estimator:
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint, whole or not at all, from which `resume` goes on."""
-        checkpoint.write(
-            checkpoint.Checkpoint(
-                reference=self.reference,
-                robots=self.robots,
-                floor=self.floor,
-                slips=self.slips,
-                rigs=self.rigs,
-                landmarks=self.landmarks,
-                base=self._base,
-                journal=tuple(self._journal),
-                early=tuple(self._early.values()),
-            ),
-            Path(path),
-        )
+        team = self.reference, self.robots, self.floor, self.slips, self.rigs, self.landmarks
+        came = self._base, tuple(self._journal), tuple(self._early.values())
+        checkpoint.write(checkpoint.Checkpoint(*team, *came), Path(path))
 
     @classmethod
     def resume(cls, path: str | Path) -> "Estimator":
@@ -341,7 +332,7 @@ class Estimator:
         links: list[Link] = [*self._loose, *taken, *self._newly_on_map(taken)]
         if stance is not None:
             if before is not None:
-                self._require_anchor(stance, taken)
+                require_anchor(stance, taken)
                 links += [stay for stay in self._places.stay_puts(before, stance) if stay.slip is not None]
             self._places.accept(self._places.after(before, stance))
             self._stances[stance.index] = stance
@@ -373,22 +364,11 @@ class Estimator:
             if id(one) not in waiting and self._places.key(one.ends[1]) not in self._live.tied
         )
 
-    def _require_anchor(self, stance: Stance, taken: tuple[Measurement, ...]) -> None:
-        if not stance.anchors and not any(isinstance(one, Odometry) and one.after == stance.index for one in taken):
-            raise MeasurementError(
-                f"stance {stance.index} has no anchor and no odometry into it, so that nothing ties it to the stances "
-                "before: name the robot that stayed put"
-            )
-
-    def _checked(self, taken: Iterable[Measurement]) -> dict[Node, float]:
-        """When moving robots were sighted; raises where a measurement relates what is not there."""
-        instants: dict[Node, float] = {}
+    def _checked(self, taken: Sequence[Measurement]) -> dict[Node, float]:
+        """Times at which moving robots were sighted; raises where a measurement relates what is not there."""
         for measured in taken:
             require_ends(measured, self._places, self._stances)
-            if isinstance(measured, Sighting) and measured.seen in self._stances[measured.stance].movers:
-                node = (measured.seen, measured.stance)
-                require_instant(measured, self._instants.get(node, instants.setdefault(node, measured.time)))
-        return instants
+        return instants_of(taken, self._stances, self._instants)
 
     def _entering(self, links: list[Link]) -> InsertionPlan:
         reference = self._places.key((self.reference, next(iter(self._stances))))

@@ -182,7 +182,7 @@ class PoseGraph:
         for measured in self.measurements:
             require_ends(measured, self.places, self.by_index)
         require_valid(self.measurements, self.floor)
-        _require_one_instant(self.measurements, self.by_index)
+        instants_of(self.measurements, self.by_index)
 
     @cached_property
     def places(self) -> PoseKeys:
@@ -324,6 +324,15 @@ def require_robots(stance: Stance, robots: tuple[str, ...]) -> None:
             )
 
 
+def require_anchor(stance: Stance, taken: Iterable[Measurement]) -> None:
+    """Raise `MeasurementError` where neither an anchor nor odometry ties a stance to those before."""
+    if not stance.anchors and not any(isinstance(one, Odometry) and one.after == stance.index for one in taken):
+        raise MeasurementError(
+            f"stance {stance.index} has no anchor and no odometry into it, so that nothing ties it to the stances "
+            "before: name the robot that stayed put"
+        )
+
+
 def require_ends(measured: Measurement, places: PoseKeys, stances: Mapping[int, Stance]) -> None:
     """Raise `MeasurementError` where a measurement relates what is not there, or a robot to itself."""
     for robot, index in measured.ends:
@@ -345,15 +354,22 @@ def require_ends(measured: Measurement, places: PoseKeys, stances: Mapping[int, 
             raise MeasurementError(f"the {measured} names {robot}, which does not observe there")
 
 
-def _require_one_instant(measurements: Iterable[Measurement], stances: Mapping[int, Stance]) -> None:
-    """A moving robot has one pose a stance, so that all its sightings there are of one instant."""
-    when: dict[Node, float] = {}
+def instants_of(
+    measurements: Iterable[Measurement], stances: Mapping[int, Stance], known: Mapping[Node, float] | None = None
+) -> dict[Node, float]:
+    """Times [UTC s] at which moving robots were sighted that are not `known`.
+
+    A moving robot has one pose a stance: raises `MeasurementError` where it was sighted there at two instants.
+    """
+    known, found = known or {}, dict[Node, float]()
     for one in measurements:
         if isinstance(one, Sighting) and one.seen in stances[one.stance].movers:
-            require_instant(one, when.setdefault((one.seen, one.stance), one.time))
+            node = (one.seen, one.stance)
+            _require_instant(one, known[node] if node in known else found.setdefault(node, one.time))
+    return found
 
 
-def require_instant(sighting: Sighting, time: float) -> None:
+def _require_instant(sighting: Sighting, time: float) -> None:
     """Raise `MeasurementError` where a moving robot was sighted at another time than its pose of the stance is."""
     if abs(sighting.time - time) > 1e-3:
         raise MeasurementError(

@@ -3,7 +3,7 @@
 import time
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import get_args
 
 from coloc_graph.backend import Estimator, Method, StanceEstimate, loosened
@@ -24,7 +24,7 @@ from coloc_graph.frontend import (
     sight_movers,
     sight_standing,
 )
-from coloc_graph.measurements import Measurement, Odometry, Sighting
+from coloc_graph.measurements import Measurement, Sighting
 from coloc_graph.run import OdometrySample, Recorded, Stance
 from coloc_graph.team import Robot, Team
 
@@ -104,96 +104,98 @@ def measure_stance(
         yield measure_pair(run, stance, *pair, replace(frontend, scale=scale), tracks, pairs, alone=False)
 
 
-class OdometryAndSightings:
-    """Where the movers were seen, and what the wheels say of each robot's way from one pose to its next.
+@dataclass(frozen=True)
+class _Known:
+    """Knowledge of the last stance that the next one needs; immutable, so that what was known before can come back."""
 
-    Takes the stances in their order; needs of the odometry what is between two poses, no more.
+    stance: Stance | None = None
+    posed: frozenset[str] = frozenset()  # robots that have a pose at the stance
+    last: Mapping[str, tuple[int, float]] = field(default_factory=dict)  # stance and time of each robot's last pose
+    standing: frozenset[str] = frozenset()  # robots that have not moved since their last pose
+    sighted: frozenset[tuple[str, str]] = frozenset()  # landmarks, by the observer that has not moved since it saw them
+    doubts: tuple[Doubt, ...] = ()
+
+    def stayed(self, stance: Stance) -> set[str]:
+        """Robots that stay from the last stance to this one."""
+        before = self.stance
+        return set() if before is None else {r for r in stance.anchors if PoseKeys.stays(r, before, stance)}
+
+
+class OdometryAndSightings:
+    """Sightings of robots and landmarks, and wheel odometry of each robot from one pose to its next.
+
+    Takes the stances in their order, and reads the odometry between two poses only.
     """
 
     def __init__(self, team: Team, *, odometry: bool = True) -> None:
         self.team, self._odometry = team, odometry
-        self._places = PoseKeys(team.names, slips_of(team))
-        self._sighted: set[tuple[str, str]] = set()  # landmarks, by who has stayed where it saw them
-        #: Landmarks that were seen and are not used.
-        self.doubts: list[Doubt] = []
-        self._before: Stance | None = None
-        self._there: set[str] = set()
-        self._last: dict[str, tuple[int, float]] = {}  # each robot's last pose: its stance, its time
-        self._samples: dict[str, list[OdometrySample]] = {robot: [] for robot in team.names}  # from there on
-        self._earlier: (
-            tuple[Stance | None, set[str], dict[str, tuple[int, float]], set[tuple[str, str]], list[Doubt]] | None
-        ) = None
+        self._slips = slips_of(team)
+        self._known, self._earlier = _Known(), _Known()
+        self._samples: dict[str, list[OdometrySample]] = {robot: [] for robot in team.names}  # since each last pose
+
+    @property
+    def doubts(self) -> list[Doubt]:
+        """Landmarks that were seen and are not used."""
+        return list(self._known.doubts)
 
     def withdraw(self) -> None:
         """Forget the last stance; once, until another has come."""
-        assert self._before is not None and self._earlier is not None
-        self._places.forget(self._earlier[0], self._before)
-        self._before, self._there, self._last, self._sighted, self.doubts = self._earlier
+        self._known = self._earlier
         self._samples = {robot: [] for robot in self.team.names}  # they are read again
-        self._earlier = None
 
     def of_stance(self, run: Recorded, stance: Stance, measured: Sequence[PairMeasurement]) -> list[Measurement]:
-        """Those of a stance, whose pairs are all `measured`."""
+        """Sightings and odometry of a stance, whose pairs are all `measured`."""
+        known = self._known
+        stayed = known.stayed(stance)
         wheels = {robot: self._wheels(run, robot, stance) for robot in self.team.names}
         sightings = sight_movers(run, stance, measured, wheels)
-        sightings += sight_standing(run, stance, measured, self._before)
-        earlier = self._before, self._there, dict(self._last), self._sighted, list(self.doubts)
-        sightings += self._of_landmarks(run, stance, measured)
-        self._earlier = earlier
-        return [*sightings, *self._ways(stance, measured, sightings, wheels)]
-
-    def _of_landmarks(self, run: Recorded, stance: Stance, measured: Sequence[PairMeasurement]) -> list[Sighting]:
-        """The landmarks that observers saw: who has stayed sees no more of one than when it came."""
-        before = self._before
-        here = {r for r in stance.observers if before is not None and r not in self._places.slips
-                and PoseKeys.stays(r, before, stance)}  # fmt: skip
-        self._sighted = {one for one in self._sighted if one[0] in here}
-        seen = (
-            (robot, what)
-            for one in measured
-            for robot, what in zip((one.homography.robot_i, one.homography.robot_j), one.landmarks, strict=True)
+        sightings += sight_standing(run, stance, measured, known.stance)
+        # who has stayed sees no more of a landmark than when it came
+        sighted = {one for one in known.sighted if one[0] in stayed - self._slips.keys()}
+        landmarks, doubts = _landmarks(run, stance, measured, sighted)
+        sightings += landmarks
+        posed = [robot for m in measured if m.relative_pose for robot, _ in m.relative_pose.ends]
+        posed += [robot for s in sightings for robot, _ in s.ends if robot in self._samples]  # landmarks have no wheels
+        here = {*stance.observers, *posed, *(stayed & known.posed)}
+        standing = known.standing & (stayed - self._slips.keys())
+        times = {s.seen: s.time for s in sightings if s.seen in stance.movers}
+        now = {robot: (stance.index, times.get(robot, stance.start)) for robot in here}
+        self._earlier = known
+        self._known = _Known(
+            stance,
+            frozenset(here),
+            {**known.last, **now},
+            frozenset(standing | here),
+            frozenset(sighted | {(one.observer, one.seen) for one in landmarks}),
+            (*known.doubts, *doubts),
         )
-        made, doubts = sight_landmarks(run, stance, seen, self._sighted)
-        self._sighted |= {(one.observer, one.seen) for one in made}
-        self.doubts += doubts
+        made: list[Measurement] = [*sightings]
+        for robot in sorted((here - standing) & known.last.keys()) if self._odometry else ():
+            before, begun = known.last[robot]
+            driven = wheels[robot].between(before, stance.index, begun, now[robot][1], self.team.clock_sigma)
+            made += [] if driven is None else [driven]
         return made
 
     def _wheels(self, run: Recorded, robot: str, stance: Stance) -> WheelTrack:
         samples = self._samples[robot]
-        known = samples[-1].time if samples else None
-        samples += [one for one in run.odometry(robot, known, stance.end) if known is None or one.time > known]
-        if robot in self._last:
-            begun = bisect_right(samples, self._last[robot][1], key=lambda one: one.time)
+        newest = samples[-1].time if samples else None
+        samples += [one for one in run.odometry(robot, newest, stance.end) if newest is None or one.time > newest]
+        if robot in self._known.last:
+            begun = bisect_right(samples, self._known.last[robot][1], key=lambda one: one.time)
             del samples[: max(begun - 1, 0)]
         return WheelTrack(robot, samples)
 
-    def _ways(
-        self,
-        stance: Stance,
-        measured: Sequence[PairMeasurement],
-        sightings: Sequence[Sighting],
-        wheels: Mapping[str, WheelTrack],
-    ) -> list[Odometry]:
-        before = self._before
-        self._places.accept(self._places.after(before, stance))
-        held = [r for r in stance.anchors if before and r in self._there and PoseKeys.stays(r, before, stance)]
-        posed = [robot for m in measured if m.relative_pose for robot, _ in m.relative_pose.ends]
-        posed += [robot for s in sightings for robot, _ in s.ends if robot in self._samples]  # landmarks have no wheels
-        self._there = {*stance.observers, *posed, *held}
-        self._before = stance
-        times = {s.seen: s.time for s in sightings if s.seen in stance.movers}
-        ways: list[Odometry] = []
-        for robot in sorted(self._there):
-            last, time_now = self._last.get(robot), times.get(robot, stance.start)
-            self._last[robot] = stance.index, time_now
-            if not self._odometry or last is None or self._key(robot, last[0]) == self._key(robot, stance.index):
-                continue
-            way = wheels[robot].between(last[0], stance.index, last[1], time_now, self.team.clock_sigma)
-            ways += [] if way is None else [way]
-        return ways
 
-    def _key(self, robot: str, stance: int) -> int:
-        return self._places.key((robot, stance))
+def _landmarks(
+    run: Recorded, stance: Stance, measured: Sequence[PairMeasurement], known: set[tuple[str, str]]
+) -> tuple[list[Sighting], list[Doubt]]:
+    """Sightings of landmarks by the observers, but for those (observer, landmark) that are `known`."""
+    seen = (
+        (robot, what)
+        for one in measured
+        for robot, what in zip((one.homography.robot_i, one.homography.robot_j), one.landmarks, strict=True)
+    )
+    return sight_landmarks(run, stance, seen, known)
 
 
 @dataclass(frozen=True, eq=False)
