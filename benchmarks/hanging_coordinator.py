@@ -5,9 +5,9 @@
 SIGUSR1: its main loop hangs. SIGUSR2: it hangs while it asks robot A. Each for `HANG` s.
 """
 
+import argparse
 import contextlib
 import signal
-import sys
 import threading
 import time
 from typing import Any
@@ -31,15 +31,19 @@ def hang() -> None:
 
 def main() -> None:
     """Lead the team until SIGTERM; drives may take any time."""
-    team, folder, address, speed = sys.argv[1:]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name in ("team", "folder", "address"):
+        parser.add_argument(name)
+    parser.add_argument("speed", type=float, help="speed of the robots [m/s]")
+    arguments = parser.parse_args()
     asks = threading.Event()
     send, step = CoordinatorLink._send, leap_frog.LeapFrog.step
 
-    def hanging_send(link: CoordinatorLink, *arguments: Any) -> None:
+    def hanging_send(link: CoordinatorLink, *rest: Any) -> None:
         if asks.is_set():
             asks.clear()
             hang()
-        send(link, *arguments)
+        send(link, *rest)
 
     def asking_step(mission: leap_frog.LeapFrog) -> None:
         if asks.is_set():
@@ -54,9 +58,8 @@ def main() -> None:
     signal.signal(signal.SIGUSR2, lambda *_: asks.set())
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    with Coordinator(
-        read_team(team), folder, MissionOptions(speed=float(speed), attempts=1000), listen=address
-    ) as coordinator:
+    team, options = read_team(arguments.team), MissionOptions(speed=arguments.speed, attempts=1000)
+    with Coordinator(team, arguments.folder, options, listen=arguments.address) as coordinator:
         coordinator.run(stop)
 
 

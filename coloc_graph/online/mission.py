@@ -30,7 +30,7 @@ class MissionOptions:
         Name of the robot that drives before the others' cameras; None for the last one of the team.
     place_sigma, heading_sigma_deg, least_points
         A stance is long enough when it measures the relative pose of every pair with standard deviations below these
-        [m], [deg], and with so many points.
+        [m], [deg], with at least this number of points.
     longest
         A stance ends after this time at the latest [s].
     speed

@@ -1,4 +1,4 @@
-"""What the online system is made of: course and formation, driving, whereabouts, the record, phases."""
+"""Parts of the online system: course, formation, driving, pose tracking, record, states."""
 
 import math
 import time
@@ -339,6 +339,22 @@ def test_a_record_that_was_cut_off_goes_on_and_the_old_one_is_kept(tmp_path):
     assert run.stances == kept.stances
     with pytest.raises(RunError, match="another team"):
         continued(path, reference_team((0.1, 0.0, 0.0, 0.0)))
+
+
+def test_a_record_that_cannot_be_continued_stays_as_it_was(tmp_path, monkeypatch):
+    team, path = reference_team(), tmp_path / "run.mcap"
+    with Record(path, team) as record:
+        record.take(detections("A", 1e9))
+        record.complete(Stance(0, 1e9, 1e9 + 2, ("A", "B"), ("C",)))
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr(Record, "complete", fail)
+    with pytest.raises(OSError, match="full"):
+        continued(path, team)
+    assert path.read_bytes() == before and [one.name for one in tmp_path.iterdir()] == ["run.mcap"]
 
 
 class Broken(Record):
