@@ -37,7 +37,7 @@ if TYPE_CHECKING:
         measure_pair,
         measured_pairs,
     )
-    from coloc_graph.frontend.stance_sightings import sight_movers, sight_standing
+    from coloc_graph.frontend.stance_sightings import sight_movers, sight_standing, unsighted_movers
     from coloc_graph.frontend.stance_tracks import StanceTracks
     from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
 
@@ -86,6 +86,7 @@ __all__ = [
     "sight_landmarks",
     "sight_movers",
     "sight_standing",
+    "unsighted_movers",
 ]
 
 __getattr__, __dir__ = lazy_names(
@@ -105,7 +106,7 @@ __getattr__, __dir__ = lazy_names(
         "pairing.correspondence": "Correspondences correspond pair_by_time",
         "sighting": "sight",
         "stance": "FrontendOptions PairMeasurement Scale little_in_common measure_pair measured_pairs",
-        "stance_sightings": "sight_movers sight_standing",
+        "stance_sightings": "sight_movers sight_standing unsighted_movers",
         "stance_tracks": "StanceTracks",
         "tracks.tracking": "MarkerTracker Track TrackerOptions",
     },

@@ -36,12 +36,13 @@ LEAST_ASIDE = np.deg2rad(10.0)
 
 @dataclass(frozen=True)
 class Doubt:
-    """A landmark that an observer saw in a stance and that is not used, and `why`, in words."""
+    """A landmark, or a robot that moved (`is_robot`), that an observer saw in a stance and that is not used; `why`."""
 
     landmark: str
     observer: str
     stance: int
     why: str
+    is_robot: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,12 +236,13 @@ def _faces(T_observer_landmark: Array, observer: Robot) -> bool:
 
 
 def in_words(doubts: Iterable[Doubt]) -> list[str]:
-    """A sentence a landmark, observer and reason: the first of its kind, and how many there are."""
+    """A sentence a landmark or robot, observer and reason: the first of its kind, and how many there are."""
     kinds: dict[tuple[str, str, str], list[Doubt]] = {}
     for one in doubts:
         kinds.setdefault((one.landmark, one.observer, "".join(c for c in one.why if not c.isdigit())), []).append(one)
     return [
-        f"stance {all_[0].stance}{f' (and {len(all_) - 1} more)' if len(all_) > 1 else ''}: landmark {landmark} is not "
-        f"used as {observer} sees it: {all_[0].why}"
-        for (landmark, observer, _), all_ in kinds.items()
+        f"stance {all_[0].stance}{f' (and {len(all_) - 1} more)' if len(all_) > 1 else ''}: "
+        + (f"{name} has no pose" if all_[0].is_robot else f"landmark {name} is not used")
+        + f" as {observer} sees it: {all_[0].why}"
+        for (name, observer, _), all_ in kinds.items()
     ]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from coloc_graph.frontend.homography.eq2_pose import turned_normal
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.correspondence import pair_by_time
-from coloc_graph.frontend.tracks.marker_pairs import couple_of
+from coloc_graph.frontend.tracks.marker_pairs import couple_of, named_pair
 from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.geometry.lie import across, floor_pose, so3_exp
 from coloc_graph.geometry.se2 import wrap
@@ -51,7 +51,7 @@ def sight(
     markers = seen.markers
     if markers is None or len(markers.positions) < 2 or not plane.d_from_mount or not plane.normal_from_mount:
         return None
-    pair = _marker_tracks(seen, tracks, observer, plane, wheels)
+    pair = _marker_tracks(seen, tracks, observer, plane, wheels, alone=stance.movers == (seen.name,))
     if pair is None:
         return None
     shared = pair_by_time(pair[0].times, pair[1].times)
@@ -98,14 +98,19 @@ def at_rest(track: Track, time: float) -> Track:
 
 
 def _marker_tracks(
-    seen: Robot | Marked, tracks: Sequence[Track], observer: Robot, plane: Plane, wheels: WheelTrack | None
+    seen: Robot | Marked,
+    tracks: Sequence[Track],
+    observer: Robot,
+    plane: Plane,
+    wheels: WheelTrack | None,
+    *,
+    alone: bool,
 ) -> tuple[Track, Track] | None:
     """The tracks of the robot's first and second marker."""
-    named = {track.marker: track for track in tracks}
-    first, second = (named.get(f"{seen.name}/{n}") for n in range(2))
-    if first is not None and second is not None:
-        return first, second
-    if any(named) or len(tracks) < 2 or wheels is None or not len(wheels):
+    named = named_pair(tracks, seen.name, alone=alone)
+    if named is not None:
+        return tracks[named[0]], tracks[named[1]]
+    if any(track.marker for track in tracks) or len(tracks) < 2 or wheels is None or not len(wheels):
         return None
     if len(tracks) > 2:
         assert seen.markers is not None

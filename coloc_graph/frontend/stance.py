@@ -23,12 +23,18 @@ from coloc_graph.frontend.pairing.clock_offset import (
     fit_at_offset,
     require_searchable,
 )
-from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW, Correspondences, correspond, correspond_roughly
+from coloc_graph.frontend.pairing.correspondence import (
+    PAIRING_WINDOW,
+    Correspondences,
+    UnpairedTracks,
+    correspond,
+    correspond_roughly,
+)
 from coloc_graph.frontend.pairing.floor_checks import of_some_span, on_one_floor, require_on_floor
 from coloc_graph.frontend.pairing.observer_pairs import Pair, pairs_of, share
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
 from coloc_graph.frontend.tracks.interpolation import LONGEST_GAP
-from coloc_graph.frontend.tracks.marker_pairs import couple_of, span_samples
+from coloc_graph.frontend.tracks.marker_pairs import couple_of, named_pair, span_samples
 from coloc_graph.frontend.tracks.paired_tracks import PairedTracks
 from coloc_graph.frontend.tracks.tracking import Track, TrackerOptions
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose
@@ -164,6 +170,10 @@ def measure_pair(
         else:
             found = correspond(tracks_i, tracks_j, *seen.cameras, alone=seen.alone, plausible=seen.plausible)
             made = _measured(seen, found, fit_homography(found.pairs, options.criterion))
+    except UnpairedTracks as why:
+        seen_instead = tracks.why_broken(robot_i, robot_j, stance.end)
+        reason = f"{why.what}; {seen_instead}" if seen_instead else str(why)
+        made = PairMeasurement(_unusable(stance, robot_i, robot_j, found, reason), None, found)
     except DegenerateGeometry as why:
         made = PairMeasurement(_unusable(stance, robot_i, robot_j, found, str(why)), None, found)
     return replace(
@@ -255,15 +265,15 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
         return ()
     robot, movers = seen.run.team[seen.robot_i], seen.stance.movers
     bias = _bias_root(found.uv_i, found.pairs.x_i, robot.camera)
-    named = {track.marker: number for number, track in enumerate(seen.tracks_i) if track.marker}
+    named = any(track.marker for track in seen.tracks_i)
     couples: dict[str, tuple[int, int]] = {}
     for mover in movers:
         markers = seen.run.team[mover].markers
         if markers is None or markers.span is None:
             continue
-        first, second = (named.get(f"{mover}/{n}") for n in range(2))
-        if first is not None and second is not None:
-            couples[mover] = first, second
+        pair = named_pair(seen.tracks_i, mover, alone=len(movers) == 1)
+        if pair is not None:
+            couples[mover] = pair
         own = [n for n, track in enumerate(seen.tracks_i) if not named and (len(movers) == 1 or track.mover == mover)]
         if own:
             couple = couple_of([seen.tracks_i[n] for n in own], robot.camera, seen.plane, markers.span)

@@ -6,6 +6,7 @@ import numpy as np
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.plane import plane_from_mount
+from coloc_graph.frontend.landmarks import Doubt
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.sighting import at_rest, sight
 from coloc_graph.frontend.stance import PairMeasurement
@@ -44,6 +45,44 @@ def sight_movers(
             if sighting is not None and (before is None or np.trace(sighting.covariance) < np.trace(before.covariance)):
                 best[mover] = sighting
     return list(best.values())
+
+
+def unsighted_movers(
+    run: Recorded,
+    stance: Stance,
+    measured: Iterable[PairMeasurement],
+    wheels: Mapping[str, WheelTrack],
+    sightings: Iterable[Sighting],
+) -> list[Doubt]:
+    """Movers that were seen in a stance and have no pose in it, with the reason."""
+    sighted = {one.seen for one in sightings}
+    if run.team.floor is None or stance.index in run.planes:
+        return []
+    doubts: dict[str, Doubt] = {}
+    for one in measured:
+        if one.tracks is None:
+            continue
+        for mover in stance.movers:
+            markers = run.team[mover].markers
+            if markers is None or mover in sighted or mover in doubts:
+                continue
+            track = wheels.get(mover)
+            if len(markers.positions) < 2:
+                why = "it carries one marker, which does not tell its heading; give it two"
+            elif len(stance.movers) > 1 and not any(t.marker or t.mover == mover for t in one.tracks[0]):
+                why = "nothing tells its lights from those of other movers; give each a colour, a blink code, or names"
+            elif track is None or not len(track):
+                why = (
+                    "nothing tells which of its two like lights is which; record its wheel odometry, or name its "
+                    f"markers `{mover}/0` and `{mover}/1`"
+                )
+            else:
+                why = (
+                    "its two lights are never seen at once, or its wheels do not tell them apart; let it drive further"
+                )
+            observer = one.homography.robot_i
+            doubts[mover] = Doubt(mover, observer, stance.index, why, is_robot=True)
+    return list(doubts.values())
 
 
 def sight_standing(

@@ -23,9 +23,9 @@ from coloc_graph.team import Markers
 
 Array = NDArray[np.float64]
 
-MIN_SAMPLES = (
-    25  # samples a track of the causal tracker, on average, below which a lone mover is tracked with hindsight
-)
+MIN_SAMPLES = 25  # mean samples of a causal track below which a lone mover is tracked with hindsight
+LEAST_SEEN = 0.5  # share of the images with both lights below which the mover was out of view
+FAST = 0.35  # share of the distance between two lights that is a large step from one image to the next
 
 
 def stance_markers(run: Recorded, stance: Stance) -> Markers | None:
@@ -109,6 +109,33 @@ class StanceTracks:
         paths = align_paths(self._path(robot_i, end), self._path(robot_j, end), window)
         found = paths[0].tracks(self.stance.movers[0]), paths[1].tracks(self.stance.movers[0])
         return found if all(found) else tracks
+
+    def why_broken(self, robot_i: str, robot_j: str, end: float) -> str | None:
+        """Reason why two observers' tracks of a lone mover broke, with what they saw; None where they did not."""
+        robots = robot_i, robot_j
+        if not any(self._broken(self.of(robot, end)) for robot in robots):
+            return None
+        paths = [self._path(robot, end) for robot in robots]
+        shares = [float((path.lights >= 2).mean()) if len(path.lights) else 0.0 for path in paths]
+        saw = [
+            f"{path.robot} saw 2 lights or more in {100 * share:.0f} % of its {len(path.lights)} images"
+            + (
+                f", {path.apart:.0f} px apart, median step {path.step:.0f} px, and its tracks broke "
+                f"{max(path.pieces, (len(self.of(path.robot, end)) + 1) // 2) - 1} times"
+                if len(path) > 1
+                else ""
+            )
+            for path, share in zip(paths, shares, strict=True)
+        ]
+        if min(shares) < LEAST_SEEN:
+            remedy = "keep the mover in both fields of view, and check exposure and threshold of the lights"
+        elif any(path.step > FAST * path.apart for path in paths):
+            remedy = "record more images a second, or let the mover drive and turn slower"
+        elif any(len(path) < LEAST_SEEN * (path.lights >= 2).sum() for path in paths):
+            remedy = "check heights, tilt, span and units in the team: on the marker plane few lights are a span apart"
+        else:
+            remedy = "let the mover drive further and turn, or record for longer"
+        return f"{'; '.join(saw)}: {remedy}"
 
     def _broken(self, tracks: Sequence[Track]) -> bool:
         movers = self.stance.movers

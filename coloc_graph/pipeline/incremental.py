@@ -23,6 +23,7 @@ from coloc_graph.frontend import (
     sight_landmarks,
     sight_movers,
     sight_standing,
+    unsighted_movers,
 )
 from coloc_graph.measurements import Measurement, Sighting
 from coloc_graph.run import OdometrySample, Recorded, Stance
@@ -135,7 +136,7 @@ class OdometryAndSightings:
 
     @property
     def doubts(self) -> list[Doubt]:
-        """Landmarks that were seen and are not used."""
+        """Landmarks and movers that were seen and are not used."""
         return list(self._known.doubts)
 
     def withdraw(self) -> None:
@@ -149,6 +150,7 @@ class OdometryAndSightings:
         stayed = known.stayed(stance)
         wheels = {robot: self._wheels(run, robot, stance) for robot in self.team.names}
         sightings = sight_movers(run, stance, measured, wheels)
+        unsighted = unsighted_movers(run, stance, measured, wheels, sightings)
         sightings += sight_standing(run, stance, measured, known.stance)
         # who has stayed sees no more of a landmark than when it came
         sighted = {one for one in known.sighted if one[0] in stayed - self._slips.keys()}
@@ -167,7 +169,7 @@ class OdometryAndSightings:
             {**known.last, **now},
             frozenset(standing | here),
             frozenset(sighted | {(one.observer, one.seen) for one in landmarks}),
-            (*known.doubts, *doubts),
+            (*known.doubts, *doubts, *unsighted),
         )
         made: list[Measurement] = [*sightings]
         for robot in sorted((here - standing) & known.last.keys()) if self._odometry else ():
@@ -264,7 +266,7 @@ class StanceSolver:
 
     @property
     def doubts(self) -> list[Doubt]:
-        """Landmarks that were seen and are not used."""
+        """Landmarks and movers that were seen and are not used."""
         return self._motions.doubts
 
     def withdraw(self) -> None:

@@ -1,13 +1,23 @@
 """A lone mover's two equal lights, tracked with hindsight where they move far from image to image."""
 
-from dataclasses import dataclass, field
+import re
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from coloc_graph.errors import DegenerateGeometry
-from coloc_graph.frontend import FrontendOptions, StanceTracks, correspond, measure_pair, plane_from_mount
+from coloc_graph.frontend import (
+    FrontendOptions,
+    StanceTracks,
+    correspond,
+    in_words,
+    measure_pair,
+    plane_from_mount,
+    sight_movers,
+    unsighted_movers,
+)
 from coloc_graph.frontend.pairing.rigid_alignment import align_paths
 from coloc_graph.frontend.tracks.rigid_path import rigid_path
 from coloc_graph.geometry.lie import floor_pose
@@ -111,3 +121,54 @@ def test_a_body_that_turns_on_the_spot_leaves_the_order_open():
     paths = path_of(one, "A"), path_of(one, "B")
     assert align_paths(*paths, WINDOW) == paths
     assert "ambiguous" in measure_pair(one, one.stance, "A", "B", FrontendOptions()).homography.unusable
+
+
+def test_a_mover_too_fast_for_the_frame_rate_is_refused_with_what_was_seen():
+    one = scene(2.0, 1.0, 1, seconds=12.0)
+    why = measure_pair(one, one.stance, "A", "B", FrontendOptions()).homography.unusable
+    assert re.search(r"A saw 2 lights or more in \d+ % of its 24 images, \d+ px apart, median step \d+ px", why)
+    assert re.search(r"its tracks broke \d+ times: record more images a second", why)
+
+
+def renamed(one, names):
+    """The scene with the lights' true identities under other names."""
+    seen = {
+        robot: [
+            replace(image, markers=tuple(names[n] if n >= 0 else "" for n in lights), uv=image.uv)
+            for image, lights in zip(images, one.lights[robot], strict=True)
+        ]
+        for robot, images in one.seen.items()
+    }
+    kept = {
+        robot: [
+            replace(image, **{
+                name: getattr(image, name)[[bool(m) for m in image.markers]]
+                for name in ("uv", "covariance", "flags", "peak", "area")
+            }, markers=tuple(filter(None, image.markers)))
+            for image in images
+        ]
+        for robot, images in seen.items()
+    }  # fmt: skip
+    return replace(one, seen=kept)
+
+
+@pytest.mark.parametrize("names", [("C/0", "C/1"), ("led0", "led1"), ("7", "12")])
+def test_a_mover_with_named_markers_is_sighted_whatever_their_names(names):
+    one = renamed(scene(20.0, 0.2, 0), names)
+    measured = measure_pair(one, one.stance, "A", "B", FrontendOptions())
+    assert [span.mover for span in measured.relative_pose.spans] == ["C"]
+    (sighting,) = sight_movers(one, one.stance, [measured], {})
+    assert sighting.seen == "C"
+    assert not unsighted_movers(one, one.stance, [measured], {}, [sighting])
+
+
+def test_a_mover_whose_like_lights_nothing_tells_apart_has_a_reason():
+    one = scene(20.0, 0.2, 0)
+    measured = measure_pair(one, one.stance, "A", "B", FrontendOptions())
+    assert measured.relative_pose is not None
+    assert not sight_movers(one, one.stance, [measured], {})
+    (doubt,) = unsighted_movers(one, one.stance, [measured], {}, [])
+    assert in_words([doubt]) == [
+        "stance 0: C has no pose as A sees it: nothing tells which of its two like lights is which; record its wheel "
+        "odometry, or name its markers `C/0` and `C/1`"
+    ]

@@ -31,6 +31,14 @@ BORDER = 6.0
 CLOCK_GRAIN = 1e-6
 
 
+class UnpairedTracks(DegenerateGeometry):
+    """No tracks of two cameras are certainly the same markers: `what` is so, and what may help."""
+
+    def __init__(self, what: str, remedy: str) -> None:
+        super().__init__(f"{what}: {remedy}")
+        self.what = what
+
+
 @dataclass(frozen=True, eq=False)
 class Correspondences:
     """The same markers at the same instants in cameras i and j: `uv_*` (n, 2) [px], `times` (n,) of camera i.
@@ -139,43 +147,43 @@ def _chosen(
     candidates: "Candidates", tracks_i: Sequence[Track], tracks_j: Sequence[Track]
 ) -> tuple[list[tuple[int, int]], Correspondences]:
     if not candidates.indices:
-        raise DegenerateGeometry(_why_none(tracks_i, tracks_j, candidates.window))
+        raise UnpairedTracks(*_why_none(tracks_i, tracks_j, candidates.window))
     if all(track.marker for track in (*tracks_i, *tracks_j)):
         return list(candidates.indices), candidates.join(list(candidates.indices))
     found = associate(candidates)
     pair = f"{tracks_i[0].robot} and {tracks_j[0].robot}"
     if found is None:
-        raise DegenerateGeometry(
-            f"no pairing of the tracks of {pair} is explained by one homography: "
-            "let the moving robot turn and drive further, and look for reflections"
+        raise UnpairedTracks(
+            f"no pairing of the tracks of {pair} is explained by one homography",
+            "let the moving robot turn and drive further, and look for reflections",
         )
     if found.posterior < SURE:
-        raise DegenerateGeometry(
+        raise UnpairedTracks(
             f"which tracks of {pair} are the same markers is ambiguous: {len(found.rivals) + 1} pairings are explained "
-            f"by one homography each, and the likeliest is right with a chance of {100 * found.posterior:.1f} % only: "
-            "let the moving robots turn and drive apart, or give markers names"
+            f"by one homography each, and the likeliest is right with a chance of {100 * found.posterior:.1f} % only",
+            "let the moving robots turn and drive apart, or give markers names",
         )
     return list(found.chosen), candidates.join(found.chosen)
 
 
-def _why_none(tracks_i: Sequence[Track], tracks_j: Sequence[Track], window: float) -> str:
+def _why_none(tracks_i: Sequence[Track], tracks_j: Sequence[Track], window: float) -> tuple[str, str]:
     if not tracks_i or not tracks_j:
         seeing = next((track.robot for track in (*tracks_i, *tracks_j)), None)
         who = "both saw none" if seeing is None else f"{seeing} alone saw one"
         return (
-            f"the observers never see a marker at the same instant, since {who}: bring the mover into both fields of "
-            "view, and check the cameras"
+            f"the observers never see a marker at the same instant, since {who}",
+            "bring the mover into both fields of view, and check the cameras",
         )
     i, j = tracks_i[0].robot, tracks_j[0].robot
     names_i, names_j = ({track.marker for track in tracks} for tracks in (tracks_i, tracks_j))
     if all(names_i | names_j) and not names_i & names_j:
         return (
-            f"no marker name is shared: {i} saw {_listed(names_i)} and {j} saw {_listed(names_j)}: "
-            "give the same marker the same name in every camera"
+            f"no marker name is shared: {i} saw {_listed(names_i)} and {j} saw {_listed(names_j)}",
+            "give the same marker the same name in every camera",
         )
     return (
-        f"{i} and {j} never see a marker at the same instant (within {1e3 * window:.0f} ms): "
-        "bring the mover into both fields of view, and check the clocks"
+        f"{i} and {j} never see a marker at the same instant (within {1e3 * window:.0f} ms)",
+        "bring the mover into both fields of view, and check the clocks",
     )
 
 

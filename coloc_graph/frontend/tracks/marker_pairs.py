@@ -1,5 +1,6 @@
 """Which tracks of one camera are markers of one robot: by the distance between them on the marker plane."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -43,6 +44,23 @@ def couple_of(tracks: Sequence[Track], camera: Camera, plane: Plane, span: float
     """Of one robot's tracks, which may be in pieces, the two of its two markers that share most samples."""
     bound = span_samples(tracks, camera, plane, span)
     return max(bound, key=lambda one: len(one[2]))[:2] if bound else None
+
+
+def named_pair(tracks: Sequence[Track], robot: str, *, alone: bool) -> tuple[int, int] | None:
+    """Numbers of the tracks of a robot's first and second marker by their names; None where they do not tell.
+
+    Names are `ROBOT/0` and `ROBOT/1`. Where one robot moves `alone`, any two names that end in numbers do, as `led0`
+    and `led1`: the smaller number is the first marker.
+    """
+    names = {track.marker: number for number, track in enumerate(tracks) if track.marker}
+    first, second = (names.get(f"{robot}/{n}") for n in range(2))
+    if first is not None and second is not None:
+        return first, second
+    ends = {name: re.search(r"[0-9]+$", name) for name in names}
+    if not alone or len(names) != 2 or not all(ends.values()):
+        return None
+    order = sorted(names, key=lambda name: int(end[0]) if (end := ends[name]) else 0)
+    return names[order[0]], names[order[1]]
 
 
 def markers_of_movers(

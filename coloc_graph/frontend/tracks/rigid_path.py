@@ -57,9 +57,16 @@ class RigidPath:
     @property
     def step(self) -> float:
         """Median distance that a light moves from one image to the next [px]."""
-        same = self.piece[1:] == self.piece[:-1]
-        moved = np.linalg.norm(np.diff(self.uv, axis=0), axis=2)[same]
-        return float(np.median(moved)) if len(moved) else float("nan")
+        if len(self) < 2:
+            return float("nan")
+        straight = np.linalg.norm(self.uv[1:] - self.uv[:-1], axis=2).mean(axis=1)
+        crossed = np.linalg.norm(self.uv[1:] - self.uv[:-1, ::-1], axis=2).mean(axis=1)
+        return float(np.median(np.minimum(straight, crossed)))
+
+    @property
+    def apart(self) -> float:
+        """Median distance between the two lights in the image [px]."""
+        return float(np.median(np.linalg.norm(self.uv[:, 0] - self.uv[:, 1], axis=1))) if len(self) else float("nan")
 
     @property
     def pieces(self) -> int:
