@@ -21,9 +21,10 @@ DRAWING = ROOT / "ARCHITECTURE.md"
 #: Layers from the bottom, with what they are for. A room imports itself and rooms of the rows above it in this list,
 #: never of its own row; the modules of the first row may import each other.
 LAYERS: list[tuple[str, set[str]]] = [
-    ("types and mathematics", {"_lazy", "_version", "errors", "geometry", "image_file", "input_file", "measurements"}),
+    ("types and mathematics", {"_lazy", "_version", "errors", "geometry", "input_file", "measurements"}),
     ("robots", {"team"}),
     ("recorded data", {"run"}),
+    ("image files", {"image_file"}),
     ("measuring, estimating, devices", {"frontend", "backend", "robot_io", "evaluation", "calibration"}),
     ("whole runs", {"simulation", "pipeline", "exchange"}),
     ("reports and missions", {"report", "online"}),
