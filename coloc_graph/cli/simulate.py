@@ -7,40 +7,54 @@ from coloc_graph.cli.printing import progress
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """The command's arguments."""
+    """Add the command and its arguments."""
     command = commands.add_parser("simulate", help="write a run of a simulated team, with truth in it")
     command.add_argument("scenario", help="single-step, six-step, hallway, team or landmarks")
     add_out(command)
-    command.add_argument("--depth", choices=("tracks", "images"), default="tracks", help="marker centres, or images")
-    command.add_argument("--seed", type=int, default=0)
-    command.add_argument("--stances", type=int, help="how many stances (hallway: 40, team: 30)")
-    command.add_argument("--points", type=int, help="correspondences a stance, at least 6")
-    command.add_argument("--noise", type=float, help="of a marker centre, px (tracks; default 0.3)")
-    command.add_argument("--mount-sigma", type=float, default=0.0, help="tilt and roll of the mounts, deg")
-    command.add_argument("--height-sigma", type=float, default=0.0, help="height of the mounts, m")
-    command.add_argument("--span-sigma", type=float, default=0.0, help="distance between a robot's markers, m")
-    command.add_argument("--floor-sigma", type=float, default=0.0, help="unevenness of the floor, deg")
-    command.add_argument("--clock-offset", type=float, default=0.0, help="of the other robots' clocks, s")
-    command.add_argument("--time-jitter", type=float, default=0.0, help="of the instants of capture, s")
-    command.add_argument("-l", type=float, help="single-step: distance between the observers, m")
-    command.add_argument("--theta", type=float, help="single-step: angle between the observers, deg")
-    command.add_argument("--robots", type=int, help="team: how many robots; default 10")
-    command.add_argument("--at-once", type=int, help="team: how many of them move at once; default a quarter")
-    command.add_argument("--blink", action="store_true", help="team: markers have no names, and tell them by blinking")
-    command.add_argument("--length", type=float, help="landmarks: how far the team goes in all, m; default 100")
-    command.add_argument("--laps", type=int, help="landmarks: in how many laps of a square course; default 4")
-    command.add_argument("--landmark-every", type=float, help="landmarks: so far apart along the course, m; default 10")
-    command.add_argument("--known", action="store_true", help="landmarks: the team is told where they are")
-    command.add_argument("--fps", type=float, help="images a second (images; default 10)")
-    command.add_argument("--image-format", choices=("jpeg", "png", "raw"), help="images; default jpeg")
     command.add_argument(
-        "--messy", action="store_true", help="images: glare, mirrors, flicker, and a person in the way"
-    )
+        "--depth", choices=("tracks", "images"), default="tracks",
+        help="write marker centres, or rendered images (default: tracks)",
+    )  # fmt: skip
+    command.add_argument("--seed", type=int, default=0, help="seed of all random numbers (default: 0)")
+    command.add_argument("--stances", type=int, help="number of stances (default: hallway 40, team 30, six-step 6)")
+    command.add_argument(
+        "--points", type=int,
+        help="correspondences a stance, at least 6 (default: 100; images and single-step 250; --blink 2000)",
+    )  # fmt: skip
+
+    errors = command.add_argument_group("errors of the simulated world (standard deviations; default: 0)")
+    errors.add_argument("--noise", type=float, help="noise of a marker centre, px, with --depth tracks (default: 0.3)")
+    errors.add_argument("--mount-sigma", type=float, default=0.0, help="tilt and roll of the mounts, deg")
+    errors.add_argument("--height-sigma", type=float, default=0.0, help="height of the mounts, m")
+    errors.add_argument("--span-sigma", type=float, default=0.0, help="distance between a robot's markers, m")
+    errors.add_argument("--floor-sigma", type=float, default=0.0, help="unevenness of the floor, deg")
+    errors.add_argument("--clock-offset", type=float, default=0.0, help="offset of the other robots' clocks, s")
+    errors.add_argument("--time-jitter", type=float, default=0.0, help="jitter of the instants of capture, s")
+
+    single = command.add_argument_group("scenario single-step")
+    single.add_argument("-l", type=float, help="distance between the observers, m (default: 0.8)")
+    single.add_argument("--theta", type=float, help="angle between the observers, deg (default: 35)")
+
+    team = command.add_argument_group("scenario team")
+    team.add_argument("--robots", type=int, help="number of robots (default: 10)")
+    team.add_argument("--at-once", type=int, help="number of robots that move at once (default: a quarter)")
+    team.add_argument("--blink", action="store_true", help="robots are told apart by blinking; markers have no names")
+
+    landmarks = command.add_argument_group("scenario landmarks")
+    landmarks.add_argument("--length", type=float, help="length of the whole course, m (default: 100)")
+    landmarks.add_argument("--laps", type=int, help="number of laps of the square course (default: 4)")
+    landmarks.add_argument("--landmark-every", type=float, help="distance between landmarks, m (default: 10)")
+    landmarks.add_argument("--known", action="store_true", help="the team knows the landmarks' positions")
+
+    images = command.add_argument_group("with --depth images")
+    images.add_argument("--fps", type=float, help="images a second (default: 10)")
+    images.add_argument("--image-format", choices=("jpeg", "png", "raw"), help="format of the images (default: jpeg)")
+    images.add_argument("--messy", action="store_true", help="add glare, mirrors, flicker, and a person in the way")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate."""
+    """Simulate a scenario and write its run."""
     from coloc_graph.errors import InputError
     from coloc_graph.simulation import Imperfections, simulate
 
@@ -48,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     other = {"tracks": ("fps", "image_format"), "images": ("noise",)}[args.depth]
     for name in other:
         if getattr(args, name) is not None:
-            raise InputError(f"--{name.replace('_', '-')} says nothing at depth {args.depth}; leave it out")
+            raise InputError(f"--{name.replace('_', '-')} does not apply with --depth {args.depth}; leave it out")
     imperfections = Imperfections(
         mount_sigma_deg=args.mount_sigma,
         height_sigma=args.height_sigma,

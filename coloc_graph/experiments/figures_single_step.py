@@ -96,7 +96,7 @@ def _draw_histogram(
 
 
 def _top(counts: dict[str, np.ndarray[tuple[int, int], np.dtype[np.int64]]]) -> int:
-    """How many bins hold all but the last half per cent of a column's runs, and room for the means above."""
+    """Number of bins that hold all but the last half per cent of a column's runs, and room for the means above."""
     longest = max(map(len, counts.values()))
     every = sum(np.pad(one.sum(axis=1), (0, longest - len(one))) for one in counts.values())
     shown = int(np.searchsorted(np.cumsum(every), 0.995 * np.sum(every))) + 1

@@ -1,4 +1,4 @@
-"""What Tables I and II share: a run of several steps, solved as the paper does it and as we do."""
+"""Multi-step runs for Tables I and II, simulated and solved as in the paper and by our estimate."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ class Course:
         return self.error_cm(places) / true if true > 0.05 else float("nan")
 
     def end_error_cm(self, places: Array) -> float:
-        """How far the last place is from the true one [cm]."""
+        """Distance of the last position from the true one [cm]."""
         return float(100 * np.linalg.norm(places[-1] - self.true[-1]))
 
 

@@ -121,7 +121,7 @@ class Table2:
 
     @property
     def cases(self) -> list[tuple[HallwayRow, Course]]:
-        """The paper's rows, each with the course of our run of that case; fewer where there is but one run."""
+        """Rows of the paper with the simulated course of the same case; fewer if there is one run only."""
         return [(row, self.outings[row.case - 1].courses[row.robot]) for row in TABLE2 if row.case <= len(self.outings)]
 
     @property

@@ -1,4 +1,4 @@
-"""What the paper reports (section V, Tables I and II), as it prints it. Lengths in centimetres, as there."""
+"""Figures of the paper (section V, Tables I and II) as printed there, lengths in centimetres."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ FIG4_MORE_THAN_200 = (0.6, 0.0)
 
 
 def fig4_within_1cm(baseline: float, theta_deg: float) -> bool | None:
-    """Whether the text puts a cell's mean error within 1 cm; None where it says nothing."""
+    """Return whether the text puts a cell's mean error within 1 cm; None where it says nothing."""
     if baseline not in (0.6, 0.8) or theta_deg not in ANGLES:
         return None
     return (baseline, theta_deg) not in FIG4_ABOVE_1CM

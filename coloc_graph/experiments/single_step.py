@@ -35,7 +35,7 @@ LEAST_DRAWN = 8
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """What one method made of each run of a cell: `lengths` (runs,) [m], NaN where the points did not
+    """Estimates of one method in the runs of a cell: `lengths` (runs,) [m], NaN where the points did not
     determine a pose, and `overlap_px` (runs,), the pixels of image i that see what image j sees, by its H."""
 
     lengths: Array

@@ -194,7 +194,7 @@ def estimates_of(cell: Cell, method: str) -> Estimates:
 
 
 def paper_says(cell: Cell) -> str:
-    """What the paper's text says of a cell's mean error."""
+    """Statement of the paper's text about the mean error of a cell."""
     mean = FIG4_MEAN_CM.get((cell.baseline, cell.theta_deg))
     if mean is not None:
         return f"{mean:.1f} cm"

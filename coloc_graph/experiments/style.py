@@ -1,4 +1,4 @@
-"""What the experiments' figures share: how the three columns (paper, eq. (2), ours) look, and PNG."""
+"""Colours and markers of the three columns (paper, eq. (2), ours), titles, and PNG."""
 
 import io
 

@@ -13,8 +13,7 @@ from coloc_graph.team import Blink, Team
 
 #: One standard deviation of how wrong a robot's own clock goes, as a share: that of a ceramic resonator.
 CLOCK_SIGMA = 1e-3
-#: From one 0 of a code to the next there are at least so many bits.
-LEAST_APART = 3
+LEAST_APART = 3  # bits, least distance between two zeros of a code
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ class Blinking:
 
 
 def blinking(team: Team, rng: np.random.Generator) -> Mapping[str, Blinking]:
-    """How the lights of a team's robots blink, of those that do."""
+    """Blinking of the robots of a team that have a code."""
     drawn = {one.name: (rng.uniform(), rng.standard_normal()) for one in team.robots}
     return {
         one.name: Blinking(

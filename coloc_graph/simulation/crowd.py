@@ -12,16 +12,15 @@ from coloc_graph.simulation.blinking import Blinking
 from coloc_graph.simulation.paths import SPEED, TURN_RATE, Array
 from coloc_graph.team.shared_view import View
 
-#: Robots keep so far from each other, middle to middle [m], and step so often [s].
-ROOM = 0.42
-STEP = 0.02
+ROOM = 0.42  # m, least distance between the middles of two robots
+STEP = 0.02  # s, time step of their movement
 #: Two lights nearer to each other than this are detected as one [px].
 MERGING = 4.0
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What a detector does wrong: `noise_px` an axis, `missed` of all lights, `false_detections` an image on average.
+    """Errors of a detector: `noise_px` an axis, `missed` of all lights, `false_detections` an image on average.
 
     Lights that touch are one detection, flagged as merged.
     """
@@ -33,7 +32,7 @@ class Faults:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What one camera detected: `images`, and for each of its detections which light it is (mover * markers + marker),
+    """Detections of one camera: `images`, and for each of its detections which light it is (mover * markers + marker),
     -1 where it is none or several."""
 
     images: list[Detections]
@@ -97,7 +96,7 @@ def detect(
     rng: np.random.Generator,
     blinking: Sequence[Blinking] = (),
 ) -> Seen:
-    """What the camera of a standing robot makes of lights at (k, ..., 3) [m] at `times` (k,) [s]; where robots blink,
+    """Detect, with the camera of a standing robot, lights at (k, ..., 3) [m] at `times` (k,) [s]; where robots blink,
     lights are at (k, movers, m, 3)."""
     uv, inside = view.project(p_lights.reshape(len(times), -1, 3))
     for n, one in enumerate(blinking):
@@ -150,8 +149,8 @@ def crowd(
     seed: int = 0,
     start: float = 1_700_000_000.0,
 ) -> tuple[list[Seen], Array]:
-    """What cameras (of robots A, B, ...) detect of robots that wander in an area, and where the lights are, (k, movers,
-    m, 3). They are on all the time, or `blinking`."""
+    """Detections by cameras (of robots A, B, ...) of robots that wander in an area, and positions (k, movers, m, 3) of
+    their lights, which are on all the time, or `blinking`."""
     rng = np.random.default_rng(seed)
     times = np.arange(round(seconds * fps)) / fps
     p_lights = lights_of(wander(movers, seconds + STEP, area, rng), times, p_markers)

@@ -15,17 +15,16 @@ from coloc_graph.team.shared_view import View
 
 Array = NDArray[np.float64]
 
-#: Tracks: two coloured LEDs on a bar, so far apart and so high [m]. Images: a tag, so large and so high [m].
-BAR = 0.4
-HEIGHT = 0.15
+# depth tracks: two coloured LEDs on a bar; depth images: a tag
+BAR = 0.4  # m, distance between the LEDs
+HEIGHT = 0.15  # m, above the floor
 HUE_DEG = 120.0
 TAG = 0.2
 #: Who surveys them knows where they stand to so much [m, deg].
 SURVEYED = 0.005
 SURVEYED_DEG = 0.5
-#: A landmark is recorded from no further than this [m], and from no more than so far aside of the way it faces [rad].
-FARTHEST = 3.0
-ASIDE = math.radians(70.0)
+FARTHEST = 3.0  # m, largest distance at which a landmark is recorded
+ASIDE = math.radians(70.0)  # rad, largest angle to the direction it faces
 
 
 def with_landmarks(team: Team, scenario: Scenario, *, tags: bool) -> Team:

@@ -1,4 +1,4 @@
-"""What the cameras of a live world see, rendered as it happens and served on a Unix socket: `ImageServer`.
+"""Images of the cameras of a live world, rendered in real time and served on a Unix socket: `ImageServer`.
 
 The protocol is that of `robot_io.camera_world`. Each connection has a thread, which renders one robot's frames at its
 camera's rate for as long as somebody listens.
@@ -22,12 +22,10 @@ from coloc_graph.simulation.rendering import Field, Sensor
 from coloc_graph.simulation.scenery import RobotInView, Scenery, backdrop, draw
 from coloc_graph.team import Team
 
-#: A frame is rendered so long after its exposure [s]: by then where everybody was is known.
-AFTER = 0.005
+AFTER = 0.005  # s after its exposure that a frame is rendered, when all poses are known
 
-#: So many images' noise is drawn, and from one image to the next it is taken so much further on.
-NOISE = 5
-LEAP = 104_729
+NOISE = 5  # images of noise drawn in advance
+LEAP = 104_729  # pixels by which the noise is shifted from image to image
 
 log = logging.getLogger(__name__)
 

@@ -37,19 +37,16 @@ from coloc_graph.simulation.uneven_floor import UnevenFloor
 from coloc_graph.simulation.world import stream
 from coloc_graph.team import Team, read_team
 
-#: True poses are kept so often [1/s], and taken from the wheels so often [s], which remember a few minutes.
-TRUTH_RATE = 20.0
-TRUTH_TAKEN = 1.0
-#: Bright things are there so far ahead of the robots' start [m].
-LENGTH = 10.0
-#: The observers look at a place so far ahead [m], over which the mover stands.
-AHEAD = 0.36 / math.tan(HALF_ANGLE)
+TRUTH_RATE = 20.0  # 1/s, rate of true poses
+TRUTH_TAKEN = 1.0  # s, period at which they are read from the wheels, which keep a few minutes
+LENGTH = 10.0  # m, depth of the region of bright objects ahead of the start
+AHEAD = 0.36 / math.tan(HALF_ANGLE)  # m, distance ahead at which the observers look, where the mover stands
 #: No path of a Unix socket may be longer [bytes].
 LONGEST_PATH = 100
 
 
 def start_poses(robots: int) -> tuple[Pose, ...]:
-    """Where a team of 3 robots or more begins: the last one in front, the others on an arc, turned towards it.
+    """Initial poses of a team of 3 robots or more: the last one in front, the others on an arc, turned towards it.
 
     The first two stand as those of the hallway do.
     """

@@ -19,14 +19,13 @@ RELATIVE = (4e-3, 4e-3, 3e-3, 5e-3, 5e-3, 4e-3)
 #: Of odometry over a step and of a sighting: heading [rad], x, y [m].
 WHEELS = (0.01, 0.01, 0.01)
 SEEN = (0.02, 0.008, 0.008)
-#: Robots stand so far apart across [m], and move so far ahead [m].
-APART = 0.6
-STEP = 0.45
+APART = 0.6  # m, distance across between robots
+STEP = 0.45  # m, distance of a move ahead
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredTeam:
-    """What a team measured, and what was true: `T_world_body` (4, 4) of every node, in the world of the estimate.
+    """Measurements of a team, and the truth: `T_world_body` (4, 4) of every node, in the world of the estimate.
 
     `wrong` are the relative poses that have nothing to do with the truth.
     """

@@ -14,12 +14,10 @@ from coloc_graph.simulation.scenery import Scenery, bright, dark, others_in_view
 from coloc_graph.simulation.world import Capture, World, stream
 from coloc_graph.team import Camera
 
-#: Light of the mains comes and goes so often [Hz], and so much of it does.
-MAINS = 100.0
-FLICKER = 0.35
-#: Lamps, windows and specks are so many times brighter than in an orderly world, at most this [grey levels].
-BRIGHTER = 3.0
-BRIGHTEST = 400.0
+MAINS = 100.0  # Hz, frequency of mains flicker
+FLICKER = 0.35  # fraction of the light that flickers
+BRIGHTER = 3.0  # factor by which lamps, windows and specks are brighter than in a tidy world
+BRIGHTEST = 400.0  # grey levels, limit of their brightness
 #: What the floor mirrors of an LED, relative to it.
 MIRRORED = 0.6
 #: A person: the width of a leg and of the body, where the body begins [m], the step [m], pace [m/s], grey level; and a
@@ -46,7 +44,7 @@ class Person:
     begins: float
 
     def legs(self, time: float) -> Array:
-        """Where both feet are on the floor (2, 2) [m]."""
+        """Positions of both feet on the floor (2, 2) [m]."""
         way = PACE * (time - self.begins)
         y = self.wide - abs((way % (4 * self.wide)) - 2 * self.wide)
         swing = STRIDE / 2 * math.sin(2 * math.pi * way / (2 * STRIDE))
@@ -63,7 +61,7 @@ def messy(scenery: Scenery) -> Scenery:
 
 
 def flicker(time: float) -> float:
-    """How bright the lights of the mains are at an instant [s], 1 on average."""
+    """Brightness of mains lighting at an instant [s], 1 on average."""
     return 1 + FLICKER * math.sin(2 * math.pi * MAINS * time)
 
 

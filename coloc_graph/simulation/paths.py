@@ -1,4 +1,4 @@
-"""How a robot gets about: `Path`, its pose at any instant, and the driving that makes one."""
+"""Movement of a robot: `Path`, its pose at any instant, and the driving that makes one."""
 
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ class Leg:
         return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.knots[:, :2], axis=0).T))])
 
     def cut(self, duration: float) -> "Leg":
-        """What is driven of it in `duration` [s] from its first knot; it must last as long."""
+        """First `duration` [s] of the leg, which must last as long."""
         end = self.times[0] + duration
         keep = self.times < end
         last = [np.interp(end, self.times, column) for column in self.knots.T]
@@ -142,7 +142,7 @@ class PathBuilder:
 
     @property
     def pose(self) -> Array:
-        """Where it is now: x, y [m], yaw [rad], (3,)."""
+        """Current x, y [m], yaw [rad], (3,)."""
         return np.asarray(self._knots[-1][-1])
 
     def follow(self, leg: Leg, tilt: ArrayLike | None = None) -> None:

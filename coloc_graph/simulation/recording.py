@@ -27,7 +27,7 @@ Record = Detections | Image | OdometrySample | Motion | Stance
 
 
 class Recorder(Protocol):
-    """What a world is written to: `run.RunWriter`, or anything with these methods."""
+    """Receiver of a world's records: `run.RunWriter`, or anything with these methods."""
 
     def write(self, record: Record) -> None:
         """Take one record."""
@@ -173,7 +173,7 @@ def _moves(world: World, begin: float, stance: Stance, wheels: dict[str, Odometr
 
 
 def _seen(world: World, k: int, scenery: Scenery | None, rendered: Rendering) -> list[Event]:
-    """What the observers of stance k took: images where there is scenery, otherwise detections."""
+    """Records of the observers of stance k: images where there is scenery, otherwise detections."""
     if scenery is None:
         return [_write(found, found.time) for tracks in observe(world, k) for found in tracks.records()]
     events = []

@@ -1,4 +1,4 @@
-"""What a camera's sensor makes of light: `render` draws LEDs as a PS3 Eye would see them, sub-pixel exact.
+"""Model of a camera's sensor: `render` draws LEDs as a PS3 Eye would see them, sub-pixel exact.
 
 A field is an image before it is exposed: expected grey levels (height, width), float32, unclipped.
 """

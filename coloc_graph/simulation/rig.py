@@ -44,7 +44,7 @@ class Imperfections:
 
     @property
     def clocks_differ(self) -> bool:
-        """Whether two robots can stamp one instant differently, or capture at different instants."""
+        """Return whether two robots can stamp one instant differently, or capture at different instants."""
         return self.clock_offset != 0 or self.time_jitter > 0
 
 
@@ -66,7 +66,7 @@ def reference_team(
 
 
 def stated_team(team: Team, imperfections: Imperfections) -> Team:
-    """What the run says of the team: nominal values, with the tolerances filled in."""
+    """Stated team of a run: nominal values, with the tolerances filled in."""
 
     def stated(robot: Robot) -> Robot:
         # a camera's noise must be above 0 for a detection to have a covariance
@@ -86,7 +86,7 @@ def stated_team(team: Team, imperfections: Imperfections) -> Team:
 
 
 def true_team(stated: Team, rng: np.random.Generator) -> Team:
-    """What the team is: drawn from the tolerances of the stated one, which are zero in the outcome."""
+    """True team: drawn from the tolerances of the stated one, which are zero in the outcome."""
 
     def drawn(robot: Robot) -> Robot:
         height, tilt, roll, span = rng.standard_normal(4).tolist()

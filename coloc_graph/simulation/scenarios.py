@@ -1,4 +1,4 @@
-"""Where the robots stand, stance by stance: `Scenario` and the formations of the paper's experiments."""
+"""Standing poses of the robots, stance by stance: `Scenario` and the formations of the paper's experiments."""
 
 import math
 from collections.abc import Callable
@@ -12,15 +12,12 @@ from coloc_graph.errors import InputError
 #: x [m], y [m], yaw [rad] of a body on the floor.
 Pose = tuple[float, float, float]
 
-#: A team's robots stand in lanes so far apart, one behind the other so far [m].
-LANE = 0.8
-ROW = 0.45
+LANE = 0.8  # m, distance between the lanes of a team
+ROW = 0.45  # m, distance between robots of one lane
 
-#: Round a course the pair comes so much further with each leap, its corners are as wide, and so far aside is its
-#: outer wall [m].
-LEAP = 0.25
-CORNER = 1.2
-WALL = 0.95
+LEAP = 0.25  # m, advance of the pair a leap on a course
+CORNER = 1.2  # m, radius of the corners of a course
+WALL = 0.95  # m, distance of its outer wall
 
 #: Half the angle between the pair's cameras in the multi-step experiments.
 HALF_ANGLE = math.radians(17.0)
@@ -28,7 +25,7 @@ HALF_ANGLE = math.radians(17.0)
 
 @dataclass(frozen=True)
 class Box:
-    """Where marker points are spread, from the middle of the standing pair: x and y from and to [m]."""
+    """Region in which marker points are spread, from the middle of the standing pair: x and y from and to [m]."""
 
     x: tuple[float, float]
     y: tuple[float, float]
@@ -76,7 +73,7 @@ class Scenario:
         return {self.stander(k): k, self.stander(k + 1): k + 1}
 
     def heading(self, k: int) -> float:
-        """Which way the team goes in stance k, and its box lies ahead [rad]."""
+        """Heading of the team in stance k [rad]; its box lies ahead."""
         return 0.0
 
     def middle(self, k: int) -> tuple[float, float]:
@@ -130,7 +127,7 @@ class CourseScenario(Scenario):
     landmarks: tuple[Pose, ...] = ()
 
     def heading(self, k: int) -> float:
-        """Which way the team goes in stance k, and its box lies ahead [rad]."""
+        """Heading of the team in stance k [rad]; its box lies ahead."""
         return self.headings[k]
 
 

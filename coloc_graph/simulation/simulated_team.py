@@ -76,7 +76,7 @@ class SimulatedTeam:
 
     @property
     def truth_path(self) -> Path:
-        """Where the truth is, once it is over."""
+        """Path of the file with the truth, complete after the mission."""
         return self.folder / "truth.mcap"
 
     def start(self, *names: str, program: Sequence[str] = ("-m", "coloc_graph.cli")) -> None:

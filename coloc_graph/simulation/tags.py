@@ -16,9 +16,8 @@ Array = NDArray[np.float64]
 BLACK = 12.0
 WHITE = 110.0
 MARGIN = 0.2
-#: A pixel is the mean of so many samples across; the lens blurs by so much [px].
-SAMPLES = 4
-BLUR = 0.8
+SAMPLES = 4  # samples across a pixel, averaged
+BLUR = 0.8  # px, blur of the lens
 #: A tag is drawn where its rim is off the image by no more than this [px].
 REACH = 40.0
 
@@ -74,7 +73,7 @@ def paint_tag(field: Field, camera: Camera, T_world_camera: Array, T_world_landm
 
 @lru_cache(maxsize=64)
 def _cells(family: str, number: int) -> NDArray[np.bool_]:
-    """Which cells of a tag are white, from the top left as it is seen."""
+    """White cells of a tag, from the top left as it is seen."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_APRILTAG_{family}"))
     size = dictionary.markerSize + 2
     return np.asarray(cv2.aruco.generateImageMarker(dictionary, number, size) > 127)

@@ -14,7 +14,7 @@ from coloc_graph.simulation.world import EPOCH, REST, Capture, World, stamp, sta
 from coloc_graph.team import IMAGES_A_BIT, Team
 from coloc_graph.team.shared_view import View
 
-#: Movers wander so far ahead of the foremost row, from and to, and to either side of their lanes [m]; for so long [s].
+# movers wander ahead of the foremost row, from and to, and to either side of their lanes [m], for a time [s]
 AHEAD = (0.7, 2.1)
 ASIDE = 0.7
 WANDERING = 20.0
@@ -95,7 +95,7 @@ def build_team_world(
 
 
 def _ways(scenario: TeamScenario, driving: dict[str, int], front: float, rng: np.random.Generator) -> dict[str, Array]:
-    """Where each mover wanders: poses (n, 3), every `STEP`."""
+    """Path of each mover: poses (n, 3), every `STEP`."""
     lanes = np.array([scenario.poses[s][1] for s in driving.values()])
     areas = np.stack(
         [

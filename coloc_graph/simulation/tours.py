@@ -1,4 +1,4 @@
-"""Where the mover goes in a stance: `scatter` for uniformly spread marker points, `patrol` for images."""
+"""Drives of the mover in a stance: `scatter` for uniformly spread marker points, `patrol` for images."""
 
 from dataclasses import dataclass
 
@@ -127,7 +127,7 @@ def _draw(
 
 
 def both_see(views: tuple[View, View], points_world: Array) -> NDArray[np.bool_]:
-    """Which points (..., 3) [world, m] both cameras see, (...)."""
+    """Mask (...) of the points (..., 3) [world, m] in view of both cameras."""
     return views[0].sees(points_world, TRACK_MARGIN) & views[1].sees(points_world, TRACK_MARGIN)
 
 

@@ -14,7 +14,7 @@ from coloc_graph.simulation.world import World, stream
 
 @dataclass(frozen=True, eq=False)
 class StanceTracks:
-    """What one observer detected in one stance: `uv` (n, m, 2) [px] of m `markers` at `stamps` (n,) [s].
+    """Detections of one observer in one stance: `uv` (n, m, 2) [px] of m `markers` at `stamps` (n,) [s].
 
     `seen` (n, m) tells which of them were detected; the others' uv mean nothing. `sigma` [px] is per axis.
     Records have the markers' names unless they are `nameless`.
@@ -43,7 +43,7 @@ class StanceTracks:
 
 
 def observe(world: World, k: int) -> tuple[StanceTracks, ...]:
-    """What the observers of stance k detect of markers, in the order of `Stance.observers`; without their names where
+    """Detections of markers by the observers of stance k, in the order of `Stance.observers`; without their names where
     robots blink."""
     rng, out = stream(world.seed, "detection", k), []
     blinks = blinking(world.true_team, stream(world.seed, "blink"))

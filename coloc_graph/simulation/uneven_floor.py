@@ -23,7 +23,7 @@ class UnevenFloor:
         self._phases = rng.uniform(0, 2 * np.pi, (2, WAVES))
 
     def slope(self, xy: ArrayLike) -> Array:
-        """How the floor rises along x and along y [rad] at places (n, 2) [m], (n, 2)."""
+        """Slopes of the floor along x and y [rad] at places (n, 2) [m], (n, 2)."""
         phases = np.einsum("awj,nj->naw", self._waves, np.asarray(xy, float)) + self._phases
         return np.asarray(self._scale * np.cos(phases).sum(axis=-1))
 

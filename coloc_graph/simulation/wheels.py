@@ -1,4 +1,4 @@
-"""What a robot's encoders make of its true path: `odometry`."""
+"""Wheel odometry of a true path: `odometry`."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ class Odometry:
     covariances: Array
 
     def records(self, robot: str, start: float, end: float, late: float) -> list[OdometrySample]:
-        """The samples from `start` (included) to `end` (true time), stamped by a clock that is `late` [s]."""
+        """Samples from `start` (included) to `end` (true time), stamped by a clock that is `late` [s]."""
         first, last = np.searchsorted(self.times, [start, end])
         return [
             OdometrySample(robot, float(self.times[i]) + late, self.poses[i], self.covariances[i])

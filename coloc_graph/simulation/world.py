@@ -93,7 +93,7 @@ class World:
     T_world_landmark: dict[str, Array] = field(default_factory=dict)
 
     def clock(self, robot: str, times: ArrayLike) -> Array:
-        """What a robot's clock says at true times [s]."""
+        """Time of a robot's clock at true times [s]."""
         return stamp(robot, self.team, self.imperfections, times)
 
     def markers_world(self, robot: str, times: ArrayLike) -> Array:
@@ -289,7 +289,7 @@ class _Builder:
 
 
 def turned_about(middle: tuple[float, float], angle: float) -> Array:
-    """The transform (4, 4) that turns the floor about a place on it [m] by an angle [rad]."""
+    """Transform (4, 4) of a turn of the floor about a point of it [m] by an angle [rad]."""
     T = np.eye(4)
     T[:3, :3] = rotation_z(angle)
     at = np.array([*middle, 0.0])
@@ -305,7 +305,7 @@ def _turned(tour: Tour, T_world_ahead: Array, angle: float) -> Tour:
 
 
 def stamp(robot: str, team: Team, imperfections: Imperfections, times: ArrayLike) -> Array:
-    """What a robot's clock says at true times [s]."""
+    """Time of a robot's clock at true times [s]."""
     late = 0.0 if robot == team.reference else imperfections.clock_offset
     return np.asarray(times, float) + late
 
