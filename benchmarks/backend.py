@@ -200,7 +200,7 @@ def wrong(seeds: int) -> None:
         spoilt = measured_team(6, 20, np.random.default_rng(seed), floor=FLOOR, wrong=0.1)
         clean = measured_team(6, 20, np.random.default_rng(seed), floor=FLOOR)
         a, b = smooth(graph_of(spoilt)), smooth(graph_of(clean))
-        refused, bad = {id(one.measurement) for one in a.refused}, set(map(id, spoilt.wrong))
+        refused, bad = {id(one.measurement) for one in a.rejected}, set(map(id, spoilt.wrong))
         found, total, false = found + len(refused & bad), total + len(bad), false + len(refused - bad)
         squares.append([_square(estimate, clean) for estimate in (a, b)])
     mean = np.mean(squares, axis=0)

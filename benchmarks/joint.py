@@ -70,7 +70,7 @@ def figures_of(world: World, options: SolveOptions) -> Figures:
     estimate = solution.estimate
     heading = max(row.heading_error_deg for row in rows)
     return Figures(
-        (a, b), heading, estimate.chi2, estimate.dof, accuracy.anees or 0.0, len(estimate.refused)
+        (a, b), heading, estimate.chi2, estimate.dof, accuracy.anees or 0.0, len(estimate.rejected)
     )  # fmt: skip
 
 
@@ -139,7 +139,7 @@ def from_images(seed: int, imperfections: Imperfections) -> Figures:
     rows = [row for row in assessed[0].robots if row.robot != "C"]
     a, b = (100 * row.length_error / row.true_length for row in rows)
     estimate, heading = solution.estimate, max(row.heading_error_deg for row in rows)
-    return Figures((a, b), heading, estimate.chi2, estimate.dof, assessed[0].anees or 0.0, len(estimate.refused))
+    return Figures((a, b), heading, estimate.chi2, estimate.dof, assessed[0].anees or 0.0, len(estimate.rejected))
 
 
 def images(seeds: int) -> dict[str, dict[str, object]]:
@@ -300,7 +300,7 @@ def speed() -> dict[str, float]:
     figures["update_1000_ms"] = 1000 * statistics.median(updates[990:])
     figures["update_1000_mean_ms"] = 1000 * statistics.mean(updates[900:])
     figures["longest_update_ms"] = 1000 * max(updates)
-    figures["refused_of_1010"] = len(estimate.refused)
+    figures["refused_of_1010"] = len(estimate.rejected)
     print(figures)
     return figures
 

@@ -95,7 +95,7 @@ def of_seed(seed: int, mode: str, length: float, laps: int) -> Outcome:
         nees_landmarks=nees,
         landmark_errors=errors,
         chi2_per_dof=estimate.chi2 / estimate.dof,
-        refused=len(estimate.refused),
+        refused=len(estimate.rejected),
         seconds=solution.seconds_backend,
     )
 

@@ -18,13 +18,14 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
+from coloc_graph.backend.landmarks import Placed
 from coloc_graph.backend.planar import filter_forward
-from coloc_graph.backend.planar.estimate import trajectory
+from coloc_graph.backend.planar.trajectory import trajectory
 from coloc_graph.evaluation import align, evaluate
 from coloc_graph.exchange.mrclam import import_mrclam
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.pipeline.ranging import DriveOptions, solve_drive
+from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.run import Run, open_run, read_truth
 
 
@@ -93,11 +94,11 @@ def main() -> None:
                 if not map_known and not between_robots:
                     continue  # one team is several worlds then
                 started = time.process_time()
-                batch = solve_drive(run, DriveOptions(between_robots=between_robots))
+                batch = solve(run, SolveOptions(between_robots=between_robots))
                 seconds = time.process_time() - started
                 of_batch = report("batch", batch.estimate.trajectories, run, map_known, seconds)
                 started = time.process_time()
-                one = solve_drive(run, DriveOptions(incremental=True, between_robots=between_robots))
+                one = solve(run, SolveOptions(incremental=True, between_robots=between_robots))
                 of_incremental = time.process_time() - started
                 of_one = report("incremental", one.estimate.trajectories, run, map_known, of_incremental)
                 report("incremental, at its time", one.online, run, map_known, of_incremental)
@@ -115,11 +116,11 @@ def main() -> None:
                     _report_map(batch.estimate.landmarks, args.data)
 
 
-def _report_map(landmarks: tuple, data: str) -> None:
+def _report_map(landmarks: Mapping[str, Placed], data: str) -> None:
     """How well the landmarks are found, after one rigid alignment."""
     truth = {f"L{int(row[0])}": row[1:3] for row in np.loadtxt(Path(data) / "Landmark_Groundtruth.dat")}
-    p = np.array([one.position for one in landmarks])
-    q = np.array([truth[one.name] for one in landmarks])
+    p = np.array([one.planar[:2] for one in landmarks.values()])
+    q = np.array([truth[name] for name in landmarks])
     p0, q0 = p - p.mean(axis=0), q - q.mean(axis=0)
     angle = np.arctan2((p0[:, 0] * q0[:, 1] - p0[:, 1] * q0[:, 0]).sum(), (p0 * q0).sum())
     c, s = np.cos(angle), np.sin(angle)

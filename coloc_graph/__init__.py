@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from coloc_graph.evaluation import align, evaluate
     from coloc_graph.measurements import Odometry, RelativePose, Sighting
     from coloc_graph.pipeline.batch import Solution, SolveOptions, solve
-    from coloc_graph.results.writer import read_result, write_result
+    from coloc_graph.results.folder import read_result
+    from coloc_graph.results.writer import write_result
     from coloc_graph.run import Run, RunWriter, Stance, open_run
     from coloc_graph.simulation import scenario, simulate
     from coloc_graph.team import Floor, Robot, Team, read_team, write_team
@@ -63,7 +64,8 @@ __getattr__, __dir__ = lazy_names(
         "evaluation": "align evaluate",
         "measurements": "Odometry RelativePose Sighting",
         "pipeline.batch": "Solution SolveOptions solve",
-        "results.writer": "read_result write_result",
+        "results.folder": "read_result",
+        "results.writer": "write_result",
         "run": "Run RunWriter Stance open_run",
         "simulation": "scenario simulate",
         "team": "Floor Robot Team read_team write_team",

@@ -58,7 +58,8 @@ class HomographyMeasurement:
     What i's clock calls t, j's calls t + `time_offset` [s]; `time_offset_sigma` [s] is its standard deviation, which
     `information` contains (both 0 where the clocks are said to agree); `by_time_offset` (8,) is what the true
     homography is off by, in those coordinates, for each second that the true offset is larger. `warning` is None, or
-    what about the measurement is weaker than it looks, in words. Where more than two observers saw the same markers
+    what about the measurement is weaker than it looks, in words; `doubt` is None, or a reason for which it is used by
+    the paper's chain alone. Where more than two observers saw the same markers
     their homographies are not independent: `share` is the part of what the pair's points say that `information` takes.
     """
 
@@ -78,6 +79,7 @@ class HomographyMeasurement:
     by_time_offset: Array | None = None
     warning: str | None = None
     share: float = 1.0
+    doubt: str | None = None
 
     @property
     def residual(self) -> float:
@@ -279,6 +281,31 @@ class RangeBearings:
 
     def __len__(self) -> int:
         return len(self.time)
+
+
+@dataclass(frozen=True, eq=False)
+class RangeBearing:
+    """One measurement of range [m] and bearing [rad] at a time [UTC s], of `target` by `robot`, each at a keyframe.
+
+    `row` is its place among the `RangeBearings` of the run; a landmark's `target_keyframe` is -1.
+    """
+
+    row: int
+    time: float
+    robot: str
+    keyframe: int
+    target: str
+    target_keyframe: int
+    range: float
+    bearing: float
+
+    @property
+    def ends(self) -> tuple[Node, Node]:
+        """The two nodes that it relates, observer first."""
+        return (self.robot, self.keyframe), (self.target, self.target_keyframe)
+
+    def __str__(self) -> str:
+        return f"range of {self.target} by {self.robot} at {self.time:.3f} s"
 
 
 @dataclass(frozen=True, eq=False)

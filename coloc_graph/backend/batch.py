@@ -37,7 +37,7 @@ ROUNDS = 20
 def smooth(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None = None) -> Estimate:
     """The most likely poses given all measurements, the floor and the stay-put constraints.
 
-    Where they disagree, and unless `refuse` is False, measurements that all others contradict are refused (graduated
+    Where they disagree, and unless `refuse` is False, measurements that all others contradict are rejected (graduated
     non-convexity on the relative poses, everything else taken for true; then each is tested against the rest), and
     anchors that did not stay put are named and taken to have moved. The search starts from `start`, or from the
     composition along the surest way. Raises `EstimationError` where the optimiser's answer does not pass its check,
@@ -59,7 +59,7 @@ def joint(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None =
 
 def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Values | None) -> Estimate:
     fit = fit_graph(method, graph, start)
-    refused: tuple[Rejection, ...] = ()
+    rejected: tuple[Rejection, ...] = ()
     bumped: tuple[Bump, ...] = ()
     suspects = _suspects(fit) if refuse else None
     if suspects is not None:
@@ -68,17 +68,17 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
         bumped = _bumps(method, graph, near)
         for bump in bumped:
             graph = _moved(graph, bump.stay_put)
-        refused, fit = _find_wrong(method, graph, near)
+        rejected, fit = _find_wrong(method, graph, near)
     return make_estimate(
         method,
         graph,
         fit.values,
-        fit.posterior.covariances(),
+        fit.marginals.covariances(),
         variables=fit.factors_of.variables,
         chi2=fit.chi2,
         dof=fit.dof,
         iterations=fit.iterations,
-        refused=refused,
+        rejected=rejected,
         bumped=bumped,
     )
 
@@ -147,13 +147,13 @@ def _find_wrong(method: Method, graph: PoseGraph, near: Near | None) -> tuple[tu
             del doubted[key]
         if worst is not None and refusing:
             doubted[id(fit.links[worst])] = fit.links[worst]
-    refused = tuple(
+    rejected = tuple(
         Rejection(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
         for link in (*graph.measurements, *graph.on_map)
         if id(link) in doubted
         for off in [_innovation(fit, link).sigmas]
     )
-    return refused, fit
+    return rejected, fit
 
 
 def _outliers(fit: Fit) -> dict[int, Link]:
@@ -184,7 +184,7 @@ def _innovation(fit: Fit, link: Link) -> Agreement:
     factor = fit.factors_of.of_link(link, i, j)
     if not all(map(fit.values.exists, factor.keys())):
         return UNCHECKED
-    return innovation([factor], fit.values, fit.posterior.joint(list(factor.keys())))
+    return innovation([factor], fit.values, fit.marginals.joint(list(factor.keys())))
 
 
 def _agrees(fit: Fit, link: Link, scale: float) -> bool:

@@ -9,6 +9,8 @@ import numpy as np
 from msgspec.structs import replace as with_fields
 from numpy.typing import NDArray
 
+from coloc_graph.backend.calibration_row import Row
+from coloc_graph.backend.sensor_calibration import CalibratedSensors
 from coloc_graph.measurements import RelativePose
 from coloc_graph.team import Landmark, Markers, Mount, Robot, Team
 
@@ -145,7 +147,7 @@ class CalibratedMount:
         )
 
     @property
-    def rows(self) -> tuple["Row", ...]:
+    def rows(self) -> tuple[Row, ...]:
         """Height, tilt and roll, one after the other."""
         stated, found = self.stated, self.mount
         return (
@@ -184,7 +186,7 @@ class CalibratedMarkers:
         )
 
     @property
-    def rows(self) -> tuple["Row", ...]:
+    def rows(self) -> tuple[Row, ...]:
         """Span, where there is one, and height."""
         s, f = self.stated, self.markers
         rows = [Row(self.robot, "markers' height", "m", s.height, s.height_sigma, f.height, f.height_sigma)]
@@ -193,38 +195,29 @@ class CalibratedMarkers:
         return tuple(rows)
 
 
-@dataclass(frozen=True)
-class Row:
-    """One number as stated and as it turned out, each with its standard deviation, in `unit`."""
-
-    robot: str
-    what: str
-    unit: str
-    stated: float
-    stated_sigma: float
-    found: float
-    found_sigma: float
-
-    @property
-    def sigmas(self) -> float:
-        """How far it is from what was stated, in what that is known to; 0 where it was called exact."""
-        return abs(self.found - self.stated) / self.stated_sigma if self.stated_sigma else 0.0
-
-    def __str__(self) -> str:
-        digits = 4 if self.unit == "m" else 2
-        return (
-            f"{self.robot}: {self.what} {self.found:.{digits}f} +- {self.found_sigma:.{digits}f} {self.unit} "
-            f"(stated {self.stated:.{digits}f} +- {self.stated_sigma:.{digits}f})"
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """All that was calibrated along with the poses: the variables' `values` and `covariances`, by key."""
+    """All that was calibrated along with the poses.
+
+    Parameters
+    ----------
+    variables, values, covariances
+        Of a joint estimate: its calibration variables, what was found of them and how well, by key.
+    sensors : mapping of str to CalibratedSensors
+        Of a ranging run: wheels and range sensors by robot.
+    landmarks : mapping of str to Landmark
+        Of a ranging run: estimated landmarks whose positions the team does not state.
+    """
 
     variables: Variables | None = None
     values: Mapping[int, Array] = field(default_factory=dict)
     covariances: Mapping[int, Array] = field(default_factory=dict)
+    sensors: Mapping[str, CalibratedSensors] = field(default_factory=dict)
+    landmarks: Mapping[str, Landmark] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        """Return whether anything was calibrated."""
+        return bool(self.rows or self.landmarks)
 
     @cached_property
     def mounts(self) -> dict[str, CalibratedMount]:
@@ -249,29 +242,28 @@ class Calibration:
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Every number of mounts and markers that had a tolerance."""
+        """Every number that was stated with a tolerance."""
         rows = [row for mount in self.mounts.values() for row in mount.rows]
         rows += [row for markers in self.markers.values() for row in markers.rows]
+        rows += [row for sensors in self.sensors.values() for row in sensors.rows]
         return tuple(row for row in rows if row.stated_sigma > 0)
 
     def of_team(self, team: Team) -> Team:
-        """The team with mounts and markers as they turned out, and with what is left of their tolerances."""
+        """Return the calibrated team: with what was estimated, and the tolerances that are left."""
         robots = []
         for robot in team.robots:
             mount, markers = self.mounts.get(robot.name), self.markers.get(robot.name)
-            robots.append(
-                with_fields(
-                    robot,
-                    mount_if_any=robot.mount if mount is None else mount.mount,
-                    markers=robot.markers if markers is None else markers.markers,
-                )
-            )
-        landmarks = [
-            landmark if landmark.name not in self.markers else with_fields(
-                landmark, markers=self.markers[landmark.name].markers
-            )
-            for landmark in team.landmarks
-        ]  # fmt: skip
+            sensors = self.sensors.get(robot.name)
+            if mount is not None:
+                robot = with_fields(robot, mount_if_any=mount.mount)
+            if markers is not None:
+                robot = with_fields(robot, markers=markers.markers)
+            robots.append(robot if sensors is None else sensors.calibrated)
+        landmarks = []
+        for landmark in team.landmarks:
+            if landmark.name in self.markers:
+                landmark = with_fields(landmark, markers=self.markers[landmark.name].markers)
+            landmarks.append(self.landmarks.get(landmark.name, landmark))
         return with_fields(team, robots=tuple(robots), landmarks=tuple(landmarks))
 
     @property

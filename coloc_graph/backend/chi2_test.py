@@ -13,7 +13,7 @@ from scipy.special import chdtrc, gammaln
 
 Array = NDArray[np.float64]
 
-#: A measurement that noise alone puts this far off less often than this is refused.
+#: A measurement that noise alone puts this far off less often than this is rejected.
 LEAST_CHANCE = 1e-6
 #: Of a whitened residual, the directions that others check by less than this share of its variance are unchecked.
 LEAST_CHECKED = 1e-3

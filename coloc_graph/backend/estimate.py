@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -13,19 +14,20 @@ from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.graph import PoseGraph, StayPut
 from coloc_graph.backend.landmarks import MAP, OnMap, Placed
-from coloc_graph.backend.marginals import Posterior
+from coloc_graph.backend.marginals import Marginals
+from coloc_graph.backend.ranging import RangingProblem
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.measurements import Measurement, Node
+from coloc_graph.measurements import Measurement, Node, RangeBearing
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Rejection:
-    """A measurement, or a place on the map, that was left out, and why, in words."""
+    """A measurement, or a landmark's position on the map, that was rejected as an outlier, and the reason."""
 
-    measurement: Measurement | OnMap
+    measurement: Measurement | RangeBearing | OnMap
     reason: str
 
 
@@ -56,56 +58,130 @@ class Bump:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Poses of all robots at all stances that are tied to the reference.
+    """Poses of all robots that are tied to the world frame, with covariances, and what was found along.
 
-    `trajectories` by robot, one pose a stance at which it is a node. `chi2` with `dof` degrees of freedom says how
-    well the measurements agree (dof 0: nothing could contradict). `untied` are the (robot, stance) that no
-    measurement ties to the reference; they have no pose. `refused` are the measurements that all others contradict,
-    and `bumped` the anchors that did. `calibration` is what a joint estimate found of mounts, markers and clocks.
-    `landmarks` are those that were sighted, by name, and `map` is where the map of those that are on one is.
+    A node is (robot, index): the index of a stance, or, of a ranging run, the number of a robot's keyframe.
+
+    Parameters
+    ----------
+    method : {"chain", "smooth", "joint", "ranging"}
+        How it was made.
+    source : PoseGraph or RangingProblem
+        What it was made of; `graph` and `ranging` give one or the other.
+    trajectories : mapping of str to Trajectory
+        By robot, one pose a node that has one.
+    disconnected : tuple of Node
+        Nodes that no measurement ties to the world frame; they have no pose.
+    chi2, dof : float
+        Squared error of all that was used, and its degrees of freedom (0: nothing could contradict).
+    iterations : int
+        Iterations of the optimiser.
+    rejected : tuple of Rejection
+        Measurements that the others contradict, each with its reason.
+    bumped : tuple of Bump
+        Anchors that moved.
+    calibration : Calibration
+        What was found of mounts, markers and clocks, or of wheels and range sensors.
+    landmarks : mapping of str to Placed
+        By name, those that were measured, or that the team states.
+    map : Placed or None
+        Pose of the map that landmarks are on, where it was found along.
     """
 
-    method: Method
-    graph: PoseGraph
+    method: Method | Literal["ranging"]
+    source: PoseGraph | RangingProblem
     trajectories: Mapping[str, Trajectory]
-    untied: tuple[Node, ...] = ()
+    disconnected: tuple[Node, ...] = ()
     chi2: float = 0.0
-    dof: int = 0
+    dof: float = 0
     iterations: int = 0
-    refused: tuple[Rejection, ...] = ()
+    rejected: tuple[Rejection, ...] = ()
     bumped: tuple[Bump, ...] = ()
     calibration: Calibration = field(default_factory=Calibration)
     landmarks: Mapping[str, Placed] = field(default_factory=dict)
     map: Placed | None = None
 
-    def pose(self, robot: str, stance: int) -> gtsam.Pose3:
-        """T_world_body of a robot at a stance; `EstimationError` where it has none."""
-        T, _ = self._at(robot, stance)
+    @property
+    def graph(self) -> PoseGraph:
+        """The pose graph; `EstimationError` of a ranging run, which has none."""
+        if isinstance(self.source, PoseGraph):
+            return self.source
+        raise EstimationError("an estimate of a ranging run has no pose graph: its measurements are in `ranging`")
+
+    @property
+    def ranging(self) -> RangingProblem:
+        """The measurements of a ranging run; `EstimationError` of a run with stances, which has none."""
+        if isinstance(self.source, RangingProblem):
+            return self.source
+        raise EstimationError("an estimate of a run with stances holds no ranges: its measurements are in `graph`")
+
+    @property
+    def is_ranging(self) -> bool:
+        """True if this is the estimate of a ranging run."""
+        return isinstance(self.source, RangingProblem)
+
+    def __repr__(self) -> str:
+        agreement = f", chi2/dof {self.chi2 / self.dof:.2f}" if self.dof > 0 else ""
+        return (
+            f"Estimate({self.method}, {len(self.trajectories)} robots, {sum(map(len, self.trajectories.values()))} "
+            f"poses, {len(self.landmarks)} landmarks, {len(self.rejected)} measurements rejected{agreement})"
+        )
+
+    def pose(self, robot: str, index: int) -> gtsam.Pose3:
+        """Return a pose T_world_body.
+
+        Parameters
+        ----------
+        robot : str
+            Its name.
+        index : int
+            The stance, or the robot's keyframe.
+
+        Raises
+        ------
+        EstimationError
+            It has no pose there.
+        """
+        T, _ = self._at(robot, index)
         return gtsam.Pose3(T)
 
-    def covariance(self, robot: str, stance: int) -> Array:
-        """Covariance (6, 6) of that pose: GTSAM's tangent, rotation [rad] first, then translation [m], body frame."""
-        return self._at(robot, stance)[1]
+    def covariance(self, robot: str, index: int) -> Array:
+        """Return the covariance (6, 6) of a pose: rotation [rad] first, then translation [m], body frame.
+
+        Parameters and errors are those of `pose`.
+        """
+        return self._at(robot, index)[1]
 
     def joint_covariance(self, nodes: Sequence[Node]) -> Array:
-        """Joint covariance (6 n, 6 n) of n (robot, stance), each in its own body's tangent, in the order given.
+        """Return the joint covariance (6 n, 6 n) of n nodes, each in its own body's tangent, in the order given.
 
-        Poses that are one place have the same rows. Raises `EstimationError` where one has no pose.
+        Nodes that share a pose have the same rows.
+
+        Raises
+        ------
+        EstimationError
+            A node has no pose, or the estimate keeps no joint covariances (`chain`, and ranging runs).
         """
         if not nodes:
             raise EstimationError("name at least one robot and stance to have a covariance")
         if self.method == "chain":
             raise EstimationError("a chain has no joint covariances: it uses some measurements only; use `smooth`")
+        if not isinstance(self.source, PoseGraph):
+            raise EstimationError(
+                "an estimate of a ranging run keeps the covariance of each pose alone, and no joint ones"
+            )
         for node in nodes:
             self._at(*node)
-        keys = [self.graph.key(*node) for node in nodes]
+        keys = [self.source.key(*node) for node in nodes]
         different = list(dict.fromkeys(keys))
-        joint = self._posterior.joint(different)
+        joint = self._marginals.joint(different)
         index = np.concatenate([6 * different.index(key) + np.arange(6) for key in keys])
         return np.asarray(joint[np.ix_(index, index)])
 
-    def residual(self, measurement: Measurement) -> float:
-        """How far a measurement is from the estimate, RMS in units of its noise; NaN where an end of it has no pose."""
+    def residual(self, measurement: Measurement | RangeBearing) -> float:
+        """Return the RMS residual of a measurement in units of its noise; NaN where an end of it has no pose."""
+        if isinstance(measurement, RangeBearing):
+            return self.ranging.residual(measurement)
         values, graph = self._values, self.graph
         i, j = (graph.key(*end) for end in measurement.ends)
         if not (values.exists(i) and values.exists(j)) or i == j:
@@ -132,44 +208,61 @@ class Estimate:
         return values
 
     @cached_property
-    def _posterior(self) -> Posterior:
-        used = self.graph.without(one.measurement for one in self.refused)
+    def _marginals(self) -> Marginals:
+        used = self.graph.without(one.measurement for one in self.rejected)
         factors_of = Factors(self.graph.floor, self.calibration.variables)
         factors, _, at_once = factors_of.of_graph(used, poses_in(self._values))
         with at_once:
-            return Posterior(factors, self._values)
+            return Marginals(factors, self._values)
 
     @cached_property
     def _index(self) -> dict[Node, int]:
+        """Row of each node in its robot's trajectory."""
+        if isinstance(self.source, RangingProblem):
+            numbers = self.source.numbers
+        else:
+            numbers = {name: one.stances for name, one in self.trajectories.items() if one.stances is not None}
         return {
-            (robot, stance): at
-            for robot, trajectory in self.trajectories.items()
-            if trajectory.stances is not None
-            for at, stance in enumerate(trajectory.stances.tolist())
+            (robot, index): row for robot, of_robot in numbers.items() for row, index in enumerate(of_robot.tolist())
         }
 
-    def _at(self, robot: str, stance: int) -> tuple[Array, Array]:
-        at, trajectory = self._index.get((robot, stance)), self.trajectories.get(robot)
+    def _at(self, robot: str, index: int) -> tuple[Array, Array]:
+        at, trajectory = self._index.get((robot, index)), self.trajectories.get(robot)
         if at is None or trajectory is None or trajectory.covariances is None:
-            raise EstimationError(f"robot {robot} has no pose at stance {stance}")
+            what = "keyframe" if self.is_ranging else "stance"
+            raise EstimationError(f"robot {robot} has no pose at {what} {index}")
         return trajectory.T_world_body[at], trajectory.covariances[at]
 
 
 @dataclass(frozen=True, eq=False)
 class StanceEstimate:
-    """Where the robots of one stance stand: `poses` T_world_body, and `covariances` (6, 6) in GTSAM's tangent.
+    """Poses of the robots of one stance, and how its measurements agree with everything before.
 
-    Robots that nothing ties to the reference are `untied`. `refused` is what was refused in this call, and `agreement`
-    says how all that it took in, together, agrees with what was in before; `residuals` are of the measurements that
-    came with the stance, in their order: RMS in units of their noise, NaN where an end of it has no pose. `landmarks`
-    are those that were sighted in it, where they are now.
+    Parameters
+    ----------
+    stance : int
+        Its index.
+    poses : mapping of str to gtsam.Pose3
+        T_world_body by robot.
+    covariances : mapping of str to (6, 6) float
+        In GTSAM's tangent, by robot.
+    disconnected : tuple of str
+        Robots that nothing ties to the reference.
+    rejected : tuple of Rejection
+        Measurements that were rejected in this call.
+    agreement : Agreement
+        Agreement of everything that this call took in with everything before.
+    residuals : tuple of float
+        Of the stance's measurements, in their order: RMS in units of their noise, NaN where an end has no pose.
+    landmarks : mapping of str to Placed
+        Landmarks that were sighted in the stance.
     """
 
     stance: int
     poses: Mapping[str, gtsam.Pose3]
     covariances: Mapping[str, Array]
-    untied: tuple[str, ...] = ()
-    refused: tuple[Rejection, ...] = ()
+    disconnected: tuple[str, ...] = ()
+    rejected: tuple[Rejection, ...] = ()
     agreement: Agreement = UNCHECKED
     residuals: tuple[float, ...] = ()
     landmarks: Mapping[str, Placed] = field(default_factory=dict)
@@ -185,7 +278,7 @@ def make_estimate(
     chi2: float = 0.0,
     dof: int = 0,
     iterations: int = 0,
-    refused: tuple[Rejection, ...] = (),
+    rejected: tuple[Rejection, ...] = (),
     bumped: tuple[Bump, ...] = (),
 ) -> Estimate:
     """An estimate of values, and of their covariances by key."""
@@ -205,10 +298,10 @@ def make_estimate(
                 stances=np.array(stances),
                 covariances=np.array([covariances[key] for key in keys]),
             )
-    untied = graph.untied(poses)
+    disconnected = graph.disconnected(poses)
     calibration = Calibration(variables, errors, {key: covariances[key] for key in errors})
     still = {name: Placed(poses[key], covariances[key]) for name, key in graph.places.still().items() if key in poses}
     here = still.pop(MAP, None)
     return Estimate(
-        method, graph, trajectories, untied, chi2, dof, iterations, refused, bumped, calibration, still, here
+        method, graph, trajectories, disconnected, chi2, dof, iterations, rejected, bumped, calibration, still, here
     )

@@ -56,7 +56,7 @@ class Estimator:
 
     What is no measurement (NaN, a covariance that is none, a robot that is not there) raises `MeasurementError`
     before anything has changed, and after any exception the estimator is as it was. What all others contradict is
-    left out and listed in `refused`. What nothing ties to the reference waits until something does. With the `rigs` of
+    left out and listed in `rejected`. What nothing ties to the reference waits until something does. With the `rigs` of
     the robots it calibrates their mounts along with the poses, as `joint` does. Not for several threads at once.
     """
 
@@ -88,7 +88,7 @@ class Estimator:
             self._places.accept(self._places.after(before, stance))
             self._stances[stance.index] = stance
         self._log = list(base.measurements)  # everything that ever came, the rejected too
-        self._refused = {  # by the measurement's identity
+        self._rejected = {  # by the measurement's identity
             id(self._log[number]): Rejection(self._log[number], why) for number, why in base.rejected.items()
         }
         self._newly: set[int] = set()  # those rejected since the last stance came, it included
@@ -97,7 +97,7 @@ class Estimator:
         self._instants = self._checked(self._log)  # when moving robots were sighted
         self._live = Isam2Graph(self._new_factors())
         if base.stances:
-            kept = self.graph.without(one.measurement for one in self.refused)
+            kept = self.graph.without(one.measurement for one in self.rejected)
             self._live, links = rebuilt(kept, self.method)
             inside = set(map(id, links))
             self._loose = [one for one in kept.links if id(one) not in inside and len(set(self._keys(one))) == 2]
@@ -145,13 +145,13 @@ class Estimator:
 
     @property
     def measurements(self) -> tuple[Measurement, ...]:
-        """Every measurement that is in, the refused ones too."""
+        """Every measurement that is in, the rejected ones too."""
         return tuple(self._log)
 
     @property
-    def refused(self) -> tuple[Rejection, ...]:
+    def rejected(self) -> tuple[Rejection, ...]:
         """What all other measurements contradict."""
-        return tuple(self._refused.values())
+        return tuple(self._rejected.values())
 
     @property
     def waiting(self) -> tuple[int, ...]:
@@ -168,7 +168,7 @@ class Estimator:
 
     def __repr__(self) -> str:
         return (
-            f"Estimator({len(self._stances)} stances, {len(self._log)} measurements, {len(self._refused)} refused, "
+            f"Estimator({len(self._stances)} stances, {len(self._log)} measurements, {len(self._rejected)} rejected, "
             f"{len(self._live.tied)} poses tied, {len(self._loose)} links and {len(self._early)} stances waiting)"
         )
 
@@ -200,13 +200,13 @@ class Estimator:
         Raises `EstimationError` while there is no stance.
         """
         graph = self.graph
-        kept = graph.without(one.measurement for one in self.refused)
+        kept = graph.without(one.measurement for one in self.rejected)
         values = self._live.values() if self._live.tied else None
         optimised = joint if self.rigs else smooth
-        return replace(optimised(kept, refuse=False, start=values), graph=graph, refused=self.refused)
+        return replace(optimised(kept, refuse=False, start=values), source=graph, rejected=self.rejected)
 
     def bumps(self) -> tuple[Bump, ...]:
-        """The anchors that did not stay put, by all that is in, the refused too; it takes a few batches."""
+        """The anchors that did not stay put, by all that is in, the rejected too; it takes a few batches."""
         return find_bumps(self.method, self.graph)
 
     def add(
@@ -215,7 +215,7 @@ class Estimator:
         """Take in a stance with what was measured in it and on the way to it; where its robots stand comes back.
 
         `after` is the stance that it follows, since which its anchors have stayed: the one numbered before it unless
-        said otherwise. A stance that comes too early waits for that one, and is then `untied`.
+        said otherwise. A stance that comes too early waits for that one, and is then `disconnected`.
         """
         taken = tuple(measurements)
         follows = stance.index - 1 if after is None else after
@@ -240,7 +240,7 @@ class Estimator:
             while early := self._next_early():
                 del self._early[early.stance.index]
                 later = self._enter_early(early)
-                estimate = replace(later, refused=(*estimate.refused, *later.refused))
+                estimate = replace(later, rejected=(*estimate.rejected, *later.rejected))
         return estimate
 
     def _enter_early(self, early: Early) -> StanceEstimate:
@@ -273,13 +273,13 @@ class Estimator:
     def revoke(self, measurement: Measurement) -> StanceEstimate:
         """Take a measurement out again, as if it had never come; the last stance's poses come back.
 
-        What was refused because it contradicted this one is taken back.
+        What was rejected because it contradicted this one is taken back.
         """
         if not any(one is measurement for one in self._log):
             raise EstimationError(f"the {measurement} is not in, so that it cannot be taken out")
         with self._all_or_nothing():
-            self._take_out(self.stances, {id(measurement)}, set(self._refused))
-        return self._at(next(reversed(self._stances.values())), self.refused, UNCHECKED)
+            self._take_out(self.stances, {id(measurement)}, set(self._rejected))
+        return self._at(next(reversed(self._stances.values())), self.rejected, UNCHECKED)
 
     def withdraw(self) -> Stance:
         """Take the last stance out again with all that was measured in it and on the way to it, as if it had never
@@ -296,10 +296,10 @@ class Estimator:
         """Keep these stances and all measurements but those `gone`, by identity; of the rejected, try those `doubted`
         again."""
         measurements = tuple(one for one in self._log if id(one) not in gone)
-        rejected = {key: one for key, one in self._refused.items() if key not in gone}
+        rejected = {key: one for key, one in self._rejected.items() if key not in gone}
         self._changed = True
         self._begin(_base(stances, measurements, rejected))
-        again = [one.measurement for key, one in rejected.items() if key in doubted]
+        again = [m for m in (one.measurement for key, one in rejected.items() if key in doubted) if isinstance(m, Link)]
         if again:
             found = {id(one.measurement): one for one in self._update(self._entering([*self._loose, *again]))[0]}
             left = {key: one for key, one in rejected.items() if key not in doubted} | found
@@ -344,14 +344,14 @@ class Estimator:
                 self._places.forget(before, stance)
                 del self._stances[stance.index]
             raise
-        refused, agreement = self._update(entering)
+        rejected, agreement = self._update(entering)
         self._journal.append(Entry(stance, taken))
         self._log += taken
         self._instants |= instants
-        self._refused |= {id(one.measurement): one for one in refused}
-        self._newly = (set() if stance is not None else self._newly) | {id(one.measurement) for one in refused}
+        self._rejected |= {id(one.measurement): one for one in rejected}
+        self._newly = (set() if stance is not None else self._newly) | {id(one.measurement) for one in rejected}
         self._loose = entering.loose
-        said = self._at(next(reversed(self._stances.values())), refused, agreement)
+        said = self._at(next(reversed(self._stances.values())), rejected, agreement)
         seen = {one.seen for one in taken if isinstance(one, Sighting)}
         return replace(said, residuals=tuple(map(self.residual, taken)), landmarks=self.placed(seen))
 
@@ -382,7 +382,7 @@ class Estimator:
             outcome = self._live.enter(entering)
         except Exception as failure:
             raise EstimationError(f"the graph cannot take this in, and is as it was: {failure}") from failure
-        return tuple(_refusal(link, off) for link, off in outcome.refused), outcome.agreement
+        return tuple(_refusal(link, off) for link, off in outcome.rejected), outcome.agreement
 
     def _keys(self, link: Link) -> tuple[int, int]:
         i, j = map(self._places.key, link.ends)
@@ -396,7 +396,7 @@ class Estimator:
                 return key
         raise EstimationError(f"robot {robot} has no pose{'' if stance is None else f' at stance {stance}'}")
 
-    def _at(self, stance: Stance, refused: tuple[Rejection, ...], agreement: Agreement) -> StanceEstimate:
+    def _at(self, stance: Stance, rejected: tuple[Rejection, ...], agreement: Agreement) -> StanceEstimate:
         keys = {robot: self._places.key((robot, stance.index)) for robot in self.robots}
         tied = {robot: key for robot, key in keys.items() if key in self._live.tied}
         return StanceEstimate(
@@ -404,6 +404,6 @@ class Estimator:
             {robot: self._live.pose(key) for robot, key in tied.items()},
             {robot: self._live.covariance(key) for robot, key in tied.items()},
             tuple(robot for robot in stance.observers if robot not in tied),
-            refused,
+            rejected,
             agreement,
         )

@@ -271,17 +271,18 @@ class PoseGraph:
         measured = tuple(m for m in self.measurements if all(index in within for _, index in m.ends))
         return replace(self, stances=first, measurements=measured)
 
-    def without(self, refused: Iterable[Link]) -> "PoseGraph":
+    def without(self, rejected: Iterable[object]) -> "PoseGraph":
         """The same nodes with fewer measurements."""
-        out = {id(one) for one in refused}
+        out = {id(one) for one in rejected}
         if not out:
             return self
         kept = tuple(m for m in self.measurements if id(m) not in out)
         graph = replace(self, measurements=kept, on_map=tuple(one for one in self.on_map if id(one) not in out))
-        vars(graph).update(nodes=self.nodes, times=self.times)  # a node stays one, and untied, if all it had is refused
+        # a node stays one, and is disconnected, if all its measurements are rejected
+        vars(graph).update(nodes=self.nodes, times=self.times)
         return graph
 
-    def untied(self, known: Iterable[int]) -> tuple[Node, ...]:
+    def disconnected(self, known: Iterable[int]) -> tuple[Node, ...]:
         """The (robot, stance) whose pose is not among these keys, in the order of the stances."""
         keys = set(known)
         return tuple(node for node in self.nodes if self.places.key(node) not in keys)

@@ -21,7 +21,7 @@ from coloc_graph.measurements import Sighting
 
 Array = NDArray[np.float64]
 
-#: With less chi2 than this in all that enters, nothing of it is refused, of however few degrees of freedom.
+#: With less chi2 than this in all that enters, nothing of it is rejected, of however few degrees of freedom.
 CLEAR = float(chdtri(1, LEAST_CHANCE))
 #: So many steps at most lead to the optimum when something enters: a first stance with mounts a degree off takes 4.
 MOST_STEPS = 10
@@ -41,7 +41,7 @@ class Entered(NamedTuple):
 class Outcome(NamedTuple):
     """What was left out, and how all that went in agrees with what was there."""
 
-    refused: list[tuple[Link, Agreement]]
+    rejected: list[tuple[Link, Agreement]]
     agreement: Agreement
 
 
@@ -106,16 +106,16 @@ class Isam2Graph:
         indices = self._into_isam(factors, values) if factors.size() else []
         inside = {index: Entered(tie[0], self.isam.getFactorsUnsafe().at(index))
                   for index, tie in zip(indices[first:], entering.near, strict=True)}  # fmt: skip
-        refused = self._enter_far([(Entered(tie[0], far[id(tie)]), gates[id(tie)]) for tie in entering.far], inside)
+        rejected = self._enter_far([(Entered(tie[0], far[id(tie)]), gates[id(tie)]) for tie in entering.far], inside)
         if entering.far or not clear:
-            refused += self._take_out(inside)
+            rejected += self._take_out(inside)
         together = self._agreement([self.isam.getFactorsUnsafe().at(index) for index in (*indices[:first], *inside)])
         for key in entering.start:
             if not np.isfinite(self.isam.calculateEstimatePose3(key).translation()).all():
                 raise EstimationError("a pose came out as not finite")
         self.tied |= entering.start.keys()
         self._anchor()
-        return Outcome(refused, together)
+        return Outcome(rejected, together)
 
     def _anchor(self) -> None:
         """Once a mount's tilts are known well enough, spans that come in are taken apart for it as it is."""
@@ -186,14 +186,14 @@ class Isam2Graph:
     def _enter_far(
         self, far: list[tuple[Entered, gtsam.NonlinearFactor | None]], inside: dict[int, Entered]
     ) -> list[tuple[Link, Agreement]]:
-        """Put in what does not contradict what is known, and note it as `inside`; what does is refused."""
-        refused: list[tuple[Link, Agreement]] = []
+        """Put in what does not contradict what is known, and note it as `inside`; what does is rejected."""
+        rejected: list[tuple[Link, Agreement]] = []
         passed: list[Entered] = []
         factors, leading = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
         for one, gate in far:
             off = self._agreement([one.factor if gate is None else gate], inside=False)
             if off.chance() < LEAST_CHANCE:
-                refused.append((one.link, off))
+                rejected.append((one.link, off))
             else:
                 passed.append(one)
                 factors.add(one.factor)
@@ -202,7 +202,7 @@ class Isam2Graph:
         if passed:
             led = self._led_in(leading)
             inside |= zip(self._into_isam(factors, gtsam.Values(), led), passed, strict=True)
-        return refused
+        return rejected
 
     def _led_in(self, leading: gtsam.NonlinearFactorGraph) -> list[int]:
         """Put in factors that are to lead the poses to where others make sense, and go there; their indices."""
@@ -221,7 +221,7 @@ class Isam2Graph:
 
     def _take_out(self, inside: dict[int, Entered]) -> list[tuple[Link, Agreement]]:
         """Take out what all others contradict, the worst first."""
-        refused: list[tuple[Link, Agreement]] = []
+        rejected: list[tuple[Link, Agreement]] = []
         before = np.inf  # how far off the worst was a step ago; where no step brings it nearer, it is the optimum
         while inside:
             among = {index: self._agreement([one.factor]) for index, one in inside.items()}
@@ -233,10 +233,10 @@ class Isam2Graph:
                 before = among[worst].chi2
                 self._linearise()
                 continue
-            refused.append((inside.pop(worst).link, among[worst]))
+            rejected.append((inside.pop(worst).link, among[worst]))
             self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [worst])
             before = np.inf
-        return refused
+        return rejected
 
     def _agreement(self, factors: list[gtsam.NonlinearFactor], *, inside: bool = True) -> Agreement:
         if not factors:

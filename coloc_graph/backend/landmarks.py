@@ -49,11 +49,21 @@ class OnMap:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Where something that never moves is: `T_world_body`, and its covariance (6, 6) in GTSAM's tangent (rotation
-    [rad] first, then translation [m], in its own frame)."""
+    """Estimated pose of something that never moves.
+
+    Parameters
+    ----------
+    T_world_body : gtsam.Pose3
+        Its pose in the world.
+    covariance : (6, 6) float
+        In GTSAM's tangent: rotation [rad] first, then translation [m], in its own frame.
+    has_heading : bool
+        False of a point, as a landmark that was ranged: its rotation means nothing.
+    """
 
     T_world_body: gtsam.Pose3
     covariance: Array
+    has_heading: bool = True
 
     @property
     def planar(self) -> tuple[float, float, float]:

@@ -45,7 +45,7 @@ class _Clique:
     covariance: Array | None = None
 
 
-class Posterior:
+class Marginals:
     """Covariances of the variables of a graph at its optimum. `EstimationError` where factors leave one open."""
 
     def __init__(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:

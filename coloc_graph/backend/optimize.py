@@ -13,7 +13,7 @@ from coloc_graph.backend.chain import compose, spanning_tree
 from coloc_graph.backend.chi2_test import Agreement, agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
 from coloc_graph.backend.graph import Link, PoseGraph, pose_of
-from coloc_graph.backend.marginals import Posterior
+from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.solver import optimise
 
 Array = NDArray[np.float64]
@@ -50,10 +50,10 @@ class Fit:
             return float(2 * self.factors.error(self.values))
 
     @cached_property
-    def posterior(self) -> Posterior:
+    def marginals(self) -> Marginals:
         """Its covariances."""
         with self.at_once:
-            return Posterior(self.factors, self.values)
+            return Marginals(self.factors, self.values)
 
     @cached_property
     def dof(self) -> int:
@@ -85,7 +85,7 @@ class Fit:
                 if alone.chance() > LOOKED_INTO:
                     found[index] = alone
                     continue
-            found[index] = agreement([factor], self.values, self.posterior.joint(list(factor.keys())))
+            found[index] = agreement([factor], self.values, self.marginals.joint(list(factor.keys())))
         return found
 
 

@@ -41,8 +41,8 @@ def print_accuracy(accuracy: Accuracy) -> None:
         )
     print_table(["robot", "true", "estimated", "error", "error rate", "end position", "heading"], rows)
     poses = counted(accuracy.nees_poses, "pose")
-    anees = "-" if accuracy.anees is None else f"{accuracy.anees:.2f} over {poses} (1 is honest)"
-    print(f"RMS position error of all poses {100 * accuracy.ate:.2f} cm; average NEES per degree of freedom {anees}")
+    anees = "-" if accuracy.anees is None else f"{accuracy.anees:.2f} over {poses}{_intervals(accuracy)}"
+    print(f"RMS position error of all poses {100 * accuracy.ate:.2f} cm; NEES per degree of freedom {anees}")
     if accuracy.distances:
         print_table(
             ["distance", "true", "estimated", "error"],
@@ -58,6 +58,19 @@ def print_accuracy(accuracy: Accuracy) -> None:
         )
 
 
+def _intervals(accuracy: Accuracy) -> str:
+    """Each robot's NEES with its 95 % interval, in brackets."""
+    rows = [(row.robot, row.nees) for row in accuracy.robots if row.nees is not None]
+    texts = [f"{robot} {one.mean:.2f}, 95 % interval {one.low:.2f} to {one.high:.2f}" for robot, one in rows]
+    return f" ({'; '.join(texts)})" if texts else ""
+
+
+def print_online(accuracy: Accuracy) -> None:
+    """Per robot the RMS error of poses as they were estimated at their time."""
+    errors = [f"{row.robot} {100 * row.ate:.1f} cm" for row in accuracy.robots]
+    print(f"RMS position error of each pose as estimated at its time: {', '.join(errors)}")
+
+
 def print_errors(accuracy: Accuracy) -> None:
     """Per robot and for the team: errors over all poses (ATE) with the NEES, and over stretches of the way (RPE)."""
     whose: list[tuple[str, Accuracy | RobotAccuracy]] = [(row.robot, row) for row in accuracy.robots]
@@ -71,7 +84,7 @@ def print_errors(accuracy: Accuracy) -> None:
         rows.append([name, *translation, *rotation, *_nees_cells(of)])
     head = ["all poses", "RMSE [cm]", "mean", "median", "max", "RMSE [deg]", "mean", "median", "max"]
     print(f"\n{ALIGNED[accuracy.alignment]}:")
-    print_table([*head, "NEES", "95 % if honest"], rows)
+    print_table([*head, "NEES", "95 % interval"], rows)
     rows = [
         [
             name,

@@ -31,7 +31,8 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.cli.printing import progress, warn
     from coloc_graph.pipeline.batch import solve
     from coloc_graph.report import hero_figure
-    from coloc_graph.results.writer import assess, require_place, write_result
+    from coloc_graph.results.folder import require_place
+    from coloc_graph.results.writer import assess, write_result
     from coloc_graph.run import open_run
     from coloc_graph.simulation import simulate
 

@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from coloc_graph.errors import InputError
-    from coloc_graph.results.writer import read_result, team_of
+    from coloc_graph.results.folder import read_result
     from coloc_graph.run.atomic_file import write_whole
 
     result, out = read_result(args.result), Path(args.out)
@@ -33,12 +33,15 @@ def run(args: argparse.Namespace) -> int:
         if out.suffix != ".mcap":
             raise InputError(f"{out}: is no name of a ROS 2 bag; give one that ends in .mcap")
         out.parent.mkdir(parents=True, exist_ok=True)
-        poses = write_ros2(result.trajectories, team_of(result), out)
+        poses = write_ros2(result.trajectories, result.team, out)
         print(f"wrote {out}: {poses} poses of {len(result.trajectories)} robots")
         return 0
     source = result.path / ("trajectories" if args.format == "tum" else f"graph.{args.format}")
-    if not source.exists() and "world" in result.summary:
-        raise InputError(f"{result.path} is of robots that drive, without stances: there is tum and ros2 of it alone")
+    if result.is_ranging and args.format in ("g2o", "dot"):
+        raise InputError(
+            f"{result.path} is of a ranging run, whose ranges and bearings {args.format} files of coloc-graph do not "
+            "hold yet: export tum or ros2"
+        )
     if not source.exists():
         raise InputError(f"{result.path} does not hold {source.name}; solve the run again with this version")
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ from coloc_graph.cli.printing import counted, print_json, progress, warn
 if TYPE_CHECKING:
     from socket import socket
 
+    from coloc_graph.backend.planar import Latest
     from coloc_graph.evaluation import Accuracy
     from coloc_graph.pipeline.batch import EnteredStance, Solution, SolveOptions
     from coloc_graph.run import Run
@@ -76,9 +77,9 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
     from coloc_graph.cli.solve_many import solve_folder
     from coloc_graph.cli.view import announce, show
     from coloc_graph.errors import InputError
-    from coloc_graph.pipeline.batch import SolveOptions
+    from coloc_graph.pipeline.batch import EnteredStance, SolveOptions
     from coloc_graph.pipeline.contents import require_applicable
-    from coloc_graph.results.writer import require_place
+    from coloc_graph.results.folder import require_place
     from coloc_graph.run import open_run
 
     options = SolveOptions(
@@ -101,37 +102,27 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
     with _earlier_result_named(args.out):
         logged = open_run(args.run_path)
         kind = require_applicable(logged, options)
-    if kind == "ranges":
-        from coloc_graph.cli.solve_drive import solve_one_drive
-
-        with _earlier_result_named(args.out):
-            solve_one_drive(args, logged)
-        if args.view:
-            from coloc_graph.viewer import Viewer, scene_of_result
-
-            with Viewer(scene_of_result(args.out), listener=listener) as viewer:
-                show(viewer, browser=not args.no_browser)
-        return 0
-    options = options.resolved()
-    assert options.method is not None  # resolved
     if not args.view:
         _solved(args, logged, options)
         return 0
 
     from coloc_graph.viewer import LiveStance, Viewer, empty_scene, scene_of_solution
 
-    if not args.incremental:
+    if not args.incremental or kind == "ranges":
         solution = _solved(args, logged, options)
         with Viewer(scene_of_solution(solution), listener=listener) as viewer:
             show(viewer, browser=not args.no_browser)
         return 0
-    with Viewer(empty_scene(logged, options.method, options.frontend), listener=listener) as viewer:
+    resolved = options.resolved()
+    assert resolved.method is not None  # resolved
+    with Viewer(empty_scene(logged, resolved.method, resolved.frontend), listener=listener) as viewer:
 
-        def entered(one: "EnteredStance") -> None:
+        def on_update(one: "EnteredStance | Latest") -> None:
+            assert isinstance(one, EnteredStance)  # the run is solved by its stances
             viewer.publish(LiveStance(one.stance, one.estimate, one.measurements, one.pairs))
 
         announce(viewer, browser=not args.no_browser)
-        solution = _solved(args, logged, options, entered)
+        solution = _solved(args, logged, options, on_update)
         with suppress(KeyboardInterrupt):  # the result is there: whoever ends it now ends the viewer
             viewer.publish(scene_of_solution(solution))
             viewer.wait_closed()
@@ -142,7 +133,7 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
 def _earlier_result_named(out: str) -> Iterator[None]:
     """An error says that an earlier result is still there, so that nobody takes it for the new one."""
     from coloc_graph.errors import ColocError
-    from coloc_graph.results.writer import holds_result
+    from coloc_graph.results.folder import holds_result
 
     try:
         yield
@@ -156,7 +147,7 @@ def _solved(
     args: argparse.Namespace,
     run: "Run",
     options: "SolveOptions",
-    entered: "Callable[[EnteredStance], None] | None" = None,
+    on_update: "Callable[[EnteredStance | Latest], None] | None" = None,
 ) -> "Solution":
     """Solve, write, print."""
     from coloc_graph.pipeline.batch import solve
@@ -164,8 +155,8 @@ def _solved(
     from coloc_graph.run.output_lock import locked_output
 
     with _earlier_result_named(args.out), locked_output(args.out):
-        with progress("stances measured") as report:
-            solution = solve(run, options, report, entered)
+        with progress("measured") as report:
+            solution = solve(run, options, report, on_update)
         accuracy = write_result(solution, args.out)
     warn([*solution.warnings, *(accuracy.warnings if accuracy else ())])
     if args.json:
@@ -177,10 +168,17 @@ def _solved(
 
 
 def _print(solution: "Solution", accuracy: "Accuracy | None", out: str) -> None:
-    """What came out, in figures."""
+    """Print accuracy or last poses, calibration, and what the estimate was made of."""
     import statistics
 
-    from coloc_graph.cli.accuracy import print_accuracy, print_calibration, print_last_poses, print_promised
+    from coloc_graph.cli.accuracy import (
+        print_accuracy,
+        print_calibration,
+        print_last_poses,
+        print_online,
+        print_promised,
+    )
+    from coloc_graph.results.writer import assess_online
 
     estimate = solution.estimate
     if accuracy is None:
@@ -188,12 +186,16 @@ def _print(solution: "Solution", accuracy: "Accuracy | None", out: str) -> None:
     else:
         print_accuracy(accuracy)
         print_promised(estimate.trajectories)
+    if (online := assess_online(solution)) is not None:
+        print_online(online)
     print_calibration(estimate.calibration)
     if solution.seconds_updates:
         median, longest = 1000 * statistics.median(solution.seconds_updates), 1000 * max(solution.seconds_updates)
-        print(f"a stance entered in {median:.1f} ms (median; at most {longest:.1f} ms)")
+        what = "a second of the run" if estimate.is_ranging else "a stance"
+        print(f"{what} entered in {median:.1f} ms (median; at most {longest:.1f} ms)")
     agreement = f", chi2/dof {estimate.chi2 / estimate.dof:.2f}" if estimate.dof > 0 else ""
+    count = solution.count
     print(
-        f"{solution.used} of {counted(len(solution.measurements), 'measurement')} used{agreement}; "
+        f"{count.used} of {counted(count.used + count.rejected, 'measurement')} used{agreement}; "
         f"{out} holds trajectories, measurements.csv and report.html"
     )

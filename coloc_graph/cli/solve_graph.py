@@ -9,8 +9,8 @@ def solve_graph(args: argparse.Namespace) -> int:
     """Solve a pose graph, write it, print."""
     from coloc_graph.errors import InputError
     from coloc_graph.pipeline.pose_graph import solve_pose_graph
+    from coloc_graph.results.folder import require_place
     from coloc_graph.results.pose_graph import summarise_pose_graph, write_pose_graph_result
-    from coloc_graph.results.writer import require_place
     from coloc_graph.run.output_lock import locked_output
 
     given = [

@@ -53,7 +53,7 @@ def write_g2o(estimate: Estimate, path: Path) -> None:
         for stay in graph.stay_puts
         if graph.key(stay.robot, stay.after) in ids
     ]
-    for link in graph.without(one.measurement for one in estimate.refused).links:
+    for link in graph.without(one.measurement for one in estimate.rejected).links:
         i, j = map(graph.places.key, link.ends)
         if i in ids and j in ids:
             upper = " ".join(repr(float(x)) for x in _information(link_covariance(link))[np.triu_indices(6)])

@@ -5,6 +5,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +16,11 @@ from coloc_graph.errors import InputError
 
 @dataclass(frozen=True)
 class LandmarkRow:
-    """A landmark's place in the world, x, y [m] and yaw [deg], with standard deviations, the correlation of x and y,
-    and how many sightings of it are in the estimate."""
+    """A landmark's pose in the world, x, y [m] and yaw [deg], with standard deviations and the correlation of x and y.
+
+    The yaw of a point, as a landmark that was ranged, is NaN, and empty in the file. `stated` says whether the team
+    states its position, `measurements` how many of it are in the estimate.
+    """
 
     name: str
     x: float
@@ -26,30 +30,45 @@ class LandmarkRow:
     y_sigma: float
     xy_correlation: float
     yaw_sigma_deg: float
-    sightings: int
+    stated: bool
+    measurements: int
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the row with null for numbers that do not exist."""
+        return {name: None if value != value else value for name, value in asdict(self).items()}
 
 
 def landmark_rows(estimate: Estimate) -> list[LandmarkRow]:
-    """The landmarks of an estimate, in the team's order."""
-    used = estimate.graph.without(one.measurement for one in estimate.refused).sighted
-    return [row_of(name, placed, len(used.get(name, ()))) for name, placed in estimate.landmarks.items()]
+    """Return the landmarks of an estimate, in the team's order."""
+    if estimate.is_ranging:
+        counts, found = estimate.ranging.counts, estimate.calibration.landmarks
+        return [row_of(name, one, name not in found, counts[name]) for name, one in estimate.landmarks.items()]
+    used, on_map = estimate.graph.without(one.measurement for one in estimate.rejected).sighted, _on_map(estimate)
+    return [row_of(name, one, name in on_map, len(used.get(name, ()))) for name, one in estimate.landmarks.items()]
 
 
 def map_row(estimate: Estimate) -> LandmarkRow | None:
-    """Where the map is in the world: T_world_map; its `sightings` are of all landmarks that are on it."""
+    """Where the map is in the world: T_world_map; its `measurements` are of all landmarks that are on it."""
     if estimate.map is None:
         return None
-    on_it = {one.landmark for one in estimate.graph.on_map}
-    return row_of("map", estimate.map, sum(row.sightings for row in landmark_rows(estimate) if row.name in on_it))
+    on_it = _on_map(estimate)
+    count = sum(row.measurements for row in landmark_rows(estimate) if row.name in on_it)
+    return row_of("map", estimate.map, False, count)
 
 
-def row_of(name: str, placed: Placed, sightings: int) -> LandmarkRow:
+def _on_map(estimate: Estimate) -> set[str]:
+    return {one.landmark for one in estimate.graph.on_map}
+
+
+def row_of(name: str, placed: Placed, stated: bool, measurements: int) -> LandmarkRow:
     """A row of the file."""
     x, y, yaw = placed.planar
     C = placed.covariance_xy_yaw
     sx, sy, turn = np.sqrt(C.diagonal()).tolist()
     correlation = float(C[0, 1] / (sx * sy)) if sx > 0 and sy > 0 else 0.0
-    return LandmarkRow(name, x, y, float(np.rad2deg(yaw)), sx, sy, correlation, float(np.rad2deg(turn)), sightings)
+    yaw, turn = (yaw, turn) if placed.has_heading else (np.nan, np.nan)
+    degrees = float(np.rad2deg(yaw)), float(np.rad2deg(turn))
+    return LandmarkRow(name, x, y, degrees[0], sx, sy, correlation, degrees[1], stated, measurements)
 
 
 def landmarks_csv(rows: list[LandmarkRow]) -> str:
@@ -57,7 +76,9 @@ def landmarks_csv(rows: list[LandmarkRow]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, [one.name for one in fields(LandmarkRow)], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(map(asdict, rows))
+    for row in rows:
+        cells = asdict(row) | {"stated": "yes" if row.stated else "no"}
+        writer.writerow({name: "" if value != value else value for name, value in cells.items()})
     return text.getvalue()
 
 
@@ -76,7 +97,12 @@ def read_landmarks(path: Path) -> tuple[LandmarkRow, ...]:
 
 
 def _read(cells: Mapping[str, str]) -> LandmarkRow:
-    numbers = {one.name: float(cells[one.name]) for one in fields(LandmarkRow) if one.name not in ("name", "sightings")}
-    if not np.isfinite(list(numbers.values())).all():
+    yaw, sigma = (float(cells[name] or "nan") for name in ("yaw_deg", "yaw_sigma_deg"))
+    numbers = {name: float(cells[name]) for name in ("x", "y", "x_sigma", "y_sigma", "xy_correlation")}
+    if not np.isfinite(list(numbers.values())).all() or np.isfinite(yaw) != np.isfinite(sigma):
         raise ValueError("a number is not finite")
-    return LandmarkRow(name=cells["name"], sightings=int(cells["sightings"]), **numbers)
+    stated = {"yes": True, "no": False}[cells["stated"]]
+    count = int(cells["measurements"])
+    return LandmarkRow(
+        name=cells["name"], yaw_deg=yaw, yaw_sigma_deg=sigma, stated=stated, measurements=count, **numbers
+    )

@@ -77,7 +77,7 @@ def measure_outing(seed: int, scenario: str, depth: Depth, stances: int | None) 
         for name, method in SOLVED_BY.items():
             # without odometry: both see the same pixels, and nothing else
             solution = solve(run, SolveOptions(method=method, odometry=False))
-            if solution.estimate.untied:
+            if solution.estimate.disconnected:
                 raise EstimationError(f"{scenario}, seed {seed}: {solution.warnings[0]}")
             assessed = assess(solution)
             assert assessed is not None  # a simulated run holds truth

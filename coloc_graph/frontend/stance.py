@@ -231,13 +231,19 @@ def _measured(
     """The measurement that a fit is; raises `DegenerateGeometry` where it is none."""
     robot_i, robot_j, plane = seen.run.team[seen.robot_i], seen.run.team[seen.robot_j], seen.plane
     pairing = "the pairing window" if offset is None else "`clock_sigma` says"
-    require_agreement(fit, found, f"{seen.robot_i} or {seen.robot_j}", pairing)
+    doubt = None
+    try:
+        require_agreement(fit, found, f"{seen.robot_i} or {seen.robot_j}", pairing)
+    except DegenerateGeometry as why:
+        if seen.options.criterion != "transfer":
+            raise
+        doubt = str(why)  # the paper's chain composes every homography that it can fit
     fit = persisting(fit, found.pairs, found.markers, found.times)
     require_determined(fit)
     own = share(found, (seen.robot_i, seen.robot_j), seen.pairs, seen.tracks, _window(seen.run))
     fit = replace(fit, information=own * fit.information)
     measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
-    measurement = replace(measurement, share=own)
+    measurement = replace(measurement, share=own, doubt=doubt)
     if offset is not None:
         said = seen.run.team.clock_sigma
         measurement = replace(

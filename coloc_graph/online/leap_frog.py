@@ -276,7 +276,7 @@ class LeapFrog:
             latency=round(latency, 4),
             points=min((len(p.correspondences) for p in one.pairs if p.correspondences is not None), default=0),
             poses={name: np.round(pose.matrix(), 12).tolist() for name, pose in one.estimate.poses.items()},
-            rejected=[str(refusal.measurement) for refusal in one.estimate.refused],
+            rejected=[str(refusal.measurement) for refusal in one.estimate.rejected],
         )
         if self._on_stance is not None:
             self._on_stance(one)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from coloc_graph.errors import InputError
-from coloc_graph.pipeline.incremental import SolveOptions
+from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
 
 #: What a run is solved by: leap-frog stances, or ranges and bearings of robots that measure while they drive.

@@ -1,18 +1,19 @@
 """One stance after the other: measured when it is over, and entered; on a logged run as on a team in the field."""
 
+import math
 import time
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import get_args
 
-from coloc_graph.backend import Estimator, Method, StanceEstimate, loosened
+from coloc_graph.backend import Estimate, Estimator, StanceEstimate
 from coloc_graph.backend.graph import PoseKeys, slips_of
 from coloc_graph.backend.landmarks import landmarks_of
-from coloc_graph.errors import ColocError, InputError
+from coloc_graph.backend.planar import IncrementalKeyframes, Latest
+from coloc_graph.backend.planar.incremental import EVERY
+from coloc_graph.errors import ColocError
 from coloc_graph.frontend import (
     Doubt,
-    FrontendOptions,
     PairMeasurement,
     Scale,
     StanceTracks,
@@ -25,68 +26,11 @@ from coloc_graph.frontend import (
     sight_standing,
     unsighted_movers,
 )
-from coloc_graph.measurements import Measurement, Sighting
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.measurements import Drive, Measurement, Sighting
+from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import OdometrySample, Recorded, Stance
-from coloc_graph.team import Robot, Team
-
-METHODS: tuple[Method, ...] = get_args(Method)
-
-#: Where the scale comes from the markers' span alone, the heights of cameras are known no better than this [m].
-UNKNOWN_HEIGHT = 0.1
-
-
-@dataclass(frozen=True)
-class SolveOptions:
-    """Everything that a result depends on besides the run.
-
-    Parameters
-    ----------
-    method : {"joint", "smooth", "chain"}, optional
-        Of a run with stances. `chain` is the paper: homographies by least squares in one image, eq. (2), composition.
-        `smooth` takes maximum-likelihood homographies and relative poses into a pose graph, with odometry and
-        sightings of the movers. `joint` (the default) takes the homographies themselves, and calibrates mounts,
-        markers and clocks along with the poses.
-    frontend : FrontendOptions, optional
-        Of a run with stances: how images are measured. The default belongs to the method.
-    odometry : bool
-        Use wheel odometry. A run with ranges alone cannot do without.
-    incremental : bool
-        Measure and enter in the order of time, as a team in the field would.
-    between_robots : bool
-        Of a run with ranges: use the ranges between robots, not those to landmarks alone.
-    """
-
-    method: Method | None = None
-    frontend: FrontendOptions | None = None
-    odometry: bool = True
-    incremental: bool = False
-    between_robots: bool = True
-
-    def __post_init__(self) -> None:
-        if self.method is not None and self.method not in METHODS:
-            raise InputError(f"there is no method `{self.method}`; choose one of {', '.join(METHODS)}")
-        if self.incremental and self.method == "chain":
-            raise InputError("a chain is composed, and never incremental: leave out `incremental`, or use joint")
-
-    def resolved(self) -> "SolveOptions":
-        """Return the options of a run with stances, with the default method and front end where none is chosen."""
-        method = self.method or "joint"
-        paper = FrontendOptions(criterion="transfer", pose="eq2")
-        return replace(
-            self, method=method, frontend=self.frontend or (paper if method == "chain" else FrontendOptions())
-        )
-
-    @property
-    def by_span(self) -> bool:
-        """Whether the scale comes from the markers' span alone."""
-        return self.frontend is not None and self.frontend.scale == "span"
-
-    def rigs(self, team: Team) -> dict[str, Robot]:
-        """The robots that a joint estimate calibrates; none of another method."""
-        if self.method != "joint":
-            return {}
-        rigs = {robot.name: robot for robot in team.robots}
-        return dict(loosened(rigs, UNKNOWN_HEIGHT)) if self.by_span else rigs
+from coloc_graph.team import Team
 
 
 def measure_stance(
@@ -276,3 +220,30 @@ class StanceSolver:
             self._motions.withdraw()
         self.measured = tuple(one for one in self.measured if one.homography.stance != index)
         self.seconds.pop()
+
+
+class RangingSolver:
+    """Takes in the measurements of a ranging run in the order of time."""
+
+    def __init__(self, team: Team, keyframes: Drive) -> None:
+        self._incremental = IncrementalKeyframes(team, keyframes)
+        begin = min(float(times[0]) for times in keyframes.times if len(times))
+        end = max(float(times[-1]) for times in keyframes.times if len(times))
+        #: Times at which to `enter` [UTC s], all measurements together.
+        self.times = tuple(begin + n * EVERY for n in range(1, math.ceil((end - begin) / EVERY) + 2))
+        #: By robot, each pose as it was estimated at its time; there once `estimate` was called.
+        self.online: Mapping[str, Trajectory] = {}
+        #: Duration of each step [s].
+        self.seconds: list[float] = []
+
+    def enter(self, until: float) -> Latest:
+        """Take in everything measured before a time [UTC s]; return the newest poses."""
+        started = time.perf_counter()
+        latest = self._incremental.advance(until)
+        self.seconds.append(time.perf_counter() - started)
+        return latest
+
+    def estimate(self) -> Estimate:
+        """Return the estimate of everything that was taken in; once, at the end."""
+        estimate, self.online = self._incremental.finish()
+        return estimate

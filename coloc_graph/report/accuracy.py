@@ -32,16 +32,16 @@ def accuracy_section(accuracy: Accuracy) -> str:
     if accuracy.anees is not None:
         note += (
             f" The squared error is {number(accuracy.anees, 2)} times what the covariances predict "
-            f"(NEES per degree of freedom, {many(accuracy.nees_poses, 'pose')}; 1 is honest)."
+            f"(NEES per degree of freedom over {many(accuracy.nees_poses, 'pose')}, expected 1)."
         )
     first = f'<h2>Accuracy</h2>\n{table(head, rows, [0], foot)}\n<p class="soft">{note}</p>'
     return f"{first}\n{_errors_table(accuracy)}\n{_relative_table(accuracy)}"
 
 
 def _errors_table(accuracy: Accuracy) -> str:
-    """Errors over all poses, and whether each robot's NEES is one that honest covariances give."""
+    """Errors over all poses, and each robot's NEES with its 95 % interval."""
     head = ["All poses", *("RMSE [cm]", "Mean", "Median", "Max"), *("RMSE [°]", "Mean", "Median", "Max"), "NEES",
-            "95 % if honest"]  # fmt: skip
+            "95 % interval"]  # fmt: skip
     rows = []
     for row in accuracy.robots:
         spreads = [number(100 * value, 2) for value in dataclasses.astuple(row.translation)]
@@ -53,8 +53,8 @@ def _errors_table(accuracy: Accuracy) -> str:
             nees = [value if row.nees.consistent else f'<span class="bad">{value}</span>', interval]
         rows.append([escape(row.robot), *spreads, *nees])
     note = (
-        "Position and rotation over all poses. The NEES of a robot whose covariances are honest is seldom outside of "
-        "the interval, which is wide since neighbouring poses share errors: few of them are independent."
+        "Position and rotation over all poses. The NEES of exact covariances is in the interval in 95 % of runs; "
+        "the interval is wide, since neighbouring poses share errors and few of them are independent."
     )
     return f'{table(head, rows, [0])}\n<p class="soft">{note}</p>'
 

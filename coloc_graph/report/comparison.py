@@ -56,6 +56,14 @@ def comparison_drawings(
     }  # fmt: skip
 
 
+@styled
+def drawn(height: float, draw: Drawing) -> Figure:
+    """Return a figure of its own of a drawing, `height` [in] high."""
+    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    draw(figure)
+    return figure
+
+
 def require_plot_place(out: str | Path, *, force: bool) -> None:
     """Raise `InputError` where plots cannot be written to `out`, a picture (.png, .svg, .pdf) or a folder."""
     out = Path(out)

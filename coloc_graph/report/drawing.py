@@ -67,7 +67,7 @@ def marker_of(estimate: Estimate, robot: str) -> str:
 
 
 def _place(estimate: Estimate, robot: str) -> int:
-    robots = estimate.graph.robots
+    robots = estimate.source.robots
     return robots.index(robot) if robot in robots else len(robots)
 
 

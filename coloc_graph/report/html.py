@@ -1,4 +1,4 @@
-"""`report.html`: one file that says how well a run was solved, with nothing to fetch and nothing to execute."""
+"""report.html: accuracy, warnings, calibration, figures and measurements of a solution in one file, without scripts."""
 
 import dataclasses
 import math
@@ -7,55 +7,65 @@ from html import escape
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from coloc_graph._version import __version__
 from coloc_graph.evaluation import Accuracy, RobotAccuracy
 from coloc_graph.exchange.landmarks import LandmarkRow, landmark_rows, map_row
 from coloc_graph.frontend import PairMeasurement
-from coloc_graph.pipeline.batch import Solution
+from coloc_graph.pipeline.solution import Solution
 from coloc_graph.report.accuracy import accuracy_section
+from coloc_graph.report.comparison import comparison_drawings, drawn
 from coloc_graph.report.drawing import Truth, position_sigmas, trajectories_of
 from coloc_graph.report.page import DASH, document, figure_card, many, number, table, warnings_section
-from coloc_graph.report.plots import error_figure, residual_figure, trajectories_figure
+from coloc_graph.report.plots import error_figure, map_figure, residual_figure, trajectories_figure
 
 
 def render_report(solution: Solution, accuracy: Accuracy | None, truth: Truth | None) -> str:
-    """The report of a solution as one self-contained HTML document.
+    """Return the report of a solution as one self-contained HTML document.
 
-    `truth` is, by robot, the true poses T_world_body (n, 4, 4) of `evaluation.align`; `accuracy` is made of it;
-    both are None where the run has no truth. No time of day and no timing is in it: the same input gives the
-    same text. Raises `InputError` where `truth` has another number of poses than the estimate.
+    Parameters
+    ----------
+    solution : Solution
+        What was solved.
+    accuracy, truth : optional
+        The accuracy, and by robot the true poses T_world_body (n, 4, 4) of `evaluation.align`; None without truth.
+
+    Notes
+    -----
+    No time of day and no timing is in it: the same input gives the same text. Raises `InputError` where `truth` has
+    another number of poses than the estimate.
     """
-    name = solution.run.path.name
+    name, is_ranging = solution.run.path.name, solution.estimate.is_ranging
+    world = "the reference robot's body at its first stance"
+    if is_ranging:
+        world = "the map of the landmarks" if solution.estimate.ranging.on_map else "the first robot's first pose"
     sections = [
         f"<h1>{escape(name)}</h1>",
         f'<p class="soft">{_headline(solution)}</p>',
-        _verdict(solution, accuracy),
+        "" if is_ranging else _verdict(solution, accuracy),
         accuracy_section(accuracy) if accuracy is not None else "",
         warnings_section([*solution.warnings, *(accuracy.warnings if accuracy is not None else ())]),
         _calibration_section(solution),
         _landmarks_section(solution),
-        _figures_section(solution, truth),
+        _figures_section(solution, accuracy, truth),
         _used_section(solution),
-        _measurements_section(solution),
-        f"<footer>coloc-graph {escape(__version__)}. Metres, degrees and pixels; the world is the reference robot's "
-        "body at its first stance.</footer>",
+        _ranges_section(solution) if is_ranging else _measurements_section(solution),
+        f"<footer>coloc-graph {escape(__version__)}. Metres, degrees and pixels; the world is {world}.</footer>",
     ]
     return document(f"{name}: {solution.estimate.method}", sections)
 
 
 def _headline(solution: Solution) -> str:
-    used, refused = _counts(solution)
-    robots = ", ".join(one.robot for one in trajectories_of(solution.estimate))
+    estimate, count = solution.estimate, solution.count
+    robots = ", ".join(one.robot for one in trajectories_of(estimate))
+    poses = many(len(solution.run.stances), "stance")
+    if estimate.is_ranging:
+        poses = many(sum(map(len, estimate.ranging.keyframes.times)), "keyframe")
     return (
-        f"Method <b>{escape(solution.estimate.method)}</b>; robots {escape(robots) or DASH}; "
-        f"{many(len(solution.run.stances), 'stance')}; {many(used, 'measurement')} used, {refused} refused"
+        f"Method <b>{escape(estimate.method)}</b>{', incremental' * solution.options.incremental}; robots "
+        f"{escape(robots) or DASH}; {poses}; {many(count.used, 'measurement')} used, {count.rejected} rejected"
     )
-
-
-def _counts(solution: Solution) -> tuple[int, int]:
-    refused = len(solution.measurements) - solution.used
-    return len(solution.measurements) - refused, refused
 
 
 def _verdict(solution: Solution, accuracy: Accuracy | None) -> str:
@@ -81,7 +91,7 @@ def _robot_verdict(row: RobotAccuracy) -> str:
 
 
 def _calibration_section(solution: Solution) -> str:
-    """What was stated with a tolerance, and what it turned out to be."""
+    """Numbers stated with a tolerance, as stated and as estimated."""
     rows = solution.estimate.calibration.rows
     if not rows:
         return ""
@@ -116,44 +126,61 @@ def _landmarks_section(solution: Solution) -> str:
             escape(row.name),
             f"{row.x:.3f} ± {row.x_sigma:.3f}",
             f"{row.y:.3f} ± {row.y_sigma:.3f}",
-            f"{row.yaw_deg:.2f} ± {row.yaw_sigma_deg:.2f}",
-            str(row.sightings),
+            f"{row.yaw_deg:.2f} ± {row.yaw_sigma_deg:.2f}" if math.isfinite(row.yaw_deg) else DASH,
+            str(row.measurements),
         ]
 
-    head = ["Landmark", "x [m]", "y [m]", "Yaw [°]", "Sightings"]
+    head = ["Landmark", "x [m]", "y [m]", "Yaw [°]", "Measurements"]
     here = map_row(solution.estimate)
     foot = [] if here is None else ["The map's origin", *cells(here)[1:]]
     return f"<h2>Landmarks</h2>\n{table(head, map(cells, rows), [0], foot)}"
 
 
-def _figures_section(solution: Solution, truth: Truth | None) -> str:
-    estimate = solution.estimate
-    errors = "Error of position and heading along the way; the band is what the covariances predict (2σ)."
-    if not truth:
-        errors = "What the covariances predict along the way (2σ): there is no truth to compare with."
-    figures = [
-        ("above", trajectories_figure(estimate, truth), "The team from above, in the world of the reference robot."),
-        ("errors", error_figure(estimate, truth), errors),
-        (
-            "residuals",
-            residual_figure([m.homography for m in solution.measurements]),
-            "How well one homography explains each stance: 1 is what the stated pixel noise gives.",
-        ),
-    ]
+def _figures_section(solution: Solution, accuracy: Accuracy | None, truth: Truth | None) -> str:
+    figures = _ranging_figures(solution, accuracy, truth) if solution.estimate.is_ranging else _figures(solution, truth)
     parts = [figure_card(name, figure, caption) for name, figure, caption in figures]
     return "<h2>Figures</h2>\n" + "\n".join(parts)
 
 
+def _figures(solution: Solution, truth: Truth | None) -> Iterator[tuple[str, Figure, str]]:
+    """Name, figure and caption, of a run with stances."""
+    estimate = solution.estimate
+    errors = "Error of position and heading along the way; the band is what the covariances predict (2σ)."
+    if not truth:
+        errors = "What the covariances predict along the way (2σ): there is no truth to compare with."
+    yield "above", trajectories_figure(estimate, truth), "The team from above, in the world of the reference robot."
+    yield "errors", error_figure(estimate, truth), errors
+    caption = "Residuals of each stance's points in units of the stated pixel noise, expected 1."
+    yield "residuals", residual_figure([m.homography for m in solution.measurements]), caption
+
+
+def _ranging_figures(
+    solution: Solution, accuracy: Accuracy | None, truth: Truth | None
+) -> Iterator[tuple[str, Figure, str]]:
+    """Name, figure and caption, of a ranging run."""
+    captions = {
+        "errors": "Error of position and heading in time; bands are what the covariances predict (2σ).",
+        "rpe": "Relative errors by the distance travelled.",
+    }
+    yield "above", map_figure(solution.estimate, truth), "Robots and landmarks from above."
+    if accuracy is not None and truth is not None:
+        drawings = comparison_drawings(solution.estimate.trajectories, truth, accuracy, on_floor=True)
+        for name, caption in captions.items():
+            if name in drawings:
+                yield name, drawn(*drawings[name]), caption
+
+
 def _used_section(solution: Solution) -> str:
-    estimate, (used, refused) = solution.estimate, _counts(solution)
-    agreement = f"{estimate.chi2 / estimate.dof:.2f} ({estimate.dof} degrees of freedom)" if estimate.dof else DASH
+    estimate = solution.estimate
+    agreement = f"{estimate.chi2 / estimate.dof:.2f} ({estimate.dof:.0f} degrees of freedom)" if estimate.dof else DASH
     facts = [
-        ("measurements used", str(used)),
-        ("measurements refused", str(refused)),
-        ("poses not tied to the reference", str(len(estimate.untied))),
-        ("stay-put constraints", str(len(estimate.graph.stay_puts))),
+        *((f"{kind} measurements used", str(one.used)) for kind, one in solution.counts.items()),
+        *((f"{kind} measurements rejected", str(one.rejected)) for kind, one in solution.counts.items()),
+        *((f"{one.kind} not used", f"{one.count}: {one.reason}") for one in solution.unused),
+        ("poses not tied to the reference", str(len(estimate.disconnected))),
+        *([] if estimate.is_ranging else [("stay-put constraints", str(len(estimate.graph.stay_puts)))]),
         *([("landmarks", str(len(estimate.landmarks)))] if estimate.landmarks else []),
-        ("chi²/dof of the graph, expected 1", agreement),
+        ("chi²/dof, expected 1", agreement),
         ("iterations", str(estimate.iterations)),
         *_flat("", dataclasses.asdict(solution.options)),
     ]
@@ -192,3 +219,19 @@ def _measurement_row(measured: PairMeasurement, why_not: str | None) -> list[str
         number(None if pose is None or pose.normal_error is None else math.degrees(pose.normal_error), 2),
         "yes" if why_not is None else f'<span class="bad">{escape(why_not)}</span>',
     ]
+
+
+def _ranges_section(solution: Solution) -> str:
+    """Ranges and bearings by robot, with the factors on their stated noise."""
+    problem = solution.estimate.ranging
+    robot, rows = problem.keyframes.measured.robot, []
+    for number_, name in enumerate(problem.keyframes.robots):
+        own = robot == number_
+        noise = (number(factor, 2) for factor in problem.noise[number_].tolist())
+        rows.append(
+            [escape(name), str((own & problem.used).sum()), str((own & problem.outliers).sum()),
+             str((own & ~problem.used & ~problem.outliers).sum()), *noise]
+        )  # fmt: skip
+    head = ["Robot", "Used", "Outliers", "Without poses", "Range noise ×", "Bearing noise ×"]
+    note = "Noise × is the factor by which residuals are larger than the stated standard deviations."
+    return f'<h2>Ranges and bearings</h2>\n{table(head, rows, [0])}\n<p class="soft">{note}</p>'

@@ -50,6 +50,23 @@ _WIDTH = 9.0  # [in]
 
 
 @styled
+def map_figure(estimate: Estimate, truth: Truth | None = None) -> Figure:
+    """Return the paths of a ranging run and its landmarks with their 95 % ellipses, from above [m]."""
+    figure = Figure(figsize=(_WIDTH, 8.0), layout="constrained")
+    axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
+    for number, trajectory in enumerate(trajectories_of(estimate)):
+        true = truth_of(trajectory, truth)
+        if true is not None:
+            axes.plot(*true[:, :2, 3].T, color=GREY, linewidth=0.6, label=None if number else "truth")
+        colour = colour_of(estimate, trajectory.robot)
+        axes.plot(*trajectory.positions[:, :2].T, color=colour, linewidth=0.9, label=trajectory.robot)
+    draw_landmarks(axes, estimate)
+    axes.set_aspect("equal")
+    axes.legend(loc="upper right", fontsize=8)
+    return figure
+
+
+@styled
 def trajectories_figure(estimate: Estimate, truth: Truth | None = None) -> Figure:
     """The team from above, world frame [m]: estimate over truth, headings, 95 % ellipses, held poses ringed.
 

@@ -20,7 +20,7 @@ from coloc_graph.evaluation import (
 )
 from coloc_graph.exchange.tum import read_tum
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.results.writer import holds_result, read_result, stated_team_of
+from coloc_graph.results.folder import holds_result, read_result
 from coloc_graph.run import is_mcap, read_truth
 
 
@@ -77,7 +77,7 @@ def of_result(
     """
     result = read_result(path)
     estimated = _with_poses(result.trajectories, f"{path}")
-    team = stated_team_of(Path(path))
+    team = result.config.team
     if truth:
         true = read_truths(truth)
     else:
@@ -88,8 +88,7 @@ def of_result(
             raise InputError(
                 f"{run}: the run holds no truth to compare with; record it on /<robot>/truth, or give it with --truth"
             )
-    on_map = result.summary.get("world") == "map"
-    alignment = alignment or ("none" if on_map else usual_alignment(estimated))
+    alignment = alignment or ("none" if result.on_map else usual_alignment(estimated))
     return Comparison(estimated, true, alignment, team.reference, team.floor is not None)
 
 

@@ -3,26 +3,15 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from coloc_graph._version import __version__
 from coloc_graph.errors import ColocError, InputError
-from coloc_graph.input_file import read_toml
 from coloc_graph.pipeline.batch import SolveOptions, solve
-from coloc_graph.pipeline.contents import require_applicable
-from coloc_graph.pipeline.ranging import DriveOptions, solve_drive
-from coloc_graph.results.ranging import write_drive_result
-from coloc_graph.results.writer import (
-    CONFIG,
-    SUMMARY,
-    holds_result,
-    options_of,
-    read_summary,
-    require_place,
-    write_result,
-)
+from coloc_graph.results.folder import SUMMARY, holds_result, read_config, read_summary, require_place
+from coloc_graph.results.writer import write_result
 from coloc_graph.run import open_run, run_id
 
 #: A run whose process dies is tried so often: whose fault it was is not known when several are under way.
@@ -115,12 +104,8 @@ def solve_one(run: Path, out: Path, options: SolveOptions) -> Outcome:
     """Solve a run and write its result; what is wrong with it is said in the outcome, whatever it is."""
     try:
         require_place(out)
-        opened = open_run(run)
-        if require_applicable(opened, options) == "ranges":
-            write_drive_result(solve_drive(opened, _of_ranges(options)), out)
-        else:
-            write_result(solve(opened, options), out)
-        return Outcome(run, out, _summary(out))
+        write_result(solve(open_run(run), options), out)
+        return Outcome(run, out, read_summary(out))
     except ColocError as error:
         earlier = f"; {out} still holds an earlier result" if holds_result(out) else ""
         return Outcome(run, out, {}, failed=f"{error}{earlier}")
@@ -130,24 +115,15 @@ def solve_one(run: Path, out: Path, options: SolveOptions) -> Outcome:
         return Outcome(run, out, {}, failed=f"{run}: cannot be solved ({type(error).__name__}: {error})")
 
 
-def _of_ranges(options: SolveOptions) -> DriveOptions:
-    return DriveOptions(incremental=options.incremental, between_robots=options.between_robots)
-
-
-def _summary(out: Path) -> dict[str, Any]:
-    return read_summary(out)
-
-
 def _earlier(run: Path, out: Path, options: SolveOptions) -> dict[str, Any] | None:
     """The summary of a result that is of this run as it is now, by these options and this version; else None."""
     if not holds_result(out):
         return None
     try:
-        summary = _summary(out)
-        config = read_toml(out / CONFIG, "solve the run again")
+        summary, config = read_summary(out), read_config(out)
         same = (
-            summary.get("version") == __version__
-            and config.get("options") in (options_of(options.resolved()), asdict(_of_ranges(options)))
+            config.version == __version__
+            and config.options in (options, options.resolved())
             and (out / SUMMARY).stat().st_mtime >= run.stat().st_mtime
             and summary.get("run_id") == run_id(run)
         )

@@ -10,7 +10,7 @@ from coloc_graph._version import __version__
 from coloc_graph.geometry.lie import quaternion
 from coloc_graph.input_file import read_text
 from coloc_graph.pipeline.pose_graph import PoseGraphSolution
-from coloc_graph.results.writer import SUMMARY, whole_result
+from coloc_graph.results.folder import SUMMARY, whole_result
 
 #: Value of `kind` in summary.json, which results of runs do not have.
 KIND = "pose graph"

@@ -83,20 +83,20 @@ class LiveScene:
         """Take in a stance; one that is in already is brought up to date."""
         stance, said = one.stance, one.estimate
         self._stances[stance.index] = stance
-        refused = {id(r.measurement): r.reason for r in said.refused}
+        rejected = {id(r.measurement): r.reason for r in said.rejected}
         times = {m.seen: m.time for m in one.measurements if isinstance(m, Sighting)}
         for robot, pose in said.poses.items():
             if robot in stance.observers or robot in times:
                 time = times.get(robot, stance.start)
                 self._poses[robot][stance.index] = (time, pose.matrix(), said.covariances[robot])
         self._landmarks |= said.landmarks
-        used = [m for m in one.measurements if id(m) not in refused]
+        used = [m for m in one.measurements if id(m) not in rejected]
         self._sighted[stance.index] = sighted_in(used, self._landmarks)
         # an estimate of a later stance, which had waited for this one, says nothing of this one's measurements
         told = said.residuals if said.stance == stance.index else ()
         residuals = {id(m): off for m, off in zip(one.measurements, told, strict=False)}
         self._found[stance.index] = [
-            (m.stance, m.robot_i, m.robot_j, residuals.get(id(m), np.nan), refused.get(id(m), ""))
+            (m.stance, m.robot_i, m.robot_j, residuals.get(id(m), np.nan), rejected.get(id(m), ""))
             for m in one.measurements
             if isinstance(m, RelativePose)
         ] + [
@@ -120,7 +120,8 @@ class LiveScene:
         found = [edge for every in self._found.values() for edge in every]
         sighted = [one for every in self._sighted.values() for one in every]
         rows = [
-            row_of(name, placed, sum(seen == name for *_, seen in sighted)) for name, placed in self._landmarks.items()
+            row_of(name, placed, False, sum(seen == name for *_, seen in sighted))
+            for name, placed in self._landmarks.items()
         ]
         held = [(robot, stance.index) for stance in stances for robot in stance.anchors]
         return replace(

@@ -1,10 +1,9 @@
 """Scenes of what there is: an estimate, a result on disk, a run that is solved for it, two results of one run."""
 
-import csv
 import itertools
 import os
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,25 +12,24 @@ import numpy as np
 from coloc_graph.backend import Estimate, Method, chain, smooth
 from coloc_graph.backend.graph import PoseKeys
 from coloc_graph.errors import EstimationError, InputError
-from coloc_graph.exchange.landmarks import landmark_rows, read_landmarks
-from coloc_graph.frontend import FrontendOptions, PairMeasurement, TrackerOptions
-from coloc_graph.input_file import read_toml
-from coloc_graph.measurements import RelativePose
-from coloc_graph.pipeline.batch import Progress, Solution, SolveOptions, solve
-from coloc_graph.pipeline.contents import kind_of
-from coloc_graph.results.writer import LANDMARKS, read_result
+from coloc_graph.evaluation import Alignment
+from coloc_graph.exchange.landmarks import LandmarkRow, landmark_rows, read_landmarks
+from coloc_graph.frontend import FrontendOptions, PairMeasurement
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.measurements import Node, RelativePose
+from coloc_graph.pipeline.batch import Progress, Solution, solve
+from coloc_graph.results.folder import LANDMARKS, MEASUREMENTS, read_result
+from coloc_graph.results.measurement_table import read_measurements
 from coloc_graph.run import Run, Stance, open_run
-from coloc_graph.team import read_team
-from coloc_graph.viewer.drive import scene_of_drive
+from coloc_graph.viewer.moments import first_poses, moment_at, moments_of
 from coloc_graph.viewer.scene import NO_EDGES, Edges, Index, Scene, layer_of
 from coloc_graph.viewer.still import landmarks_in, sighted_in
-from coloc_graph.viewer.ties import ties_in, ties_on_disk, wheels_of
+from coloc_graph.viewer.ties import links_of, ties_in, wheels_of
 from coloc_graph.viewer.truth import true_layers
 
 #: What the methods' layers are called.
-NAMES = {"chain": "chained", "smooth": "smoothed", "joint": "joint"}
+NAMES = {"chain": "chained", "smooth": "smoothed", "joint": "joint", "ranging": "ranging"}
 OF_GRAPH = "of the measurement in the estimate"
-OF_POINTS = "of the points against their homography"
 
 
 def scene_of_estimate(
@@ -54,8 +52,8 @@ def scene_of_estimate(
     on_floor = run is not None and run.team.floor is not None
     true, notes = true_layers(run, graph.robots, graph.stances, estimate.trajectories, on_floor=on_floor)
     sightings, odometry = ties_in(graph.measurements, graph.robots, graph.stances)
-    refused = {id(one.measurement) for one in estimate.refused}
-    sighted = sighted_in((m for m in graph.measurements if id(m) not in refused), graph.landmarks)
+    rejected = {id(one.measurement) for one in estimate.rejected}
+    sighted = sighted_in((m for m in graph.measurements if id(m) not in rejected), graph.landmarks)
     return Scene(
         robots=graph.robots,
         stances=graph.stances,
@@ -90,67 +88,108 @@ def empty_scene(run: Run, method: Method, frontend: FrontendOptions | None = Non
 
 
 def scene_of_run(run: Run, progress: Progress | None = None) -> Scene:
-    """The scene of a run, solved: joint, with the chain and the pose graph of the same measurements beside it.
+    """Return the scene of a run, solved with default options; of stances with chain and pose graph beside it.
 
-    Raises as `pipeline.solve` does.
+    Raises as `solve` does.
     """
-    if kind_of(run) == "ranges":
-        raise InputError(f"{run.path} is solved by its ranges: solve it, and view the folder of its result")
-    options = SolveOptions().resolved()
-    return scene_of_solution(solve(run, options, progress))
+    return scene_of_solution(solve(run, progress=progress))
 
 
 def scene_of_solution(solution: Solution) -> Scene:
-    """The scene of a solution, with what the other methods make of the same measurements beside it."""
-    estimate, others = solution.estimate, []
+    """Return the scene of a solution; of stances with the estimates of other methods beside it."""
+    estimate, run, others = solution.estimate, solution.run, []
+    if estimate.is_ranging:
+        problem = estimate.ranging
+        measured = [
+            (one.time, one.robot, one.target)
+            for one, used in zip(problem.measurements, problem.used.tolist(), strict=True)
+            if used
+        ]
+        rows = landmark_rows(estimate)
+        return _scene_of_ranges(run, run.path.name, estimate.trajectories, problem.on_map, measured, rows)
     for name, method in (("smooth", smooth), ("chain", chain)):
         if name != estimate.method:
-            with suppress(EstimationError):  # what one method can solve and another cannot is left out
+            with suppress(EstimationError):  # a method that cannot solve the graph has no layer
                 others.append(method(estimate.graph))
     return scene_of_estimate(
-        estimate, run=solution.run, measurements=solution.measurements, others=others,
-        frontend=solution.options.resolved().frontend,
-    )  # fmt: skip
+        estimate, run=run, measurements=solution.measurements, others=others, frontend=solution.options.frontend
+    )
 
 
 def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Scene:
-    """The scene of a result on disk, and of its run at `run_path` or where the result says that it is.
+    """Return the scene of a result on disk, and of its run at `run_path` or where the result says that it is.
 
-    Raises `InputError` where the folder is no result, or the run is not the one it was made of.
+    Raises `InputError` where the folder is no result of this format, or the run is not the one it was made of.
     """
     result = read_result(path)
     where = run_path or result.run_path
     result.require_run(where)
-    run = open_run(where)
-    if kind_of(run) == "ranges":
-        return scene_of_drive(result, run)
-    name = NAMES.get(str(result.summary.get("method")), str(result.summary.get("method")))
+    run, title, table = open_run(where), result.path.absolute().name, result.path / MEASUREMENTS
+    landmarks = read_landmarks(result.path / LANDMARKS)
+    if result.is_ranging:
+        with _damage_named(table):
+            measured = [
+                (float(row["time"]), row["robot_i"], row["robot_j"])
+                for row in read_measurements(table, ["range"])
+                if row["used"] == "yes"
+            ]
+        return _scene_of_ranges(run, title, result.trajectories, result.on_map, measured, landmarks)
     robots, stances = run.team.names, run.stances
-    refined = result.path / "team.toml"
-    on_floor = run.team.floor is not None
-    true, notes = true_layers(run, robots, stances, result.trajectories, on_floor=on_floor)
-    edges = _edges_on_disk(result.path / "measurements.csv", robots, stances)
-    pairs = {
-        (stances[row].index, frozenset((robots[i], robots[j])))
-        for row, i, j in zip(edges.rows.tolist(), edges.i.tolist(), edges.j.tolist(), strict=True)
-    }
-    sightings, odometry, sighted = ties_on_disk(result.path / "graph.g2o", pairs, robots, stances)
+    name = NAMES.get(str(result.summary.get("method")), str(result.summary.get("method")))
+    true, notes = true_layers(run, robots, stances, result.trajectories, on_floor=run.team.floor is not None)
+    names = {row.name for row in landmarks}
+    with _damage_named(table):
+        edges = _edges_on_disk(table, robots, stances)
+        ends = {kind: _ends_on_disk(table, kind) for kind in ("sighting", "odometry")}
+    sighted = [(a[0], a[1], b[0]) for a, b in ends["sighting"] if b[0] in names]
     return Scene(
         robots=robots,
         stances=stances,
         layers=(layer_of(name, robots, stances, result.trajectories), *true),
         edges=edges,
-        sightings=sightings,
-        odometry=odometry,
+        sightings=links_of(ends["sighting"], robots, stances),
+        odometry=links_of(ends["odometry"], robots, stances),
         stayed=stayed(robots, stances, _anchored(stances, result.summary.get("bumped", []))),
         team=run.team,
-        calibrated=read_team(refined) if refined.exists() else None,
+        calibrated=result.calibrated_team,
         run=run,
-        frontend=_frontend(result.path / "config.toml"),
+        frontend=result.config.options.frontend or FrontendOptions(),
         wheels=wheels_of(run),
-        title=result.path.absolute().name,
+        title=title,
         notes=notes,
-        landmarks=landmarks_in(read_landmarks(result.path / LANDMARKS), sighted, robots, stances),
+        landmarks=landmarks_in(landmarks, sighted, robots, stances),
+    )
+
+
+def _scene_of_ranges(
+    run: Run,
+    title: str,
+    trajectories: Mapping[str, Trajectory],
+    on_map: bool,
+    measured: Sequence[tuple[float, str, str]],
+    landmarks: Sequence[LandmarkRow],
+) -> Scene:
+    """The scene of a ranging run: in each moment the first keyframe of each robot, and who `measured` whom [s]."""
+    robots, moments = run.team.names, moments_of(trajectories)
+    first = {robot: first_poses(one, moments) for robot, one in trajectories.items()}
+    alignment: Alignment = "none" if on_map else "team"
+    true, notes = true_layers(run, robots, moments, first, on_floor=True, alignment=alignment)
+    at = moment_at(np.array([time for time, _, _ in measured]), moments).tolist()
+    seen = sorted({(k, a, b) for k, (_, a, b) in zip(at, measured, strict=True) if k >= 0})
+    # a point has no heading; it is drawn with none
+    rows = [row if np.isfinite(row.yaw_deg) else replace(row, yaw_deg=0.0, yaw_sigma_deg=0.0) for row in landmarks]
+    names = {row.name for row in rows}
+    return Scene(
+        robots=robots,
+        stances=moments,
+        layers=(layer_of(NAMES["ranging"], robots, moments, first), *true),
+        sightings=links_of([((a, k), (b, k)) for k, a, b in seen if b in robots], robots, moments),
+        team=run.team,
+        run=run,
+        wheels=wheels_of(run),
+        title=title,
+        notes=notes,
+        landmarks=landmarks_in(rows, [(a, k, b) for k, a, b in seen if b in names], robots, moments),
     )
 
 
@@ -174,9 +213,9 @@ def is_run(path: str | Path) -> bool:
 
 def _edges(estimate: Estimate, measurements: Sequence[PairMeasurement]) -> Edges:
     graph = estimate.graph
-    refused = {id(one.measurement): one.reason for one in estimate.refused}
+    rejected = {id(one.measurement): one.reason for one in estimate.rejected}
     found = [
-        (one.stance, one.robot_i, one.robot_j, estimate.residual(one), refused.get(id(one), ""))
+        (one.stance, one.robot_i, one.robot_j, estimate.residual(one), rejected.get(id(one), ""))
         for one in graph.measurements
         if isinstance(one, RelativePose)
     ]
@@ -209,27 +248,30 @@ def as_edges(
 
 
 def _edges_on_disk(path: Path, robots: Sequence[str], stances: Sequence[Stance]) -> Edges:
-    """The measurements of a result, with their residual in the estimate (of the homography's points in results of
-    versions that did not write it)."""
+    """The homographies of a result, with their residuals in the estimate."""
+    found = [
+        (int(row["index_i"]), row["robot_i"], row["robot_j"], float(row["residual"] or "nan"), row["reason"])
+        for row in read_measurements(path, ["homography"])
+    ]
+    return as_edges(found, robots, stances, OF_GRAPH)
+
+
+def _ends_on_disk(path: Path, kind: str) -> list[tuple[Node, Node]]:
+    """The ends of the used measurements of a kind; a landmark's is of the stance at which it was seen."""
+    return [
+        ((row["robot_i"], int(row["index_i"])), (row["robot_j"], int(row["index_j"] or row["index_i"])))
+        for row in read_measurements(path, [kind])
+        if row["used"] == "yes"
+    ]
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """Name the file whose rows are damaged."""
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = csv.DictReader(file)
-            column = "estimate_residual" if "estimate_residual" in (rows.fieldnames or ()) else "residual"
-            found = [
-                (
-                    int(row["stance"]),
-                    row["robot_i"],
-                    row["robot_j"],
-                    float(row[column] or "nan"),
-                    (row["why_not"] or "for no reason that is written") if row["usable"] != "yes" else "",
-                )
-                for row in rows
-            ]
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); solve the run again") from error
+        yield
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{path} is damaged ({error}); solve the run again") from error
-    return as_edges(found, robots, stances, OF_POINTS if column == "residual" else OF_GRAPH)
 
 
 def _anchored(stances: Sequence[Stance], bumped: Sequence[Sequence[object]]) -> list[tuple[str, int]]:
@@ -248,12 +290,3 @@ def stayed(robots: Sequence[str], stances: Sequence[Stance], held: Sequence[tupl
     row_of = {stance.index: row for row, stance in enumerate(stances)}
     number = {robot: n for n, robot in enumerate(robots)}
     return np.array([(number[robot], row_of[after]) for robot, after in held], np.int64).reshape(-1, 2)
-
-
-def _frontend(path: Path) -> FrontendOptions:
-    """The front end that a result was made with; as it is by default where the file does not say."""
-    try:
-        stated = read_toml(path, "solve the run again")["options"]["frontend"]
-        return FrontendOptions(**(stated | {"tracker": TrackerOptions(**stated.get("tracker", {}))}))
-    except (InputError, KeyError, TypeError, AttributeError):
-        return FrontendOptions()

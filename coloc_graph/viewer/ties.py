@@ -1,11 +1,9 @@
-"""Sightings and odometry as links between poses, of a graph or of a result on disk."""
+"""Sightings and odometry as links between poses."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from coloc_graph.exchange.g2o import read_g2o
 from coloc_graph.frontend import WheelTrack
 from coloc_graph.measurements import Measurement, Node, Odometry, Sighting
 from coloc_graph.run import Run, Stance
@@ -20,40 +18,6 @@ def ties_in(measurements: Iterable[Measurement], robots: Sequence[str], stances:
     every = list(measurements)
     sightings, odometry = ([m.ends for m in every if isinstance(m, kind)] for kind in (Sighting, Odometry))
     return links_of(sightings, robots, stances), links_of(odometry, robots, stances)
-
-
-def ties_on_disk(
-    path: Path, pairs: Collection[tuple[int, frozenset[str]]], robots: Sequence[str], stances: Sequence[Stance]
-) -> tuple[Links, Links, list[tuple[str, int, str]]]:
-    """Those of a `graph.g2o`, which does not say of what an edge was made, and sightings of landmarks as (observer,
-    stance, landmark).
-
-    What ties a robot to itself is odometry, unless it stayed put there, and what ties two that are not one of the
-    `pairs` (stance, both robots) of `measurements.csv` is a sighting. Raises `InputError` where it is damaged.
-    """
-    graph = read_g2o(path)
-    stayed = {stay.ends for stay in graph.stay_puts}
-    sightings, odometry, landmarks = [], [], []
-    for at in range(graph.factors.size()):
-        keys = list(graph.factors.at(at).keys())
-        if len(keys) == 2 and keys[0] in graph.names and keys[1] in graph.landmarks:
-            landmarks += [(robot, stance, graph.landmarks[keys[1]]) for robot, stance in graph.names[keys[0]][:1]]
-        if len(keys) != 2 or any(key not in graph.names for key in keys):
-            continue
-        i, j = (graph.names[key] for key in keys)
-        if i[0][0] == j[0][0]:
-            if (i[-1], j[0]) not in stayed:
-                odometry.append((i[-1], j[0]))
-        else:
-            common = list(_at_once(i, j))
-            if common and not any((a[1], frozenset((a[0], b[0]))) in pairs for a, b in common):
-                sightings.append(common[0])
-    return links_of(sightings, robots, stances), links_of(odometry, robots, stances), landmarks
-
-
-def _at_once(i: Sequence[Node], j: Sequence[Node]) -> Iterator[tuple[Node, Node]]:
-    """Nodes of two places that are of one stance."""
-    return ((a, b) for a in i for b in j if a[1] == b[1])
 
 
 def links_of(

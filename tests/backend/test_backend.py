@@ -203,7 +203,7 @@ def test_a_missing_measurement_leaves_out_what_it_would_tie_and_says_which(rng, 
     poses = [relative(s.index, *s.observers, T) for s, T in zip(when, steps(rng, 4), strict=True) if s.index != 1]
     estimate = method(graph_of(when, poses))
     # A's second place, at stance 1 and held through stance 2, and all that was measured from it
-    assert estimate.untied == (("A", 1), ("A", 2), ("B", 2), ("B", 3), ("A", 3))
+    assert estimate.disconnected == (("A", 1), ("A", 2), ("B", 2), ("B", 3), ("A", 3))
     assert estimate.trajectories["A"].stances.tolist() == [0]
     assert estimate.trajectories["B"].stances.tolist() == [0, 1]
     with pytest.raises(EstimationError, match="robot A has no pose at stance 2"):
@@ -309,7 +309,7 @@ def test_a_long_straight_chain_with_tight_sigmas_is_solved():
     # the k-th turn swings the arm of 299 - k metres that is left: sum of squares 1^2 + ... + 299^2
     expected = 0.02**2 * sum(k**2 for k in range(300)) + 300 * 0.002**2
     assert C[4, 4] == pytest.approx(expected, rel=1e-4)
-    assert not estimate.untied
+    assert not estimate.disconnected
 
 
 def test_another_gtsam_is_refused_with_what_to_do():

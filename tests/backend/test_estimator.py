@@ -32,7 +32,7 @@ def state_of(estimator):
     poses = {n: estimator.pose(*n).matrix() for n in graph.nodes}
     return (
         repr(estimator), graph.stances, tuple(map(id, estimator.measurements)), estimator.waiting,
-        tuple(id(r.measurement) for r in estimator.refused), poses,
+        tuple(id(r.measurement) for r in estimator.rejected), poses,
     )  # fmt: skip
 
 
@@ -71,7 +71,7 @@ def test_incremental_at_the_end_is_batch(made):
 def test_an_incremental_solution_is_heard_of_stance_by_stance(hallway):
     run = open_run(hallway)
     heard = []
-    solution = solve(run, SolveOptions(incremental=True), entered=heard.append)
+    solution = solve(run, SolveOptions(incremental=True), on_update=heard.append)
     assert [one.stance.index for one in heard] == [stance.index for stance in run.stances]
     assert heard[0].stance.anchors == () and len(heard[0].pairs) == 1
     assert sum(len(one.measurements) for one in heard) == len(solution.estimate.graph.measurements)
@@ -104,7 +104,7 @@ def test_a_stance_gives_where_its_robots_stand(team):
     estimator = Estimator("A", team.robots, team.floor)
     for stance in team.stances:
         found = estimator.add(stance, of_stance(team, stance.index))
-        assert found.stance == stance.index and set(found.poses) == set(team.robots) and not found.untied
+        assert found.stance == stance.index and set(found.poses) == set(team.robots) and not found.disconnected
         robot = stance.observers[-1]
         assert found.poses[robot].equals(estimator.pose(robot), 0.0)
         assert np.array_equal(found.covariances[robot], estimator.covariance(robot))
@@ -135,7 +135,7 @@ def test_stances_out_of_order_wait_for_the_one_they_follow(team):
     for index in order:
         found = estimator.add(team.stances[index], of_stance(team, index))
         if index == 3:
-            assert estimator.waiting == (2, 3) and found.untied == team.stances[3].observers and not found.poses
+            assert estimator.waiting == (2, 3) and found.disconnected == team.stances[3].observers and not found.poses
             assert [s.index for s in estimator.stances] == [0]
         if index == 1:
             assert estimator.waiting == () and found.stance == 3
@@ -184,7 +184,8 @@ def test_what_nothing_ties_waits_until_something_does():
     estimator.insert(*bridges)
     batch = smooth(graph_of_team(made))
     assert (
-        largest_difference(estimator.estimate(), batch, [n for n in batch.graph.nodes if n not in batch.untied]) < 1e-6
+        largest_difference(estimator.estimate(), batch, [n for n in batch.graph.nodes if n not in batch.disconnected])
+        < 1e-6
     )
 
 
@@ -223,7 +224,7 @@ def test_a_withdrawn_stance_is_as_if_it_had_never_come_and_can_come_again():
             assert_same(earlier, state_of(estimator), atol=1e-4)  # ISAM2 linearised elsewhere
             estimator.add(stance, of_stance(made, stance.index), after=follows)
         before = stance
-    assert {id(one.measurement) for one in estimator.refused} == {id(one.measurement) for one in whole.refused}
+    assert {id(one.measurement) for one in estimator.rejected} == {id(one.measurement) for one in whole.rejected}
     assert largest_difference(estimator.estimate(), whole.estimate(), whole.graph.nodes) < 1e-6
     with pytest.raises(EstimationError, match="the first stance"):
         for _ in made.stances:
@@ -233,10 +234,10 @@ def test_a_withdrawn_stance_is_as_if_it_had_never_come_and_can_come_again():
 def test_wrong_homographies_are_refused_before_they_enter_and_leave_no_trace():
     made = team_of(6, 20, seed=1, wrong=0.1)
     estimator = fed(made)
-    assert {id(r.measurement) for r in estimator.refused} == set(map(id, made.wrong)) and len(made.wrong) >= 8
+    assert {id(r.measurement) for r in estimator.rejected} == set(map(id, made.wrong)) and len(made.wrong) >= 8
     right = smooth(graph_of_team(made, [m for m in made.measurements if m not in made.wrong]))
     assert largest_difference(estimator.estimate(), right, right.graph.nodes) < 1e-6
-    assert all("contradicted by the other measurements" in r.reason for r in estimator.refused)
+    assert all("contradicted by the other measurements" in r.reason for r in estimator.rejected)
 
 
 @pytest.mark.parametrize("off", [0.03, 0.045])
@@ -246,7 +247,7 @@ def test_a_homography_that_is_a_little_wrong_is_refused_too(team, off):
     T = gtsam.Pose3(victim.T_i_j).compose(gtsam.Pose3(floor_pose(off, -off, 0.0)))
     spoilt = RelativePose(7, victim.robot_i, victim.robot_j, T, victim.covariance)
     estimator = fed(team, [spoilt if m is victim else m for m in team.measurements])
-    assert [r.measurement for r in estimator.refused] == [spoilt]
+    assert [r.measurement for r in estimator.rejected] == [spoilt]
     right = smooth(graph_of_team(team, [m for m in team.measurements if m is not victim]))
     assert largest_difference(estimator.estimate(), right, right.graph.nodes) < 1e-6
 
@@ -260,10 +261,10 @@ def test_what_a_wrong_measurement_kept_out_comes_back_when_that_is_revoked():
     estimator = Estimator("A", made.robots, made.floor)
     estimator.add(made.stances[0], [wrong])
     estimator.insert(a, *others)
-    b = {id(r.measurement) for r in estimator.refused}
+    b = {id(r.measurement) for r in estimator.rejected}
     assert id(a) in b
     estimator.revoke(wrong)
-    assert not estimator.refused
+    assert not estimator.rejected
     batch = smooth(graph_of_team(made))
     assert largest_difference(estimator.estimate(), batch, batch.graph.nodes) < 1e-6
 
@@ -290,11 +291,11 @@ def test_a_checkpoint_keeps_what_was_rejected_revoked_and_withdrawn(tmp_path):
     made = team_of(6, 10, seed=1, wrong=0.1)
     estimator = fed(made)
     resumed = assert_resumed(estimator, tmp_path / "fed.json")
-    assert resumed.refused and [(r.measurement.ends, r.reason) for r in resumed.refused] == [
-        (r.measurement.ends, r.reason) for r in estimator.refused
+    assert resumed.rejected and [(r.measurement.ends, r.reason) for r in resumed.rejected] == [
+        (r.measurement.ends, r.reason) for r in estimator.rejected
     ]
     last = estimator.withdraw()
-    estimator.revoke(estimator.refused[0].measurement)
+    estimator.revoke(estimator.rejected[0].measurement)
     late, *others = of_stance(made, last.index)
     estimator.add(last, others)
     estimator.insert(late)

@@ -76,7 +76,7 @@ def test_the_fit_is_as_good_as_its_noise_and_the_poses_as_their_covariances(solv
 
 def test_incremental_is_batch(solved, wrong_mounts):
     again = solve(open_run(wrong_mounts), SolveOptions(incremental=True))
-    assert again.estimate.method == "joint" and not again.estimate.refused
+    assert again.estimate.method == "joint" and not again.estimate.rejected
     assert again.estimate.chi2 == pytest.approx(solved.estimate.chi2, abs=0.5)
     for robot, trajectory in solved.estimate.trajectories.items():
         other = again.estimate.trajectories[robot]
@@ -92,7 +92,7 @@ def test_as_it_comes_mounts_that_are_many_degrees_off_are_found_as_in_batch(tmp_
         solve(open_run(tmp_path / "run.mcap"), SolveOptions(incremental=incremental)).estimate
         for incremental in (False, True)
     )
-    assert not batch.refused and not by_stance.refused
+    assert not batch.rejected and not by_stance.rejected
     for robot, trajectory in batch.trajectories.items():
         assert np.abs(by_stance.trajectories[robot].positions - trajectory.positions).max() < 1e-4, robot
 
@@ -133,7 +133,7 @@ def test_from_mounts_three_degrees_and_two_centimetres_wrong_it_comes_to_the_sam
 
     rigs = {"A": off("A", signs), "B": off("B", signs[::-1]), "C": graph.rigs["C"]}
     estimate = joint(replace(graph, rigs=rigs))
-    assert not estimate.refused and estimate.chi2 / estimate.dof < 1.3
+    assert not estimate.rejected and estimate.chi2 / estimate.dof < 1.3
     for robot in "AB":
         a, b = true.mounts[robot].mount, estimate.calibration.mounts[robot].mount
         assert abs(a.tilt_deg - b.tilt_deg) < 0.05 and abs(a.roll_deg - b.roll_deg) < 0.1
@@ -168,7 +168,7 @@ def test_a_wrong_homography_is_found(solved):
     # one stance's homography in place of another's
     wrong = replace(second, homography=first.homography, spans=first.spans, T_i_j=first.T_i_j)
     estimate = joint(replace(graph, measurements=tuple(wrong if m is second else m for m in graph.measurements)))
-    assert [refusal.measurement for refusal in estimate.refused] == [wrong]
+    assert [refusal.measurement for refusal in estimate.rejected] == [wrong]
     right = joint(graph.without([second]))
     for robot, trajectory in right.trajectories.items():
         np.testing.assert_allclose(estimate.trajectories[robot].positions, trajectory.positions, atol=1e-4)

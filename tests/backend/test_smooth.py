@@ -12,7 +12,7 @@ from teams import FLOOR, ate, graph_of_team, planar_nees, team_of
 from coloc_graph.backend import PoseGraph, chain, diagnose, smooth
 from coloc_graph.backend.chi2_test import Agreement
 from coloc_graph.backend.factors import Factors
-from coloc_graph.backend.marginals import Posterior
+from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.optimize import fit_graph
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.lie import floor_pose
@@ -32,7 +32,7 @@ def test_every_robot_has_a_pose_at_every_stance_whatever_its_role():
     team = team_of(5, 9)
     estimate = smooth(graph_of_team(team))
     assert set(estimate.graph.nodes) == {(robot, k) for robot in team.robots for k in range(9)}
-    assert not estimate.untied and all(len(one) == 9 for one in estimate.trajectories.values())
+    assert not estimate.disconnected and all(len(one) == 9 for one in estimate.trajectories.values())
     drivers = {stance.movers[0] for stance in team.stances}
     assert drivers == set(team.robots)
     # a driver's pose is of the instant at which it was sighted
@@ -62,8 +62,8 @@ def test_nees_over_200_seeds_is_inside_its_interval(robots):
 def test_wrong_homographies_in_a_loopy_team_are_all_found_and_no_right_one_is_refused(six):
     team, estimate = six
     assert len(team.wrong) >= 8
-    assert {id(r.measurement) for r in estimate.refused} == set(map(id, team.wrong))
-    assert all("contradicted" in r.reason and "sigmas" in r.reason for r in estimate.refused)
+    assert {id(r.measurement) for r in estimate.rejected} == set(map(id, team.wrong))
+    assert all("contradicted" in r.reason and "sigmas" in r.reason for r in estimate.rejected)
     # what remains is a fit as good as any
     low, high = chi2.ppf([1e-4, 1 - 1e-4], estimate.dof)
     assert low < estimate.chi2 < high
@@ -81,7 +81,7 @@ def test_even_a_third_of_the_homographies_may_be_wrong():
     team = team_of(6, 12, seed=5, wrong=0.3)
     estimate = smooth(graph_of_team(team))
     assert len(team.wrong) > 20
-    assert {id(r.measurement) for r in estimate.refused} == set(map(id, team.wrong))
+    assert {id(r.measurement) for r in estimate.rejected} == set(map(id, team.wrong))
 
 
 def test_right_measurements_that_are_doubted_are_taken_back(monkeypatch):
@@ -91,7 +91,7 @@ def test_right_measurements_that_are_doubted_are_taken_back(monkeypatch):
     genuine = module._outliers
     monkeypatch.setattr(module, "_outliers", lambda fit: genuine(fit) | {id(m): m for m in right[::9]})
     estimate = smooth(graph_of_team(team))
-    assert {id(r.measurement) for r in estimate.refused} == set(map(id, team.wrong))
+    assert {id(r.measurement) for r in estimate.rejected} == set(map(id, team.wrong))
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_in_a_large_graph_a_few_wrong_homographies_are_found_from_where_the_fit_
     assert 1 < len(team.wrong) < 8
     graph = graph_of_team(team)
     estimate = smooth(graph)
-    assert {id(r.measurement) for r in estimate.refused} == set(map(id, team.wrong)) and not estimate.bumped
+    assert {id(r.measurement) for r in estimate.rejected} == set(map(id, team.wrong)) and not estimate.bumped
     right = smooth(graph.without(team.wrong), refuse=False)
     for robot, trajectory in right.trajectories.items():
         np.testing.assert_allclose(estimate.trajectories[robot].positions, trajectory.positions, atol=1e-5)
@@ -133,7 +133,7 @@ def test_what_all_measurements_share_is_no_reason_to_refuse_a_few():
     made = [replace(m, covariance=m.covariance / 4) for m in team.measurements]
     estimate = smooth(graph_of_team(team, made))
     assert estimate.chi2 / estimate.dof > 2
-    assert not estimate.refused and not estimate.bumped
+    assert not estimate.rejected and not estimate.bumped
 
 
 def three(seed, **options):
@@ -147,10 +147,10 @@ def test_in_a_chain_of_three_odometry_contradicts_a_wrong_homography():
     bad = RelativePose(6, wrong.robot_i, wrong.robot_j, T, wrong.covariance, T, 0, 0.0)
     made = [bad if m is wrong else m for m in team.measurements]
     estimate = smooth(graph_of_team(team, made))
-    assert [r.measurement for r in estimate.refused] == [bad]
+    assert [r.measurement for r in estimate.rejected] == [bad]
     # nothing can contradict it without the wheels, and then nothing is refused
     alone = smooth(graph_of_team(team, [m for m in made if isinstance(m, RelativePose)]))
-    assert not alone.refused
+    assert not alone.rejected
     assert ate(estimate, team) < 0.5 * ate(alone, team)
 
 
@@ -175,7 +175,7 @@ def test_a_bumped_anchor_is_found_and_named_and_no_homography_is_blamed(size, re
     estimate = smooth(graph_of_team(team, made))
     (found,) = estimate.bumped
     assert (found.stay_put.robot, found.stay_put.before, found.stay_put.after) == (robot, 5, 6)
-    assert not estimate.refused
+    assert not estimate.rejected
     np.testing.assert_allclose(found.T_before_after.translation()[:2], bump[:2, 3], atol=0.05)
     assert f"robot {robot} was bumped between stances 5 and 6" in str(found)
     # before and after are two places now
@@ -185,7 +185,7 @@ def test_a_bumped_anchor_is_found_and_named_and_no_homography_is_blamed(size, re
 def test_a_healthy_team_has_neither_bumps_nor_refusals():
     for seed in range(5):
         estimate = smooth(graph_of_team(three(seed)))
-        assert estimate.bumped == () and estimate.refused == ()
+        assert estimate.bumped == () and estimate.rejected == ()
 
 
 def test_a_slip_is_a_constraint_of_its_own_and_widens_the_covariance():
@@ -239,7 +239,7 @@ def test_covariances_are_those_of_the_dense_inverse():
         ordering.push_back(key)
     A = linear.jacobian(ordering)[0]
     dense = np.linalg.inv(A.T @ A).reshape(len(keys), 6, len(keys), 6)
-    posterior = Posterior(fit.factors, fit.values)
+    posterior = Marginals(fit.factors, fit.values)
     scale = np.abs(dense).max()
     for n, key in enumerate(keys):
         np.testing.assert_allclose(posterior.covariance(key), dense[n, :, n], atol=1e-9 * scale)
@@ -261,7 +261,7 @@ def test_a_variable_that_nothing_measures_has_no_covariance():
     for key in keys:
         values.insert(key, gtsam.Pose3())
     with pytest.raises(EstimationError, match="leaves a variable open"):
-        Posterior(factors, values)
+        Marginals(factors, values)
 
 
 def straight(count, sigmas):
@@ -315,7 +315,7 @@ def test_chained_and_smoothed_agree_without_redundancy_with_any_roles():
     graph = graph_of_team(team, made)
     a, b = chain(graph), smooth(graph)
     for node in graph.nodes:
-        if node not in a.untied:
+        if node not in a.disconnected:
             np.testing.assert_allclose(a.pose(*node).matrix(), b.pose(*node).matrix(), rtol=0, atol=1e-9)
 
 
@@ -329,7 +329,7 @@ def test_what_is_not_tied_is_diagnosed_before_solving_with_what_would_tie_it():
     assert diagnose(graph_of_team(team_of(6, 4))) == ()
     tied = set(graph_of_team(team, made).nodes) - {n for part in parts for n in part.nodes}
     estimate = smooth(graph_of_team(team, made))
-    assert set(estimate.untied).isdisjoint(tied)
+    assert set(estimate.disconnected).isdisjoint(tied)
 
 
 def test_a_team_that_nothing_connects_is_refused_in_words():

@@ -49,10 +49,10 @@ def test_a_graph_goes_out_and_comes_back_with_its_stay_puts(tmp_path, floor):
 def test_refused_measurements_are_not_written(tmp_path):
     team = team_of(6, 8, seed=1, wrong=0.1)
     estimate = smooth(graph_of_team(team))
-    assert estimate.refused
+    assert estimate.rejected
     write_g2o(estimate, tmp_path / "graph.g2o")
     edges = [line for line in (tmp_path / "graph.g2o").read_text().splitlines() if line.startswith("EDGE")]
-    assert len(edges) == len(estimate.graph.measurements) - len(estimate.refused)
+    assert len(edges) == len(estimate.graph.measurements) - len(estimate.rejected)
 
 
 V2 = "VERTEX_SE2 {} 0 0 0"

@@ -115,9 +115,9 @@ def test_a_folder_that_is_no_dataset_is_refused(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif("COLOC_DATA" not in os.environ, reason="COLOC_DATA does not say where mrclam6 is")
 def test_the_real_dataset_is_as_good_as_it_is_said_to_be(tmp_path):
-    from coloc_graph.pipeline.ranging import solve_drive
-    from coloc_graph.results.ranging import assess_drive
+    from coloc_graph.pipeline.batch import solve
+    from coloc_graph.results.writer import assess
 
     import_mrclam(Path(os.environ["COLOC_DATA"]) / "mrclam6", tmp_path / "run.mcap")
-    assessed = assess_drive(solve_drive(open_run(tmp_path / "run.mcap")))
-    assert max(row.translation.rmse for row in assessed.accuracy.robots) < 0.06
+    assessed = assess(solve(open_run(tmp_path / "run.mcap")))
+    assert max(row.translation.rmse for row in assessed[0].robots) < 0.06

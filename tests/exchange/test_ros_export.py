@@ -15,7 +15,8 @@ from coloc_graph.exchange.ros_export import write_ros2
 from coloc_graph.exchange.ros_poses import T_of, ros_covariance
 from coloc_graph.geometry.lie import se3_exp, so3_exp, so3_log
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.results.writer import read_result, team_of, write_result
+from coloc_graph.results.folder import read_result
+from coloc_graph.results.writer import write_result
 from coloc_graph.run.schemas import to_ns
 from coloc_graph.team import write_team
 
@@ -78,7 +79,7 @@ def test_each_pose_is_in_tf_and_in_its_topic_with_its_time_and_frames(messages, 
 def test_cameras_sit_on_their_robots_and_look_down(messages, result, short_solution):
     ((received, message),) = messages["/tf_static"]
     assert received == min(ns for topic in messages.values() for ns, _ in topic)
-    team = team_of(read_result(result))
+    team = read_result(result).team
     assert [one.child_frame_id for one in message.transforms] == ["A/camera", "B/camera", "C/camera"]
     for one in message.transforms:
         name = one.header.frame_id.removesuffix("/base_link")
@@ -136,7 +137,7 @@ def test_a_robot_that_knows_its_way_ahead_knows_it_along_the_world_where_it_head
 def test_the_same_result_gives_the_same_bytes(bag, result, tmp_path):
     read = read_result(result)
     poses = sum(map(len, read.trajectories.values()))
-    assert write_ros2(read.trajectories, team_of(read), tmp_path / "again.mcap") == poses
+    assert write_ros2(read.trajectories, read.team, tmp_path / "again.mcap") == poses
     assert (tmp_path / "again.mcap").read_bytes() == bag.read_bytes()
 
 
@@ -177,10 +178,10 @@ def test_where_it_cannot_go_is_told(bag, result, tmp_path, capsys, name, words):
 def test_cameras_are_as_the_estimate_found_them_or_else_as_they_were_stated(short_solution, result, tmp_path, capsys):
     copy, stated = tmp_path / "copy", short_solution.run.team
     shutil.copytree(result, copy)
-    assert team_of(read_result(copy)) == stated
+    assert read_result(copy).team == stated
     found = msgspec.structs.replace(stated, clock_sigma=0.5)
     write_team(found, copy / "team.toml")
-    assert team_of(read_result(copy)) == found
+    assert read_result(copy).team == found
     (copy / "team.toml").unlink()
     (copy / "config.toml").write_text("[options]\n")
     assert main(["export", "ros2", str(copy), "--out", str(tmp_path / "x.mcap")]) == 2

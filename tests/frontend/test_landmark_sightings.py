@@ -14,7 +14,8 @@ from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.inspection import inspect, landmarks_seen
-from coloc_graph.results.writer import LANDMARKS, read_result, write_result
+from coloc_graph.results.folder import LANDMARKS, read_result
+from coloc_graph.results.writer import write_result
 from coloc_graph.run import Image, Motion, OdometrySample, Stance, open_run, read_true_team
 from coloc_graph.simulation import Sensor, reference_team, simulate
 from coloc_graph.simulation.rendering import expose
@@ -280,7 +281,7 @@ def solved(lap):
 
 def test_a_run_with_landmarks_is_solved_and_they_are_where_they_truly_are(lap, solved):
     estimate = solved.estimate
-    assert len(estimate.landmarks) == 2 and not estimate.refused and not solved.warnings
+    assert len(estimate.landmarks) == 2 and not estimate.rejected and not solved.warnings
     true = {one.name: floor_pose(*one.position, np.deg2rad(one.yaw_deg)) for one in read_true_team(lap).landmarks}
     # in the map's frame, which is the true floor's but for the survey
     for name, placed in estimate.landmarks.items():
@@ -323,7 +324,7 @@ def test_landmarks_come_in_stance_by_stance_as_they_do_at_once(lap, solved):
         live.add(LiveStance(one.stance, one.estimate, one.measurements, one.pairs))
         counts.append(len(live.scene().landmarks))
 
-    by_stance = solve(open_run(lap), SolveOptions(incremental=True), entered=told)
+    by_stance = solve(open_run(lap), SolveOptions(incremental=True), on_update=told)
     # a viewer that looks on shows them as they come
     assert counts == sorted(counts) and counts[0] < counts[-1] == 2
     shown = live.scene().landmarks
@@ -332,7 +333,7 @@ def test_landmarks_come_in_stance_by_stance_as_they_do_at_once(lap, solved):
         np.testing.assert_allclose(place, solved.estimate.landmarks[name].planar[:2], atol=0.02)
     for name, placed in solved.estimate.landmarks.items():
         assert placed.T_world_body.equals(by_stance.estimate.landmarks[name].T_world_body, 1e-5)
-    assert not by_stance.estimate.refused
+    assert not by_stance.estimate.rejected
 
 
 def test_info_counts_where_landmarks_are_seen(lap, capsys):

@@ -124,7 +124,7 @@ def test_a_killed_coordinator_s_record_misses_half_a_second_at_most(mission):
 def test_the_record_solved_offline_is_what_was_known_online(mission):
     online = {row["stance"]: row["poses"] for row in mission.rows if row["what"] == "entered"}
     heard = []
-    solve(open_run(mission.folder / "mission" / "run.mcap"), SolveOptions(incremental=True), entered=heard.append)
+    solve(open_run(mission.folder / "mission" / "run.mcap"), SolveOptions(incremental=True), on_update=heard.append)
     assert len(heard) == mission.stances
     for one in heard:
         poses = online[one.stance.index]

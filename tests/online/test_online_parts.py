@@ -273,7 +273,7 @@ def test_an_anchor_that_was_pushed_is_named_and_its_stance_comes_again(tmp_path,
     assert bump.stay_put.robot == anchor and bump.stay_put.after == stance.index
     T = bump.T_before_after
     assert (T.x(), T.y(), T.rotation().yaw()) == pytest.approx(push, abs=0.04)
-    assert solver.estimator.stances[-1] == seen.stances[4] and not solver.estimator.refused
+    assert solver.estimator.stances[-1] == seen.stances[4] and not solver.estimator.rejected
 
     class Told:
         """The run, in which the wheels' last word before the stance is what the coordinator makes of it."""
@@ -293,7 +293,7 @@ def test_an_anchor_that_was_pushed_is_named_and_its_stance_comes_again(tmp_path,
     measuring.end()
     measuring = EstimationWorker(Told(), solver)
     assert isinstance(entered(replace(seen.stances[5], anchors=())), EnteredStance)
-    assert not solver.estimator.refused
+    assert not solver.estimator.rejected
     T = np.linalg.inv(stands) @ solver.estimator.pose(anchor, 5).matrix()
     assert (T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])) == pytest.approx(push, abs=0.04)
     measuring.end()

@@ -100,8 +100,8 @@ def test_a_straight_drive_in_the_middle_is_a_warning_and_what_hung_on_it_is_unti
     assert [m.homography.stance for m in solution.measurements if m.homography.unusable] == [3]
     assert any("stance 3" in warning and "line" in warning and "turn" in warning for warning in solution.warnings)
     # at stance 3 B is the anchor and A has moved: from there on nothing ties A, and with it anything
-    assert solution.estimate.untied[0] == ("A", 3)
-    assert {stance for _, stance in solution.estimate.untied} == set(range(3, 8))
+    assert solution.estimate.disconnected[0] == ("A", 3)
+    assert {stance for _, stance in solution.estimate.disconnected} == set(range(3, 8))
     assert any(
         re.match(r"A.* at stances 3 to 7: not tied to the reference; .*A.* would tie", w) for w in solution.warnings
     )
@@ -119,7 +119,7 @@ def test_wheels_bridge_a_stance_without_a_homography_with_the_sigma_that_wheels_
 ):
     solution = solve(spoilt(hallway, tmp_path / "bad.mcap", copied, collinear, {3}))
     whole = solutions["joint"].estimate
-    assert not solution.estimate.untied
+    assert not solution.estimate.disconnected
     ratio = solution.estimate.covariance("A", 3)[3, 3] / whole.covariance("A", 3)[3, 3]
     assert ratio > 1.5
     for robot, trajectory in whole.trajectories.items():
@@ -131,7 +131,7 @@ def test_wheels_bridge_a_stance_without_a_homography_with_the_sigma_that_wheels_
 def test_a_straight_drive_at_the_end_costs_the_last_pose_alone(hallway, copied, collinear, tmp_path):
     run = spoilt(hallway, tmp_path / "bad.mcap", copied, collinear, {7})
     solution = solve(run, SolveOptions(method="chain"))
-    assert {stance for _, stance in solution.estimate.untied} == {7} and len(solution.estimate.untied) == 1
+    assert {stance for _, stance in solution.estimate.disconnected} == {7} and len(solution.estimate.disconnected) == 1
 
 
 def test_nothing_but_straight_drives_is_an_error_with_its_remedy(short, copied, collinear, tmp_path):
@@ -189,11 +189,11 @@ def test_mounts_that_are_not_as_stated_are_warned_of(hallway, copied, tmp_path):
 
 
 def test_whether_measurements_disagree_depends_on_the_degrees_of_freedom(solutions):
-    from coloc_graph.pipeline.batch import _warnings
+    from coloc_graph.pipeline.explanations import warnings_of_graph
 
     estimate = solutions["smooth"].estimate
     for dof, chi2, warned in ((1, 10.0, False), (1, 20.0, True), (24, 55.0, False), (600, 1500.0, True)):
-        warnings = _warnings(dataclasses.replace(estimate, chi2=chi2, dof=dof), (), ())
+        warnings = warnings_of_graph(dataclasses.replace(estimate, chi2=chi2, dof=dof), (), ())
         assert (len(warnings) == 1) == warned, (dof, chi2)
         assert all(f"chi2/dof {chi2 / dof:.1f}" in one and "once in" in one for one in warnings)
 

@@ -6,7 +6,7 @@ import pytest
 from mrclam_folder import DELAY, DEPTH, LANDMARKS, ROBOT_OFFSET, SCALE, TURN_SCALE, make
 from msgspec.structs import replace as with_fields
 
-from coloc_graph.backend.planar import IncrementalDrive, optimise_drive
+from coloc_graph.backend.planar import IncrementalKeyframes, optimise_keyframes
 from coloc_graph.backend.planar.factors import DriveFactors, State
 from coloc_graph.backend.planar.filter import Models, filter_forward
 from coloc_graph.backend.planar.placing import Placing
@@ -15,8 +15,8 @@ from coloc_graph.cli import main
 from coloc_graph.errors import InputError, RunError
 from coloc_graph.exchange.mrclam import import_mrclam
 from coloc_graph.frontend.keyframes import keyframes_of
-from coloc_graph.pipeline.ranging import DriveOptions, calibrated, solve_drive
-from coloc_graph.results.ranging import assess_drive, write_drive_result
+from coloc_graph.pipeline.batch import SolveOptions, solve
+from coloc_graph.results.writer import assess, assess_online, write_result
 from coloc_graph.run import OdometrySample, Ranges, open_run, whole_run
 from coloc_graph.team import Landmark, Ranging, Robot, Team
 from coloc_graph.viewer import scene_of_result
@@ -42,12 +42,12 @@ def unmapped(folder, run):
 
 @pytest.fixture(scope="module")
 def batch(run):
-    return solve_drive(run)
+    return solve(run)
 
 
 @pytest.fixture(scope="module")
 def incremental(run):
-    return solve_drive(run, DriveOptions(incremental=True))
+    return solve(run, SolveOptions(incremental=True))
 
 
 def rms(accuracy):
@@ -55,24 +55,24 @@ def rms(accuracy):
 
 
 def test_robots_are_where_they_are_and_the_covariances_say_how_well(batch):
-    accuracy = assess_drive(batch).accuracy
+    accuracy = assess(batch)[0]
     assert rms(accuracy) < 0.05
     assert 0.4 < accuracy.anees < 1.5
     estimate = batch.estimate
     assert 0.6 < estimate.chi2 / estimate.dof < 1.3
-    assert np.all((estimate.noise > 0.6) & (estimate.noise < 1.5))
+    assert np.all((estimate.ranging.noise > 0.6) & (estimate.ranging.noise < 1.5))
     assert not batch.warnings
 
 
 def test_wheels_that_are_not_as_they_say_are_found_out(run, batch):
     for robot in run.team.names:
-        errors, C = batch.estimate.errors[robot].wheels
+        errors, C = batch.estimate.calibration.sensors[robot].errors.wheels
         wheels = run.team[robot].wheels
         true = np.array([SCALE - wheels.scale, TURN_SCALE - wheels.turn_scale, DELAY - wheels.delay])
         assert np.all(np.abs(errors - true) < 4 * np.sqrt(np.diagonal(C)))
         assert np.sqrt(C[2, 2]) < wheels.delay_sigma / 2
-    found = calibrated(run.team, batch.estimate)
-    stated, errors = run.team["R1"], batch.estimate.errors["R1"]
+    found = batch.estimate.calibration.of_team(run.team)
+    stated, errors = run.team["R1"], batch.estimate.calibration.sensors["R1"].errors
     wheels, ranging = found["R1"].wheels, found["R1"].ranging
     at = [wheels.scale - stated.wheels.scale, wheels.turn_scale - stated.wheels.turn_scale]
     assert [*at, wheels.delay - stated.wheels.delay] == pytest.approx(errors.wheels[0].tolist())
@@ -80,12 +80,12 @@ def test_wheels_that_are_not_as_they_say_are_found_out(run, batch):
     at += [ranging.depth - stated.ranging.depth, ranging.robot_offset]
     assert at == pytest.approx(errors.ranging[0].tolist())
     assert wheels.delay_sigma == pytest.approx(np.sqrt(errors.wheels[1][2, 2]))
-    assert ranging.range_sigma == pytest.approx(stated.ranging.range_sigma * batch.estimate.noise[0, 0])
+    assert ranging.range_sigma == pytest.approx(stated.ranging.range_sigma * batch.estimate.ranging.noise[0, 0])
 
 
 def test_each_robot_helps_the_others(run, batch):
-    alone = solve_drive(run, DriveOptions(between_robots=False))
-    assert len(alone.estimate.drive.measured) < len(batch.estimate.drive.measured)
+    alone = solve(run, SolveOptions(between_robots=False))
+    assert len(alone.estimate.ranging.keyframes.measured) < len(batch.estimate.ranging.keyframes.measured)
 
     def sigma(solution):
         return np.mean([np.sqrt(t.covariances[:, 3, 3]).mean() for t in solution.estimate.trajectories.values()])
@@ -94,11 +94,12 @@ def test_each_robot_helps_the_others(run, batch):
 
 
 def test_as_it_happens_it_is_nearly_as_good(batch, incremental):
-    of_batch, of_one = assess_drive(batch), assess_drive(incremental)
-    assert rms(of_one.accuracy) < 1.2 * rms(of_batch.accuracy)
-    assert rms(of_one.online) < 0.12
+    of_batch, of_one, online = assess(batch)[0], assess(incremental)[0], assess_online(incremental)
+    assert rms(of_one) < 1.2 * rms(of_batch)
+    assert rms(online) < 0.12
     # nothing that comes later is in what was thought at the time
-    assert rms(of_one.online) > rms(of_one.accuracy)
+    assert rms(online) > rms(of_one)
+    assert assess_online(batch) is None
     assert set(incremental.online) == set(incremental.estimate.trajectories)
     for robot, online in incremental.online.items():
         assert np.isfinite(online.covariances).all()
@@ -107,28 +108,29 @@ def test_as_it_happens_it_is_nearly_as_good(batch, incremental):
 
 
 def test_without_a_map_robots_and_landmarks_are_found_up_to_where_the_map_lies(unmapped):
-    solution = solve_drive(unmapped)
-    assert not solution.estimate.on_map
+    solution = solve(unmapped)
+    assert not solution.estimate.ranging.on_map
     start = solution.estimate.trajectories["R1"]
     assert np.allclose(start.T_world_body[0], np.eye(4), atol=1e-3)
-    assert rms(assess_drive(solution).accuracy) < 0.06
-    found = np.array([one.position for one in solution.estimate.landmarks])
-    true = np.array([LANDMARKS[int(one.name[1:])] for one in solution.estimate.landmarks])
+    assert rms(assess(solution)[0]) < 0.06
+    landmarks = solution.estimate.landmarks
+    found = np.array([one.planar[:2] for one in landmarks.values()])
+    true = np.array([LANDMARKS[int(name[1:])] for name in landmarks])
     p, q = found - found.mean(axis=0), true - true.mean(axis=0)
     angle = np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum())
     c, s = np.cos(angle), np.sin(angle)
     off = p @ np.array([[c, s], [-s, c]]) - q
-    sigmas = np.array([np.sqrt(np.trace(one.covariance)) for one in solution.estimate.landmarks])
+    sigmas = np.array([np.sqrt(np.trace(one.covariance_xy_yaw[:2, :2])) for one in landmarks.values()])
     assert np.all(np.hypot(*off.T) < 3 * sigmas)
     assert np.median(np.hypot(*off.T)) < 0.1
-    known = calibrated(unmapped.team, solution.estimate).landmarks[0]
-    assert known.position == pytest.approx(tuple(solution.estimate.landmarks[0].position))
+    known = solution.estimate.calibration.of_team(unmapped.team).landmarks[0]
+    assert known.position == pytest.approx(next(iter(landmarks.values())).planar[:2])
 
 
 def test_a_map_that_lies_elsewhere_moves_the_estimate_with_it_and_nothing_else(folder, batch):
     made = make(folder / "moved", seed=1, seconds=40.0, turned=1.0, shifted=(5.0, -2.0))
     import_mrclam(made.path, folder / "moved.mcap")
-    moved = solve_drive(open_run(folder / "moved.mcap"))
+    moved = solve(open_run(folder / "moved.mcap"))
     T = np.eye(4)
     T[:2, :2] = [[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]]
     T[:2, 3] = 5.0, -2.0
@@ -139,13 +141,18 @@ def test_a_map_that_lies_elsewhere_moves_the_estimate_with_it_and_nothing_else(f
 
 
 def test_what_was_read_wrong_is_doubted_and_moves_nothing(run, batch):
-    drive = batch.estimate.drive
+    drive = batch.estimate.ranging.keyframes
     target, robots = drive.measured.target.copy(), len(drive.robots)
     landmarks = np.flatnonzero((target >= robots) & (drive.measured.share[:, 0] > 0.3))
     wrong = landmarks[10::8]
     target[wrong] = robots + (target[wrong] - robots + 3) % len(drive.landmarks)
-    estimate = optimise_drive(run.team, replace(drive, measured=replace(drive.measured, target=target)))
-    assert set(wrong) == set(np.flatnonzero(estimate.doubted))
+    estimate = optimise_keyframes(run.team, replace(drive, measured=replace(drive.measured, target=target)))
+    assert (
+        set(wrong)
+        == set(np.flatnonzero(estimate.ranging.outliers))
+        == {one.measurement.row for one in estimate.rejected}
+    )
+    assert all("an outlier: " in one.reason for one in estimate.rejected)
     for robot, trajectory in batch.estimate.trajectories.items():
         off = estimate.trajectories[robot].positions - trajectory.positions
         assert np.sqrt((off**2).sum(axis=1).mean()) < 0.02
@@ -162,7 +169,7 @@ def test_the_filter_needs_no_first_poses(run):
 def test_that_a_range_is_a_depth_and_longer_to_robots_is_found_out(run, batch):
     sigmas = []
     for robot in run.team.names:
-        errors, C = batch.estimate.errors[robot].ranging
+        errors, C = batch.estimate.calibration.sensors[robot].errors.ranging
         off = errors[5:] - (DEPTH - run.team[robot].ranging.depth, ROBOT_OFFSET)
         sigmas.append(np.sqrt(np.diagonal(C)[5:]))
         assert np.all(np.abs(off) < 4 * sigmas[-1])
@@ -269,7 +276,7 @@ def test_second_by_second_it_is_the_same_as_all_at_once(somewhere):
 
 def test_what_has_left_the_window_is_not_forgotten(run, batch):
     drive = keyframes_of(run)
-    one = IncrementalDrive(run.team, drive, lag=10.0, calibrating=12.0)
+    one = IncrementalKeyframes(run.team, drive, lag=10.0, calibrating=12.0)
     start = min(times[0] for times in drive.times)
     for second in range(1, 42):
         latest = one.advance(start + second)
@@ -278,8 +285,8 @@ def test_what_has_left_the_window_is_not_forgotten(run, batch):
     for robot in run.team.names:
         # of wheels and sensors as much is known as in batch
         for kind in ("wheels", "ranging"):
-            found, C = getattr(estimate.errors[robot], kind)
-            best, best_C = getattr(batch.estimate.errors[robot], kind)
+            found, C = getattr(estimate.calibration.sensors[robot].errors, kind)
+            best, best_C = getattr(batch.estimate.calibration.sensors[robot].errors, kind)
             assert np.all(np.abs(found - best) < 1.5 * np.sqrt(np.diagonal(best_C)))
             assert np.allclose(np.sqrt(np.diagonal(C)), np.sqrt(np.diagonal(best_C)), rtol=0.3)
         off = estimate.trajectories[robot].positions - batch.estimate.trajectories[robot].positions
@@ -347,7 +354,7 @@ def test_ranges_where_there_is_no_odometry_are_left_out_and_counted(tmp_path):
 def test_one_landmark_alone_places_nobody(tmp_path, capsys):
     path = write(tmp_path / "run.mcap")
     assert main(["solve", str(path), "--out", str(tmp_path / "result")]) == 2
-    assert "no robot's measurements say where it is" in capsys.readouterr().err
+    assert "a robot must observe at least two landmarks" in capsys.readouterr().err
     assert not (tmp_path / "result").exists()
 
 
@@ -364,7 +371,12 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     printed = capsys.readouterr().out
     assert "RMS position" in printed and "3 robots" not in printed
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["method"] == "incremental" and summary["world"] == "map"
+    assert (
+        summary["format"] == 1
+        and summary["method"] == "ranging"
+        and summary["incremental"]
+        and summary["world"] == "map"
+    )
     assert summary["online_accuracy"]["ate_m"] > summary["accuracy"]["ate_m"] > 0
     rows = (out / "measurements.csv").read_text().splitlines()
     assert len(rows) == 1 + summary["measurements"]["used"] + summary["measurements"]["rejected"]
@@ -373,37 +385,41 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
         *("trajectories", "online"),
     }
     report = (out / "report.html").read_text()
-    assert "the landmarks&#x27; map" in report or "the landmarks' map" in report
+    assert "the map of the landmarks" in report
     assert report.count("<svg") >= 2
     assert main(["evaluate", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ate_m"] == pytest.approx(summary["accuracy"]["ate_m"])
     assert main(["solve", str(run.path), "--out", str(out), "--method", "chain"]) == 2
     capsys.readouterr()
     assert main(["export", "g2o", str(out), "--out", str(tmp_path / "x.g2o")]) == 2
-    assert "of robots that drive, without stances" in capsys.readouterr().err
-    assert main(["view", str(run.path)]) == 2
-    assert "is solved by its ranges: solve it, and view the folder of its result" in capsys.readouterr().err
+    assert "is of a ranging run, whose ranges and bearings g2o files" in capsys.readouterr().err
     assert main(["export", "ros2", str(out), "--out", str(tmp_path / "x.mcap")]) == 0
     landmarks = (out / "landmarks.csv").read_text().splitlines()
-    assert landmarks[0].startswith("name,x,y,x_sigma,y_sigma") and len(landmarks) == 1 + len(LANDMARKS)
+    assert (
+        landmarks[0].startswith("name,x,y,yaw_deg,x_sigma,y_sigma")
+        and ",," in landmarks[1]
+        and len(landmarks) == 1 + len(LANDMARKS)
+    )
     assert main(["info", str(run.path)]) == 0
     page = tmp_path / "page.html"
     assert main(["view", str(out), "--export", str(page)]) == 0 and page.stat().st_size > 100_000
-    (out / "measurements.csv").write_text("\n".join([*rows[:9], "soon,R1,R2,1,0,1,1,0,0,no"]) + "\n")
+    (out / "measurements.csv").write_text("\n".join([*rows[:9], rows[9].replace(rows[9].split(",")[3], "soon")]) + "\n")
     assert main(["view", str(out), "--export", str(page)]) == 2
     assert "measurements.csv is damaged" in capsys.readouterr().err
 
 
 def test_the_viewer_shows_where_each_was_and_what_it_measured(run, batch, tmp_path):
-    write_drive_result(batch, tmp_path / "result")
+    write_result(batch, tmp_path / "result")
     table = tmp_path / "result" / "measurements.csv"
     head, *rows = table.read_text().splitlines()
     doubted = np.arange(len(rows)) % 100 < 50
-    rows = [row.removesuffix("no") + "yes" if off else row for row, off in zip(rows, doubted, strict=True)]
+    rows = [
+        row.replace("range,yes,", "range,no,doubtful") if off else row for row, off in zip(rows, doubted, strict=True)
+    ]
     table.write_text("\n".join([head, *rows]) + "\n")
     scene = scene_of_result(tmp_path / "result")
     estimated, true = scene.layers
-    truth = assess_drive(batch).true
+    truth = assess(batch)[1]
     trajectories = batch.estimate.trajectories
     for number, robot in enumerate(scene.robots):
         rows = estimated.rows[number]
@@ -419,8 +435,8 @@ def test_the_viewer_shows_where_each_was_and_what_it_measured(run, batch, tmp_pa
         np.testing.assert_allclose(true.xyz[number, rows][there], known[there][:, :3, 3], atol=1e-6)
     links, seen = scene.sightings, scene.landmarks.sightings
     assert len(scene.landmarks) == len(LANDMARKS) and len(links) > 10 and len(seen) > 20
-    m, names = batch.estimate.drive.measured, (*batch.estimate.drive.robots, *batch.estimate.drive.landmarks)
-    used = np.isfinite(batch.estimate.residuals[:, 0]) & ~doubted
+    m, names = batch.estimate.ranging.keyframes.measured, batch.estimate.ranging.names
+    used = batch.estimate.ranging.used & ~doubted
     told = {
         (int(np.floor(m.time[n] - scene.starts[0] + 1e-9)), names[m.robot[n]], names[m.target[n]])
         for n in np.flatnonzero(used)
@@ -430,7 +446,7 @@ def test_the_viewer_shows_where_each_was_and_what_it_measured(run, batch, tmp_pa
         (int(k), scene.robots[i], scene.landmarks.names[j]) for k, i, j in zip(seen.rows_j, seen.i, seen.j, strict=True)
     }
     assert shown == told
-    known = {one.name: one.position for one in batch.estimate.landmarks}
+    known = {name: one.planar[:2] for name, one in batch.estimate.landmarks.items()}
     for name, place in zip(scene.landmarks.names, scene.landmarks.xy, strict=True):
         np.testing.assert_allclose(place, known[name], atol=1e-6)
 
@@ -449,6 +465,6 @@ def test_exact_wheels_and_sensors_are_no_variables(run):
             for robot in run.team.robots
         ),
     )
-    estimate = optimise_drive(exact, keyframes_of(replace(run, team=exact)), calibrate_noise=False)
-    assert all(one.wheels is None and one.ranging is None for one in estimate.errors.values())
+    estimate = optimise_keyframes(exact, keyframes_of(replace(run, team=exact)), calibrate_noise=False)
+    assert not estimate.calibration
     assert set(estimate.trajectories) == set(run.team.names)

@@ -76,8 +76,8 @@ def test_robots_belong_to_a_team_only(tmp_path):
 
 def test_a_team_is_solved_and_its_covariances_are_believable(ten):
     solution = solve(ten, SolveOptions())
-    assert not solution.estimate.untied
-    assert not solution.estimate.refused
+    assert not solution.estimate.disconnected
+    assert not solution.estimate.rejected
     assert 0.8 < solution.estimate.chi2 / solution.estimate.dof < 1.25
     accuracy, _ = assess(solution)
     assert len(accuracy.robots) == 10
@@ -147,7 +147,7 @@ def test_robots_that_share_no_view_of_a_mover_are_tied_by_seeing_each_other_stan
         assert before is None or not {one.observer, one.seen} <= set(stance.anchors) & set(before.observers)
     monkeypatch.setattr(stance_solver, "sight_standing", lambda *_: [])
     without = solve(ten, SolveOptions(odometry=False)).estimate
-    assert without.untied
+    assert without.disconnected
 
 
 def test_pixels_that_three_observers_share_count_once():

@@ -14,7 +14,7 @@ from coloc_graph.evaluation import ALIGNMENTS
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.geometry.lie import floor_pose, se3_exp
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.results.writer import read_result
+from coloc_graph.results.folder import read_result
 from coloc_graph.run import read_truth
 
 EVO = Path(__file__).parents[1] / "evaluation" / "evo"

@@ -10,7 +10,9 @@ import pytest
 
 from coloc_graph.errors import InputError
 from coloc_graph.pipeline.batch import solve
-from coloc_graph.results.writer import MEASUREMENT_COLUMNS, read_result, write_result
+from coloc_graph.results.folder import read_result
+from coloc_graph.results.measurement_table import MEASUREMENT_COLUMNS
+from coloc_graph.results.writer import write_result
 from coloc_graph.run import open_run, run_id
 from coloc_graph.simulation import simulate
 from coloc_graph.team import Team
@@ -59,14 +61,23 @@ def test_a_summary_is_json_that_every_program_reads(result):
     json.loads((result / "summary.json").read_text(), parse_constant=refuse)
 
 
-def test_measurements_are_one_row_a_homography(result, solutions):
+def test_measurements_are_one_row_each_of_every_kind(result, solutions):
     with (result / "measurements.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == MEASUREMENT_COLUMNS
-    assert [(row["stance"], row["robot_i"], row["robot_j"]) for row in rows] == [
-        (str(s.index), *s.observers) for s in solutions["joint"].run.stances
+    counts = json.loads((result / "summary.json").read_text())["measurements"]["kinds"]
+    assert set(counts) == {"homography", "sighting", "odometry"}
+    for kind, count in counts.items():
+        own = [row["used"] for row in rows if row["kind"] == kind]
+        assert (own.count("yes"), own.count("no")) == (count["used"], count["rejected"]) and count["used"]
+    assert all(0 < float(row["residual"]) < 6 for row in rows)
+    odometry = [(row["robot_i"], row["robot_j"]) for row in rows if row["kind"] == "odometry"]
+    assert all(i == j for i, j in odometry)
+    rows = [row for row in rows if row["kind"] == "homography"]
+    assert [(row["index_i"], row["index_j"], row["robot_i"], row["robot_j"]) for row in rows] == [
+        (str(s.index), str(s.index), *s.observers) for s in solutions["joint"].run.stances
     ]
-    assert {row["usable"] for row in rows} == {"yes"}
+    assert {row["used"] for row in rows} == {"yes"}
     for row, measured in zip(rows, solutions["joint"].measurements, strict=True):
         assert int(row["inliers"]) == measured.homography.inliers <= int(row["points"])
         distance = np.linalg.norm(measured.relative_pose.T_i_j[:3, 3])

@@ -1,4 +1,4 @@
-"""The most likely poses, landmarks and errors of a whole drive together: `optimise_drive`."""
+"""Maximum-likelihood poses, landmarks and sensor errors of a whole ranging run."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.planar.estimate import DriveEstimate, Errors
+from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.planar.factors import DriveFactors, Rows, State, robust
 from coloc_graph.backend.planar.filter import Filtered, Models, filter_forward
 from coloc_graph.backend.planar.slices import Slices, slices_of
-from coloc_graph.backend.planar.summary import DOUBTED, Found, measured_off, summed_up
+from coloc_graph.backend.planar.summary import OUTLIER, Found, measured_off, ranging_estimate
+from coloc_graph.backend.sensor_calibration import SensorErrors
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Drive
 from coloc_graph.team import Team
@@ -32,8 +33,8 @@ CHECK = (
 NOISE_RANGE = (0.2, 5.0)
 
 
-def optimise_drive(team: Team, drive: Drive, *, calibrate_noise: bool = True) -> DriveEstimate:
-    """The most likely of all, given all steps and measurements, from where a filter sees it.
+def optimise_keyframes(team: Team, drive: Drive, *, calibrate_noise: bool = True) -> Estimate:
+    """Estimate everything together, given all steps and measurements; a filter gives the initial values.
 
     Noise of measurements is what the team states, times what makes it that of the residuals (`calibrate_noise`), by
     robot and kind. That of steps is as stated: errors of wheels last, and one step says nothing of them.
@@ -43,7 +44,7 @@ def optimise_drive(team: Team, drive: Drive, *, calibrate_noise: bool = True) ->
     models = Models(team, drive)
     if not filtered.placed_at:
         raise EstimationError(
-            "no robot's measurements say where it is: let one see two landmarks of known positions several times"
+            "no robot can be placed: a robot must observe at least two landmarks with known positions, several times"
         )
     factors = DriveFactors(drive, models)
     fit = _fitted(factors, _start(filtered, factors))
@@ -55,7 +56,7 @@ def optimise_drive(team: Team, drive: Drive, *, calibrate_noise: bool = True) ->
         iterations += fit.iterations
     taken = np.zeros(len(drive.measured), bool)
     taken[fit.problem.measured] = True
-    return summed_up(factors, _found(factors, filtered, fit), taken, iterations, absorbed)
+    return ranging_estimate(factors, _found(factors, filtered, fit), taken, iterations, absorbed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +190,7 @@ def _found(factors: DriveFactors, filtered: Filtered, fit: _Fit) -> Found:
         covariances[poses] = pose_covariances(state.poses[poses], joint)
     C = whole_covariance(factors, fit.shared)
     errors = [
-        factors.errors_in(robot, state.shared, C) if robot in filtered.placed_at else Errors(None, None)
+        factors.errors_in(robot, state.shared, C) if robot in filtered.placed_at else SensorErrors(None, None)
         for robot in range(len(factors.drive.robots))
     ]
     seen = np.flatnonzero(np.isfinite(filtered.landmarks[:, 0])).tolist()
@@ -207,7 +208,7 @@ def _noise(factors: DriveFactors, fit: _Fit) -> tuple[Array, float]:
     taken = _taken(fit)
     share, robots = m.share[index], m.robot[index]
     off = measured_off(factors, fit.state)[index]
-    good = np.abs(off).max(axis=1, initial=0.0) < DOUBTED
+    good = np.abs(off).max(axis=1, initial=0.0) < OUTLIER
     noise = factors.noise.copy()
     for robot in np.unique(robots[good]).tolist():
         own = good & (robots == robot)

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.planar.estimate import Errors
 from coloc_graph.backend.planar.filter import Models
 from coloc_graph.backend.planar.model import RANGING, WHEELS
+from coloc_graph.backend.sensor_calibration import SensorErrors
 from coloc_graph.geometry.se2 import wrap
 from coloc_graph.measurements import Drive
 
@@ -181,7 +181,7 @@ class DriveFactors:
         J[0, :, :3], J[0, :, 3] = np.eye(3), state.poses[pose] - at
         return Rows(J / GAUGE_SIGMA, 3 * np.array([[pose]]) + np.arange(3))
 
-    def errors_in(self, robot: int, shared: Array, covariance: Array) -> Errors:
+    def errors_in(self, robot: int, shared: Array, covariance: Array) -> SensorErrors:
         """What is off of a robot's wheels and sensor, of the covariance (m, m) of all that is shared."""
         found = []
         for start, size, sigmas in (
@@ -190,7 +190,7 @@ class DriveFactors:
         ):
             at = slice(start, start + size)
             found.append((shared[at], covariance[at, at]) if sigmas.any() else None)
-        return Errors(*found)
+        return SensorErrors(*found)
 
     def landmark_covariance(self, landmark: int, covariance: Array) -> Array:
         """That of a landmark (2, 2), of the covariance (m, m) of all that is shared."""

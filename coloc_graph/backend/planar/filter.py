@@ -65,6 +65,7 @@ class Models:
     """The wheels and sensors of a team, with what is known of their errors."""
 
     def __init__(self, team: Team, drive: Drive) -> None:
+        self.team = team
         robots = [team[name] for name in drive.robots]
         self.wheels = [
             WheelsModel(steps, robot.wheels or Wheels()) for robot, steps in zip(robots, drive.steps, strict=True)

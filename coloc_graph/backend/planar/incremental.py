@@ -1,4 +1,4 @@
-"""A drive as it happens: the most likely of the last while, and what came before summed up: `IncrementalDrive`.
+"""A drive as it happens: the most likely of the last while, and what came before summed up: `IncrementalKeyframes`.
 
 A filter goes along for where robots and landmarks first appear. What is estimated of a keyframe is kept twice: at its
 time, and as it leaves the window, by when what came after it has had its say.
@@ -9,12 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.planar.batch import found_landmarks, pose_covariances, whole_covariance
-from coloc_graph.backend.planar.estimate import DriveEstimate, Errors, trajectory
 from coloc_graph.backend.planar.factors import DriveFactors, State, robust
 from coloc_graph.backend.planar.filter import Filter
 from coloc_graph.backend.planar.slices import Slices, Summary, slices_of
-from coloc_graph.backend.planar.summary import Found, summed_up
+from coloc_graph.backend.planar.summary import Found, ranging_estimate
+from coloc_graph.backend.planar.trajectory import trajectory
+from coloc_graph.backend.sensor_calibration import SensorErrors
 from coloc_graph.geometry.se2 import compose
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Drive
@@ -50,7 +52,7 @@ class _Solved:
     shared: Array
 
 
-class IncrementalDrive:
+class IncrementalKeyframes:
     """Estimates a drive in the order of time: `advance` takes in what was measured until a time.
 
     Poses are corrected for `lag` [s] after their time, and all of them until `calibrating` [s] after the first.
@@ -234,7 +236,7 @@ class IncrementalDrive:
             if not wanted:
                 return
 
-    def finish(self) -> tuple[DriveEstimate, dict[str, Trajectory]]:
+    def finish(self) -> tuple[Estimate, dict[str, Trajectory]]:
         """The estimate of all keyframes as they left, and, by robot, what was thought of each at its time."""
         factors, state = self._factors, self._state
         C = np.zeros((len(factors.free),) * 2)
@@ -243,12 +245,12 @@ class IncrementalDrive:
             self._note_leaving(self._solved.slices.count)
             C = whole_covariance(factors, self._solved.shared)
         errors = [
-            factors.errors_in(robot, state.shared, C) if count else Errors(None, None)
+            factors.errors_in(robot, state.shared, C) if count else SensorErrors(None, None)
             for robot, count in enumerate(self._entered)
         ]
         landmarks = found_landmarks(factors, state.shared, C, sorted(self._landmarks))
         found = Found(State(self._smoothed, state.shared), self._smoothed_C, landmarks, errors)
-        estimate = summed_up(factors, found, self._taken, 0)
+        estimate = ranging_estimate(factors, found, self._taken, 0)
         online = {}
         for robot, name in enumerate(self.drive.robots):
             own = slice(factors.first[robot], factors.first[robot + 1])

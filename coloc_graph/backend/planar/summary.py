@@ -1,18 +1,25 @@
-"""How well an estimate of a drive agrees with what was measured, and all that is said of it: `summed_up`."""
+"""The estimate of a ranging run, made of what an optimiser found: `ranging_estimate`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.planar.estimate import DriveEstimate, Errors, PlacedLandmark, trajectory
+from coloc_graph.backend.calibration import Calibration
+from coloc_graph.backend.estimate import Estimate, Rejection
+from coloc_graph.backend.landmarks import Placed
 from coloc_graph.backend.planar.factors import DriveFactors, State
+from coloc_graph.backend.planar.trajectory import trajectory
+from coloc_graph.backend.ranging import RangingProblem
+from coloc_graph.backend.sensor_calibration import CalibratedSensors, SensorErrors
+from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.team import Landmark
 
 Array = NDArray[np.float64]
 
-#: A measurement further off than this in one of its numbers [sigmas] is of something else.
-DOUBTED = 6.0
+OUTLIER = 6.0  # residual of a range or bearing beyond which a measurement is an outlier [sigmas]
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +30,7 @@ class Found:
     state: State
     covariances: Array
     landmarks: Mapping[int, tuple[Array, Array]]
-    errors: Sequence[Errors]
+    errors: Sequence[SensorErrors]
 
 
 def measured_off(factors: DriveFactors, state: State) -> Array:
@@ -32,10 +39,10 @@ def measured_off(factors: DriveFactors, state: State) -> Array:
     return factors.measured(state, np.arange(len(m))).residuals / np.sqrt(m.share)
 
 
-def summed_up(
+def ranging_estimate(
     factors: DriveFactors, found: Found, taken: NDArray[np.bool_], iterations: int, absorbed: float | None = None
-) -> DriveEstimate:
-    """The estimate that was found, of the measurements that were taken in.
+) -> Estimate:
+    """Return the estimate of what was found, of the measurements that were taken in.
 
     `absorbed` are the degrees of freedom that a fit of all of it together leaves beyond what shares say; without it
     there is no chi2.
@@ -43,41 +50,55 @@ def summed_up(
     drive, models = factors.drive, factors.models
     off = np.where(taken[:, None], measured_off(factors, found.state), np.nan)
     valid = np.isfinite(off[:, 0])
-    doubted = valid & (np.abs(np.where(valid[:, None], off, 0.0)).max(axis=1, initial=0.0) > DOUBTED)
-    good = valid & ~doubted
+    outliers = valid & (np.abs(np.where(valid[:, None], off, 0.0)).max(axis=1, initial=0.0) > OUTLIER)
+    good = valid & ~outliers
     share = drive.measured.share[good]
     chi2, dof = float((share * off[good] ** 2).sum()), float(share.sum())
-    trajectories, unplaced = {}, []
+    trajectories, numbers, disconnected = {}, {}, []
     for robot, (name, times) in enumerate(zip(drive.robots, drive.times, strict=True)):
         own = np.arange(factors.first[robot], factors.first[robot + 1])
         poses, covariances = found.state.poses[own], found.covariances[own]
         there = np.isfinite(poses[:, 0])
+        disconnected += [(name, number) for number in np.flatnonzero(~there).tolist()]
         if not there.any():
-            unplaced.append(name)
             continue
         trajectories[name] = trajectory(name, times[there], poses[there], covariances[there])
+        numbers[name] = np.flatnonzero(there)
         steps = factors.steps(found.state, own[:-1]).residuals
         chi2 += float(np.nansum(steps**2))
         dof += 3.0 * np.isfinite(steps[:, 0]).sum() - 3.0 * there.sum()
-    counts = np.bincount(drive.measured.target[valid], minlength=len(drive.robots) + len(drive.landmarks))
-    landmarks = []
+    landmarks, positions = {}, {}
     for number, name in enumerate(drive.landmarks):
         if number in found.landmarks:
             position, C = found.landmarks[number]
-            stated = bool(np.isfinite(models.map[number, 0]))
-            landmarks.append(PlacedLandmark(name, position, C, stated, int(counts[len(drive.robots) + number])))
-            dof -= 0 if stated else 2
-    return DriveEstimate(
-        drive=drive,
+            landmarks[name] = _placed(position, C)
+            if not np.isfinite(models.map[number, 0]):
+                sigma = float(np.sqrt(np.trace(C) / 2))
+                positions[name] = Landmark(name=name, position=tuple(position.tolist()), position_sigma=sigma)
+                dof -= 2
+    problem = RangingProblem(drive, numbers, off, outliers, factors.noise, models.map_known)
+    sensors = {
+        name: CalibratedSensors(models.team[name], errors, tuple(factors.noise[robot].tolist()))
+        for robot, (name, errors) in enumerate(zip(drive.robots, found.errors, strict=True))
+    }
+    return Estimate(
+        method="ranging",
+        source=problem,
         trajectories=trajectories,
-        landmarks=tuple(landmarks),
-        errors=dict(zip(drive.robots, found.errors, strict=True)),
-        noise=factors.noise,
-        doubted=doubted,
-        residuals=off,
+        disconnected=tuple(disconnected),
         chi2=0.0 if absorbed is None else chi2,
         dof=0.0 if absorbed is None else float(dof) + absorbed + (0 if models.map_known else 3),
         iterations=iterations,
-        on_map=models.map_known,
-        unplaced=tuple(unplaced),
+        rejected=tuple(
+            Rejection(problem.measurements[row], problem.reason(row) or "") for row in np.flatnonzero(outliers).tolist()
+        ),
+        calibration=Calibration(sensors=sensors, landmarks=positions),
+        landmarks=landmarks,
     )
+
+
+def _placed(position: Array, covariance: Array) -> Placed:
+    """Return a landmark that is a point at (2,) on the floor, with a covariance (2, 2)."""
+    C = np.zeros((6, 6))
+    C[3:5, 3:5] = covariance
+    return Placed(gtsam.Pose3(floor_pose(position[0], position[1], 0.0)), C, has_heading=False)

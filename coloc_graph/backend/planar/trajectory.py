@@ -1,0 +1,21 @@
+"""Trajectories in space of poses on the floor."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+#: Where a pose (x, y, heading) is among the tangent components of one in space.
+PLACE = np.array([3, 4, 2])
+FLAT = 1e-6  # standard deviation of roll, pitch [rad] and height [m] of a pose on the floor
+
+
+def trajectory(robot: str, times: Array, poses: Array, covariances: Array) -> Trajectory:
+    """Return a trajectory of poses (n, 3) x, y, heading, with covariances (n, 3, 3) in the body frame."""
+    C = np.zeros((len(poses), 6, 6))
+    C[:, [0, 1, 5], [0, 1, 5]] = FLAT**2
+    C[:, PLACE[:, None], PLACE] = covariances
+    return Trajectory(robot=robot, times=times, T_world_body=floor_pose(*poses.T), covariances=C)

@@ -1,0 +1,96 @@
+"""The measurements of a ranging run as its estimate sees them, in place of a pose graph."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.measurements import Drive, Node, RangeBearing
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RangingProblem:
+    """Keyframes of a ranging run, and how its measurements agree with the estimate.
+
+    Parameters
+    ----------
+    keyframes : Drive
+        Keyframes, steps between them, and ranges and bearings.
+    numbers : mapping of str to (n,) int
+        By robot, the keyframe of each pose of its trajectory.
+    residuals : (m, 2) float
+        Of ranges and bearings in units of their noise; NaN where a measurement was not used.
+    outliers : (m,) bool
+        Measurements that were rejected: their robust weight is near 0.
+    noise : (robots, 2) float
+        Factors on the stated standard deviations of ranges and of bearings.
+    on_map : bool
+        The world is the map of the landmarks; otherwise it is the first robot's first pose.
+    """
+
+    keyframes: Drive
+    numbers: Mapping[str, NDArray[np.int64]]
+    residuals: Array
+    outliers: NDArray[np.bool_]
+    noise: Array
+    on_map: bool
+
+    def __repr__(self) -> str:
+        return f"RangingProblem({self.keyframes!r}, {int(self.outliers.sum())} outliers)"
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Robots, by number."""
+        return self.keyframes.robots
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Robots, then landmarks: the names of `robot` and `target` of the measurements, by number."""
+        return (*self.keyframes.robots, *self.keyframes.landmarks)
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """True where a measurement is in the estimate and is no outlier, (m,)."""
+        return np.isfinite(self.residuals[:, 0]) & ~self.outliers
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of measurements of each landmark, outliers included."""
+        target = self.keyframes.measured.target[np.isfinite(self.residuals[:, 0])]
+        counts = np.bincount(target, minlength=len(self.names)).tolist()
+        return dict(zip(self.keyframes.landmarks, counts[len(self.keyframes.robots) :], strict=True))
+
+    @cached_property
+    def measurements(self) -> tuple[RangeBearing, ...]:
+        """All measurements, one by one."""
+        m, names = self.keyframes.measured, self.names
+        columns = (m.time, m.robot, m.keyframe, m.target, m.target_keyframe, m.range, m.bearing)
+        return tuple(
+            RangeBearing(row, time, names[robot], keyframe, names[target], target_keyframe, distance, bearing)
+            for row, (time, robot, keyframe, target, target_keyframe, distance, bearing) in enumerate(
+                zip(*(column.tolist() for column in columns), strict=True)
+            )
+        )
+
+    def residual(self, measurement: RangeBearing) -> float:
+        """RMS residual of a range and bearing in units of its noise; NaN where it was not used."""
+        return float(np.sqrt(np.mean(self.residuals[measurement.row] ** 2)))
+
+    def nodes(self) -> Iterator[Node]:
+        """Every keyframe of every robot."""
+        for robot, times in zip(self.keyframes.robots, self.keyframes.times, strict=True):
+            for number in range(len(times)):
+                yield robot, number
+
+    def reason(self, row: int) -> str | None:
+        """Return why a measurement is not used; None where it is."""
+        if self.outliers[row]:
+            worst = float(np.abs(self.residuals[row]).max())
+            return f"an outlier: {worst:.1f} sigmas from the estimate"
+        if not np.isfinite(self.residuals[row, 0]):
+            return "one of its ends has no pose"
+        return None

@@ -1,0 +1,142 @@
+"""Reasons and warnings of a solution, in words."""
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+from scipy.special import chdtrc
+
+from coloc_graph.backend import DisconnectedComponent, Estimate
+from coloc_graph.backend.ranging import RangingProblem
+from coloc_graph.frontend import PairMeasurement, little_in_common
+from coloc_graph.frontend.pairing.plane_check import implausible
+from coloc_graph.pipeline.options import SolveOptions
+from coloc_graph.run import Run
+
+LEAST_CHANCE = 1e-4  # probability of a chi2 by noise alone below which measurements are warned to disagree
+REASONS_NAMED = 3  # kinds of reasons that are named where no measurement is usable
+
+
+def reasons(measurements: Sequence[PairMeasurement]) -> str:
+    """Reasons for which all measurements are unusable: one of each kind with its count, most frequent first."""
+    kinds: dict[str, list[str]] = {}
+    for measured in measurements:
+        h = measured.homography
+        kinds.setdefault(_kind(h.unusable or "", h.robot_i, h.robot_j), []).append(
+            f"at stance {h.stance}, {h.robot_i} and {h.robot_j}: {h.unusable}"
+        )
+    by_count = sorted(kinds.values(), key=lambda kind: -len(kind))
+    total = len(measurements)
+    named = [
+        kind[0] + (f" (the same in {len(kind)} of {total} measurements)" if total > 1 else "")
+        for kind in by_count[:REASONS_NAMED]
+    ]
+    more = sum(map(len, by_count[REASONS_NAMED:]))
+    return "; ".join([*named, f"and {more} more for other reasons"] if more else named)
+
+
+def _kind(reason: str, *robots: str) -> str:
+    """A reason without the numbers and names that differ from stance to stance."""
+    for robot in robots:
+        reason = re.sub(rf"\b{re.escape(robot)}\b", "?", reason)
+    reason = re.sub(r"`[^`]*`(, `[^`]*`)*", "?", reason)
+    return re.sub(r"\d+(\.\d+)?(e[+-]?\d+)?", "?", reason)
+
+
+def implausible_planes(run: Run, options: SolveOptions, measurements: Sequence[PairMeasurement]) -> Iterator[str]:
+    """Stated planes that contradict the markers seen in them: the first of each observer, and the number of others."""
+    if options.by_span:
+        return  # the stated distance is not used
+    stances = {stance.index: stance for stance in run.stances}
+    found: dict[str, list[tuple[int, str]]] = {}
+    for measured in measurements:
+        if measured.correspondences is not None:
+            robot, stance = measured.homography.robot_i, stances[measured.homography.stance]
+            what = implausible(run, stance, robot, measured.correspondences)
+            if what is not None and stance.index not in [index for index, _ in found.get(robot, [])]:
+                found.setdefault(robot, []).append((stance.index, what))
+    for each in found.values():
+        others = len(each) - 1
+        yield f"stance {each[0][0]}{f' (and {others} more alike)' if others else ''}: {each[0][1]}"
+
+
+def why_disconnected(disconnected: tuple[DisconnectedComponent, ...], measurements: Iterable[PairMeasurement]) -> str:
+    """The first unusable measurement, or else what would tie the first disconnected part."""
+    unusable = [m.homography for m in measurements if m.homography.unusable]
+    if unusable:
+        return f"stance {unusable[0].stance}, {unusable[0].robot_i} and {unusable[0].robot_j}: {unusable[0].unusable}"
+    return str(disconnected[0])
+
+
+def warnings_of_graph(
+    estimate: Estimate, disconnected: Sequence[DisconnectedComponent], measurements: Sequence[PairMeasurement]
+) -> list[str]:
+    """Warnings of an estimate of stances: unusable and rejected measurements, bumps, unlikely calibrations, chi2."""
+    stances = estimate.graph.by_index
+    warnings = [
+        f"stance {m.homography.stance}: {m.homography.robot_i} and {m.homography.robot_j} not used: "
+        f"{m.homography.unusable}"
+        for m in measurements
+        if m.homography.unusable and not little_in_common(m.homography, stances[m.homography.stance])
+    ]
+    warnings += [
+        f"stance {m.homography.stance}: {m.homography.robot_i} and {m.homography.robot_j} are used, and doubtful: "
+        f"{m.homography.doubt}"
+        for m in measurements
+        if m.homography.doubt
+    ]
+    warnings += [f"{part} (left out of the result)" for part in disconnected[:REASONS_NAMED]]
+    if len(disconnected) > REASONS_NAMED:
+        warnings.append(f"{len(disconnected) - REASONS_NAMED} more groups of poses are not tied to the reference")
+    warnings += [f"the {one.measurement} is not used: it is {one.reason}" for one in estimate.rejected]
+    warnings += [str(bump) for bump in estimate.bumped]
+    warnings += _far(estimate)
+    chance = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
+    if chance < LEAST_CHANCE:
+        warnings.append(
+            f"the measurements disagree (chi2/dof {estimate.chi2 / estimate.dof:.1f} with {estimate.dof} degrees of "
+            f"freedom, expected 1; noise alone does that {_once_in(chance)}): a robot moved that is called an anchor, "
+            "or mounts, heights, the floor or the noise are not as stated"
+        )
+    return warnings
+
+
+def _once_in(chance: float) -> str:
+    """A small probability in words."""
+    if chance < 1e-9:
+        return "less than once in 1 000 000 000 runs"
+    return f"about once in {10 ** round(-math.log10(chance)):,} runs".replace(",", " ")
+
+
+def warnings_of_ranges(estimate: Estimate) -> list[str]:
+    """Warnings of the estimate of a ranging run: robots without poses, outliers, unlikely calibrations."""
+    problem = estimate.ranging
+    warnings = [
+        f"robot {name} has no poses: it was never measured together with two things whose positions are known"
+        for name in problem.keyframes.robots
+        if name not in estimate.trajectories
+    ]
+    if estimate.rejected:
+        warnings.append(_outliers(problem))
+    return [*warnings, *_far(estimate)]
+
+
+def _outliers(problem: RangingProblem) -> str:
+    m = problem.keyframes.measured
+    pairs: dict[tuple[int, int], int] = {}
+    for row in np.flatnonzero(problem.outliers).tolist():
+        pair = int(m.robot[row]), int(m.target[row])
+        pairs[pair] = pairs.get(pair, 0) + 1
+    (robot, target), most = max(pairs.items(), key=lambda one: one[1])
+    return (
+        f"{sum(pairs.values())} of {len(m)} measurements were rejected as outliers (robust weight near 0), "
+        f"{most} of them of {problem.names[target]} by {problem.names[robot]}"
+    )
+
+
+def _far(estimate: Estimate) -> list[str]:
+    return [
+        f"{row} is {row.sigmas:.1f} sigmas from what the team states: measure it again, or state it so"
+        for row in estimate.calibration.far
+    ]

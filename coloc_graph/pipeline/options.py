@@ -1,0 +1,67 @@
+"""Everything that a result depends on besides the run: `SolveOptions`."""
+
+from dataclasses import dataclass, replace
+from typing import get_args
+
+from coloc_graph.backend import Method, loosened
+from coloc_graph.errors import InputError
+from coloc_graph.frontend import FrontendOptions
+from coloc_graph.team import Robot, Team
+
+METHODS: tuple[Method, ...] = get_args(Method)
+
+UNKNOWN_HEIGHT = 0.1  # tolerance of camera heights where the scale comes from the markers' span alone [m]
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """Everything that a result depends on besides the run.
+
+    Parameters
+    ----------
+    method : {"joint", "smooth", "chain"}, optional
+        Of a run with stances. `chain` is the paper: homographies by least squares in one image, eq. (2), composition.
+        `smooth` takes maximum-likelihood homographies and relative poses into a pose graph, with odometry and
+        sightings of the movers. `joint` (the default) takes the homographies themselves, and calibrates mounts,
+        markers and clocks along with the poses.
+    frontend : FrontendOptions, optional
+        Of a run with stances: how images are measured. The default belongs to the method.
+    odometry : bool
+        Use wheel odometry. A run with ranges alone cannot do without.
+    incremental : bool
+        Measure and enter in the order of time, as a team in the field would.
+    between_robots : bool
+        Of a run with ranges: use the ranges between robots, not those to landmarks alone.
+    """
+
+    method: Method | None = None
+    frontend: FrontendOptions | None = None
+    odometry: bool = True
+    incremental: bool = False
+    between_robots: bool = True
+
+    def __post_init__(self) -> None:
+        if self.method is not None and self.method not in METHODS:
+            raise InputError(f"there is no method `{self.method}`; choose one of {', '.join(METHODS)}")
+        if self.incremental and self.method == "chain":
+            raise InputError("a chain is composed, and never incremental: leave out `incremental`, or use joint")
+
+    def resolved(self) -> "SolveOptions":
+        """Return the options of a run with stances, with the default method and front end where none is chosen."""
+        method = self.method or "joint"
+        paper = FrontendOptions(criterion="transfer", pose="eq2")
+        return replace(
+            self, method=method, frontend=self.frontend or (paper if method == "chain" else FrontendOptions())
+        )
+
+    @property
+    def by_span(self) -> bool:
+        """Return whether the scale comes from the markers' span alone."""
+        return self.frontend is not None and self.frontend.scale == "span"
+
+    def rigs(self, team: Team) -> dict[str, Robot]:
+        """Return the robots that a joint estimate calibrates; none of another method."""
+        if self.method != "joint":
+            return {}
+        rigs = {robot.name: robot for robot in team.robots}
+        return dict(loosened(rigs, UNKNOWN_HEIGHT)) if self.by_span else rigs

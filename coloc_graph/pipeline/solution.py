@@ -1,0 +1,113 @@
+"""Result of a solve: `Solution`."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from coloc_graph.backend import Estimate
+from coloc_graph.backend.graph import Link
+from coloc_graph.frontend import PairMeasurement
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.measurements import Odometry, RelativePose, Sighting
+from coloc_graph.pipeline.contents import Unused
+from coloc_graph.pipeline.options import SolveOptions
+from coloc_graph.run import Run
+
+
+@dataclass(frozen=True)
+class Count:
+    """Number of measurements of a kind that are in an estimate, and that are not."""
+
+    used: int
+    rejected: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Solution:
+    """A solved run: the estimate, what it was made of, and how long it took.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    options : SolveOptions
+        What it was solved with.
+    estimate : Estimate
+        The poses, and all that was found along.
+    measurements : tuple of PairMeasurement
+        Of a run with stances: every pair of observers of every stance, unusable ones too.
+    warnings : tuple of str
+        Sentences on what was left out, and on what looks wrong.
+    seconds_frontend, seconds_backend : float
+        Time it took [s].
+    seconds_updates : tuple of float
+        Time of each update of an incremental estimate [s]; () in batch.
+    unused : tuple of Unused
+        Recorded data that the estimate does not use.
+    online : mapping of str to Trajectory
+        Of an incremental estimate of a ranging run: each pose as it was estimated at its time.
+    """
+
+    run: Run
+    options: SolveOptions
+    estimate: Estimate
+    measurements: tuple[PairMeasurement, ...]
+    warnings: tuple[str, ...]
+    seconds_frontend: float
+    seconds_backend: float
+    seconds_updates: tuple[float, ...] = ()
+    unused: tuple[Unused, ...] = ()
+    online: Mapping[str, Trajectory] = field(default_factory=dict)
+
+    def why_not(self, measured: PairMeasurement) -> str | None:
+        """Return why a pair's measurement is not in the estimate; None where it is."""
+        if measured.homography.unusable is not None:
+            return measured.homography.unusable
+        pose = measured.relative_pose
+        return None if pose is None else self.reason(pose)
+
+    def reason(self, link: Link) -> str | None:
+        """Return why a measurement of the graph is not in the estimate; None where it is."""
+        if id(link) in self._rejected:
+            return self._rejected[id(link)]
+        return "not tied to the reference" if not self._disconnected.isdisjoint(link.ends) else None
+
+    @cached_property
+    def _rejected(self) -> dict[int, str]:
+        return {id(one.measurement): one.reason for one in self.estimate.rejected}
+
+    @cached_property
+    def _disconnected(self) -> frozenset[tuple[str, int]]:
+        return frozenset(self.estimate.disconnected)
+
+    @property
+    def links(self) -> Iterator[tuple[str, Sighting | Odometry, str | None]]:
+        """Sightings and odometry of the graph: kind, measurement, and the reason where it is not used."""
+        for one in self.estimate.graph.measurements:
+            if not isinstance(one, RelativePose):
+                yield ("odometry" if isinstance(one, Odometry) else "sighting"), one, self.reason(one)
+
+    @cached_property
+    def counts(self) -> dict[str, Count]:
+        """Number of measurements by kind: `homography`, `sighting` and `odometry`, or `range`."""
+        if self.estimate.is_ranging:
+            used = self.estimate.ranging.used
+            return {"range": Count(int(np.count_nonzero(used)), int(np.count_nonzero(~used)))}
+        reasons: dict[str, list[str | None]] = {"homography": [self.why_not(one) for one in self.measurements]}
+        for kind, _, reason in self.links:
+            reasons.setdefault(kind, []).append(reason)
+        return {kind: Count(found.count(None), len(found) - found.count(None)) for kind, found in reasons.items()}
+
+    @property
+    def count(self) -> Count:
+        """Number of homographies, or of ranges."""
+        return next(iter(self.counts.values()))
+
+    def __repr__(self) -> str:
+        count = self.count
+        return (
+            f"Solution({self.run!r}, {self.estimate.method}, {count.used} of {count.used + count.rejected} "
+            f"measurements used, {len(self.warnings)} warnings)"
+        )
