@@ -20,12 +20,12 @@ def run(args: argparse.Namespace) -> int:
     """Look and print."""
     from coloc_graph.cli.printing import counted, print_json, print_table
     from coloc_graph.pipeline.inspection import inspect, landmarks_seen
-    from coloc_graph.run import open_run, read_truth
+    from coloc_graph.run import open_run, truth_counts
     from coloc_graph.run.schemas import topic_of
 
     opened = open_run(args.run_path)
     findings, landmarks = inspect(opened), landmarks_seen(opened)
-    truth = {robot: len(poses) for robot, poses in sorted(read_truth(args.run_path).items())}
+    truth = dict(sorted(truth_counts(args.run_path).items()))
     topics = opened.topics | {topic_of(robot, "truth"): count for robot, count in truth.items()}
     seconds = (opened.end - opened.start) if opened.start is not None and opened.end is not None else 0.0
     if args.json:

@@ -83,7 +83,7 @@ def of_result(
     else:
         run = run_path or result.run_path
         result.require_run(run)
-        true = read_truth(run)
+        true = read_truth(run, estimated)
         if not true:
             raise InputError(
                 f"{run}: the run holds no truth to compare with; record it on /<robot>/truth, or give it with --truth"

@@ -60,7 +60,7 @@ def assess_online(solution: Solution, truth_path: str | Path | None = None) -> A
 def _assess(
     solution: Solution, trajectories: Mapping[str, Trajectory], truth_path: str | Path | None
 ) -> tuple[Accuracy, Poses] | None:
-    truth = read_truth(solution.run.path if truth_path is None else truth_path)
+    truth = read_truth(solution.run.path if truth_path is None else truth_path, trajectories)
     if not truth:
         return None
     on_floor, how = solution.run.team.floor is not None, usual_alignment(trajectories)

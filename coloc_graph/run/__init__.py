@@ -16,7 +16,7 @@ from coloc_graph.run.messages import (
     Ranges,
     Stance,
 )
-from coloc_graph.run.reader import Run, open_run, read_true_team, read_truth, run_id
+from coloc_graph.run.reader import Run, open_run, read_true_team, read_truth, run_id, truth_counts
 from coloc_graph.run.recorded import Recorded
 from coloc_graph.run.writer import RunWriter, whole_run
 
@@ -38,5 +38,6 @@ __all__ = [
     "read_true_team",
     "read_truth",
     "run_id",
+    "truth_counts",
     "whole_run",
 ]

@@ -1,7 +1,7 @@
 """`open_run` and the `Run` it gives; `read_truth` and `read_true_team`, which are for evaluation alone."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,8 +13,10 @@ from coloc_graph.run import decode, schemas
 from coloc_graph.run.encode import check_robots, check_targets
 from coloc_graph.run.index import Index, build_index
 from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Planes, Ranges, Stance
-from coloc_graph.run.topics import Item, decoded, read_topic, time_span
+from coloc_graph.run.topics import Item, decoded, read_near, read_topic, time_span
 from coloc_graph.team import Team
+
+SAME_TIME = 1_000  # difference of instants that are the same, by rounding [ns]
 
 #: A run's id is made of at most so many bytes.
 MAX_IDENTIFYING = 1 << 20
@@ -135,18 +137,48 @@ def open_run(path: str | Path) -> Run:
     )
 
 
-def read_truth(path: str | Path) -> dict[str, Trajectory]:
-    """The true trajectories T_world_body, by robot. For evaluation: no estimator may call it."""
+def read_truth(path: str | Path, near: Mapping[str, Trajectory] | None = None) -> dict[str, Trajectory]:
+    """Read the true trajectories T_world_body of a run. For evaluation: no estimator may call it.
+
+    Parameters
+    ----------
+    path : str or Path
+        The run.
+    near : mapping of str to Trajectory, optional
+        Estimated trajectories: of these robots, only the true poses right before and right after each estimated one
+        are read, and the first and the last.
+
+    Returns
+    -------
+    dict of str to Trajectory
+        By robot; {} of a run without truth.
+    """
     index = build_index(Path(path))
     truth = {}
     for topic in dict.fromkeys(info.topic for info in index.channels.values()):
         split = schemas.robot_and_kind(topic)
         if split and split[1] == "truth":
-            items = topic, read_topic(index, topic)
-            poses = list(decoded(index, items, lambda item: (item.ns, decode.decode_pose(item.ns, item.data))))
+            estimated = None if near is None else near.get(split[0])
+            if estimated is None:
+                items = read_topic(index, topic)
+            else:
+                items = iter(read_near(index, topic, [schemas.to_ns(time) + SAME_TIME for time in estimated.times]))
+            poses = list(decoded(index, (topic, items), lambda item: (item.ns, decode.decode_pose(item.ns, item.data))))
             times = np.array([schemas.to_seconds(ns) for ns, _ in poses])
             truth[split[0]] = Trajectory(split[0], times, np.array([T for _, T in poses]).reshape(-1, 4, 4))
     return truth
+
+
+def truth_counts(path: str | Path) -> dict[str, int]:
+    """Return the number of true poses of a run by robot, without reading them."""
+    index = build_index(Path(path))
+    counts: dict[str, int] = {}
+    for chunk in index.chunks:
+        for channel, count in chunk.counts.items():
+            split = schemas.robot_and_kind(index.channels[channel].topic)
+            if split and split[1] == "truth":
+                counts[split[0]] = counts.get(split[0], 0) + count
+    return counts
 
 
 def read_true_team(path: str | Path) -> Team | None:

@@ -1,6 +1,8 @@
 """The messages of one topic, by time and one chunk at a time, from the file to records."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+import itertools
+from bisect import bisect_right
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
 from coloc_graph.errors import RunError
@@ -34,6 +36,13 @@ def read_topic(index: Index, topic: str, first: int = 0, last: int | None = None
     """A topic's messages from `first` to `last` [ns], in the order in which they were written."""
     wanted, chunks = _chunks(index, topic)
     chunks = [chunk for chunk in chunks if chunk.end >= first and (last is None or chunk.start <= last)]
+    for item in _in_order(index, topic, wanted, chunks):
+        if first <= item.ns and (last is None or item.ns <= last):
+            yield item
+
+
+def _in_order(index: Index, topic: str, wanted: dict[int, str], chunks: Iterable[ChunkInfo]) -> Iterator[Item]:
+    """The messages of a topic in some chunks; `RunError` where time runs backwards."""
     before = 0
     for message in _messages(index, topic, wanted, chunks):
         if message.ns < before:
@@ -42,8 +51,27 @@ def read_topic(index: Index, topic: str, first: int = 0, last: int | None = None
                 "write each topic in the order of time"
             )
         before = message.ns
-        if first <= message.ns and (last is None or message.ns <= last):
-            yield Item(message.ns, wanted[message.channel], message.data)
+        yield Item(message.ns, wanted[message.channel], message.data)
+
+
+def read_near(index: Index, topic: str, instants: Sequence[int]) -> list[Item]:
+    """Return a topic's last message up to each instant [ns], the one after it, and the first and last of all.
+
+    Only chunks that can hold one of these are read, where chunks do not overlap in time.
+    """
+    wanted, chunks = _chunks(index, topic)
+    if all(before.end <= after.start for before, after in itertools.pairwise(chunks)):
+        starts, kept = [chunk.start for chunk in chunks], {0, len(chunks) - 1}
+        for instant in instants:
+            at = bisect_right(starts, instant) - 1
+            kept |= {at - 1, at, at + 1}
+        chunks = [chunk for number, chunk in enumerate(chunks) if number in kept]
+    items = list(_in_order(index, topic, wanted, chunks))
+    times, chosen = [item.ns for item in items], {0, len(items) - 1}
+    for instant in instants:
+        at = bisect_right(times, instant) - 1
+        chosen |= {at, at + 1}
+    return [item for number, item in enumerate(items) if number in chosen]
 
 
 def _messages(index: Index, topic: str, channels: Collection[int], chunks: Iterable[ChunkInfo]) -> Iterator[Message]:

@@ -20,7 +20,7 @@ def true_layers(
     alignment: Alignment = "reference",
 ) -> tuple[tuple[Layer, ...], tuple[str, ...]]:
     """The true poses in the estimate's world, at its times, if there are any; and in words where there are none."""
-    truth = read_truth(run.path) if run is not None and any(len(one) for one in estimated.values()) else {}
+    truth = read_truth(run.path, estimated) if run is not None and any(len(one) for one in estimated.values()) else {}
     if run is None or not truth:
         return (), ()
     try:
