@@ -1,7 +1,7 @@
-"""GTSAM factors of a model in numpy, each evaluated alone, or all of a graph at once.
+"""GTSAM factors of numpy models, evaluated one by one or in batches.
 
-GTSAM asks one Python factor after the other; numpy takes as long for one as for thirty. So whoever is asked first at
-some values evaluates all of them there, and the others find their part.
+GTSAM calls one Python factor after the other, and numpy takes as long for one as for thirty. The first factor that is
+called at some values therefore evaluates all of them there; the others look up their part.
 """
 
 from collections import defaultdict
@@ -16,32 +16,43 @@ from coloc_graph.backend.camera_model import BEYOND, Model, Together
 
 Array = NDArray[np.float64]
 
-#: So many are evaluated in one go: more take memory, and are no faster each.
-MOST = 256
+MAX_BATCH_SIZE = 256  # factors evaluated in one call; more take memory and are no faster each
 
 
-class Seen:
-    """What a factor evaluates: a model, on two poses and those of its variables that have a key; the others are 0."""
+class FactorEvaluator:
+    """Callback of a `gtsam.CustomFactor`: residual and Jacobians of a model.
+
+    Parameters
+    ----------
+    model
+        The measurement model.
+    poses
+        Keys of the two poses it is on.
+    keys
+        Keys of its calibration variables; a variable without a key is 0.
+    sizes
+        Dimensions of these variables.
+    """
 
     def __init__(self, model: Model, poses: tuple[int, int], keys: Sequence[int | None], sizes: Sequence[int]) -> None:
         self.model, self.poses, self.keys, self.sizes = model, poses, tuple(keys), tuple(sizes)
         self.variable = [(number, key) for number, key in enumerate(keys) if key is not None]
-        #: With whom it is evaluated; None: alone.
+        #: Factors with which it is evaluated; None: it is evaluated alone.
         self.among: BatchedFactors | None = None
         self._alone: Together | None = None
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        """The whitened residual (rows,), as GTSAM asks for it."""
+        """Whitened residual (rows,); fills the Jacobians that GTSAM passes."""
         found = self.among.at(self, values) if self.among is not None else None
         e, by = self.alone(values) if found is None else found
         if jacobians is not None:
             jacobians[0], jacobians[1] = by[0], by[1]
-            for place, (number, _key) in enumerate(self.variable, start=2):
-                jacobians[place] = by[2 + number]
+            for slot, (number, _key) in enumerate(self.variable, start=2):
+                jacobians[slot] = by[2 + number]
         return e
 
     def alone(self, values: gtsam.Values) -> tuple[Array, list[Array]]:
-        """The whitened residual (rows,), and its Jacobians (rows, size) by both poses and every variable."""
+        """Whitened residual (rows,), and its Jacobians (rows, size) by both poses and every variable."""
         if self._alone is None:
             self._alone = self.model.together([self.model])
         errors = [np.zeros((1, size)) for size in self.sizes]
@@ -53,12 +64,12 @@ class Seen:
 
 
 class BatchedFactor(gtsam.CustomFactor):
-    """The GTSAM factor of what was `seen`."""
+    """GTSAM factor of a `FactorEvaluator`, with unit noise."""
 
-    def __init__(self, seen: Seen) -> None:
-        unit = gtsam.noiseModel.Unit.Create(seen.model.rows)
-        super().__init__(unit, [*seen.poses, *(key for _, key in seen.variable)], seen)
-        self.seen = seen
+    def __init__(self, evaluator: FactorEvaluator) -> None:
+        unit = gtsam.noiseModel.Unit.Create(evaluator.model.rows)
+        super().__init__(unit, [*evaluator.poses, *(key for _, key in evaluator.variable)], evaluator)
+        self.evaluator = evaluator
 
 
 def _evaluated(models: Together, T_i: Array, T_j: Array, errors: Sequence[Array]) -> tuple[Array, list[Array]]:
@@ -72,15 +83,15 @@ def _evaluated(models: Together, T_i: Array, T_j: Array, errors: Sequence[Array]
 
 
 class _Group:
-    """Some of one kind, and where their poses are among those of all."""
+    """Factors of one kind, with the indices of their poses among all."""
 
-    def __init__(self, members: Sequence[Seen], places: dict[int, int]) -> None:
+    def __init__(self, members: Sequence[FactorEvaluator], indices: dict[int, int]) -> None:
         self.members = members
         self._models = members[0].model.together([one.model for one in members])
-        self._ends = [np.array([places[one.poses[end]] for one in members]) for end in (0, 1)]
+        self._ends = [np.array([indices[one.poses[end]] for one in members]) for end in (0, 1)]
 
     def at(self, poses: Array, errors: dict[int, Array]) -> tuple[Array, list[Array]]:
-        """The residuals (n, rows) and their Jacobians, with the errors of the variables by their keys."""
+        """Residuals (n, rows) and their Jacobians; `errors` are the calibration variables by key."""
         slots = []
         for number, size in enumerate(self.members[0].sizes):
             slot = np.zeros((len(self.members), size))
@@ -93,23 +104,25 @@ class _Group:
 
 
 class BatchedFactors:
-    """Factors that are evaluated at once, as long as it is entered (`with`)."""
+    """Context manager within which factors are evaluated in batches."""
 
-    def __init__(self, members: Sequence[Seen]) -> None:
+    def __init__(self, members: Sequence[FactorEvaluator]) -> None:
         self._members = members
         self._poses = list(dict.fromkeys(key for one in members for key in one.poses))
         self._variables = sorted({key for one in members for _, key in one.variable})
-        places = {key: place for place, key in enumerate(self._poses)}
-        kinds: dict[Hashable, list[Seen]] = defaultdict(list)
+        indices = {key: index for index, key in enumerate(self._poses)}
+        kinds: dict[Hashable, list[FactorEvaluator]] = defaultdict(list)
         for one in members:
             kinds[one.model.kind, one.sizes].append(one)
         self._groups = [
-            _Group(some[first : first + MOST], places) for some in kinds.values() for first in range(0, len(some), MOST)
+            _Group(some[first : first + MAX_BATCH_SIZE], indices)
+            for some in kinds.values()
+            for first in range(0, len(some), MAX_BATCH_SIZE)
         ]
-        self._place = {
+        self._index = {
             id(one): (n, row) for n, group in enumerate(self._groups) for row, one in enumerate(group.members)
         }
-        self._where: dict[int, bytes] = {}  # at which poses and errors all were evaluated last
+        self._values: dict[int, bytes] = {}  # poses and calibration variables of the last evaluation
         self._found: list[tuple[Array, list[Array]]] = []
 
     def __enter__(self) -> "BatchedFactors":
@@ -123,19 +136,19 @@ class BatchedFactors:
         for one in self._members:
             one.among = None
 
-    def at(self, member: Seen, values: gtsam.Values) -> tuple[Array, list[Array]] | None:
-        """What `Seen.alone` gives; None where the values are not those of the whole graph."""
-        if not self._is_where(member, values):
+    def at(self, member: FactorEvaluator, values: gtsam.Values) -> tuple[Array, list[Array]] | None:
+        """Result of `FactorEvaluator.alone`, from the batch; None where the values lack a variable of the graph."""
+        if not self._is_current(member, values):
             if not all(map(values.exists, (*self._poses, *self._variables))):
                 return None
             self._evaluate(values)
-        group, row = self._place[id(member)]
+        group, row = self._index[id(member)]
         e, by = self._found[group]
         return e[row], [one[row] for one in by]
 
-    def _is_where(self, member: Seen, values: gtsam.Values) -> bool:
-        """Whether a member is asked for where all were evaluated last."""
-        where = self._where
+    def _is_current(self, member: FactorEvaluator, values: gtsam.Values) -> bool:
+        """True if a member's variables are those of the last evaluation."""
+        where = self._values
         return all(values.atPose3(key).matrix().tobytes() == where.get(key) for key in member.poses) and all(
             values.atVector(key).tobytes() == where.get(key) for _, key in member.variable
         )
@@ -144,5 +157,5 @@ class BatchedFactors:
         poses = [values.atPose3(key).matrix() for key in self._poses]
         errors = {key: values.atVector(key) for key in self._variables}
         self._found = [group.at(np.array(poses), errors) for group in self._groups]
-        self._where = {key: T.tobytes() for key, T in zip(self._poses, poses, strict=True)}
-        self._where |= {key: one.tobytes() for key, one in errors.items()}
+        self._values = {key: T.tobytes() for key, T in zip(self._poses, poses, strict=True)}
+        self._values |= {key: one.tobytes() for key, one in errors.items()}

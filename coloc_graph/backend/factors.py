@@ -174,7 +174,7 @@ class Factors:
             factors.add(self.calibration_prior(key))
         for factor in made:
             factors.add(factor)
-        return factors, tuple(links), BatchedFactors([one.seen for one in made if isinstance(one, BatchedFactor)])
+        return factors, tuple(links), BatchedFactors([one.evaluator for one in made if isinstance(one, BatchedFactor)])
 
     def nominal(self, key: int) -> Array:
         """Where the search for a calibration variable starts: as stated."""

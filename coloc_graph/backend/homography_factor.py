@@ -1,7 +1,7 @@
-"""GTSAM factors of what cameras saw: homographies with the movers' spans, and sighted markers, on poses and mounts.
+"""GTSAM factors of homographies with marker spans, and of sighted markers, on poses and calibration variables.
 
-The mathematics is in `camera_model` and `homography_model`; here it meets keys and values. An exact mount is a
-constant, a stated tolerance a variable, so that a factor's keys are its two poses and what is uncertain of what it saw.
+The models are in `camera_model` and `homography_model`. A mount that is stated as exact is a constant; one with a
+tolerance is a variable, and one of the factor's keys after those of its two poses.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.batched_factors import BatchedFactor, Seen
+from coloc_graph.backend.batched_factors import BatchedFactor, FactorEvaluator
 from coloc_graph.backend.calibration import Variables, sigmas_of_plane
 from coloc_graph.backend.camera_model import MarkersModel
 from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
@@ -19,8 +19,7 @@ from coloc_graph.measurements import RelativePose, Sighting
 
 Array = NDArray[np.float64]
 
-#: A search for one pose takes three steps; more is a search that leads nowhere.
-MOST_STEPS = 8
+MAX_STEPS = 8  # Gauss-Newton steps to one pose; three are usual
 
 
 def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, on_floor: bool) -> BatchedFactor:
@@ -31,7 +30,7 @@ def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, 
     if not link.plane.normal_from_mount:
         plane = StatedPlaneModel(link.homography, link.plane.N / link.plane.d, rig_i.mount, rig_j.mount)
         key = variables.plane(link.robot_i, link.stance, sigmas_of_plane(link))
-        return BatchedFactor(Seen(plane, (i, j), (key,), (3,)))
+        return BatchedFactor(FactorEvaluator(plane, (i, j), (key,), (3,)))
     measured = link.homography
     markers = {robot: rig for robot in link.movers if (rig := variables.rigs[robot].markers) is not None}
     about, tilt_sigma = variables.anchor(link.robot_i)
@@ -43,12 +42,12 @@ def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, 
         *map(variables.markers, model.movers),
         clocks,
     )
-    return BatchedFactor(Seen(model, (i, j), keys, (3, 3, *[2] * len(model.movers), 1)))
+    return BatchedFactor(FactorEvaluator(model, (i, j), keys, (3, 3, *[2] * len(model.movers), 1)))
 
 
 def related(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[[int], Array]) -> gtsam.Pose3:
-    """The pose on the floor of j in i that a homography's factor likes best, with calibration variables at `errors` of
-    their keys; as it was measured where the search for it leads nowhere."""
+    """Most likely pose of j in i on the floor by a homography's factor, with calibration variables at `errors` of their
+    keys; the measured pose where the search diverges."""
     i, j, *variable = map(int, factor.keys())
     values = gtsam.Values()
     values.insert(i, gtsam.Pose3())
@@ -56,7 +55,7 @@ def related(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[
         values.insert(key, errors(key))
     T_i_j = gtsam.Pose3(floor_pose(link.T_i_j[0, 3], link.T_i_j[1, 3], yaw(link.T_i_j)))
     values.insert(j, T_i_j)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         values.update(j, T_i_j)
         A, b = factor.linearize(values).jacobian()
         planar = A[:, 8:11]  # heading, x, y of j
@@ -72,7 +71,7 @@ def related(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[
 def markers_factor(link: Sighting, i: int, j: int, variables: Variables) -> BatchedFactor:
     """The factor of sighted markers on the poses of observer and seen, the observer's mount and the markers."""
     keys = variables.mount(link.observer), variables.markers(link.seen)
-    return BatchedFactor(Seen(_markers_model(link, variables), (i, j), keys, (3, 2)))
+    return BatchedFactor(FactorEvaluator(_markers_model(link, variables), (i, j), keys, (3, 2)))
 
 
 def sighted(link: Sighting, variables: Variables, errors: Callable[[int], Array]) -> gtsam.Pose3:

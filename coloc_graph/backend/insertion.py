@@ -1,4 +1,4 @@
-"""Which links can enter a graph that is there already, in which order, and where the poses they bring start."""
+"""Order in which links enter an existing graph, and initial values of the poses that they bring."""
 
 from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
@@ -13,10 +13,9 @@ from coloc_graph.measurements import Odometry, RelativePose, Sighting
 
 Array = NDArray[np.float64]
 
-#: What is no further than this from where it is expected [m, rad], or than so many sigmas of the wheels that expect it
-#: there, is taken in at once and tested then.
-NEAR = 0.05
-SIGMAS = 6.0
+# a measurement within either of these of its expected value enters at once and is tested afterwards
+INNOVATION_GATE = 0.05  # m, rad
+INNOVATION_GATE_SIGMAS = 6.0  # standard deviations of the odometry that predicts it
 
 #: A link and the keys of its ends.
 Tie = tuple[Link, int, int]
@@ -24,9 +23,12 @@ Tie = tuple[Link, int, int]
 
 @dataclass(frozen=True, eq=False)
 class InsertionPlan:
-    """What one call puts into the graph: where new poses `start`, the `ties` that hold them, measurements that are
-    `near` what these say and are tested when all is in, those that are `far` and are tested before they enter, and
-    what is `loose` still."""
+    """Plan of what one call puts into the graph.
+
+    `start` are the initial values of new poses and `ties` the links that determine them; measurements `near` their
+    expected value are tested when all is in, those `far` from it before they enter. What is `loose` is not connected
+    to the reference yet.
+    """
 
     start: dict[int, gtsam.Pose3]
     ties: list[Tie]
@@ -37,7 +39,7 @@ class InsertionPlan:
 
 class InsertionPlanner:
     """Sorts links by what is `tied` to the reference; `ends` gives their keys, `known` the poses of tied keys, and
-    `errors` what calibration variables are thought to be."""
+    `errors` the estimates of calibration variables."""
 
     def __init__(
         self,
@@ -52,7 +54,7 @@ class InsertionPlanner:
         self._errors = errors
 
     def sort(self, links: list[Link]) -> InsertionPlan:
-        """What hangs on the poses that are tied, what does not yet, and where new poses start."""
+        """Plan the insertion of links, wheel odometry first."""
         start: dict[int, gtsam.Pose3] = {}
         if not self._tied:
             start[self._reference] = gtsam.Pose3()
@@ -60,7 +62,7 @@ class InsertionPlanner:
         near: list[Tie] = []
         far: list[Tie] = []
         rough: dict[int, float] = {}  # started by wheels alone, with their sigma
-        # wheels first: they are seldom wrong by much, so that what they predict can refuse a wrong homography
+        # odometry first: it is seldom wrong by much, so that its prediction can reject a wrong homography
         left = sorted(links, key=lambda link: isinstance(link, RelativePose | Sighting))
         while left:
             still: list[Link] = []
@@ -95,10 +97,10 @@ class InsertionPlanner:
     def _refine(
         self, T_i_j: gtsam.Pose3, i: int, j: int, start: dict[int, gtsam.Pose3], rough: dict[int, float]
     ) -> bool:
-        """Whether a measurement is near what is expected; a new pose that wheels alone placed then starts by it."""
+        """Return whether a measurement is within the innovation gate; then it places what only odometry had placed."""
         T_world_i, T_world_j = self._pose_of(i, start), self._pose_of(j, start)
         off = T_world_i.between(T_world_j).between(T_i_j)
-        near = max(NEAR, SIGMAS * max(rough.get(i, 0.0), rough.get(j, 0.0)))
+        near = max(INNOVATION_GATE, INNOVATION_GATE_SIGMAS * max(rough.get(i, 0.0), rough.get(j, 0.0)))
         if np.abs(off.translation()).max() > near or abs(off.rotation().yaw()) > near:
             return False
         if j in rough:

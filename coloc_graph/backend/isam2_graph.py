@@ -15,7 +15,7 @@ from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_
 from coloc_graph.backend.graph import Link, PoseGraph
 from coloc_graph.backend.insertion import InsertionPlan, Tie
 from coloc_graph.backend.optimize import fit_graph
-from coloc_graph.backend.solver import CALIBRATED, isam_parameters, joint_covariance, optimise, with_stack
+from coloc_graph.backend.solver import RELINEARIZE_CALIBRATION, isam_parameters, joint_covariance, optimise, with_stack
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Sighting
 
@@ -148,7 +148,8 @@ class Isam2Graph:
         indices = list(self.isam.update(factors, values, list(instead_of)).getNewFactorsIndices())
         for _ in range(MOST_STEPS):
             now = {key: self.errors(key) for key in self._calibrated}
-            if all(np.abs(now[key] - before).max() < CALIBRATED for key, before in self._calibrated.items()):
+            changes = (np.abs(now[key] - before).max() for key, before in self._calibrated.items())
+            if all(change < RELINEARIZE_CALIBRATION for change in changes):
                 break
             self._linearise()
             self._calibrated = now

@@ -1,4 +1,4 @@
-"""The numerical work: Levenberg-Marquardt with QR, and its answer checked."""
+"""Levenberg-Marquardt with QR, with a check of its result; parameters of ISAM2."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -14,39 +14,33 @@ from coloc_graph.errors import EstimationError
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-#: GTSAM walks its trees by recursion: a chain of more than this many poses gets a stack of its own.
-DEEP = 3000
-#: That stack [bytes]: at 8 MiB a chain of 50,000 poses ends the process. Only what is used of it takes memory.
-STACK = 1 << 30
+# GTSAM walks its trees by recursion: with 8 MiB of stack a chain of 50,000 poses ends the process
+DEEP_RECURSION_POSES = 3000  # poses above which the solver runs in a thread with a larger stack
+STACK_SIZE = 1 << 30  # bytes of that stack; only the part in use takes memory
 
-#: A search that goes on for longer is not going to end. With less error than this there is none to begin.
-MOST_ITERATIONS = 500
-NOTHING_TO_GAIN = 1e-9
+MAX_ITERATIONS = 500  # of Levenberg-Marquardt; no search that needs more converges
+COST_TOLERANCE = 1e-9  # half chi2 below which there is nothing to optimise
 
-#: Over more poses than this each iteration gains a little for hundreds of them, since GTSAM's between-factors leave
-#: the derivative of the logarithm out: there the search ends where one gains less than `NOISE` a pose in half chi2,
-#: of which a pose has about 3.
-LONG = 2000
-NOISE = 1e-5
+# GTSAM's between-factors leave the derivative of the logarithm out, so that in large graphs each iteration gains a
+# little for hundreds of them: there the search ends when one gains less than noise
+LARGE_GRAPH_POSES = 2000  # poses above which that holds
+COST_TOLERANCE_PER_POSE = 1e-5  # half chi2 a pose; its expected value is about 1.5
 
-#: A pose of ours is linearised anew where it has turned by more than this [rad], or shifted by that [m]: never. Errors
-#: of linearisation come from turns; a far pose shifts by centimetres whenever the heading of an early one changes by
-#: 1e-4 rad, and with GTSAM's single threshold of 0.01 the whole chain is then redone at every step (with turns of
-#: 0.01 from stance 2,600 on).
-TURNED = 0.03
-SHIFTED = 1e9
-#: Where mounts are calibrated, also where it has tilted by this [rad]: a homography's residual grows with the square of
-#: a tilt times that of distance over height, and half a milliradian is then a fifth of its noise. And where it has
-#: turned by a sixth as much as otherwise: a sighting's pixels tell a tenth of a millimetre.
-TILTED = 5e-4
-AIMED = 5e-3
-#: A calibration variable is linearised anew where it has changed by more than this [m, rad, relative, s].
-CALIBRATED = 3e-4
+# ISAM2 linearises a pose anew when its estimate has changed by more than these. Errors of linearisation come from
+# rotations; a distant pose moves by centimetres whenever the heading of an early one changes by 1e-4 rad, and with
+# GTSAM's single threshold of 0.01 the whole chain would be linearised anew at every step
+RELINEARIZE_ROTATION = 0.03  # rad
+RELINEARIZE_TRANSLATION = 1e9  # m: never
+# where mounts are calibrated: the residual of a homography grows with the square of a tilt times distance over height,
+# and half a milliradian is then a fifth of its noise; the pixels of a sighting tell a tenth of a millimetre
+RELINEARIZE_TILT_JOINT = 5e-4  # rad, roll and pitch
+RELINEARIZE_HEADING_JOINT = 5e-3  # rad
+RELINEARIZE_CALIBRATION = 3e-4  # change of a calibration variable [m, rad, relative, s]
 
 
 def with_stack(poses: int, work: Callable[[], T]) -> T:
-    """The result of `work`, done where a graph of so many poses does not overflow the stack."""
-    if poses <= DEEP:
+    """Return the result of `work`, done in a thread with a larger stack where the graph has many `poses`."""
+    if poses <= DEEP_RECURSION_POSES:
         return work()
     results: list[T] = []
     failures: list[BaseException] = []
@@ -57,7 +51,7 @@ def with_stack(poses: int, work: Callable[[], T]) -> T:
         except BaseException as failure:  # handed to the caller
             failures.append(failure)
 
-    before = threading.stack_size(STACK)
+    before = threading.stack_size(STACK_SIZE)
     try:
         thread = threading.Thread(target=body)
         thread.start()
@@ -70,27 +64,29 @@ def with_stack(poses: int, work: Callable[[], T]) -> T:
 
 
 def lm_parameters(poses: int) -> gtsam.LevenbergMarquardtParams:
-    """QR, since Cholesky throws on healthy chains, and down to rounding; in `LONG` runs to far below what is noise."""
+    """Parameters of Levenberg-Marquardt: QR, since Cholesky throws on healthy chains; converged to rounding, or to far
+    below noise above `LARGE_GRAPH_POSES`."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
     parameters.setRelativeErrorTol(1e-10)
-    parameters.setAbsoluteErrorTol(1e-10 if poses <= LONG else NOISE * poses)
+    parameters.setAbsoluteErrorTol(1e-10 if poses <= LARGE_GRAPH_POSES else COST_TOLERANCE_PER_POSE * poses)
     # our information reaches 1e12, of which GTSAM's bound of 1e5 is no damping: with wrong measurements it gave up
     parameters.setlambdaUpperBound(1e15)
-    parameters.setMaxIterations(MOST_ITERATIONS)
+    parameters.setMaxIterations(MAX_ITERATIONS)
     return parameters
 
 
 def isam_parameters(*, calibrates: bool = False) -> gtsam.ISAM2Params:
-    """QR for the same reason, and what is linearised anew: by the kind of key, as that of poses is x."""
+    """Parameters of ISAM2: QR for the same reason; thresholds of relinearisation by the kind of key (x is a pose)."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     parameters.relinearizeSkip = 1
-    tilted, turned = (TILTED, AIMED) if calibrates else (TURNED, TURNED)
+    tilt = RELINEARIZE_TILT_JOINT if calibrates else RELINEARIZE_ROTATION
+    heading = RELINEARIZE_HEADING_JOINT if calibrates else RELINEARIZE_ROTATION
     thresholds = gtsam.ISAM2ThresholdMap()
-    thresholds.insert(("x", np.array([tilted, tilted, turned] + [SHIFTED] * 3)))
+    thresholds.insert(("x", np.array([tilt, tilt, heading] + [RELINEARIZE_TRANSLATION] * 3)))
     for kind, size in SIZES.items():
-        thresholds.insert((chr(kind), np.full(size, CALIBRATED)))
+        thresholds.insert((chr(kind), np.full(size, RELINEARIZE_CALIBRATION)))
     parameters.setRelinearizeThreshold(thresholds)
     return parameters
 
@@ -108,7 +104,7 @@ def optimise(
     """
     optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, lm_parameters(initial.size()))
     before = optimiser.error()
-    if before < NOTHING_TO_GAIN:
+    if before < COST_TOLERANCE:
         return initial, 0  # nothing contradicts anything; LM would only try out its dampings
     if not np.isfinite(before):
         raise EstimationError("the graph's error is not finite where the search starts: a measurement holds no number")
@@ -122,8 +118,8 @@ def optimise(
             return values, used + int(rough.iterations())
     values = optimiser.optimize()
     after = optimiser.error()
-    if optimiser.iterations() >= MOST_ITERATIONS:
-        raise EstimationError(f"the optimiser did not converge in {MOST_ITERATIONS} iterations (error {after:.6g})")
+    if optimiser.iterations() >= MAX_ITERATIONS:
+        raise EstimationError(f"the optimiser did not converge in {MAX_ITERATIONS} iterations (error {after:.6g})")
     if not np.isfinite(after) or after > before * (1 + 1e-9) + 1e-9:
         raise EstimationError(f"the optimiser did not lower the graph's error ({before:.6g} to {after:.6g})")
     if (
@@ -145,6 +141,6 @@ def _one_step(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsa
 
 
 def joint_covariance(isam: gtsam.ISAM2, keys: Sequence[int]) -> Array:
-    """Joint covariance of different variables, in the order given: (6 n, 6 n) of n poses."""
+    """Joint covariance of different variables, in the order given; (6 n, 6 n) for n poses."""
     joint = isam.jointMarginalCovariance(list(keys))
     return np.block([[joint.at(a, b) for b in keys] for a in keys])

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors, Seen
+from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors, FactorEvaluator
 from coloc_graph.backend.camera_model import BEYOND, MarkersModel, Mounts
 from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
 from coloc_graph.backend.span_factor import SpanModel, Spans, spans_on_plane
@@ -252,13 +252,13 @@ def test_factors_evaluated_at_once_are_those_evaluated_alone(rng):
         HomographyModel(homography(rng), spans, MOUNT_I, MOUNT_J, both, True, np.zeros(3), 0.01)
         for spans in ((short, long), (long, short), (long,))
     ]
-    seen = [Seen(model, (1, 2), (11, 12, *[21] * len(model.movers), 31), (3, 3, *[2] * len(model.movers), 1))
+    seen = [FactorEvaluator(model, (1, 2), (11, 12, *[21] * len(model.movers), 31), (3, 3, *[2] * len(model.movers), 1))
             for model in made]  # fmt: skip
-    seen.append(Seen(made[0], (2, 1), (None, 12, 21, None), (3, 3, 2, 1)))
-    seen.append(Seen(made[0], (1, 3), (11, 12, 21, 31), (3, 3, 2, 1)))  # robot 3 is below the floor
+    seen.append(FactorEvaluator(made[0], (2, 1), (None, 12, 21, None), (3, 3, 2, 1)))
+    seen.append(FactorEvaluator(made[0], (1, 3), (11, 12, 21, 31), (3, 3, 2, 1)))  # robot 3 is below the floor
     x = seen_by(T_WORLD_I, MOUNT_I, MARKERS.p_body @ T_WORLD_J[:3, :3].T + T_WORLD_J[:3, 3] + (1.0, 0.0, 0.0))
     sight = MarkersModel(x, np.broadcast_to(1e-6 * np.eye(2), (2, 2, 2)), MOUNT_I, MARKERS)
-    seen.append(Seen(sight, (1, 2), (11, 21), (3, 2)))
+    seen.append(FactorEvaluator(sight, (1, 2), (11, 21), (3, 2)))
 
     def values_of(step):
         values = gtsam.Values()
@@ -285,7 +285,7 @@ def test_factors_evaluated_at_once_are_those_evaluated_alone(rng):
 
 def test_within_a_graph_a_factor_is_evaluated_alone_where_nothing_else_is_known(rng):
     model = model_of(rng)
-    seen = [Seen(model, (1, j), (None, None, None, None), (3, 3, 2, 1)) for j in (2, 3)]
+    seen = [FactorEvaluator(model, (1, j), (None, None, None, None), (3, 3, 2, 1)) for j in (2, 3)]
     values = gtsam.Values()
     values.insert(1, gtsam.Pose3(T_WORLD_I))
     values.insert(2, gtsam.Pose3(T_WORLD_J))
