@@ -19,7 +19,14 @@ from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.robot_io.create import protocol as oi
 from coloc_graph.robot_io.create.driver import Create
 from coloc_graph.robot_io.create.emulator import CreateEmulator
-from coloc_graph.robot_io.create.odometry import DeltaWay, EncoderWay, Odometer, arc, arc_covariance, ticks_between
+from coloc_graph.robot_io.create.odometry import (
+    DeltaOdometry,
+    EncoderOdometry,
+    Odometer,
+    arc,
+    arc_covariance,
+    ticks_between,
+)
 from coloc_graph.robot_io.create.physics import Body, Physics, Wall
 from coloc_graph.robot_io.create.protocol import Mode, Packet, decode_values
 from coloc_graph.robot_io.create.state import DELTAS
@@ -563,7 +570,7 @@ def test_limits_keep_the_curve(create, robot):
     assert create.drive(-0.3, 0.0) == (-0.1, 0.0)
     assert create.drive(0.0, 3.0) == pytest.approx((0.0, 0.5), abs=5e-3)
     for bad in ((float("nan"), 0.0), (0.0, float("inf"))):
-        with pytest.raises(InputError, match="is no motion"):
+        with pytest.raises(InputError, match="is not a motion"):
             create.drive(*bad)
     for lease in (0.0, -1.0, 0.51, float("nan")):
         with pytest.raises(InputError, match=r"at most 0\.5 s"):
@@ -645,18 +652,18 @@ def test_an_arc_by_hand():
 
 
 def test_counts_that_no_wheel_can_reach_are_left_out():
-    way = EncoderWay()
+    way = EncoderOdometry()
     ticks = [(100, 100), (110, 110), (9000, 110), (120, 120), (5, 5), (5, 5), (5, 5), (10, 10)]
     told = [way.step({Packet.LEFT_TICKS: left, Packet.RIGHT_TICKS: right}, 0.015) for left, right in ticks]
     forward = [None if one is None else round(one[0][0] / 4.4459e-4) for one in told]
     assert forward == [0, 10, None, 10, -115, 0, 0, 5]
-    way = EncoderWay()
+    way = EncoderOdometry()
     told = [way.step({Packet.LEFT_TICKS: n, Packet.RIGHT_TICKS: n}, 0.015) for n in (30000, 0, 3, 6, 9)]
     assert [one is None for one in told] == [False, True, True, False, False]
 
 
 def test_a_robot_that_counts_anew_is_said_to_be_anywhere_it_could_have_come_to():
-    way, odometer, samples = EncoderWay(), Odometer("A"), []
+    way, odometer, samples = EncoderOdometry(), Odometer("A"), []
     for n, ticks in enumerate([30000, 30000, 0, 0, 0, *range(16, 200, 16)]):
         step = way.step({Packet.LEFT_TICKS: ticks, Packet.RIGHT_TICKS: ticks}, 0.3 if n == 2 else 0.015)
         samples += odometer.add(10 + 0.015 * n + 0.3 * (n > 1), *step) if step else []
@@ -666,7 +673,7 @@ def test_a_robot_that_counts_anew_is_said_to_be_anywhere_it_could_have_come_to()
 @pytest.mark.parametrize("before", [0, 1, 5])
 def test_frames_that_were_held_up_lose_no_way(before):
     """A reader that was not run for 0.6 s finds `before` old frames, then one with all of the way."""
-    way, odometer, samples = EncoderWay(), Odometer("A"), []
+    way, odometer, samples = EncoderOdometry(), Odometer("A"), []
     late, speed = 0.6, 0.45
     written = np.arange(0.0, 3.0, 0.015)
     held = (written > 1.0) & (written < 1.0 + late)
@@ -690,7 +697,7 @@ def simulated(model, seed, frames=167, period=0.03, **physics):
     rng = np.random.default_rng(seed)
     body = Body(model, Physics(seed=seed, step=0.01, **physics), 0.0)
     odometer = Odometer("A", late=0.1 if model == 2 else np.inf)
-    way = EncoderWay() if model == 2 else DeltaWay()
+    way = EncoderOdometry() if model == 2 else DeltaOdometry()
     samples, asked = [], np.zeros(2)
     true_start = body.x, body.y, body.yaw
     for n in range(frames):

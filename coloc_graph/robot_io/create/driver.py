@@ -140,7 +140,7 @@ class Create:
         self.close()
 
     def close(self) -> None:
-        """Stop the wheels, leave the robot passive, let go of the port. Never raises."""
+        """Stop the wheels, leave the robot in passive mode, and close the port. Never raises."""
         line = self._line
         if line is None:
             return
@@ -185,7 +185,7 @@ class Create:
             If the robot must not drive.
         """
         if not (math.isfinite(v) and math.isfinite(w)):
-            raise InputError(f"drive({v}, {w}) is no motion: give finite m/s and rad/s")
+            raise InputError(f"drive({v}, {w}) is not a motion: give finite m/s and rad/s")
         if not 0 < lease <= MAX_LEASE:
             raise InputError(f"a lease is above 0 and at most {MAX_LEASE} s, not {lease} s: renew it instead")
         halts, line = self._halts if self._line else None, self._may_drive()

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from coloc_graph.robot_io.create.odometry import DeltaWay, EncoderWay, Odometer
+from coloc_graph.robot_io.create.odometry import DeltaOdometry, EncoderOdometry, Odometer
 from coloc_graph.robot_io.create.state import CreateState, read_state
 from coloc_graph.run.messages import OdometrySample
 
@@ -25,7 +25,7 @@ class SensorFeed:
         self._epoch = time.time() - self.last if epoch is None else epoch
         # a Create 1 reports its distance seldom, and then all of it
         self._odometer = Odometer(robot, period) if model == 2 else Odometer(robot, period, math.inf)
-        self._way = EncoderWay() if model == 2 else DeltaWay()
+        self._way = EncoderOdometry() if model == 2 else DeltaOdometry()
         self._samples: deque[OdometrySample] = deque(maxlen=20_000)
         self._fresh = threading.Condition()
 

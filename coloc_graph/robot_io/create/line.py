@@ -71,7 +71,7 @@ class CreateLine:
             raise RobotError(f"cannot start the watchdog process of {self.port} ({error}): free some memory") from error
 
     def _first_opened(self, model: int) -> serial.Serial:
-        """Open the port once the watchdog of a driver that was killed has let go of it."""
+        """Open the port, waiting until the watchdog of a driver that was killed has closed it."""
         until = time.monotonic() + FREED
         while True:
             try:
@@ -111,7 +111,7 @@ class CreateLine:
         raise RobotError(f"the line on {self.port} is lost ({self.lost}): check the cable and open it again")
 
     def _write(self, data: bytes) -> None:
-        # pyserial's own timeout calls it one where this process was not run for so long, though all was written
+        # pyserial's own timeout fails if this process did not run meanwhile, though all was written
         until = time.monotonic() + WRITE
         while data:
             _, ready, _ = select.select([], [self._serial.fileno()], [], max(until - time.monotonic(), 0))

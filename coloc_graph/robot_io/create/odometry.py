@@ -115,7 +115,7 @@ class Odometer:
         x, y, yaw = compose((float(self.pose[0]), float(self.pose[1]), float(self.pose[2])), way)
         self.pose = np.array([x, y, wrap(yaw)])
         if moved or covariance.any():
-            # an error in heading at the end of the way so far swings what follows
+            # an error of the heading rotates the increments that follow
             c, s = cos(self._way[2]), sin(self._way[2])
             R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
             dx, dy = c * way[0] - s * way[1], s * way[0] + c * way[1]
@@ -136,7 +136,7 @@ class Odometer:
         return sample
 
 
-class EncoderWay:
+class EncoderOdometry:
     """Increments of a Create 2 from its encoders (packets 43, 44).
 
     Counts that no wheel can have reached are ignored: those of a damaged frame whose checksum fits by chance. After
@@ -170,7 +170,7 @@ class EncoderWay:
         return arc(left, right, wheels.base), covariance
 
 
-class DeltaWay:
+class DeltaOdometry:
     """Increments of a Create 1: its requested speeds, bounded by packets 19 and 20 when they come.
 
     A packet counts whole units (mm, deg); the true distance is up to one unit longer, the remainder is lost.

@@ -120,7 +120,7 @@ class Watchdog:
     def _send(self, word: int) -> bool:
         try:
             os.write(self._pipe, _MESSAGE.pack(word))
-        except BlockingIOError:  # it was stopped (SIGSTOP) for so long that the pipe is full
+        except BlockingIOError:  # it is stopped (SIGSTOP) and the pipe is full
             return False
         except OSError:
             self._alive = False

@@ -276,7 +276,7 @@ class CoordinatorLink:
         def take(sample: zenoh.Sample) -> None:
             robot = robot_of(sample)
             if robot not in self._inboxes:
-                self._counter.add("foreign", f"refused a message of `{robot[:40]}`, which is no robot of the team")
+                self._counter.add("foreign", f"refused a message of `{robot[:40]}`, which is not a robot of the team")
                 return
             data = sample.payload.to_bytes()
             try:
@@ -324,7 +324,7 @@ class CoordinatorLink:
     def _take_time(self, sample: zenoh.Sample) -> None:
         received, robot = self._clock(), robot_of(sample)
         if robot not in self._inboxes:
-            self._counter.add("foreign", f"refused the time of `{robot[:40]}`, which is no robot of the team")
+            self._counter.add("foreign", f"refused the time of `{robot[:40]}`, which is not a robot of the team")
             return
         try:
             reply = decode(sample.payload.to_bytes(), ClockReply)

@@ -171,7 +171,7 @@ class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Event(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Something that happened to a robot: `kind` is one word, `text` a sentence or the kind's value."""
+    """An event of a robot: `kind` is one word, `text` a sentence or the kind's value."""
 
     session: str
     number: int

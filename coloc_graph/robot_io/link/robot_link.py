@@ -73,7 +73,7 @@ class RobotLink:
         clock: Clock = time.monotonic_ns,
     ) -> None:
         if not is_session(session):
-            raise InputError(f"`{session}` is no name of a session: use letters, digits, - and _")
+            raise InputError(f"`{session}` is not a name of a session: use letters, digits, - and _")
         self.name, self.session, self._clock = name, session, clock
         self._counter = LinkCounter()
         self._commands = CommandFilter(name, session, handler, clock, self._counter)

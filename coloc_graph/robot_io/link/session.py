@@ -61,7 +61,7 @@ def on_receiving_thread(call: Callable[[zenoh.Sample], None]) -> "zenoh.handlers
 
 
 def robot_of(sample: zenoh.Sample) -> str:
-    """Name of the robot in a key; something that is no robot's name if the key has wildcards."""
+    """Name of the robot in a key; if it has wildcards, its first part."""
     parts = str(sample.key_expr).split("/")
     return parts[1] if len(parts) >= 3 and not {"*", "**"} & set(parts) else parts[0]
 
