@@ -100,7 +100,8 @@ def online(args: argparse.Namespace) -> int:
             state = coordinator.run(stop)
     if coordinator.stances == 0:
         return 1
-    report(out / "mission", field.truth_path, stopped=stop.is_set())
+    if not report(out / "mission", field.truth_path, stopped=stop.is_set()):
+        return 1
     slowest = max(coordinator.latencies)
     print(
         f"{coordinator.stances} stances in {time.monotonic() - began:.0f} s; from the last image of a stance "

@@ -46,10 +46,11 @@ def watched(team: "Team", port: int | None, *, browser: bool, view: bool = True)
         )
 
 
-def report(folder: Path, truth_path: Path | None = None, *, stopped: bool = False) -> None:
+def report(folder: Path, truth_path: Path | None = None, *, stopped: bool = False) -> bool:
     """Solve the record of a mission as it was solved on the way, write the result beside it, and print it.
 
-    After a mission that a signal `stopped` nothing is printed where nobody reads it: it must end by itself.
+    After a mission that a signal `stopped` nothing is printed where nobody reads it: it must end by itself. Return
+    whether it was printed.
     """
     from coloc_graph.cli.accuracy import print_accuracy, print_calibration, print_last_poses, print_promised
     from coloc_graph.cli.printing import warn
@@ -61,7 +62,7 @@ def report(folder: Path, truth_path: Path | None = None, *, stopped: bool = Fals
     solution = solve(open_run(folder / "run.mcap"), SolveOptions(incremental=True))
     write_result(solution, folder / "result")
     if stopped and not output_is_read():
-        return
+        return False
     warn(solution.warnings)
     assessed = None if truth_path is None else assess(solution, truth_path)
     if assessed is None:
@@ -75,3 +76,4 @@ def report(folder: Path, truth_path: Path | None = None, *, stopped: bool = Fals
     agreement = f", chi2/dof {estimate.chi2 / estimate.dof:.2f}" if estimate.dof > 0 else ""
     stances = len(solution.run.stances)
     print(f"{stances} stances{agreement}; {folder / 'run.mcap'} is the record, {folder / 'result'} the result")
+    return True

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from fake_robots import FakeRobot, fake_team
 
+from coloc_graph.cli import running
 from coloc_graph.cli.nonblocking_log import CAPACITY, NonBlockingHandler
 from coloc_graph.errors import InputError
 from coloc_graph.online.mission_folder import MissionFolder
@@ -195,6 +196,18 @@ def test_log_messages_that_nobody_reads_are_dropped_counted_and_never_waited_for
     kept = [line for line in lines if line.startswith("message")]
     assert kept == [f"message {n}" for n in range(len(kept))]
     assert int(lines[-1].split()[0]) == CAPACITY + 100 - len(kept) > 0
+
+
+def test_output_that_nobody_reads_is_noticed(monkeypatch, tmp_path):
+    monkeypatch.setattr(running, "READER_WAIT", 0.05)
+    reader, writer = full_pipe()
+    with (tmp_path / "err").open("w") as err, os.fdopen(writer, "w") as out:
+        monkeypatch.setattr(sys, "stdout", out)
+        monkeypatch.setattr(sys, "stderr", err)
+        assert not running.output_is_read()
+        os.read(reader, 4096)
+        assert running.output_is_read()
+    os.close(reader)
 
 
 def test_a_mission_folder_is_locked_and_given_back(tmp_path):
