@@ -24,7 +24,6 @@ class Cameras:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._followed: tuple[str, NDArray[np.float64]] | None = None
 
     def on_size_change(self, current: Callable[[], float], wake: Callable[[], None]) -> None:
         """Call `wake` when a camera has moved and robots are drawn at another size than the current."""
@@ -52,19 +51,17 @@ class Cameras:
             client.camera.position, client.camera.look_at = position, look_at
 
     def follow(self, robot: str, scene: Scene, frame: Frame) -> None:
-        """Move all cameras along with a robot; a name that is no robot's ends it."""
+        """Have all cameras look at a robot, from their direction and distance; a name of no robot does nothing."""
         if robot not in scene.robots:
-            self._followed = None
             return
         here = frame.poses[scene.robots.index(robot), :3]
         if not np.isfinite(here).all():
             return
-        before, self._followed = self._followed, (robot, here)
         for client in self._server.get_clients().values():
-            is_new = before is None or before[0] != robot
-            shift = here - (client.camera.look_at if is_new or before is None else before[1])
-            if np.abs(shift).max() > 1e-6:
-                client.camera.position = client.camera.position + shift  # what it looks at moves with it
+            camera = client.camera
+            if np.abs(here - camera.look_at).max() > 1e-6:
+                # both together: a browser may still answer with an earlier camera, of which the two agree
+                camera.position, camera.look_at = here + camera.position - camera.look_at, here
 
 
 def seen_size(distance: float) -> float:

@@ -59,9 +59,13 @@ def until(what, timeout=60.0):
 
 
 def client_of(viewer):
-    """The browser's end, once it has said where its camera is."""
-    assert until(lambda: viewer.server.get_clients())
-    return next(iter(viewer.server.get_clients().values()))
+    """The browser's end, once its camera is where the viewer has it begin: a page connects with another one."""
+    assert until(viewer.server.get_clients)
+    client = next(iter(viewer.server.get_clients().values()))
+    first = viewer.server.initial_camera
+    assert until(lambda: np.allclose(client.camera.position, first.position, atol=0.05))
+    assert until(lambda: np.allclose(client.camera.look_at, first.look_at, atol=0.05))
+    return client
 
 
 def pixel_of(client, point):
