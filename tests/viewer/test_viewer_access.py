@@ -4,6 +4,7 @@ import socket
 import time
 
 import msgspec
+import numpy as np
 import pytest
 import viser
 import websockets.asyncio.server
@@ -13,8 +14,13 @@ from websockets.sync.client import connect
 
 from coloc_graph.cli import main
 from coloc_graph.errors import ColocError, InputError
+from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.run import Stance
 from coloc_graph.viewer import Scene, Viewer, server
 from coloc_graph.viewer.access import Access, is_loopback
+from coloc_graph.viewer.panel import set_value
+from coloc_graph.viewer.scene import layer_of
 from coloc_graph.viewer.server import open_listener, url_of
 
 PROTOCOL = [f"viser-v{viser.__version__}"]
@@ -248,3 +254,23 @@ def test_a_closed_viewer_leaves_its_port():
     viewer.close()
     open_listener(port=port).close()
     assert not viewer._thread.is_alive()
+
+
+def test_a_camera_follows_a_robot_although_its_browser_answers_late():
+    stances = tuple(Stance(n, 10.0 * n, 10.0 * n + 5, ("A",)) for n in range(3))
+    n = np.arange(3)
+    path = Trajectory("A", 10.0 * n, floor_pose(3.0 * n, 0.0 * n, 0.0 * n), n, np.tile(1e-4 * np.eye(6), (3, 1, 1)))
+    scene = Scene(("A",), stances, (layer_of("joint", ("A",), stances, {"A": path}),))
+    with Viewer(scene, port=0) as viewer, opened(viewer) as browser:
+        send(browser, CAMERA | {"position": [-1, -2, 3], "look_at": [0, 0, 0]})
+        assert waited(lambda: len(viewer.server.get_clients()) == 1)
+        camera = next(iter(viewer.server.get_clients().values())).camera
+        set_value(viewer.panel.follow, "A")
+        for row, late in ((0, 0), (2, 0), (1, 5)):
+            assert viewer.wait_idle()
+            send(browser, CAMERA | {"position": [late - 1, -2, 3], "look_at": [late, 0, 0]})  # of some time ago
+            assert waited(lambda late=late: np.allclose(camera.look_at, (late, 0, 0)))
+            viewer.go(row)
+            here = np.array([3.0 * row, 0.0, 0.0])
+            assert waited(lambda here=here: np.allclose(camera.look_at, here))
+            assert np.allclose(camera.position - here, (-1, -2, 3))
