@@ -302,7 +302,7 @@ def test_report_says_lengths_counts_options_and_reasons() -> None:
         "hall.mcap",
         f"A: {100 * row.true_length:.1f} cm true, {100 * row.estimated_length:.1f} cm estimated, ",
         f"{row.length_error_percent:.2f} %",
-        "5 measurements used, 1 refused",
+        "5 measurements used, 1 rejected",
         "frontend.criterion",
         "reprojection",
         "let it turn",

@@ -2,12 +2,14 @@
 
 import csv
 import json
+import shutil
 import tomllib
 
 import msgspec
 import numpy as np
 import pytest
 
+from coloc_graph.cli import main
 from coloc_graph.errors import InputError
 from coloc_graph.pipeline.batch import solve
 from coloc_graph.results.folder import read_result
@@ -45,7 +47,7 @@ def test_a_result_has_every_file_of_the_design(result):
 def test_the_summary_has_every_key_of_the_design(result):
     summary = json.loads((result / "summary.json").read_text())
     assert summary["method"] == "joint" and summary["robots"] == ["A", "B", "C"] and summary["stances"] == 8
-    assert summary["measurements"] == {"used": 8, "rejected": 0}
+    assert {name: summary["measurements"][name] for name in ("used", "rejected")} == {"used": 8, "rejected": 0}
     assert set(summary["seconds"]) == {"frontend", "backend", "total"}
     assert all(seconds >= 0 for seconds in summary["seconds"].values())
     accuracy = summary["accuracy"]
@@ -190,10 +192,10 @@ def test_a_run_without_truth_has_no_accuracy(short, copied, tmp_path):
         (None, r"is not a result: it has no summary.json"),
         ("{", "summary.json: is damaged"),
         ("[]", "summary.json is damaged"),
-        ("{}", r"summary.json: .* missing required field `robots`; solve the run again"),
-        ('{"robots": ["A"], "run": "x.mcap"}', "A.tum: cannot be read"),
-        ('{"robots": 3, "run": "x.mcap"}', "summary.json: Expected `array`"),
-        ('{"robots": ["../A"], "run": "x.mcap"}', "summary.json: the name `../A` is not usable"),
+        ('{"format": 1}', r"summary.json: .* missing required field `robots`; solve the run again"),
+        ('{"format": 1, "robots": ["A"], "run": "x.mcap"}', "A.tum: cannot be read"),
+        ('{"format": 1, "robots": 3, "run": "x.mcap"}', "summary.json: Expected `array`"),
+        ('{"format": 1, "robots": ["../A"], "run": "x.mcap"}', "summary.json: the name `../A` is not usable"),
         ("[" * 100_000, "summary.json: is damaged"),
         ('{"robots": ' + "1" * 5000 + "}", "summary.json: is damaged"),
     ],
@@ -238,3 +240,22 @@ def test_a_result_of_a_version_without_ids_is_taken_as_it_is(short, hallway, sho
     del summary["run_id"]
     (tmp_path / "out" / "summary.json").write_text(json.dumps(summary))
     read_result(tmp_path / "out").require_run(hallway)
+
+
+def test_results_of_earlier_versions_are_refused_in_one_sentence_everywhere(result, short, tmp_path, capsys):
+    old = tmp_path / "old"
+    shutil.copytree(result, old)
+    summary = json.loads((old / "summary.json").read_text())
+    for number, words in ((None, "an earlier version of coloc-graph wrote it"), (2, "its format is 2")):
+        text = json.dumps({name: value for name, value in summary.items() if name != "format"} | {"format": number})
+        (old / "summary.json").write_text(text)
+        for command in (
+            ["evaluate", str(old)],
+            ["export", "tum", str(old), "--out", str(tmp_path / "out")],
+            ["view", str(old), "--export", str(tmp_path / "page.html")],
+            ["view", str(result), "--compare", str(old), "--export", str(tmp_path / "page.html")],
+        ):
+            assert main(command) == 2, command
+            error = capsys.readouterr().err
+            assert words in error and "solve the run again" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "out").exists() and not (tmp_path / "page.html").exists()

@@ -437,3 +437,21 @@ def test_conformance_cut_off():
 def test_conformance_damaged():
     with pytest.raises(RunError, match=r"damaged at byte 1654 \(a chunk that"):
         open_run(CONFORMANCE / "damaged.mcap")
+
+
+def test_truth_near_an_estimate_is_the_truth_that_is_compared(short):
+    from coloc_graph.evaluation import align
+    from coloc_graph.geometry.trajectory import Trajectory
+    from coloc_graph.run import truth_counts
+
+    whole = read_truth(short)
+    assert truth_counts(short) == {robot: len(true) for robot, true in whole.items()}
+    true = whole["C"]
+    times = np.concatenate([true.times[[0, 40, -1]], [true.times[3] + 0.003, true.times[-2] + 0.001]])
+    estimated = {"C": Trajectory("C", np.sort(times), np.tile(np.eye(4), (5, 1, 1)))}
+    near = read_truth(short, estimated)
+    assert len(near["C"]) <= 12 < len(true) and set(near) == set(whole)
+    for name in ("times", "T_world_body"):
+        assert np.isin(getattr(near["C"], name), getattr(true, name)).all()
+    expected, found = (align(estimated, one, "C", on_floor=True)["C"] for one in (whole, near))
+    np.testing.assert_array_equal(expected, found)
