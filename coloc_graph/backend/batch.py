@@ -20,18 +20,12 @@ from coloc_graph.backend.solver import lm_parameters, with_stack
 from coloc_graph.measurements import RelativePose, Sighting
 from coloc_graph.team import Slip
 
-#: A fit that noise alone makes this bad less often than this is looked into.
-LEAST_CHANCE_OF_ALL = 1e-4
-#: Nor is one whose chi2 is less than this times its dof: of 100,000 residuals 2 % more than stated would be a sign, and
-#: no model is that good.
-LITTLE = 1.1
-#: A stay-put constraint is loosened by so much to see whether the others contradict it.
-TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)
-MOST_BUMPS = 3
-#: What may be wrong, and is tested against all the rest.
-TESTED = (RelativePose, Sighting, OnMap)
-#: Rounds of refusing the worst and taking back what then agrees.
-ROUNDS = 20
+LEAST_CHANCE_OF_ALL = 1e-4  # probability of a fit as bad as this by noise below which outliers are searched for
+CHI2_PER_DOF_OF_MODEL = 1.1  # chi2/dof up to which a fit passes in any case: no model is better than that
+TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)  # slip that a stay-put constraint is given to test it
+MAX_BUMPS = 3  # bumped anchors that are searched for
+TESTED = (RelativePose, Sighting, OnMap)  # links that are tested against all others
+MAX_ROUNDS = 20  # rounds of rejecting the worst link and taking back those that then agree
 
 
 def smooth(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None = None) -> Estimate:
@@ -63,12 +57,12 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
     bumped: tuple[Bump, ...] = ()
     suspects = _suspects(fit) if refuse else None
     if suspects is not None:
-        near = Near(graph, fit.values, suspects) if suspects and len(fit.links) > ALL_TESTED else None
+        warm = WarmStart(graph, fit.values, suspects) if suspects and len(fit.links) > ALL_TESTED else None
         del fit  # of a large graph it holds gigabytes
-        bumped = _bumps(method, graph, near)
+        bumped = _bumps(method, graph, warm)
         for bump in bumped:
             graph = _moved(graph, bump.stay_put)
-        rejected, fit = _find_wrong(method, graph, near)
+        rejected, fit = _find_outliers(method, graph, warm)
     return make_estimate(
         method,
         graph,
@@ -88,15 +82,15 @@ def _suspects(fit: Fit) -> tuple[Link, ...] | None:
     where nothing is suspicious."""
     if fit.dof <= 0:
         return None
-    if fit.chance < LEAST_CHANCE_OF_ALL and fit.chi2 > LITTLE * fit.dof:
+    if fit.chance < LEAST_CHANCE_OF_ALL and fit.chi2 > CHI2_PER_DOF_OF_MODEL * fit.dof:
         return ()
     tested = fit.agreements((*TESTED, StayPut))
     return tuple(fit.links[index] for index, one in tested.items() if one.chance() < LEAST_CHANCE) or None
 
 
 @dataclass(frozen=True, eq=False)
-class Near:
-    """The fit of a large graph that is right but for a few links, the `suspects`: the search goes on from there."""
+class WarmStart:
+    """Fit of a large graph that only a few links, the `suspects`, contradict: initial values of further searches."""
 
     graph: PoseGraph
     values: gtsam.Values
@@ -104,11 +98,11 @@ class Near:
 
     @property
     def robots(self) -> set[str]:
-        """Who may have been pushed."""
+        """Robots that may have been bumped."""
         return {robot for link in self.suspects for robot, _ in link.ends}
 
     def start(self, graph: PoseGraph) -> gtsam.Values:
-        """All that was found, for a graph with the same nodes, fewer of which are one place."""
+        """Return initial values for a graph with the same nodes and fewer stay-put constraints."""
         start = gtsam.Values()
         for key, errors in calibrations_in(self.values).items():
             start.insert(key, errors)
@@ -128,13 +122,13 @@ def _scale(tested: Iterable[Agreement]) -> float:
     return max(1.0, float(np.median(ratios))) if ratios else 1.0
 
 
-def _find_wrong(method: Method, graph: PoseGraph, near: Near | None) -> tuple[tuple[Rejection, ...], Fit]:
-    """The measurements that all others contradict, and the fit of these."""
+def _find_outliers(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tuple[tuple[Rejection, ...], Fit]:
+    """Return the outliers, and the fit without them."""
     # poses alone for a start: GTSAM's optimiser copies its factors, which those that are Python cannot be
-    doubted = {} if near else _outliers(fit_graph("smooth", graph))
-    start = near.start(graph) if near else None
+    doubted = {} if warm else _outliers(fit_graph("smooth", graph))
+    start = warm.start(graph) if warm else None
     # twice the same set ends it, as does the last round
-    for left in reversed(range(ROUNDS)):
+    for left in reversed(range(MAX_ROUNDS)):
         fit = fit_graph(method, graph.without(doubted.values()), start)
         tested = fit.agreements(TESTED)
         scale = _scale(tested.values())
@@ -201,12 +195,12 @@ def find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
     return with_stack(len(graph.nodes), lambda: _bumps(method, graph, None))
 
 
-def _bumps(method: Method, graph: PoseGraph, near: Near | None) -> tuple[Bump, ...]:
-    robots = near.robots.intersection(graph.robots) if near else graph.robots
+def _bumps(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tuple[Bump, ...]:
+    robots = warm.robots.intersection(graph.robots) if warm else graph.robots
     loose = replace(graph, slips={**dict.fromkeys(robots, TEST_SLIP), **graph.slips})
-    start = near.start(loose) if near else None
+    start = warm.start(loose) if warm else None
     bumps: list[Bump] = []
-    for _ in range(MOST_BUMPS):
+    for _ in range(MAX_BUMPS):
         fit = fit_graph(method, loose, start)
         tested = fit.agreements((StayPut, *TESTED))
         stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
