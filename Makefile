@@ -1,5 +1,6 @@
 # make demo   a virtual environment, the package, and the main job: render, solve, show
 # make test   the same environment: lint, format, types, tests
+# make test-long  the longest statistics and a whole mission: some minutes more, before a release
 # make bench  the benchmarks behind the figures in the README; DATA=DIR for that on the stereo pairs of a chessboard,
 #             GRAPHS=DIR for those on the pose graphs sphere2500 and M3500, MRCLAM=DIR for that on an MR.CLAM dataset
 
@@ -35,6 +36,10 @@ else
 unit: $(VENV)/installed-dev
 	$(BIN)/pytest $(ARGS)
 endif
+
+test-long: $(VENV)/installed-dev
+	$(BIN)/pytest --numprocesses 2 --whole -m long tests
+	$(BIN)/pytest --whole tests/online/test_online.py
 
 bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/single_step.py

@@ -23,12 +23,16 @@ for _number in (signal.SIGHUP, signal.SIGINT):
 
 
 def pytest_addoption(parser):
-    """The whole of what takes too long for every time."""
-    parser.addoption("--whole", action="store_true", help="a mission of 12 stances to which all happens: four minutes")
+    """Add --whole, for `make test-long`."""
+    parser.addoption("--whole", action="store_true", help="run tests marked long, and a mission of 12 stances")
 
 
-def pytest_collection_modifyitems(items):
-    """Mark the tests that run in real time."""
+def pytest_collection_modifyitems(config, items):
+    """Mark the tests that run in real time, and skip the long ones unless asked for."""
+    if not config.getoption("--whole"):
+        for item in items:
+            if item.get_closest_marker("long"):
+                item.add_marker(pytest.mark.skip(reason="long statistics: make test-long"))
     for item in items:
         if item.path.stem.removeprefix("test_") in REALTIME:
             item.add_marker(pytest.mark.realtime)

@@ -8,7 +8,19 @@ import tomllib
 from importlib import resources
 
 import pytest
-from architecture import LAYERS, MODULES, PACKAGE, RANK, ROOT, circles, imported_names, module_imports, room_of
+from architecture import (
+    DRAWING,
+    LAYERS,
+    MODULES,
+    PACKAGE,
+    RANK,
+    ROOT,
+    circles,
+    drawing,
+    imported_names,
+    module_imports,
+    room_of,
+)
 from packaging.specifiers import SpecifierSet
 
 from coloc_graph._version import __version__
@@ -168,3 +180,7 @@ def test_an_unsupported_python_or_system_is_told_in_words_before_anything_is_ins
     monkeypatch.setattr(sys, "platform", platform)
     with pytest.raises(SystemExit, match=words):
         runpy.run_path(str(ROOT / "setup.py"), run_name="__main__")
+
+
+def test_the_drawing_of_the_architecture_is_up_to_date():
+    assert DRAWING.read_text(encoding="utf-8") == drawing(), "run python scripts/architecture.py"

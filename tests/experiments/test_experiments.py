@@ -1,10 +1,12 @@
 """The paper's experiments, small: what is reported is the paper's, what is counted adds up, ours is better."""
 
 import json
+import operator
 import os
 import re
 import subprocess
 import sys
+from functools import partial
 from types import SimpleNamespace
 
 import distributed
@@ -154,7 +156,9 @@ def test_progress_is_told_and_errors_come_through():
     assert spread(abs, [-1, 2, -3], progress=lambda done, total: told.append((done, total))) == [1, 2, 3]
     assert told == [(1, 3), (2, 3), (3, 3)]
     with pytest.raises(InputError, match="distance between the two robots"):
-        measure_cells([(-1.0, 0.0), (0.6, 0.0)], runs=1, processes=2)
+        measure_cells([(-1.0, 0.0), (0.6, 0.0)], runs=1)
+    with pytest.raises(ZeroDivisionError):
+        spread(partial(operator.truediv, 1), [0, 1], processes=2)
 
 
 def test_table_1_stands_where_the_paper_stood(steps):
@@ -178,20 +182,26 @@ def test_table_2_goes_down_the_hallway(hall):
     assert hall.rms("ours")["end_error_cm"] < hall.rms("eq2")["end_error_cm"] / 2
 
 
-def test_what_is_saved_is_a_picture_and_the_numbers(single, steps, hall, tmp_path):
+@pytest.fixture(scope="module")
+def saved(single, steps, hall, tmp_path_factory):
+    """The paths of PNG, SVG and JSON of each experiment."""
     five = Fig5(single.depth, single.seed, single.runs, single.draws, single.cells)
-    for result in (single, five, steps, hall):
-        png, svg, numbers = save(result, tmp_path / "out")
+    out = tmp_path_factory.mktemp("saved")
+    return {result.name: save(result, out) for result in (single, five, steps, hall)}
+
+
+def test_what_is_saved_is_a_picture_and_the_numbers(single, saved):
+    assert list(saved) == ["fig4", "fig5", "table1", "table2"]
+    for name, (png, svg, numbers) in saved.items():
         pixels = matplotlib.image.imread(png)
         assert min(pixels.shape[:2]) > 400 and len(np.unique(pixels.reshape(-1, pixels.shape[2]), axis=0)) > 30
         assert svg.read_text().startswith("<svg") and "eq. (2)" in svg.read_text()
-        saved = json.loads(numbers.read_text())
-        assert saved["experiment"] == result.name and saved["depth"] == "tracks"
+        held = json.loads(numbers.read_text())
+        assert held["experiment"] == name and held["depth"] == "tracks"
 
 
-def test_the_same_result_is_the_same_bytes(hall, tmp_path):
-    once, again = (save(hall, tmp_path / name) for name in ("once", "again"))
-    assert [path.read_bytes() for path in once] == [path.read_bytes() for path in again]
+def test_the_same_result_is_the_same_bytes(hall, saved, tmp_path):
+    assert [path.read_bytes() for path in saved["table2"]] == [path.read_bytes() for path in save(hall, tmp_path)]
 
 
 def test_the_figures_show_the_numbers(single):
