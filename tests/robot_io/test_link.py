@@ -384,7 +384,8 @@ def event_of(session, number):
 
 def test_a_second_program_of_the_same_name_is_refused_and_the_first_one_goes_on(pair, caplog):
     heard, first = pair
-    with Robot("A", heard.address, session="second") as second:
+    another_clock = {"clock": lambda: time.monotonic_ns() + 3600 * 10**9}
+    with Robot("A", heard.address, session="second", **another_clock) as second:
         second.put_event("of the second")
         assert until(lambda: second.link.refused is not None)
         assert second.link.refused == (
@@ -399,6 +400,8 @@ def test_a_second_program_of_the_same_name_is_refused_and_the_first_one_goes_on(
         assert first.bodies == [Capture(capture=n) for n in range(20)] and second.bodies == []
         assert second.link.last_heard == 0 and first.link.refused is None
     assert heard.presence == [("A", True)]
+    assert heard.link.clocks["A"].jumps == 0
+    assert abs(heard.link.clocks["A"].estimate(time.monotonic_ns()).offset) < 1e9
     first.link.close()
     assert until(lambda: heard.presence[-1] == ("A", False))
     with Robot("A", heard.address, session="third") as third:
