@@ -43,6 +43,7 @@ def test_every_robot_has_a_pose_at_every_stance_whatever_its_role():
         assert np.array_equal(estimate.pose(*stay.ends[0]).matrix(), estimate.pose(*stay.ends[1]).matrix())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("robots", [3, 6])
 def test_nees_over_200_seeds_is_inside_its_interval(robots):
     nees, fits = [], []
