@@ -167,7 +167,7 @@ def test_a_bumped_anchor_is_found_and_named_and_no_homography_is_blamed(size, re
     for m in team.measurements:
         (i, a), (j, b) = m.ends
         if isinstance(m, RelativePose) and m.stance == 6:
-            T = m.T_i_j
+            T = gtsam.Pose3(m.T_i_j)
             T = gtsam.Pose3(bump).inverse().compose(T) if i == robot else T.compose(gtsam.Pose3(bump))
             m = RelativePose(6, i, j, T, m.covariance, T, 0, 0.0)
         elif isinstance(m, Odometry) and m.robot == robot and a == 6:
