@@ -151,11 +151,13 @@ def _solved(
 ) -> "Solution":
     """Solve, write, print."""
     from coloc_graph.pipeline.batch import solve
+    from coloc_graph.pipeline.contents import kind_of
     from coloc_graph.results.writer import summarise, write_result
     from coloc_graph.run.output_lock import locked_output
 
+    label = "stances measured" if kind_of(run) == "stances" else "seconds of the run done"
     with _earlier_result_named(args.out), locked_output(args.out):
-        with progress("measured") as report:
+        with progress(label) as report:
             solution = solve(run, options, report, on_update)
         accuracy = write_result(solution, args.out)
     warn([*solution.warnings, *(accuracy.warnings if accuracy else ())])
