@@ -95,7 +95,7 @@ def test_simulate_solve_info_evaluate_round_trip(call, tmp_path):
     assert evaluated["anees"] == pytest.approx(solved["accuracy"]["anees"], rel=1e-6)
 
     code, text, err = call("evaluate", out)
-    assert (code, err) == (0, "") and text.startswith("robot") and "average NEES" in text
+    assert (code, err) == (0, "") and text.startswith("robot") and "NEES per degree of freedom" in text
 
     code, text, err = call("info", run, "--json")
     info = json.loads(text)
