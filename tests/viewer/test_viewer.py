@@ -607,7 +607,7 @@ def test_truth_that_does_not_cover_the_estimate_is_said_to_be_left_out(short, co
     partly = copied(short, tmp_path / "partly.mcap", truth=True)
     run = open_run(partly)
     late = {robot: one for robot, one in read_truth(partly).items() if robot != "B"}
-    monkeypatch.setattr("coloc_graph.viewer.truth.read_truth", lambda path: late)
+    monkeypatch.setattr("coloc_graph.viewer.truth.read_truth", lambda *_: late)
     drawn = scene_of_run(run)
     assert drawn.true is None and len(drawn.notes) == 1
     assert drawn.notes[0].startswith("the truth in the run is not shown: ") and "B" in drawn.notes[0]
