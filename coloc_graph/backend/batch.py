@@ -3,7 +3,7 @@
 `smooth` takes poses alone for unknown, `joint` the mounts, markers and clocks of the team with them.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -17,14 +17,17 @@ from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.landmarks import ALWAYS, OnMap
 from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
 from coloc_graph.backend.solver import lm_parameters, with_stack
-from coloc_graph.measurements import RelativePose, Sighting
+from coloc_graph.measurements import Odometry, RelativePose, Sighting
 from coloc_graph.team import Slip
 
 LEAST_CHANCE_OF_ALL = 1e-4  # probability of a fit as bad as this by noise below which outliers are searched for
 CHI2_PER_DOF_OF_MODEL = 1.1  # chi2/dof up to which a fit passes in any case: no model is better than that
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)  # slip that a stay-put constraint is given to test it
 MAX_BUMPS = 3  # bumped anchors that are searched for
-TESTED = (RelativePose, Sighting, OnMap)  # links that are tested against all others
+TESTED = (RelativePose, Sighting, OnMap)  # links that are tested to see whether anything is wrong
+SEARCHED = (*TESTED, Odometry)  # links that may be wrong once something is
+REJECTION_PRICE = 30.0  # chi2 that one more outlier must explain
+EQUAL_CHI2 = 9.0  # two causes explain equally well if chi2 differs by less
 MAX_ROUNDS = 20  # rounds of rejecting the worst link and taking back those that then agree
 
 
@@ -61,7 +64,7 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
         del fit  # of a large graph it holds gigabytes
         bumped = _bumps(method, graph, warm)
         for bump in bumped:
-            graph = _moved(graph, bump.stay_put)
+            graph = _with_bump(graph, bump)
         rejected, fit = _find_outliers(method, graph, warm)
     return make_estimate(
         method,
@@ -123,16 +126,47 @@ def _scale(tested: Iterable[Agreement]) -> float:
 
 
 def _find_outliers(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tuple[tuple[Rejection, ...], Fit]:
-    """Return the outliers, and the fit without them."""
-    # poses alone for a start: GTSAM's optimiser copies its factors, which those that are Python cannot be
-    doubted = {} if warm else _outliers(fit_graph("smooth", graph))
+    """Return the outliers, and the fit without them.
+
+    The search starts from what graduated non-convexity leaves out, and, in a graph that is small enough, from nothing
+    as well: what rejects fewer measurements for the same fit is the likelier cause.
+    """
     start = warm.start(graph) if warm else None
+    if warm is not None:
+        doubted, fit = _search(method, graph, {}, start)
+    else:
+        # poses alone for a start: GTSAM's optimiser copies its factors, which those that are Python cannot be
+        first = _outliers(fit_graph("smooth", graph))
+        doubted, fit = _search(method, graph, first, start)
+        if first and len(fit.links) <= ALL_TESTED and len(doubted) > 1:
+            other, other_fit = _search(method, graph, {}, start)
+            if _price(other, other_fit) < _price(doubted, fit):
+                doubted, fit = other, other_fit
+    rejected = tuple(
+        Rejection(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
+        for link in (*graph.measurements, *graph.on_map)
+        if id(link) in doubted
+        for off in [_innovation(fit, link).sigmas]
+    )
+    return rejected, fit
+
+
+def _price(rejected: Mapping[int, Link], fit: Fit) -> float:
+    """Implausibility of a set of rejections: chi2 beyond what is expected, and a price for each."""
+    return fit.chi2 - fit.dof + REJECTION_PRICE * len(rejected)
+
+
+def _search(
+    method: Method, graph: PoseGraph, doubted: dict[int, Link], start: gtsam.Values | None
+) -> tuple[dict[int, Link], Fit]:
+    """Reject the worst measurement and take back what then agrees, in turns; from what is doubted on."""
+    doubted = dict(doubted)
     # twice the same set ends it, as does the last round
     for left in reversed(range(MAX_ROUNDS)):
         fit = fit_graph(method, graph.without(doubted.values()), start)
-        tested = fit.agreements(TESTED)
+        tested = fit.agreements(SEARCHED)
         scale = _scale(tested.values())
-        worst = min(tested, key=lambda index: tested[index].chance(scale), default=None)
+        worst = min(tested, key=lambda index: tested[index].log_chance(), default=None)
         again = {key for key, link in doubted.items() if _agrees(fit, link, scale)}
         refusing = worst is not None and tested[worst].chance(scale) < LEAST_CHANCE
         if not left or not (again or refusing):
@@ -141,13 +175,7 @@ def _find_outliers(method: Method, graph: PoseGraph, warm: WarmStart | None) -> 
             del doubted[key]
         if worst is not None and refusing:
             doubted[id(fit.links[worst])] = fit.links[worst]
-    rejected = tuple(
-        Rejection(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
-        for link in (*graph.measurements, *graph.on_map)
-        if id(link) in doubted
-        for off in [_innovation(fit, link).sigmas]
-    )
-    return rejected, fit
+    return doubted, fit
 
 
 def _outliers(fit: Fit) -> dict[int, Link]:
@@ -202,7 +230,7 @@ def _bumps(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tuple[Bu
     bumps: list[Bump] = []
     for _ in range(MAX_BUMPS):
         fit = fit_graph(method, loose, start)
-        tested = fit.agreements((StayPut, *TESTED))
+        tested = fit.agreements((StayPut, *SEARCHED))
         stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
         if not stays:
             break
@@ -218,18 +246,74 @@ def _bumps(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tuple[Bu
         scale = _scale(rest.values())
         if stays[plainest].chance(scale) > LEAST_CHANCE:
             break
-        others = {index: one for index, one in tested.items() if index not in stays}
+        others = {
+            index: one
+            for index, one in tested.items()
+            if index not in stays and not isinstance(fit.links[index], Odometry)
+        }
         if others:
             wrong = min(others, key=lambda index: others[index].log_chance())
             without = fit_graph(method, loose.without([fit.links[wrong]]), start)
             more = Agreement(max(moved.chi2 - without.chi2, 0.0), max(moved.dof - without.dof, 1))
             if more.chance(scale) < LEAST_CHANCE:
                 break
-        loose = freed
-        before, after = (moved.values.atPose3(loose.places.key(node)) for node in stay.ends)
+        before, after = (moved.values.atPose3(freed.places.key(node)) for node in stay.ends)
         named = replace(stay, slip=graph.slips.get(stay.robot))
-        bumps.append(Bump(named, before.between(after), stays[plainest].sigmas))
+        bump = Bump(named, before.between(after), stays[plainest].sigmas)
+        instead = _odometry_instead(method, loose, stay, tested, fit, moved, start)
+        if instead is not None:
+            links, more_chi2 = instead
+            if more_chi2 < -EQUAL_CHI2 * scale:
+                break  # the odometry explains more: it is rejected in the search for wrong measurements
+            if more_chi2 < EQUAL_CHI2 * scale:
+                bump = replace(bump, or_else=links)
+        loose = _with_bump(loose, bump)
+        bumps.append(bump)
     return tuple(bumps)
+
+
+def _odometry_instead(
+    method: Method,
+    graph: PoseGraph,
+    stay: StayPut,
+    tested: Mapping[int, Agreement],
+    fit: Fit,
+    moved: Fit,
+    start: gtsam.Values | None,
+) -> tuple[tuple[Odometry, ...], float] | None:
+    """Odometry of one robot that, were it wrong, would explain what a bump does, and by how much its chi2 is larger.
+
+    None where no odometry across the stay-put contradicts anything.
+    """
+    by_robot: dict[str, list[Odometry]] = {}
+    for index, one in tested.items():
+        link = fit.links[index]
+        if isinstance(link, Odometry) and link.before < stay.after <= link.after and one.chance() < LEAST_CHANCE:
+            by_robot.setdefault(link.robot, []).append(link)
+    best: tuple[tuple[Odometry, ...], float] | None = None
+    for links in by_robot.values():
+        without = fit_graph(method, graph.without(links), start)
+        # of chi2 each degree of freedom is expected to leave one
+        more = (without.chi2 - without.dof) - (moved.chi2 - moved.dof)
+        if best is None or more < best[1]:
+            best = tuple(links), more
+    return best
+
+
+def _with_bump(graph: PoseGraph, bump: Bump) -> PoseGraph:
+    """The graph in which a bumped robot was no anchor, and odometry that may be wrong instead is as uncertain."""
+    graph = _moved(graph, bump.stay_put)
+    if not bump.or_else:
+        return graph
+    xi = gtsam.Pose3.Logmap(bump.T_before_after)[2:5]
+    loosened = {
+        id(one): replace(
+            one, covariance=one.covariance + np.diag(np.square(np.maximum(np.abs(xi), np.abs(xi).max() / 2)))
+        )
+        for one in bump.or_else
+    }
+    measurements = tuple(loosened.get(id(one), one) for one in graph.measurements)
+    return replace(graph, measurements=measurements)
 
 
 def _moved(graph: PoseGraph, stay: StayPut) -> PoseGraph:

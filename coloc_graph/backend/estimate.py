@@ -18,7 +18,7 @@ from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.ranging import RangingProblem
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.measurements import Measurement, Node, RangeBearing
+from coloc_graph.measurements import Measurement, Node, Odometry, RangeBearing
 
 Array = NDArray[np.float64]
 
@@ -35,12 +35,14 @@ class Rejection:
 class Bump:
     """An anchor that did not stay put: what the others say it did, and how many sigmas that is off its stay-put.
 
-    `T_before_after` is its body after in its body before.
+    `T_before_after` is its body after in its body before. `or_else` is odometry that, were it wrong, would explain the
+    measurements as well; it is then taken to be as uncertain as the bump is large.
     """
 
     stay_put: StayPut
     T_before_after: gtsam.Pose3
     sigmas: float
+    or_else: tuple[Odometry, ...] = ()
 
     @property
     def what(self) -> str:
@@ -53,6 +55,13 @@ class Bump:
         )
 
     def __str__(self) -> str:
+        if self.or_else:
+            first = self.or_else[0]
+            return (
+                f"{self.what}, or else the {first} is wrong: both explain the measurements equally well, and the "
+                f"estimate is as uncertain as either; check whether {self.stay_put.robot} was pushed, and the wheels "
+                f"and clock of {first.robot}"
+            )
         return f"{self.what}; do not name it as an anchor of stance {self.stay_put.after}"
 
 

@@ -1,0 +1,66 @@
+"""Who is blamed: odometry that is wrong and anchors that were bumped are told apart, or both are named."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from teams import graph_of_team, planar_nees, team_of
+
+from coloc_graph.backend import smooth
+from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.measurements import Odometry, RelativePose
+
+
+def with_wrong_odometry(team, rng):
+    """The measurements with the odometry of one robot off by 30 cm and 10 deg once, and which it is."""
+    ways = [m for m in team.measurements if isinstance(m, Odometry) and m.after < team.stances[-1].index]
+    wrong = ways[rng.integers(len(ways))]
+    yaw = rng.uniform(-3, 3)
+    jump = gtsam.Pose3(floor_pose(0.3 * np.cos(yaw), 0.3 * np.sin(yaw), 0.17))
+    bad = replace(wrong, T_before_after=gtsam.Pose3(wrong.T_before_after).compose(jump))
+    return [bad if m is wrong else m for m in team.measurements], bad
+
+
+def with_bump(team, stance):
+    """The measurements as they are where the anchor of a stance was bumped before it, and who that is."""
+    bump = gtsam.Pose3(floor_pose(0.06, -0.05, 0.12))
+    robot = team.stances[stance].anchors[0]
+    made = []
+    for m in team.measurements:
+        if isinstance(m, RelativePose) and m.stance == stance and robot in (m.robot_i, m.robot_j):
+            T = gtsam.Pose3(m.T_i_j)
+            m = replace(m, T_i_j=bump.inverse().compose(T) if m.robot_i == robot else T.compose(bump))
+        elif isinstance(m, Odometry) and m.robot == robot and m.before == stance:
+            m = replace(m, T_before_after=bump.inverse().compose(gtsam.Pose3(m.T_before_after)))
+        made.append(m)
+    return made, robot
+
+
+@pytest.mark.parametrize("robots", [3, 4])
+@pytest.mark.parametrize("seed", range(6))
+def test_wrong_odometry_is_named_alone_or_beside_a_bump_and_no_innocent_robot_alone(robots, seed):
+    team = team_of(robots, 10, seed)
+    made, bad = with_wrong_odometry(team, np.random.default_rng(seed))
+    estimate = smooth(graph_of_team(team, made))
+    rejected = [one.measurement for one in estimate.refused]
+    named = any(one is bad for one in rejected)
+    for bump in estimate.bumped:
+        assert bump.or_else and any(one.robot == bad.robot for one in bump.or_else)
+        assert "or else the odometry of" in str(bump) and "equally well" in str(bump)
+        named |= any(one is bad for one in bump.or_else)
+    assert named
+    assert all(one is bad for one in rejected)
+    last = team.stances[-1].index
+    for node in (node for node in team.T_world_body if node[1] == last):
+        assert planar_nees(estimate, team, node) < 30
+
+
+@pytest.mark.parametrize("robots", [3, 4])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_bump_is_named_alone_or_beside_the_odometry_that_would_explain_it(robots, seed):
+    team = team_of(robots, 10, seed)
+    made, robot = with_bump(team, 5)
+    estimate = smooth(graph_of_team(team, made))
+    assert robot in {bump.stay_put.robot for bump in estimate.bumped}
+    assert all(bump.stay_put.robot == robot or bump.or_else for bump in estimate.bumped)
