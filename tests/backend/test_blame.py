@@ -2,13 +2,12 @@
 
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 from teams import graph_of_team, planar_nees, team_of
 
 from coloc_graph.backend import smooth
-from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.measurements import Odometry, RelativePose
 
 
@@ -17,28 +16,27 @@ def with_wrong_odometry(team, rng):
     ways = [m for m in team.measurements if isinstance(m, Odometry) and m.after < team.stances[-1].index]
     wrong = ways[rng.integers(len(ways))]
     yaw = rng.uniform(-3, 3)
-    jump = gtsam.Pose3(floor_pose(0.3 * np.cos(yaw), 0.3 * np.sin(yaw), 0.17))
-    bad = replace(wrong, T_before_after=gtsam.Pose3(wrong.T_before_after).compose(jump))
+    jump = floor_pose(0.3 * np.cos(yaw), 0.3 * np.sin(yaw), 0.17)
+    bad = replace(wrong, T_before_after=wrong.T_before_after @ jump)
     return [bad if m is wrong else m for m in team.measurements], bad
 
 
 def with_bump(team, stance):
     """The measurements as they are where the anchor of a stance was bumped before it, and who that is."""
-    bump = gtsam.Pose3(floor_pose(0.06, -0.05, 0.12))
+    bump = floor_pose(0.06, -0.05, 0.12)
     robot = team.stances[stance].anchors[0]
     made = []
     for m in team.measurements:
         if isinstance(m, RelativePose) and m.stance == stance and robot in (m.robot_i, m.robot_j):
-            T = gtsam.Pose3(m.T_i_j)
-            m = replace(m, T_i_j=bump.inverse().compose(T) if m.robot_i == robot else T.compose(bump))
+            m = replace(m, T_i_j=se3_inverse(bump) @ m.T_i_j if m.robot_i == robot else m.T_i_j @ bump)
         elif isinstance(m, Odometry) and m.robot == robot and m.before == stance:
-            m = replace(m, T_before_after=bump.inverse().compose(gtsam.Pose3(m.T_before_after)))
+            m = replace(m, T_before_after=se3_inverse(bump) @ m.T_before_after)
         made.append(m)
     return made, robot
 
 
 @pytest.mark.parametrize("robots", [3, 4])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_wrong_odometry_is_named_alone_or_beside_a_bump_and_no_innocent_robot_alone(robots, seed):
     team = team_of(robots, 10, seed)
     made, bad = with_wrong_odometry(team, np.random.default_rng(seed))
@@ -57,7 +55,7 @@ def test_wrong_odometry_is_named_alone_or_beside_a_bump_and_no_innocent_robot_al
 
 
 @pytest.mark.parametrize("robots", [3, 4])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_bump_is_named_alone_or_beside_the_odometry_that_would_explain_it(robots, seed):
     team = team_of(robots, 10, seed)
     made, robot = with_bump(team, 5)
