@@ -41,7 +41,7 @@ def test_wrong_odometry_is_named_alone_or_beside_a_bump_and_no_innocent_robot_al
     team = team_of(robots, 10, seed)
     made, bad = with_wrong_odometry(team, np.random.default_rng(seed))
     estimate = smooth(graph_of_team(team, made))
-    rejected = [one.measurement for one in estimate.refused]
+    rejected = [one.measurement for one in estimate.rejected]
     named = any(one is bad for one in rejected)
     for bump in estimate.bumped:
         assert bump.or_else and any(one.robot == bad.robot for one in bump.or_else)
