@@ -292,7 +292,7 @@ def _of_chunk() -> Iterator[bytes]:
     from coloc_graph.run.chunks import decompressed
     from coloc_graph.run.index import build_index
 
-    for path in sorted(Path("tests/run/conformance/run").glob("*.mcap")):
+    for path in map(Path("tests/run/conformance/run").joinpath, ("minimal.mcap", "everything.mcap")):
         index = build_index(path)
         with path.open("rb") as file:
             yield from (decompressed(path, file, one) for one in index.chunks)
@@ -304,7 +304,7 @@ def _of_record() -> Iterator[bytes]:
 
     kinds = {"Team": 0, "Detections": 1, "Odometry": 2, "Motion": 3, "Ranges": 4, "Stance": 5, "Planes": 6,
              "RawImage": 7, "CompressedImage": 8, "PoseInFrame": 9}  # fmt: skip
-    for path in sorted(Path("tests/run/conformance/run").glob("*.mcap")):
+    for path in map(Path("tests/run/conformance/run").joinpath, ("minimal.mcap", "everything.mcap")):
         index = build_index(path)
         with path.open("rb") as file:
             for chunk_info in index.chunks:
