@@ -152,7 +152,7 @@ def calibrate_camera(
 
 
 def tilt_deg(pose: Array) -> float:
-    """How far a board's plane is turned out of the image plane, from its pose (6,) [deg]."""
+    """Angle between a board's plane and the image plane, from its pose (6,) [deg]."""
     R, _ = cv2.Rodrigues(pose[:3])
     return math.degrees(math.acos(min(1.0, abs(float(R[2, 2])))))
 

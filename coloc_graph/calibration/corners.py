@@ -21,8 +21,7 @@ Image = NDArray[np.uint8]
 #: larger one sees the neighbour's edges (11 px on squares of 13 px: 0.58 px RMS instead of 0.16).
 WINDOW = 0.45
 LARGEST_WINDOW = 12
-#: JPEG's blocks and the sensor's noise are smoothed by so many pixels first.
-SMOOTHING = 0.7
+SMOOTHING = 0.7  # px, sigma of the blur against JPEG's blocks and the sensor's noise
 #: Fewer corners of a ChArUco board than this say too little about its pose.
 LEAST_CORNERS = 8
 
@@ -47,7 +46,7 @@ class Views:
 
     @property
     def images(self) -> int:
-        """How many images were looked at."""
+        """Number of images that were searched."""
         return len(self.views) + len(self.missed)
 
 
@@ -127,7 +126,7 @@ def _refined(image: Image, points: Array, uv: NDArray[np.float32], square: float
 
 
 def _remedy(images: Sequence[Image], board: Board) -> str:
-    """What to try where a board is not found: another size that is seen, or the usual."""
+    """Remedy if a board is not found: another size that is seen, or the usual."""
     for other in _others(board):
         if any(find_board(image, other) is not None for image in images):
             counted = "inner corners, not squares" if board.dictionary is None else "squares, columns first"

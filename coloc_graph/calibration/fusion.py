@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Said:
-    """What n images say of one value of m numbers: `values` (n, m), each one's `own` covariance (n, m, m), and the
+    """Estimates of one value of m numbers from n images: `values` (n, m), the `own` covariance of each (n, m, m), and the
     covariance of what they share, `common` (n, m, n, m)."""
 
     values: Array

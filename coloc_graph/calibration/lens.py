@@ -1,4 +1,4 @@
-"""What intrinsics and their covariance mean in the image: where the lens model folds, how well a ray is known."""
+"""Intrinsics in the image: the fold of a lens model, the uncertainty of a ray."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ def folds(intrinsics: Array, width: int, height: int) -> str | None:
 
 
 def ray_sigmas(intrinsics: Array, covariance: Array, uv: Array, at: Array | None = None) -> Array:
-    """How well the pixel of a fixed ray is known (m,) [px an axis], for rays of pixels `at` (m, 2), or of `uv` (n, 2).
+    """Standard deviation of a fixed ray (m,) [px an axis], for rays of pixels `at` (m, 2), or of `uv` (n, 2).
 
     A camera that is turned a little sees what one with other intrinsics would: what a rotation makes up for, the best
     over the pixels `uv`, is left out. Rays that the model does not have come out as infinite.
@@ -60,7 +60,7 @@ def ray_sigmas(intrinsics: Array, covariance: Array, uv: Array, at: Array | None
 
 
 def _of_rays(camera: Camera, intrinsics: Array, uv: Array) -> tuple[Array, Array]:
-    """How pixels change with intrinsics (2m, p) and with a rotation (2m, 3), at the rays of pixels (m, 2)."""
+    """Derivatives of pixels by intrinsics (2m, p) and by a rotation (2m, 3), at the rays of pixels (m, 2)."""
     x = camera.normalise(uv)
     _, A, B = project(intrinsics, np.array([1e-12, 0, 0, 0, 0, 0.0]), np.column_stack([x, np.ones(len(x))]))
     return A, B[:, :3]

@@ -1,4 +1,4 @@
-"""How many lens coefficients the images call for, and what the intrinsics are without each part of the images."""
+"""Choice of the number of lens coefficients, and the intrinsics without each part of the images."""
 
 import math
 from collections.abc import Callable, Sequence

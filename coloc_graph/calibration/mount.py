@@ -1,4 +1,4 @@
-"""How a camera sits on its robot, from images of a board that lies flat on the floor in front of it.
+"""Extrinsics of a camera, from images of a board that lies flat on the floor in front of its robot.
 
 The board's plane is the floor, so that each image tells the camera's height, tilt and roll; where the board lies, and
 which way it is turned, is free. All images are weighed together by generalised least squares: what each corner has
@@ -41,7 +41,7 @@ LEAST_NOISE = 0.03
 
 @dataclass(frozen=True)
 class BoardOnFloor:
-    """What one image says: height [m], tilt and roll [deg] of the camera, RMS distance of the corners [px].
+    """Estimate from one image: height [m], tilt and roll [deg] of the camera, RMS distance of the corners [px].
 
     `refused` says why it was left out.
     """

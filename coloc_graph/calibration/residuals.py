@@ -1,4 +1,4 @@
-"""What residuals say: how much of an error is a corner's own, and how much neighbours share."""
+"""Residuals taken apart: the error of a corner of its own, and the error that neighbours share."""
 
 import math
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ def noise_and_shared(
 
 
 def fitted_directions(views: Sequence[View], bundle: Bundle) -> list[Array]:
-    """What a bundle's poses and intrinsics took of each image's residuals: (2n, 6 + p), for `noise_and_shared`."""
+    """Directions in which a bundle's poses and intrinsics absorb each image's residuals: (2n, 6 + p)."""
     directions = []
     for view, pose in zip(views, bundle.poses, strict=True):
         _, A, B = project(bundle.intrinsics, pose, view.points)

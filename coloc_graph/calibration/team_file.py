@@ -1,4 +1,4 @@
-"""What was calibrated, written into a team.toml: all else in it stays as it is, comments too."""
+"""Write a calibration into a team.toml: all else in it stays as it is, comments too."""
 
 from collections.abc import Mapping
 from pathlib import Path

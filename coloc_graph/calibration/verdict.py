@@ -1,4 +1,4 @@
-"""Whether a calibration is good, in words that say what to do."""
+"""Verdict on a calibration, in words that say what to do."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ PLACES = 10
 
 
 def cell_counts(uv: Array, width: int, height: int, columns: int, rows: int) -> NDArray[np.int64]:
-    """How many of the pixels uv (n, 2) are in each cell of an image (rows, columns)."""
+    """Number of pixels uv (n, 2) in each cell of an image (rows, columns)."""
     edges = (np.linspace(-0.5, height - 0.5, rows + 1), np.linspace(-0.5, width - 0.5, columns + 1))
     return np.histogram2d(uv[:, 1], uv[:, 0], bins=edges)[0].astype(np.int64)
 
@@ -43,7 +43,7 @@ def uncovered(uv: Array, width: int, height: int) -> tuple[str, ...]:
 
 
 def verdict(calibration: CameraCalibration) -> tuple[str, ...]:
-    """What is to be done about a calibration, the most important first; `GOOD` alone where nothing is."""
+    """Sentences on what to do about a calibration, the most important first; `GOOD` alone if nothing."""
     used = calibration.used
     uv = np.concatenate([view.uv for view in used.views])
     said = []

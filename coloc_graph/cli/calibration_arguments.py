@@ -1,4 +1,4 @@
-"""What `coloc calibrate camera` and `mount` share: whose camera, the boards in images, what was written."""
+"""Arguments that `coloc calibrate camera` and `mount` share: the robot, the boards in images, the outputs."""
 
 import argparse
 from contextlib import ExitStack
@@ -46,7 +46,7 @@ def seen_in(args: argparse.Namespace) -> "tuple[Views, Board]":
 
 
 def say_written(args: argparse.Namespace) -> None:
-    """What was written, to stderr."""
+    """Print the paths of what was written, to stderr."""
     import sys
 
     for path in (getattr(args, "out", None), args.out_team or args.team, getattr(args, "camera_info", None)):

@@ -48,7 +48,7 @@ def landmark_rows(estimate: Estimate) -> list[LandmarkRow]:
 
 
 def map_row(estimate: Estimate) -> LandmarkRow | None:
-    """Where the map is in the world: T_world_map; its `measurements` are of all landmarks that are on it."""
+    """Pose T_world_map of the map in the world; its `measurements` are of all landmarks on it."""
     if estimate.map is None:
         return None
     on_it = _on_map(estimate)

@@ -46,17 +46,15 @@ WHEELS = Wheels(delay=0.1, scale_sigma=0.1, turn_scale_sigma=0.1, delay_sigma=0.
 ALONG = (0.08, 0.004)
 ACROSS = (0.012, 0.002)
 TURN = (0.1, 0.08, 0.006)
-#: Commands that stay the same are kept so often [s].
-KEPT_EVERY = 0.2
-#: Truth is kept so often [s]: motion capture's 100 a second would be most of the run.
-TRUTH_EVERY = 0.045
+KEPT_EVERY = 0.2  # s, period at which commands that stay the same are kept
+TRUTH_EVERY = 0.045  # s, period at which truth is kept: all 100 a second would be most of the run
 #: The way of one command is followed to so much [s]; one that is older was no command any more.
 LONGEST_COMMAND = 2.0
 
 
 @dataclass(frozen=True)
 class MrclamSummary:
-    """What was imported: robots and landmarks, how many measurements, for how long [s]; and `warnings`."""
+    """Summary of an import: robots, landmarks, number of measurements, duration [s], and `warnings`."""
 
     robots: tuple[str, ...]
     landmarks: tuple[str, ...]
@@ -194,7 +192,7 @@ def _without_map(team: Team) -> Team:
 def _ranges(
     table: DatTable, subject: int, codes: dict[int, int], names: dict[int, str], warnings: list[str]
 ) -> list[Ranges]:
-    """What a robot measured, instant by instant; barcodes that nobody has, and its own, are left out."""
+    """Measurements of a robot, instant by instant; unknown barcodes, and its own, are left out."""
     seen = np.array([codes.get(code, -1) for code in table.values[:, 1].astype(int).tolist()], int)
     known = np.array([one in names and one != subject for one in seen.tolist()], bool)
     if not known.all():
@@ -219,7 +217,7 @@ def _ranges(
 
 
 def _odometry(table: DatTable) -> _Odometry:
-    """Where the commands lead: each holds until the next one; those that stay the same are put together."""
+    """Dead reckoning of the commands: each holds until the next one; equal ones are merged."""
     times, commands = table.values[:, 0], table.values[:, 1:]
     # a row that changes nothing is kept so that time goes on
     keep = np.r_[True, (np.diff(commands, axis=0) != 0).any(axis=1)] | _every(times, KEPT_EVERY)
@@ -239,7 +237,7 @@ def _odometry(table: DatTable) -> _Odometry:
 
 
 def _every(times: Array, period: float) -> NDArray[np.bool_]:
-    """Which of ascending times are the first of their period, and the last of all."""
+    """True for the first of ascending times in each period, and for the last of all."""
     periods = np.floor((times - times[0]) / period)
     first: NDArray[np.bool_] = np.r_[True, np.diff(periods) > 0]
     first[-1] = True

@@ -77,7 +77,7 @@ class _Messages:
         self.store = get_typestore(Stores.LATEST)
 
     def mounts(self, trajectories: Mapping[str, Trajectory], team: Team) -> _Message:
-        """Where each robot's camera sits on it."""
+        """Static transforms from each robot to its camera."""
         ns = min(to_ns(float(one.times[0])) for one in trajectories.values())
         mounts = [
             self._transform(ns, f"{robot}/base_link", f"{robot}/camera", team[robot].mount.T_body_camera)

@@ -160,7 +160,7 @@ def _numbers(found: Any, name: str) -> list[float]:
 
 
 def differences(found: Camera, stated: Camera) -> list[str]:
-    """What a camera_info says otherwise than the team, in words."""
+    """Differences between a camera_info and the camera in the team, in words."""
     said = []
     for name in ("width", "height", "fx", "fy", "cx", "cy"):
         a, b = getattr(found, name), getattr(stated, name)

@@ -17,7 +17,7 @@ MotionSource = Literal["odometry", "stands", "moves"]
 
 
 class OdometrySigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How far odometry errs, one standard deviation each, growing with the root of the way.
+    """Standard deviations of odometry, which grow with the root of the distance.
 
     `along` and `across` [m] are of the way after one metre, ahead and sideways; `turned` [rad] is of the heading after
     turning by one radian, `veer` [rad] after driving one metre.
@@ -73,7 +73,7 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class RosMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What of a ROS bag is what. `team` is the path of a team.toml, from where the map lies.
+    """Map of the topics of a ROS bag. `team` is the path of a team.toml, from where the map lies.
 
     `time` is where a message's time is from: its header's stamp, or when the bag received it. `motion` is when a robot
     counts as moving, and what makes a stance.

@@ -43,7 +43,7 @@ class InOrder(Generic[T]):
         self._due, self._held = deque(due.tolist()), dict[int, T]()
 
     def take(self, ns: int, message: T) -> Iterator[tuple[int, T]]:
-        """What is due with a message, which may be nothing, or several; one that is there already is dropped.
+        """Yield the messages that are due with a message, none or several; one that is there already is dropped.
 
         `OverflowError` where more are held back than are held.
         """

@@ -37,8 +37,7 @@ TYPES = {
     "truth": (POSE, POSE_WITH_COVARIANCE, ODOMETRY),
 }
 TF_TOPICS = {"/tf": False, "/tf_static": True}
-#: So often is told how far reading is, in messages.
-TELL_EVERY = 100
+TELL_EVERY = 100  # messages between two reports of progress
 
 
 class Moment(NamedTuple):
@@ -61,7 +60,7 @@ class TruePose(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a bag has of a map: the order of each topic's messages and, but for images, what is in them, in that order.
+    """Content of a bag that a map asks for: the order of each topic's messages and, but for images, their values in it.
 
     `by_bag` are the topics whose time is when the bag received them. `frames` are of tf, empty where no robot asks for
     them. `notes` are sentences on what was odd.

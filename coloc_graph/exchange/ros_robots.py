@@ -1,4 +1,4 @@
-"""What a ROS bag says of each robot, as a run has it: camera, odometry, true poses, movements; and what is odd."""
+"""Robots of a ROS bag as a run has them: camera, odometry, true poses, movements; and warnings."""
 
 import itertools
 import re
@@ -29,8 +29,7 @@ STAMPED = 12
 LEVEL = 5.0
 BREAKS_NAMED = 3  # jumps of one topic that are described one by one
 BODY_FRAME = re.compile(r"(^|[/_])(base(_link|_footprint)?|body|chassis|footprint)$")  # frames of the body itself
-#: Images that are taken so long before or after all odometry are told of [s].
-UNKNOWN = 1.0
+UNKNOWN = 1.0  # s, images further before or after all odometry are warned of
 
 
 def with_cameras(bag: Bag, the_map: RosMap, recording: Recording, team: Team) -> tuple[Team, list[str]]:
@@ -167,7 +166,7 @@ def _extent(recording: Recording) -> tuple[float, float]:
 
 
 def of_motion(bag: Bag, the_map: RosMap, recording: Recording, moves: list[Movements]) -> list[str]:
-    """What is odd about how robots moved."""
+    """Warnings on the movements of robots."""
     said = []
     for robot, one in zip(the_map.robots, moves, strict=True):
         if one.crept:
@@ -195,7 +194,7 @@ def of_motion(bag: Bag, the_map: RosMap, recording: Recording, moves: list[Movem
 
 
 def of_team(bag: Bag, the_map: RosMap, team: Team, recording: Recording) -> list[str]:
-    """Who is left out, and truths that are not of one world."""
+    """Warnings on robots that are left out, and on truths in different frames."""
     said = []
     absent = [name for name in team.names if name not in {robot.name for robot in the_map.robots}]
     if absent:

@@ -19,8 +19,7 @@ Array = NDArray[np.float64]
 #: Begin and end of a stretch of time [UTC s].
 Span = tuple[float, float]
 
-#: An observer has taken at least so many images in a stance.
-LEAST_IMAGES = 2
+LEAST_IMAGES = 2  # images of an observer in a stance, at least
 
 
 class MotionThresholds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -107,13 +106,13 @@ def _at(t: Array, p: Array, times: Array) -> Array:
 
 
 def _differ(a: Array, b: Array, thresholds: MotionThresholds) -> NDArray[np.bool_]:
-    """Which of poses (n, 3) and (n, 3) are a movement apart."""
+    """True for pairs of poses (n, 3) and (n, 3) that are a movement apart."""
     off = np.atleast_2d(a - b)
     return np.asarray((np.hypot(off[:, 0], off[:, 1]) > thresholds.step) | (np.abs(off[:, 2]) > thresholds.turned))
 
 
 def _creeps(t: Array, p: Array, span: Span, thresholds: MotionThresholds) -> bool:
-    """Whether a robot that seems to stand gets somewhere; at both ends it may yet brake and set off."""
+    """True if a robot that seems to stand creeps; at both ends it may still brake and set off."""
     half = thresholds.window / 2
     inside = p[(t >= span[0] + half) & (t <= span[1] - half)]
     return bool(len(inside)) and bool(_differ(inside, inside[:1], thresholds).any())

@@ -31,7 +31,7 @@ IMAGE_MARGIN = 1.0
 
 @dataclass(frozen=True)
 class ImportSummary:
-    """What was imported: how many stances and rows, which robots observe in any stance (in the team's order).
+    """Summary of an import: numbers of stances and rows, the robots that observe in any stance (in the team's order).
 
     `warnings` are sentences on what was assumed or looks wrong.
     """
@@ -190,7 +190,7 @@ def _require_stances_in_order(tracks: _Tracks) -> None:
 
 
 def _observers(tracks: _Tracks, team: Team) -> dict[int, tuple[str, ...]]:
-    """Who has rows in each stance, in the team's order; `TracksError` where no stance has two."""
+    """Observers of each stance, in the team's order; `TracksError` if no stance has two."""
     observers = {
         stance: tuple(team.names[place] for place in np.unique(tracks.robot[tracks.stance == stance]))
         for stance in np.unique(tracks.stance).tolist()
@@ -205,7 +205,7 @@ def _observers(tracks: _Tracks, team: Team) -> dict[int, tuple[str, ...]]:
 
 
 def _read_moves(path: Path, team: Team, tracks: _Tracks) -> dict[int, tuple[str, ...]]:
-    """Who moved since the stance before, by stance; no rows say that nobody ever did."""
+    """Robots that moved since the stance before, by stance; no rows mean that none ever did."""
     table = read_table(path, "moves", MOVES_HEADER)
     places, stances = table.robots(team), table.stances()
     known = set(tracks.stance.tolist())

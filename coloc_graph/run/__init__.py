@@ -1,4 +1,4 @@
-"""What a team recorded: `RunWriter` writes it, `open_run` gives it back lazily, as the records of `messages`.
+"""Runs, the recordings of a team: `RunWriter` writes one, `open_run` reads it lazily, as the records of `messages`.
 
 A run is one MCAP file that Foxglove opens; docs/run-format.md says what is in it. `read_truth` and
 `read_true_team` are for evaluation alone.

@@ -27,7 +27,7 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
 class ChannelInfo(NamedTuple):
-    """What a channel carries."""
+    """Topic, schema and encoding of a channel."""
 
     topic: str
     schema: str

@@ -69,7 +69,7 @@ def decode_motion(robot: str, ns: int, data: memoryview) -> Motion:
 
 
 def decode_ranges(robot: str, ns: int, data: memoryview) -> Ranges:
-    """What a sensor of range and bearing measured at one instant."""
+    """Measurements of a range and bearing sensor at one instant."""
     wire = _json(data, schemas.RangesWire)
     if not len(wire.target) == len(wire.range) == len(wire.bearing):
         lengths = f"`range` has {len(wire.range)} and `bearing` {len(wire.bearing)}"

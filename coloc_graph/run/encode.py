@@ -91,7 +91,7 @@ def encode_pose(time: float, T_world_body: Array) -> bytes:
 
 
 def _is_rigid(T: list[list[float]]) -> bool:
-    """Whether the rows of a transform are finite, and the first three of its columns those of a rotation."""
+    """True if a transform is finite and its first three columns are those of a rotation."""
     if not all(math.isfinite(value) for row in T for value in row):
         return False
     a, b, c = zip(*(row[:3] for row in T[:3]), strict=True)

@@ -3,7 +3,7 @@
 import struct
 from typing import NamedTuple
 
-#: Most pixels that are decoded; a grey image of so many takes 64 MiB.
+#: Most pixels that are decoded; a grey image of this size takes 64 MiB.
 MAX_PIXELS = 2**26
 #: Most pixels times scans: a progressive JPEG is decoded once a scan.
 MAX_SCANNED_PIXELS = 2**28

@@ -1,4 +1,4 @@
-"""What is where in the MCAP file under a run.
+"""Index of the MCAP file of a run: its chunks, their messages, and what is damaged.
 
 mcap's own readers need a whole file, believe every length that they read, and name no place. This one walks
 over the record headers (https://mcap.dev/spec), the same way for a whole file and for one that was cut off.
@@ -53,7 +53,7 @@ class Index:
 
 
 def is_mcap(path: Path) -> bool:
-    """Whether a file begins as an MCAP file does."""
+    """True if a file begins as an MCAP file does."""
     with path.open("rb") as file:
         return file.read(len(MAGIC)) == MAGIC
 
@@ -191,7 +191,7 @@ class _Walk:
         return sum(chunk.counts.values())
 
     def _compare_with_summary(self, footer: Footer) -> None:
-        """What was found must be what the writer says it wrote: headers and indexes have no checksums."""
+        """Compare the chunks and counts with those in the summary: headers and indexes have no checksums."""
         start = footer.summary_start
         footer_start = self.size - len(MAGIC) - FOOTER_SIZE
         summary = self._read(start, footer_start - start)

@@ -1,4 +1,4 @@
-"""What a run is made of, as Python sees it: one frozen record a message.
+"""Records of a run: one frozen dataclass a message.
 
 Times are UTC seconds (float64) by the clock of the robot that wrote the message. Pixels: (0, 0) is the centre
 of the top-left pixel.
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 class Flag(IntFlag):
-    """What is doubtful about a detection."""
+    """Reasons to doubt a detection."""
 
     NONE = 0
     SATURATED = 1  # the blob's core is at the sensor's limit
@@ -66,7 +66,7 @@ class EncodedImage:
 
 @dataclass(frozen=True, eq=False)
 class OdometrySample:
-    """Where the wheels say the robot is: `pose` (x [m], y [m], yaw [rad]) in its own odometry frame.
+    """Sample of wheel odometry: `pose` (x [m], y [m], yaw [rad]) in the robot's own odometry frame.
 
     `covariance` (3, 3) is that of the increment since the previous sample, in the previous sample's body.
     """
@@ -79,7 +79,7 @@ class OdometrySample:
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """How far (n,) [m] and in which direction (n,) [rad, left of ahead is positive] a robot measured `targets`.
+    """Ranges (n,) [m] and bearings (n,) [rad, left of ahead is positive] of `targets`, measured by one robot.
 
     Targets are robots and landmarks of the team.
     """

@@ -17,14 +17,12 @@ from coloc_graph.run.topics import Item, decoded, read_near, read_topic, time_sp
 from coloc_graph.team import Team
 
 SAME_TIME = 1_000  # difference of instants that are the same, by rounding [ns]
-
-#: A run's id is made of at most so many bytes.
-MAX_IDENTIFYING = 1 << 20
+MAX_IDENTIFYING = 1 << 20  # bytes of which a run's id is made, at most
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run:
-    """What a team recorded, read when it is asked for; it holds no open file. Truth is out of its reach.
+    """Recording of a team, read on demand; it holds no open file and gives no access to truth.
 
     `topics` counts the messages of each topic, `start` and `end` are the first and the last message's time
     [UTC s] (None where there is none but the team). `warnings` are sentences on what could not be read.
@@ -55,7 +53,7 @@ class Run:
         return decoded(self._index, items, lambda item: decode.decode_image(robot, item.ns, item.schema, item.data))
 
     def detections(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Detections]:
-        """What was detected in the images of a robot's camera, one record an image."""
+        """Detections in the images of a robot's camera, one record an image."""
         items = self._items(robot, "detections", start, end)
         return decoded(self._index, items, lambda item: decode.decode_detections(robot, item.ns, item.data))
 
@@ -70,7 +68,7 @@ class Run:
         return decoded(self._index, items, lambda item: decode.decode_motion(robot, item.ns, item.data))
 
     def ranges(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Ranges]:
-        """What a robot's sensor of range and bearing measured, one record an instant."""
+        """Measurements of a robot's range and bearing sensor, one record an instant."""
         items = self._items(robot, "ranges", start, end)
         for one in decoded(self._index, items, lambda item: decode.decode_ranges(robot, item.ns, item.data)):
             check_targets(self.team, one, f"{self.path}: the ranges of {robot} at {one.time} s")
@@ -78,15 +76,15 @@ class Run:
 
     @property
     def has_ranges(self) -> bool:
-        """Whether any robot's sensor of range and bearing measured something."""
+        """True if any robot has range and bearing measurements."""
         return any(self._count(robot, "ranges") for robot in self.team.names)
 
     def has_images(self, robot: str) -> bool:
-        """Whether there is an image of this robot's camera."""
+        """True if there is an image of this robot's camera."""
         return self._count(robot, "image") > 0
 
     def has_detections(self, robot: str) -> bool:
-        """Whether there are detections of this robot's camera."""
+        """True if there are detections of this robot's camera."""
         return self._count(robot, "detections") > 0
 
     def _count(self, robot: str, kind: str) -> int:
@@ -182,12 +180,12 @@ def truth_counts(path: str | Path) -> dict[str, int]:
 
 
 def read_true_team(path: str | Path) -> Team | None:
-    """What the team was really like, None where that is not recorded. For evaluation alone."""
+    """True mounts and markers of the team, None if they are not recorded. For evaluation alone."""
     return _read_team(build_index(Path(path)), schemas.TRUE_TEAM_TOPIC)
 
 
 def run_id(path: str | Path) -> str:
-    """What tells a run from every other: the same for its file moved, copied or cut off, whatever the name.
+    """Identifier of a run, the same for its file moved, copied or cut off, whatever the name.
 
     The SHA-256 of the file up to the end of its second chunk, of 1 MiB at most: the team, and the first data.
     """

@@ -1,4 +1,4 @@
-"""What is asked of a run to measure its stances."""
+"""Interface of a recording for the measurement of stances."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,22 +9,22 @@ from coloc_graph.team import Team
 
 
 class Recorded(Protocol):
-    """What is asked of a run to measure a stance: `run.Run`, or a team's memory while it is out."""
+    """Interface for the measurement of a stance: `run.Run`, or the memory of a mission."""
 
     @property
     def path(self) -> Path:
-        """Where it is from, for messages."""
+        """Origin, for messages."""
 
     @property
     def team(self) -> Team:
-        """Who the robots are."""
+        """The team."""
 
     @property
     def planes(self) -> dict[int, Planes]:
         """Planes that are stated, by stance."""
 
     def has_detections(self, robot: str) -> bool:
-        """Whether there are detections of this robot's camera."""
+        """True if there are detections of this robot's camera."""
 
     def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
         """The detections of a robot's camera in a time [UTC s]."""

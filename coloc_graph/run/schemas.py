@@ -63,7 +63,7 @@ class RangesWire(Wire, frozen=True):
 
 
 class MotionWire(Wire, frozen=True):
-    """Whether a movement begins (true) or ends."""
+    """Begin (true) or end of a movement."""
 
     moving: bool
 
@@ -132,7 +132,7 @@ def schemas_of(topic: str) -> tuple[str, ...]:
 
 
 def is_truth(topic: str) -> bool:
-    """Whether a topic tells what only an evaluation may know."""
+    """True if a topic holds truth, which is for evaluation alone."""
     return topic == TRUE_TEAM_TOPIC or topic.endswith("/truth")
 
 

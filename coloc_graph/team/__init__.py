@@ -1,4 +1,4 @@
-"""Who the robots are: `Team` of `Robot`s and `Landmark`s on a `Floor`, and the file team.toml.
+"""Description of a team: `Team` of `Robot`s and `Landmark`s on a `Floor`, and the file team.toml.
 
 Fields carry the unit a person writes (`tilt_deg`); metres where a name says nothing. Tolerances (`*_sigma*`)
 are one standard deviation: what a simulated truth is drawn from and what the estimators take as a prior.

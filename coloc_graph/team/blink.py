@@ -6,13 +6,10 @@ import msgspec
 
 from coloc_graph.team.checks import require_finite
 
-#: A bit is at least, and at most, so long [s]: what is off for longer is lost, and images are at least two a bit.
-SHORTEST = 0.02
-LONGEST = 0.25
-#: So many images at least must a camera take in a bit.
-IMAGES_A_BIT = 2
-#: A code is at most so long.
-MOST_BITS = 32
+SHORTEST = 0.02  # s, shortest bit: a camera takes at least two images in it
+LONGEST = 0.25  # s, longest bit: a track that is off for longer is lost
+IMAGES_A_BIT = 2  # images in a bit, at least
+MOST_BITS = 32  # bits of a code, at most
 
 
 class Blink(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

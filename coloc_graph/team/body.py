@@ -1,4 +1,4 @@
-"""What sits on a robot's body: `Mount`, `Markers`; how it stands, `Slip`; and what its program opens, `Devices`."""
+"""Parts of a robot: `Mount` and `Markers` on its body, `Slip` as an anchor, `Devices` of its program."""
 
 import math
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the camera sits on the body: `T_body_camera`, with tolerances.
+    """Extrinsics of the camera, `T_body_camera`, with tolerances.
 
     `height` is that of the optical centre above the floor, `x` and `y` its place on the body [m]. `tilt_deg`
     looks down where it is positive; the order is yaw, tilt, roll about the body's z, y, x.
@@ -93,7 +93,7 @@ LEAST_SLIP = 1e-3
 
 
 class Slip(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How far a robot that should stay put may slip from one stance to the next: `sigma` [m] and `sigma_deg`."""
+    """Slip of an anchor from one stance to the next, one standard deviation: `sigma` [m] and `sigma_deg`."""
 
     sigma: float
     sigma_deg: float
@@ -108,7 +108,7 @@ class Slip(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class Devices(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a robot's own program opens, and where the robot is put down.
+    """Devices that a robot's own program opens, and the pose at which the robot begins.
 
     `camera` is a source of images ("v4l2:/dev/video0"), `wheels` the serial port of its Create, of `model` 1 or 2
     (found out where it is not said). `start` is x, y [m] and yaw [deg] at the beginning, on a floor whose x axis is

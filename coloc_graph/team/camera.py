@@ -97,7 +97,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return None if reached >= math.hypot(across, down) else reached * math.sqrt(self.fx * self.fy)
 
     def _unfolded(self, x: Array, y: Array) -> NDArray[np.bool_]:
-        """Where the distorted radius still grows: beyond, a lens model folds far points back into the image."""
+        """True where the distorted radius still grows: beyond, a lens model folds far points back into the image."""
         k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *([0.0] * (8 - len(self.distortion))))
         r2 = x * x + y * y
         with np.errstate(invalid="ignore"):
@@ -146,7 +146,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return np.where((moved < 1e-9)[:, None], np.stack([x, y], axis=1), np.nan)
 
     def per_pixel(self, x: ArrayLike) -> Array:
-        """How far one pixel to the right, and one down, go at normalised coordinates x (n, 2): (n, 2, 2)."""
+        """Derivative (n, 2, 2) of normalised coordinates by pixels, at normalised coordinates x (n, 2)."""
         at = np.asarray(x, float)
         if not self.distortion:
             return np.broadcast_to(np.diag([1 / self.fx, 1 / self.fy]), (len(at), 2, 2))

@@ -32,7 +32,7 @@ class Tag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 
 class Landmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What does not move: `markers` on a body of its own, a `tag`, or a bare point for sensors of range and bearing.
+    """Landmark: `markers` on a body of its own, a `tag`, or a bare point for range and bearing sensors.
 
     Its frame is a body's: x is the way it faces (out of a tag), y to its left, z up, on the floor. `position` (x, y)
     [m] and `yaw_deg` are on a map of all landmarks, known to `position_sigma` [m] and `yaw_sigma_deg`; where they are
@@ -74,7 +74,7 @@ class Landmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def seen_as(self) -> Markers | None:
-        """What a camera sees of it: its markers, or the middles of its tag's left and right edge (`frontend.tags`).
+        """Markers that a camera sees: its own, or the middles of its tag's left and right edge (`apriltags`).
 
         None of a bare point.
         """
@@ -85,7 +85,7 @@ class Landmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def on_map(self) -> bool:
-        """Whether the team says where it is on the map, and how it is turned."""
+        """True if the team states its position and yaw on the map."""
         return self.position is not None and self.yaw_deg is not None
 
 

@@ -1,4 +1,4 @@
-"""What a robot measures by besides its camera's images: `Ranging`, and `Wheels` that are not as they say."""
+"""Sensors besides the camera: `Ranging`, and the calibration of `Wheels`."""
 
 import msgspec
 
@@ -52,7 +52,7 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How odometry and the way differ: the way is `scale` and `turn_scale` times what it says, `delay` [s] later.
+    """Calibration of wheel odometry: the motion is `scale` and `turn_scale` times what it reports, `delay` [s] later.
 
     A delay is what odometry has that is made of commands. `*_sigma` are tolerances: what has one is found along with
     the poses. How noisy odometry is the run itself says, sample by sample.

@@ -1,4 +1,4 @@
-"""What cameras at rest see of the floor: `View`, and the places where a robot's markers are in all of them."""
+"""Floor that cameras at rest see: `View`, and the positions where a robot's markers are in all of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,9 +11,8 @@ from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
 
-#: Places are looked for so far apart, and so far to either side [m].
-GRID = 0.05
-WIDE = 1.5
+GRID = 0.05  # m, distance between positions that are tried
+WIDE = 1.5  # m, positions to either side
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +28,7 @@ class View:
         return self.camera.project(np.asarray(points_world, float) @ T_camera_world[:3, :3].T + T_camera_world[:3, 3])
 
     def sees(self, points_world: ArrayLike, margin: float) -> NDArray[np.bool_]:
-        """Which points (..., 3) [m] lie in the image, `margin` [px] from its border."""
+        """True for points (..., 3) [m] in the image, `margin` [px] from its border."""
         uv, inside = self.project(points_world)
         size = np.array([self.camera.width, self.camera.height])
         with np.errstate(invalid="ignore"):

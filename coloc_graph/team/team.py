@@ -49,7 +49,7 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     @property
     def mount(self) -> Mount:
-        """How the camera sits on the body; `TeamError` where the robot has none."""
+        """Extrinsics of the camera; `TeamError` if the robot has none."""
         if self.mount_if_any is None:
             raise TeamError(f"robot {self.name} has no camera in the team; give it one under [robots.camera]")
         return self.mount_if_any
