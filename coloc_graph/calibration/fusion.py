@@ -12,8 +12,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Said:
-    """Estimates of one value of m numbers from n images: `values` (n, m), the `own` covariance of each (n, m, m), and the
-    covariance of what they share, `common` (n, m, n, m)."""
+    """Estimates of one value of m numbers from n images.
+
+    `values` (n, m), the `own` covariance of each (n, m, m), and the covariance of what they share, `common`
+    (n, m, n, m).
+    """
 
     values: Array
     own: Array
