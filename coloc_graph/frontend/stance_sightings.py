@@ -67,7 +67,12 @@ def unsighted_movers(
             if markers is None or mover in sighted or mover in doubts:
                 continue
             track = wheels.get(mover)
-            if len(markers.positions) < 2:
+            if any(seen.marker for side in one.tracks for seen in side):
+                why = (
+                    f"its markers' names do not tell which is which; call them `{mover}/0` and `{mover}/1` in the order "
+                    "of the team, and see both at once"
+                )
+            elif len(markers.positions) < 2:
                 why = "it carries one marker, which does not tell its heading; give it two"
             elif len(stance.movers) > 1 and not any(t.marker or t.mover == mover for t in one.tracks[0]):
                 why = "nothing tells its lights from those of other movers; give each a colour, a blink code, or names"
