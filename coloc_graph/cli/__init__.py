@@ -24,6 +24,7 @@ from coloc_graph.cli import (
     robot,
     simulate,
     solve,
+    team,
     view,
 )
 from coloc_graph.errors import ColocError
@@ -42,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"coloc {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in (
-        *(demo, calibrate, simulate, import_, info, solve, evaluate, view, export, experiment),
+        *(demo, team, calibrate, simulate, import_, info, solve, evaluate, view, export, experiment),
         *(coordinate, robot, certificates),
     ):
         module.add(commands)

@@ -139,7 +139,7 @@ def _nanoseconds(table: Table) -> NDArray[np.int64]:
 
 def _sigma(table: Table, robot: NDArray[np.int64], team: Team) -> Array:
     if "sigma" not in table.columns:
-        return np.array([one.camera.noise_px for one in team.robots])[robot]
+        return np.array([one.camera_if_any.noise_px if one.camera_if_any else np.nan for one in team.robots])[robot]
     sigma = table.numbers("sigma")
     row = first(sigma <= 0)
     if row is not None:
@@ -389,7 +389,8 @@ def _warnings(tracks: _Tracks, team: Team, stances: list[Stance], *, moves_known
             f"{path}: in {len(alone)} of {len(stances)} stances there is one observer only (the first is stance "
             f"{alone[0].index}, with `{alone[0].observers[0]}`), so that they give no measurement"
         )
-    size = np.array([(robot.camera.width, robot.camera.height) for robot in team.robots])[tracks.robot]
+    cameras = [robot.camera_if_any for robot in team.robots]
+    size = np.array([(one.width, one.height) if one else (0, 0) for one in cameras])[tracks.robot]
     beyond = np.maximum(-0.5 - tracks.uv, tracks.uv - (size - 0.5)).max(axis=1)
     far = beyond > IMAGE_MARGIN
     row = first(far)

@@ -35,8 +35,11 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         if (self.camera_if_any is None) != (self.mount_if_any is None):
             there, missing = ("camera", "mount") if self.mount_if_any is None else ("mount", "camera")
             raise ValueError(f"robot {self.name} has a `{there}` but no `{missing}`; give both, or neither")
-        if self.camera_if_any is None and self.ranging is None:
-            raise ValueError(f"robot {self.name} has no `camera` with its `mount`, and no `ranging`; give it one")
+        if self.camera_if_any is None and self.ranging is None and self.markers is None:
+            raise ValueError(
+                f"robot {self.name} has no `camera` with its `mount`, no `ranging`, and no `markers` to be watched by; "
+                "give it one of them"
+            )
         if self.blink is not None and self.markers is None:
             raise ValueError(f"robot {self.name} has a `blink` but no markers; give it [robots.markers], or no `blink`")
 

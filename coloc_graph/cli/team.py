@@ -1,0 +1,188 @@
+"""coloc team new ROBOT... --out TEAM.toml, and coloc team check TEAM.toml."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coloc_graph.team import Team
+
+TEMPLATE_HEAD = """\
+# Who the robots are; docs/team.md has every field. Lengths in metres, angles in degrees.
+# Measure and correct the numbers; `coloc calibrate` finds cameras and mounts, `coloc team check` looks it through.
+reference = "{reference}"            # the world frame is where this robot stands at the first stance
+
+[floor]                    # leave out where the robots stand on no common floor
+tilt_sigma_deg = 0.1       # how uneven, one sigma
+height_sigma = 0.0005
+"""
+TEMPLATE_ROBOT = '\n[[robots]]\nname = "{name}"\n'
+TEMPLATE_CAMERA = """\
+
+[robots.camera]
+width = {width}                # px
+height = {height}
+fx = {focal}               # px; half the width divided by the tangent of half the horizontal angle of view
+fy = {focal}
+cx = {cx}                 # px, the centre where it is not calibrated
+cy = {cy}
+fps = {fps}
+
+[robots.mount]             # how the camera sits on the body
+height = {camera_height}               # of the optical centre above the floor
+tilt_deg = {tilt}            # looking down is positive
+height_sigma = 0.005       # tolerances, one sigma: they are found along with the poses
+tilt_sigma_deg = 1.0
+roll_sigma_deg = 1.0
+"""
+TEMPLATE_MARKERS = """\
+
+[robots.markers]
+height = {marker_height}              # of both lights above the floor
+positions = [[0.0, {half}], [0.0, -{half}]]  # x ahead, y to the left, on the body
+span_sigma = 0.0005        # how well the distance between them is known
+"""
+
+
+def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """The command's arguments."""
+    command = commands.add_parser("team", help="begin a team.toml, or look one through")
+    kinds = command.add_subparsers(dest="kind", required=True, metavar="KIND")
+    new = kinds.add_parser("new", help="write a team.toml to correct: robots with cameras and two lights each")
+    new.add_argument("robots", nargs="+", metavar="ROBOT", help="names; the first is the reference")
+    new.add_argument("--out", required=True, metavar="TEAM.toml")
+    new.add_argument("--force", action="store_true", help="replace a file that is there")
+    new.add_argument("--no-camera", action="append", default=[], metavar="ROBOT", help="a robot that only moves")
+    new.add_argument("--size", default="640x480", help="of the images [px] (default: 640x480)")
+    new.add_argument("--view-deg", type=float, default=60.0, help="horizontal angle of view (default: 60)")
+    new.add_argument("--fps", type=float, default=30.0, help="images a second (default: 30)")
+    new.add_argument("--camera-height", type=float, default=0.4, help="above the floor [m] (default: 0.4)")
+    new.add_argument("--tilt-deg", type=float, default=20.0, help="of the camera, down (default: 20)")
+    new.add_argument("--marker-height", type=float, default=0.15, help="above the floor [m] (default: 0.15)")
+    new.add_argument("--span", type=float, default=0.25, help="between a robot's two lights [m] (default: 0.25)")
+    new.set_defaults(run=run_new)
+    check = kinds.add_parser("check", help="read a team.toml and name what a run of it could not use")
+    check.add_argument("team", metavar="TEAM.toml")
+    check.set_defaults(run=run_check)
+
+
+def run_new(args: argparse.Namespace) -> int:
+    """Write a team."""
+    import math
+    from pathlib import Path
+
+    import msgspec
+
+    from coloc_graph.errors import InputError
+    from coloc_graph.run.atomic_file import require_writable, write_whole
+    from coloc_graph.team import Team
+
+    width, times, height = args.size.partition("x")
+    if not (times and width.isascii() and width.isdigit() and height.isascii() and height.isdigit()):
+        raise InputError(f"--size is `{args.size}`; write it like 640x480")
+    if not 0 < args.view_deg < 180:
+        raise InputError(f"--view-deg is {args.view_deg:g}; give an angle between 0 and 180")
+    stranger = next((name for name in args.no_camera if name not in args.robots), None)
+    if stranger is not None:
+        raise InputError(f"--no-camera names `{stranger}`, which is not one of the robots {', '.join(args.robots)}")
+    require_writable(args.out, force=args.force, what="a team.toml")
+    across, down = int(width), int(height)
+    focal = round(across / 2 / math.tan(math.radians(args.view_deg) / 2), 1)
+    camera = TEMPLATE_CAMERA.format(
+        width=across,
+        height=down,
+        focal=focal,
+        cx=(across - 1) / 2,
+        cy=(down - 1) / 2,
+        fps=args.fps,
+        camera_height=args.camera_height,
+        tilt=args.tilt_deg,
+    )
+    markers = TEMPLATE_MARKERS.format(marker_height=args.marker_height, half=args.span / 2)
+    text = TEMPLATE_HEAD.format(reference=args.robots[0]) + "".join(
+        TEMPLATE_ROBOT.format(name=name) + ("" if name in args.no_camera else camera) + markers for name in args.robots
+    )
+    try:
+        team = msgspec.toml.decode(text, type=Team)
+    except msgspec.DecodeError as error:
+        raise InputError(f"that is no team: {error}") from error
+    problems, _ = findings(team)
+    if problems:
+        raise InputError(f"that is no team to solve: {problems[0]}")
+    write_whole(Path(args.out), text)
+    print(f"{args.out}: robots {', '.join(team.names)}; correct its numbers, then `coloc team check {args.out}`")
+    return 0
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """Read a team and print what it allows, and what is doubtful."""
+    from coloc_graph.team import read_team
+
+    team = read_team(args.team)
+    for robot in team.robots:
+        camera, mount = robot.camera_if_any, robot.mount_if_any
+        parts = [
+            f"camera {camera.width} x {camera.height}, {mount.height:g} m high, {mount.tilt_deg:g} deg down"
+            if camera is not None and mount is not None
+            else "no camera",
+            f"{len(robot.markers.positions)} markers {robot.markers.height:g} m high"
+            if robot.markers
+            else "no markers",
+        ]
+        print(f"{robot.name}: {', '.join(parts)}")
+    problems, doubts = findings(team)
+    for one in problems:
+        print(f"problem: {one}")
+    for one in doubts:
+        print(f"doubtful: {one}")
+    if not problems and not doubts:
+        print("nothing wrong was found")
+    return 1 if problems else 0
+
+
+def findings(team: "Team") -> tuple[list[str], list[str]]:
+    """Reasons why no run of a team gives a pose, and numbers of it that are doubtful."""
+    import math
+
+    watching = [robot for robot in team.robots if robot.camera_if_any is not None]
+    marked = [robot for robot in team.robots if robot.markers is not None]
+    problems, doubts = [], []
+    if len(watching) < 2 and not any(robot.ranging for robot in team.robots):
+        problems.append("fewer than two robots have a camera, and a stance needs two that watch")
+    if watching and not marked:
+        problems.append("no robot carries markers, so that there is nothing to watch: give one [robots.markers]")
+    if len(team.robots) == 2 and watching and not any(robot.ranging for robot in team.robots):
+        doubts.append("two robots cannot watch a third: add the one that moves, even one without a camera")
+    for robot in watching:
+        camera, mount = robot.camera, robot.mount
+        for other in marked:
+            assert other.markers is not None
+            if other is not robot and other.markers.height >= mount.height:
+                problems.append(
+                    f"the camera of {robot.name} ({mount.height:g} m) is not above the markers of {other.name} "
+                    f"({other.markers.height:g} m): mount it higher, or the markers lower (metres?)"
+                )
+        if not 0.02 < mount.height < 5:
+            doubts.append(f"the camera of {robot.name} is {mount.height:g} m high: metres?")
+        view = math.degrees(2 * math.atan(camera.width / 2 / camera.fx))
+        if not 15 < view < 150:
+            doubts.append(
+                f"the camera of {robot.name} sees {view:.0f} deg across: is fx ({camera.fx:g} px) of this size?"
+            )
+        if (
+            abs(camera.cx - camera.width / 2) > 0.2 * camera.width
+            or abs(camera.cy - camera.height / 2) > 0.2 * camera.height
+        ):
+            doubts.append(f"the principal point of {robot.name} is far from the image's middle: is it of this size?")
+        top = mount.tilt_deg - math.degrees(math.atan(camera.height / 2 / camera.fy))
+        bottom = mount.tilt_deg + math.degrees(math.atan(camera.height / 2 / camera.fy))
+        if bottom <= 0 or top >= 90:
+            doubts.append(f"the camera of {robot.name} does not see the floor at a tilt of {mount.tilt_deg:g} deg")
+        if mount.tilt_sigma_deg == 0 and mount.roll_sigma_deg == 0 and mount.height_sigma == 0:
+            doubts.append(f"the mount of {robot.name} is exact: state its tolerances, and it is found along")
+    for robot in marked:
+        assert robot.markers is not None
+        if robot.markers.span is None:
+            doubts.append(f"{robot.name} carries one marker, which does not tell its heading: give it two")
+        elif not 0.01 < robot.markers.span < 3:
+            doubts.append(f"the markers of {robot.name} are {robot.markers.span:g} m apart: metres?")
+    return problems, doubts

@@ -1,0 +1,37 @@
+"""coloc team new and check: a team that can be solved, also with a robot that only moves and has no camera."""
+
+import pytest
+
+from coloc_graph.cli import main
+from coloc_graph.team import read_team
+
+
+def test_a_new_team_reads_back_and_has_nothing_wrong(tmp_path, capsys):
+    path = tmp_path / "team.toml"
+    assert main(["team", "new", "A", "B", "C", "--no-camera", "C", "--size", "320x240", "--out", str(path)]) == 0
+    team = read_team(path)
+    assert team.names == ("A", "B", "C")
+    assert team["C"].camera_if_any is None
+    assert (team["A"].camera.width, team["A"].camera.height) == (320, 240)
+    capsys.readouterr()
+    assert main(["team", "check", str(path)]) == 0
+    assert "nothing wrong was found" in capsys.readouterr().out
+    assert main(["team", "new", "A", "B", "C", "--out", str(path)]) == 2
+    assert "replace it with --force" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["A", "B", "--size", "320"], "write it like 640x480"),
+        (["A", "B", "--no-camera", "X"], "`X`, which is not one of the robots A, B"),
+        (["A", "B", "--no-camera", "B"], "fewer than two robots have a camera"),
+        (["A", "B", "C", "--camera-height", "0.1"], "is not above the markers"),
+        (["A", "A"], "two robots are called `A`"),
+    ],
+)
+def test_a_team_that_cannot_be_solved_is_not_written(tmp_path, capsys, arguments, words):
+    path = tmp_path / "team.toml"
+    assert main(["team", "new", *arguments, "--out", str(path)]) == 2
+    assert words in capsys.readouterr().err
+    assert not path.exists()
