@@ -69,8 +69,8 @@ def unsighted_movers(
             track = wheels.get(mover)
             if any(seen.marker for side in one.tracks for seen in side):
                 why = (
-                    f"its markers' names do not tell which is which; call them `{mover}/0` and `{mover}/1` in the order "
-                    "of the team, and see both at once"
+                    f"its markers' names do not tell which is which; call them `{mover}/0` and `{mover}/1` in the "
+                    "order of the team, and see both at once"
                 )
             elif len(markers.positions) < 2:
                 why = "it carries one marker, which does not tell its heading; give it two"
