@@ -17,6 +17,7 @@ from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.landmarks import ALWAYS, OnMap
 from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
 from coloc_graph.backend.solver import lm_parameters, with_stack
+from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Odometry, RelativePose, Sighting
 from coloc_graph.team import Slip
 
@@ -163,7 +164,13 @@ def _search(
     doubted = dict(doubted)
     # twice the same set ends it, as does the last round
     for left in reversed(range(MAX_ROUNDS)):
-        fit = fit_graph(method, graph.without(doubted.values()), start)
+        try:
+            fit = fit_graph(method, graph.without(doubted.values()), start)
+        except EstimationError:
+            if not doubted:
+                raise
+            # without these nothing ties the robots to each other: they disagree, and it is not known which are wrong
+            return {}, fit_graph(method, graph, start)
         tested = fit.agreements(SEARCHED)
         scale = _scale(tested.values())
         worst = min(tested, key=lambda index: tested[index].log_chance(), default=None)

@@ -150,7 +150,7 @@ def test_a_mount_that_is_not_as_stated_is_warned_of_by_name(wrong_mounts, copied
         wrong_mounts, tmp_path / "tilted.mcap", team=msgspec.structs.replace(run.team, robots=(tilted, *others))
     )
     solution = solve(open_run(path))
-    (warning,) = [one for one in solution.warnings if "sigmas off what the team says" in one]
+    (warning,) = [one for one in solution.warnings if "sigmas from what the team states" in one]
     assert warning.startswith("A: tilt") and "stated 26.00 +- 1.00" in warning
 
 
@@ -326,7 +326,7 @@ def test_a_long_run_finds_its_mounts_in_its_first_part(solved, monkeypatch):
     estimate = joint(solved.estimate.graph)
     for robot, trajectory in solved.estimate.trajectories.items():
         np.testing.assert_allclose(estimate.trajectories[robot].positions, trajectory.positions, atol=1e-4)
-    assert estimate.chi2 == pytest.approx(solved.estimate.chi2, abs=0.1)
+    assert estimate.chi2 == pytest.approx(solved.estimate.chi2, rel=5e-3)
     with_part = started[:]
     started.clear()
     monkeypatch.setattr(module, "LONG_RUN", 80)

@@ -101,7 +101,7 @@ def test_a_bad_tum_file_is_one_sentence_with_its_line(tmp_path, text, words):
 def test_a_tum_file_that_is_not_there_or_no_text_is_named(tmp_path):
     (tmp_path / "x.tum").write_bytes(b"\xff\xfe\x00")
     for name in ("nowhere.tum", "x.tum"):
-        with pytest.raises(InputError, match=rf"{name}: cannot be read"):
+        with pytest.raises(InputError, match=rf"{name}: (cannot be read|is text in UTF-16; save it as UTF-8)"):
             read_tum(tmp_path / name)
 
 
@@ -139,7 +139,7 @@ def test_g2o_is_what_gtsam_reads(g2o, solutions):
     assert factors.size() == len(estimate.graph.measurements) == 8 + 8 + 14
     for at, measured in enumerate(estimate.graph.relative_poses):
         factor = factors.at(at)
-        assert factor.measured().equals(measured.T_i_j, 1e-12)
+        assert np.allclose(factor.measured().matrix(), measured.T_i_j, atol=1e-12)
         # GTSAM and we mean the same covariance: rotation first
         C = np.linalg.inv(factor.noiseModel().information())
         np.testing.assert_allclose(C, measured.covariance, rtol=1e-6, atol=1e-9 * measured.covariance.max())

@@ -294,7 +294,7 @@ BAD = {
     ),
     "stances out of order": ({"tracks": HEADER + "1,1,A,x,9,9\n0,5,A,x,9,9\n"}, "stance 1 begins at 1 s, not after"),
     "not UTF-8": ({"tracks": HEADER.encode() + b"0,1,A,\xff,9,9\n"}, "line 2: is not UTF-8 text"),
-    "UTF-16": ({"tracks": OK.encode("utf-16")}, "line 1: is not UTF-8 text; save the tracks as CSV in UTF-8"),
+    "UTF-16": ({"tracks": OK.encode("utf-16")}, "is text in UTF-16; save it as UTF-8"),
     "open quote": ({"tracks": HEADER + '0,1,A,"x,9,9\n'}, "line 2: is not CSV"),
     "planes header": ({"planes": "stance,robot,n\n"}, r"line 1: the header is .* `stance,robot,nx,ny,nz,d\[,normal"),
     "planes sigma": (

@@ -167,7 +167,7 @@ def test_stances_are_those_that_were_recorded(imported, recorded):
 
 def test_a_run_that_went_through_a_bag_is_solved_as_it_was(imported, recorded):
     solution, before = solve(open_run(imported["bare mcap"][0])), solve(open_run(recorded))
-    assert solution.warnings == () and solution.used == before.used == 2
+    assert solution.warnings == () and solution.count.used == before.count.used == 2
     for name, trajectory in solution.estimate.trajectories.items():
         other = before.estimate.trajectories[name]
         off = np.abs(trajectory.positions - other.positions).max()

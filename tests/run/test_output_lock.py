@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_run import make
+from conformance_run import make
 
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError, RunError
@@ -113,13 +113,13 @@ def test_what_a_killed_command_wrote_is_said_and_can_be_read_and_does_not_lock(t
     out = tmp_path / "run.mcap"
     code = (
         "import os, signal, sys; sys.path.insert(0, sys.argv[2])\n"
-        "from test_run import make; from coloc_graph.run import Motion, whole_run\n"
+        "from conformance_run import make; from coloc_graph.run import Motion, whole_run\n"
         "with whole_run(sys.argv[1], make.team(), flush_every=None) as writer:\n"
         "    writer.write(Motion('A', 1.0, True))\n"
         "    writer._flush(); writer._file.flush(); os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    here = str(Path(__file__).parent)
-    process = subprocess.run([sys.executable, "-c", code, str(out), here], check=False)
+    here = str(Path(__file__).parents[1] / "support")
+    process = subprocess.run([sys.executable, "-c", code, str(out), here], check=False, capture_output=True)
     assert process.returncode == -signal.SIGKILL
     (part,) = parts_left(out)
     assert len(list(open_run(part).motions("A"))) == 1

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 import zstandard
+from conformance_run import everything, make
 from mcap.writer import CompressionType, IndexType, Writer
-from test_run import everything, make
 
 from coloc_graph.errors import RunError
 from coloc_graph.run import EncodedImage, RunWriter, open_run
