@@ -155,7 +155,7 @@ def _chosen(
     if found is None:
         raise UnpairedTracks(
             f"no pairing of the tracks of {pair} is explained by one homography",
-            "let the moving robot turn and drive further, and look for reflections",
+            "let the moving robot turn and drive further, look for reflections, and calibrate the lenses",
         )
     if found.posterior < SURE:
         raise UnpairedTracks(
