@@ -33,16 +33,16 @@ def print_accuracy(accuracy: Accuracy) -> None:
                 row.robot,
                 f"{100 * row.true_length:.1f} cm",
                 f"{100 * row.estimated_length:.1f} cm",
-                f"{100 * abs(row.length_error):.2f} cm",
-                "-" if percent is None else f"{percent:.2f} %",
-                f"{100 * row.end_position_error:.2f} cm",
+                f"{1000 * abs(row.length_error):.1f} mm",
+                "-" if percent is None else f"{percent:.3f} %",
+                f"{1000 * row.end_position_error:.1f} mm",
                 f"{row.heading_error_deg:.2f} deg",
             ]
         )
     print_table(["robot", "true", "estimated", "error", "error rate", "end position", "heading"], rows)
     poses = counted(accuracy.nees_poses, "pose")
     anees = "-" if accuracy.anees is None else f"{accuracy.anees:.2f} over {poses}{_intervals(accuracy)}"
-    print(f"RMS position error of all poses {100 * accuracy.ate:.2f} cm; NEES per degree of freedom {anees}")
+    print(f"RMS position error of all poses {1000 * accuracy.ate:.1f} mm; NEES per degree of freedom {anees}")
     if accuracy.distances:
         print_table(
             ["distance", "true", "estimated", "error"],
@@ -147,7 +147,7 @@ def print_promised(trajectories: "Mapping[str, Trajectory]") -> None:
     for robot, trajectory in trajectories.items():
         sigmas = last_sigmas(trajectory)
         if sigmas is not None:
-            promised.append(f"{robot} {100 * math.hypot(*sigmas[:2]):.2f} cm, {math.degrees(sigmas[2]):.2f} deg")
+            promised.append(f"{robot} {1000 * math.hypot(*sigmas[:2]):.1f} mm, {math.degrees(sigmas[2]):.2f} deg")
     if promised:
         print("predicted 1-sigma at the end: " + "; ".join(promised))
 

@@ -79,7 +79,7 @@ def test_simulate_solve_info_evaluate_round_trip(call, tmp_path):
 
     code, text, err = call("solve", run, "--out", out)
     assert code == 0 and "3 of 3 measurements used, chi2/dof " in text and "error rate" in text
-    assert re.search(r"predicted 1-sigma at the end: A \d\.\d\d cm, \d\.\d\d deg; B ", text)
+    assert re.search(r"predicted 1-sigma at the end: A \d+\.\d mm, \d\.\d\d deg; B ", text)
     assert "stances measured: 3 of 3" in err and "stances measured" not in text
 
     code, text, err = call("solve", run, "--out", out, "--json", "--method", "chain")

@@ -359,7 +359,7 @@ def test_one_landmark_alone_places_nobody(tmp_path, capsys):
 
 
 def test_a_robot_needs_a_camera_or_a_sensor_of_ranges():
-    with pytest.raises(ValueError, match="no `camera` with its `mount`, and no `ranging`"):
+    with pytest.raises(ValueError, match="no `camera` with its `mount`, no `ranging`"):
         Robot(name="A")
     with pytest.raises(ValueError, match="`range_sigma` is 0"):
         Ranging(range_sigma=0.0, bearing_sigma_deg=1.0)

@@ -53,8 +53,8 @@ def _require_still(agree: NDArray[np.bool_], found: Correspondences, who: str) -
         )
     when = times[order[before[at]]] - times[order[0]]
     raise DegenerateGeometry(
-        f"{when:.1f} s after the first points, others begin that agree on another homography: {who} was bumped, or "
-        "a clock stepped, while the stance was taken; take it again"
+        f"{when:.1f} s after the first points, others begin that agree on another homography: {who} was bumped, a "
+        "clock stepped, or the tracks of two lights were swapped while the stance was taken; take it again"
     )
 
 
