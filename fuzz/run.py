@@ -78,7 +78,10 @@ def fuzzed(name: str, args: argparse.Namespace) -> bool:
         r"^#(\d+)\s", process.stderr, re.M
     )
     covered = re.findall(r"cov: (\d+)", process.stderr)
-    ended = "nothing found" if process.returncode == 0 else f"FOUND, see {out}"
+    if not done:
+        ended = f"DID NOT BEGIN, see {out}/log.txt"
+    else:
+        ended = "nothing found" if process.returncode == 0 else f"FOUND, see {out}"
     print(f"{name}: {done[-1] if done else 0} inputs, {covered[-1] if covered else 0} edges: {ended}", flush=True)
     return process.returncode == 0
 

@@ -32,7 +32,7 @@ from coloc_graph.exchange.tracks import TRACKS_HEADER, import_tracks
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.results.comparison import of_result
-from coloc_graph.results.writer import read_result, team_of
+from coloc_graph.results.folder import read_result
 from coloc_graph.robot_io.link import messages
 from coloc_graph.run import decode, open_run, read_true_team, read_truth, run_id, schemas
 from coloc_graph.run.index import MAGIC
@@ -218,7 +218,7 @@ def result(data: bytes) -> None:
     (folder / "summary.json").write_bytes(summary)
     (folder / "config.toml").write_bytes(config)
     found = read_result(folder)
-    team_of(found)
+    assert found.team.robots
     of_result(folder, truth=[str(folder / "trajectories")])
 
 
