@@ -12,6 +12,9 @@ import numpy as np
 from coloc_graph.backend import Estimate
 from coloc_graph.backend.landmarks import Placed
 from coloc_graph.errors import InputError
+from coloc_graph.input_file import read_text
+
+REMEDY = "solve the run again"  # of a file that is damaged
 
 
 @dataclass(frozen=True)
@@ -86,14 +89,11 @@ def read_landmarks(path: Path) -> tuple[LandmarkRow, ...]:
     """The rows of a file, () where there is none; `InputError` naming the line where it is damaged."""
     if not path.exists():
         return ()
-    rows = []
-    with path.open(encoding="utf-8", newline="") as file:
-        for line, cells in enumerate(csv.DictReader(file), start=2):
-            try:
-                rows.append(_read(cells))
-            except (KeyError, TypeError, ValueError) as error:
-                raise InputError(f"{path}, line {line}: is damaged ({error}); solve the run again") from error
-    return tuple(rows)
+    reader = csv.DictReader(io.StringIO(read_text(path, REMEDY), newline=""))
+    try:
+        return tuple(map(_read, reader))
+    except (KeyError, TypeError, ValueError, OverflowError, csv.Error) as error:
+        raise InputError(f"{path}, line {max(reader.line_num, 1)}: is damaged ({error}); {REMEDY}") from error
 
 
 def _read(cells: Mapping[str, str]) -> LandmarkRow:

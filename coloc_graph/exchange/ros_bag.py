@@ -139,7 +139,9 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
     with _understood(path):
         reader, ros2, notes = open_reader(path)
     try:
-        yield Bag(path, reader, _standard_types(ros2=ros2), ros2=ros2, notes=notes)
+        with _understood(path):  # a database may have topics without a name
+            bag = Bag(path, reader, _standard_types(ros2=ros2), ros2=ros2, notes=notes)
+        yield bag
     finally:
         reader.close()
 

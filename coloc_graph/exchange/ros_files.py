@@ -88,9 +88,7 @@ def _mcap(files: list[Path], path: Path, notes: list[str]) -> tuple[Any, bool, l
         bag = McapBag(files)
     except RunError as error:
         if "outside of chunks" not in str(error):
-            raise BagError(
-                f"{error}".replace("copy it again from where it was recorded", "or run `mcap recover`")
-            ) from error
+            raise BagError(f"{error}".replace("from where it was recorded", "or mend it by `mcap recover`")) from error
         return _rosbags(path), True, notes  # written without chunks, and so without compression
     return bag, True, notes + bag.notes
 

@@ -9,6 +9,7 @@ import pytest
 
 from coloc_graph.errors import InputError
 from coloc_graph.exchange.g2o_writer import write_g2o
+from coloc_graph.exchange.landmarks import read_landmarks
 from coloc_graph.exchange.tum import COVARIANCE_HEADER, read_tum, write_tum
 from coloc_graph.geometry.lie import se3, so3_exp
 from coloc_graph.geometry.trajectory import Trajectory
@@ -160,3 +161,15 @@ def test_g2o_has_plain_ids_and_says_who_stayed_put(g2o, solutions):
     assert len(stays) == 7
     assert "# 0 is A@0" in lines and "FIX 0" in lines
     assert any(re.fullmatch(r"# \d+ is B@0 = B@1", line) for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [(b"name,x\n\xa4,1\n", "line 2: is not UTF-8 text"), (b"name,x\nL,1\n", "line 2: is damaged"),
+     (b"name,x\n" + b"9" * 200_000, "is damaged")],
+)  # fmt: skip
+def test_landmarks_that_are_damaged_are_one_sentence(tmp_path, data, says):
+    (tmp_path / "landmarks.csv").write_bytes(data)
+    with pytest.raises(InputError, match=says) as refusal:
+        read_landmarks(tmp_path / "landmarks.csv")
+    assert "\n" not in str(refusal.value) and len(str(refusal.value)) < 1000

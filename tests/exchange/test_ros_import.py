@@ -721,6 +721,21 @@ def test_a_bag_without_a_profile_or_metadata_is_read(tmp_path, bring_in):
     assert said == f"{copy.parent}: has no metadata.yaml (its recorder was ended); read is bag.mcap"
 
 
+def test_a_database_with_a_topic_without_a_name_is_one_sentence(tmp_path, bring_in):
+    bag = write_bag(tmp_path, "sqlite3", pictures())
+    file = next(bag.glob("*.db3"))
+    with contextlib.closing(sqlite3.connect(file)) as database:
+        (definition,) = database.execute("SELECT sql FROM sqlite_master WHERE name = 'topics'").fetchone()
+        rows = database.execute("SELECT * FROM topics").fetchall()
+        database.execute("DROP TABLE topics")
+        database.execute(definition.replace("NOT NULL", ""))
+        database.executemany(f"INSERT INTO topics VALUES ({','.join('?' * len(rows[0]))})", rows)
+        database.execute("UPDATE topics SET name = NULL")
+        database.commit()
+    with pytest.raises(BagError, match="cannot be read as a ROS bag"):
+        bring_in(file)
+
+
 def test_slashes_before_topics_do_not_matter(tmp_path, bring_in):
     bag = write_bag(tmp_path, "mcap", pictures())
     counts = bring_in(bag)[1].counts
