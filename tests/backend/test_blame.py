@@ -8,7 +8,7 @@ from teams import graph_of_team, planar_nees, team_of
 
 from coloc_graph.backend import smooth
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
-from coloc_graph.measurements import Odometry, RelativePose
+from coloc_graph.measurements import Odometry, RelativePose, Sighting
 
 
 def with_wrong_odometry(team, rng):
@@ -62,3 +62,18 @@ def test_a_bump_is_named_alone_or_beside_the_odometry_that_would_explain_it(robo
     estimate = smooth(graph_of_team(team, made))
     assert robot in {bump.stay_put.robot for bump in estimate.bumped}
     assert all(bump.stay_put.robot == robot or bump.or_else for bump in estimate.bumped)
+
+
+def test_where_a_bump_and_wrong_odometry_explain_as_much_both_are_named_and_the_estimate_is_as_uncertain():
+    team = team_of(3, 10, 7)
+    made, bad = with_wrong_odometry(team, np.random.default_rng(7))
+    estimate = smooth(graph_of_team(team, [m for m in made if not isinstance(m, Sighting)]))
+    (bump,) = estimate.bumped
+    assert {one.robot for one in bump.or_else} == {bad.robot} and bump.stay_put.robot != bad.robot
+    assert "or else the odometry of B" in str(bump) and "explain the measurements equally well" in str(bump)
+    last = team.stances[-1].index
+    far = float(np.linalg.norm(bump.T_before_after.translation()))
+    sigma = max(
+        float(np.sqrt(np.trace(estimate.covariance(*node)[3:5, 3:5]))) for node in team.T_world_body if node[1] == last
+    )
+    assert sigma > 0.5 * far
