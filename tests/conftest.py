@@ -39,7 +39,7 @@ def pytest_collection_modifyitems(config, items):
 
 
 def copy_run(source, to, *, change=lambda record: record, stances=None, team=None, truth=False, more=()):
-    """The run `source` written anew to `to`, without its truth unless asked for.
+    """The run `source` written anew to `to`, without its truth unless asked for (or with another: by robot).
 
     `change` is given each record and returns what is written instead (None: nothing); `more` are written besides.
     """
@@ -52,7 +52,7 @@ def copy_run(source, to, *, change=lambda record: record, stances=None, team=Non
     with RunWriter(to, team or run.team, image_format="raw") as writer:
         if truth:
             writer.write_true_team(read_true_team(source) or run.team)
-            for robot, true in read_truth(source).items():
+            for robot, true in (read_truth(source) if truth is True else truth).items():
                 for time, T in zip(true.times.tolist(), true.T_world_body, strict=True):
                     writer.write_truth(robot, time, T)
         for record in sorted(records, key=lambda one: one.start if hasattr(one, "anchors") else one.time):

@@ -152,7 +152,7 @@ def _solved(
     """Solve, write, print."""
     from coloc_graph.pipeline.batch import solve
     from coloc_graph.pipeline.contents import kind_of
-    from coloc_graph.results.writer import summarise, write_result
+    from coloc_graph.results.writer import summarise, with_truth_warning, write_result
     from coloc_graph.run.output_lock import locked_output
 
     label = "stances measured" if kind_of(run) == "stances" else "seconds of the run done"
@@ -160,6 +160,8 @@ def _solved(
         with progress(label) as report:
             solution = solve(run, options, report, on_update)
         accuracy = write_result(solution, args.out)
+    if accuracy is None:
+        solution = with_truth_warning(solution)
     warn([*solution.warnings, *(accuracy.warnings if accuracy else ())])
     if args.json:
         print_json(summarise(solution, accuracy))
@@ -183,11 +185,12 @@ def _print(solution: "Solution", accuracy: "Accuracy | None", out: str) -> None:
     from coloc_graph.results.writer import assess_online
 
     estimate = solution.estimate
-    if accuracy is None:
-        print_last_poses(estimate.trajectories)
-    else:
+    if accuracy is not None:
         print_accuracy(accuracy)
         print_promised(estimate.trajectories)
+    compared = set() if accuracy is None else {row.robot for row in accuracy.robots}
+    if others := {robot: one for robot, one in estimate.trajectories.items() if robot not in compared}:
+        print_last_poses(others)
     if (online := assess_online(solution)) is not None:
         print_online(online)
     print_calibration(estimate.calibration)

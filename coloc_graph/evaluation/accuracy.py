@@ -20,7 +20,7 @@ from coloc_graph.evaluation.pose_errors import (
     relative_errors,
     spread,
 )
-from coloc_graph.evaluation.truth import left_out, with_truth
+from coloc_graph.evaluation.truth import first_with_truth, left_out, with_truth
 from coloc_graph.geometry.lie import yaw
 from coloc_graph.geometry.trajectory import Trajectory
 
@@ -115,19 +115,24 @@ def evaluate(
     alignment: Alignment = "reference",
     rpe: Sequence[float] = RPE_DISTANCES,
     pairs_from: PairsFrom = "estimate",
+    reference: str | None = None,
 ) -> Accuracy:
     """Compare an estimate with the true poses (n, 4, 4) of `align`, by the alignment that it was asked for.
 
-    `on_floor`: the NEES is that of heading, x and y, since the floor decides the rest. `rpe` are the distances of the
-    RPE [m], of the robots' paths in the estimate or in the truth (`pairs_from`).
+    Poses without truth are left out, and so are robots without any; `Accuracy.warnings` counts them. At least one pose
+    has truth. `on_floor`: the NEES is that of heading, x and y, since the floor decides the rest. `rpe` are the
+    distances of the RPE [m], of the robots' paths in the estimate or in the truth (`pairs_from`). `reference` is the
+    robot that was aligned: where its first pose with truth is not the one that defines the world, there is no NEES.
     """
     warnings = left_out(estimated, true)
+    late = _aligned_late(estimated, true, reference) if alignment == "reference" and reference is not None else None
+    warnings += (late,) if late else ()
     kept = {robot: with_truth(true[robot]) for robot in estimated}
-    estimated = {robot: one.where(kept[robot]) for robot, one in estimated.items()}
+    estimated = {robot: one.where(kept[robot]) for robot, one in estimated.items() if kept[robot].any()}
     true = {robot: true[robot][kept[robot]] for robot in estimated}
     # covariances are in the body's tangent, which no alignment turns; but they are of errors from the world's beginning
     # on, and what a fit took from all poses together they do not know
-    stated = alignment in ("reference", "none")
+    stated = alignment in ("reference", "none") and not late
     components = PLANAR if on_floor else FREE
 
     rows, absolute, pairs = [], [], []
@@ -165,6 +170,19 @@ def evaluate(
         nees_poses=nees_poses,
         distances=_distances(rows, estimated, true) if alignment != "robot" else (),
         warnings=warnings,
+    )
+
+
+def _aligned_late(estimated: Mapping[str, Trajectory], true: Mapping[str, Array], reference: str) -> str | None:
+    """Sentence on an alignment by another pose of the reference than its first; None where it is the first, or held."""
+    first = first_with_truth(estimated, true, reference)
+    if first is None or (estimated[reference].T_world_body[: first + 1] == estimated[reference].T_world_body[0]).all():
+        return None
+    at = estimated[reference]
+    where = f"stance {at.stances[first]}" if at.stances is not None else f"{at.times[first]:.3f} s"
+    return (
+        f"the truth of the reference robot {reference} begins after the estimate: aligned by its pose at {where}; "
+        "there is no NEES, since the covariances are of errors since the estimate begins"
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.evaluation.truth import LONGEST_TRUTH_GAP, true_poses, with_truth
+from coloc_graph.evaluation.truth import LONGEST_TRUTH_GAP, first_with_truth, require_some, true_poses, with_truth
 from coloc_graph.geometry.lie import closest_rotation, floor_pose, se3, se3_inverse, yaw
 from coloc_graph.geometry.trajectory import Trajectory
 
@@ -24,9 +24,16 @@ ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 _THIN = 1e-9
 
 
-def usual_alignment(estimated: Mapping[str, Trajectory]) -> Alignment:
-    """By the reference, in whose world poses at stances are; by the team where poses belong to no stances."""
-    return "reference" if all(one.stances is not None for one in estimated.values()) else "team"
+def usual_alignment(
+    estimated: Mapping[str, Trajectory], truth: Mapping[str, Trajectory], reference: str | None
+) -> Alignment:
+    """By the reference, in whose world poses at stances are; by the team where poses belong to no stances, or the
+    reference has no truth at its poses."""
+    if reference is None or any(one.stances is None for one in estimated.values()):
+        return "team"
+    if reference in estimated and not with_truth(true_poses(truth, estimated[reference])).any():
+        return "team"
+    return "reference"
 
 
 def align(
@@ -41,10 +48,11 @@ def align(
     """The true poses T_world_body (n, 4, 4) at each robot's estimated poses, in the estimate's world; NaN without.
 
     They are found by time (`true_poses`). On a floor the truth is turned and moved on it only. `reference` is the
-    robot that defines the world, where that is what is aligned. Raises `InputError` where the truth lacks a robot or
-    is at none of its times, and where what is to be aligned says too little.
+    robot that defines the world, where that is what is aligned: by its first pose that has a true one. Raises
+    `InputError` where no pose has a true one, and where what is to be aligned says too little.
     """
     at = {robot: true_poses(truth, one, longest_gap) for robot, one in estimated.items()}
+    require_some(truth, estimated, at)
     if alignment == "none":
         return at
     if alignment == "reference":
@@ -55,6 +63,8 @@ def align(
         return {robot: T_world_truth @ poses for robot, poses in at.items()}
     return {
         robot: _fitted({robot: estimated[robot]}, {robot: poses}, on_floor=on_floor) @ poses
+        if with_truth(poses).any()
+        else poses
         for robot, poses in at.items()
     }
 
@@ -62,17 +72,16 @@ def align(
 def _of_reference(
     estimated: Mapping[str, Trajectory], at: Mapping[str, Array], reference: str | None, *, on_floor: bool
 ) -> Array:
-    """T_world_truth (4, 4) that puts the reference's first pose where it truly was."""
+    """T_world_truth (4, 4) that puts the reference's first pose with truth where it truly was."""
     if reference is None or reference not in at:
         raise InputError(f"the estimate does not hold the reference robot {reference}; nothing can be compared")
-    first = estimated[reference]
-    if not with_truth(at[reference])[0]:
-        begins = f"stance {first.stances[0]}" if first.stances is not None else f"{first.times[0]:.3f} s"
+    first = first_with_truth(estimated, at, reference)
+    if first is None:
         raise InputError(
-            f"the truth of the reference robot {reference} begins after {begins}, where the estimate does; "
-            "record it from there on, or align the team"
+            f"there is no truth of the reference robot {reference} at the times of its poses: give its truth, or align "
+            "the team (--align team)"
         )
-    T_truth_body, T_world_body = at[reference][0], first.T_world_body[0]
+    T_truth_body, T_world_body = at[reference][first], estimated[reference].T_world_body[first]
     if on_floor:
         T_truth_body, T_world_body = (floor_pose(T[0, 3], T[1, 3], yaw(T)) for T in (T_truth_body, T_world_body))
     return np.asarray(T_world_body @ se3_inverse(T_truth_body))

@@ -22,15 +22,11 @@ def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, longest_g
 
     Near is at most `longest_gap` [s] apart. In a longer gap a robot of an estimate with stances stood where it was
     before, since robots stand while they observe and truth may be sparse then; of one without, nothing is known.
-    Raises `InputError` where the truth lacks the robot, or is at none of its times.
     """
     true = truth.get(estimated.robot)
-    if true is None or not len(true):
-        raise InputError(
-            f"the truth does not hold robot {estimated.robot}, which the estimate does; "
-            "give its truth, or leave the robot out"
-        )
     times = estimated.times
+    if true is None or not len(true):
+        return np.full((len(times), 4, 4), np.nan)
     index = np.searchsorted(true.times, times + SAME_TIME, side="right") - 1
     known = (index >= 0) & (times <= true.times[-1] + SAME_TIME)
     index = index.clip(min=0)
@@ -39,12 +35,6 @@ def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, longest_g
     near = (gap > 0) & (gap <= longest_gap)
     if estimated.stances is None:
         known &= near | (times <= true.times[index] + SAME_TIME)
-    if not known.any():
-        raise InputError(
-            f"the truth of robot {estimated.robot} is at none of its times: the estimate reaches from "
-            f"{_span(times)}, the truth from {_span(true.times)}, with gaps; check the clocks, or record truth "
-            "more often"
-        )
     share = np.where(near, ((times - true.times[index]) / np.where(near, gap, 1.0)).clip(0, 1), 0.0)[:, None]
     T_world_body, ahead = true.T_world_body[index].copy(), true.T_world_body[after]
     moved = share[:, 0] > 0
@@ -60,6 +50,32 @@ def with_truth(true: Array) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(true).all(axis=(1, 2)))
 
 
+def first_with_truth(estimated: Mapping[str, Trajectory], true: Mapping[str, Array], robot: str) -> int | None:
+    """Index of a robot's first pose that has a true one; None where none has, or the robot is not there."""
+    known = np.flatnonzero(with_truth(true[robot])) if robot in estimated else np.zeros(0, np.int64)
+    return int(known[0]) if len(known) else None
+
+
+def require_some(
+    truth: Mapping[str, Trajectory], estimated: Mapping[str, Trajectory], true: Mapping[str, Array]
+) -> None:
+    """Raise `InputError` where no pose of any robot has a true one."""
+    if any(with_truth(one).any() for one in true.values()):
+        return
+    both = [robot for robot in estimated if len(truth.get(robot, ()))]
+    if not both:
+        raise InputError(
+            f"the truth holds {', '.join(truth) or 'no robot'}, and the estimate {', '.join(estimated)}: give the "
+            "truth of a robot that was estimated"
+        )
+    robot = both[0]
+    raise InputError(
+        f"the truth of robot {robot} is at none of its times: the estimate reaches from "
+        f"{_span(estimated[robot].times)}, the truth from {_span(truth[robot].times)}, with gaps; check the clocks, or "
+        "record truth more often"
+    )
+
+
 def left_out(estimated: Mapping[str, Trajectory], true: Mapping[str, Array]) -> tuple[str, ...]:
     """A sentence a robot on the poses that have no true one, and are left out."""
     sentences = []
@@ -67,6 +83,9 @@ def left_out(estimated: Mapping[str, Trajectory], true: Mapping[str, Array]) -> 
         known = np.flatnonzero(with_truth(true[robot]))
         n, lost = len(true[robot]), len(true[robot]) - len(known)
         if not lost:
+            continue
+        if not len(known):
+            sentences.append(f"robot {robot} is not evaluated: there is no truth at the times of its {n} poses")
             continue
         before, after = int(known[0]), n - 1 - int(known[-1])
         sentences.append(

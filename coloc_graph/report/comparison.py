@@ -155,7 +155,7 @@ def _errors(
     columns = ["x", "y", *([] if on_floor else ["z"]), "heading"]
     grid = figure.subplots(len(estimated), len(columns), sharex=True, squeeze=False)
     begin = min(float(one.times[0]) for one in estimated.values())
-    banded = accuracy.alignment in ("reference", "none")
+    banded = accuracy.anees is not None  # otherwise the covariances are not of these errors
     any_band = False
     for place, (robot, one) in enumerate(estimated.items()):
         colour = COLOURS[place % len(COLOURS)]

@@ -59,7 +59,13 @@ class Comparison:
             longest_gap=self.longest_gap,
         )
         accuracy = evaluate(
-            self.estimated, true, on_floor=self.on_floor, alignment=self.alignment, rpe=rpe, pairs_from=pairs_from
+            self.estimated,
+            true,
+            on_floor=self.on_floor,
+            alignment=self.alignment,
+            rpe=rpe,
+            pairs_from=pairs_from,
+            reference=self.reference,
         )
         return accuracy, true
 
@@ -88,7 +94,7 @@ def of_result(
             raise InputError(
                 f"{run}: the run holds no truth to compare with; record it on /<robot>/truth, or give it with --truth"
             )
-    alignment = alignment or ("none" if result.on_map else usual_alignment(estimated))
+    alignment = alignment or ("none" if result.on_map else usual_alignment(estimated, true, team.reference))
     return Comparison(estimated, true, alignment, team.reference, team.floor is not None)
 
 

@@ -5,12 +5,14 @@ The same run, options and version give the same bytes, except for `seconds` in s
 
 import dataclasses
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.errors import ColocError
 from coloc_graph.evaluation import Accuracy, accuracy_json, align, evaluate, usual_alignment
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o_writer import write_g2o
@@ -46,15 +48,29 @@ def assess(solution: Solution, truth_path: str | Path | None = None) -> tuple[Ac
     Returns
     -------
     (Accuracy, mapping of str to (n, 4, 4) float) or None
-        The accuracy, and the true poses in the estimate's world, NaN where there is none; None without truth.
+        The accuracy, and the true poses in the estimate's world, NaN where there is none; None without truth that
+        can be compared with, of which `with_truth_warning` has the reason.
     """
-    return _assess(solution, solution.estimate.trajectories, truth_path)
+    with suppress(ColocError):
+        return _assess(solution, solution.estimate.trajectories, truth_path)
+    return None
+
+
+def with_truth_warning(solution: Solution) -> Solution:
+    """Return a solution with a warning where its run holds truth that cannot be compared with."""
+    try:
+        _assess(solution, solution.estimate.trajectories, None)
+    except ColocError as why:
+        return dataclasses.replace(solution, warnings=(*solution.warnings, f"not compared with truth: {why}"))
+    return solution
 
 
 def assess_online(solution: Solution, truth_path: str | Path | None = None) -> Accuracy | None:
     """Compare each pose as it was estimated at its time with truth; None where there is none of either."""
-    assessed = _assess(solution, solution.online, truth_path) if solution.online else None
-    return None if assessed is None else assessed[0]
+    with suppress(ColocError):
+        assessed = _assess(solution, solution.online, truth_path) if solution.online else None
+        return None if assessed is None else assessed[0]
+    return None
 
 
 def _assess(
@@ -63,11 +79,12 @@ def _assess(
     truth = read_truth(solution.run.path if truth_path is None else truth_path, trajectories)
     if not truth:
         return None
-    on_floor, how = solution.run.team.floor is not None, usual_alignment(trajectories)
+    team = solution.run.team
+    on_floor, how = team.floor is not None, usual_alignment(trajectories, truth, team.reference)
     if solution.estimate.is_ranging:
         on_floor, how = True, "none" if solution.estimate.ranging.on_map else "team"
-    true = align(trajectories, truth, solution.run.team.reference, on_floor=on_floor, alignment=how)
-    return evaluate(trajectories, true, on_floor=on_floor, alignment=how), true
+    true = align(trajectories, truth, team.reference, on_floor=on_floor, alignment=how)
+    return evaluate(trajectories, true, on_floor=on_floor, alignment=how, reference=team.reference), true
 
 
 def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
@@ -95,6 +112,8 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
     estimate = solution.estimate
     assessed = assess(solution)
     accuracy, true = assessed if assessed is not None else (None, None)
+    if assessed is None:
+        solution = with_truth_warning(solution)
     with whole_result(out) as part:
         for robot, trajectory in estimate.trajectories.items():
             write_tum(trajectory, part / "trajectories" / f"{robot}.tum")

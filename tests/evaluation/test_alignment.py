@@ -132,5 +132,7 @@ def test_what_has_no_rotation_to_fit_is_refused_in_words(estimated, planar, word
 
 def test_the_usual_alignment_is_by_the_reference_where_there_are_stances(rng):
     one = line("A")
-    assert usual_alignment({"A": one}) == "team"
-    assert usual_alignment({"A": Trajectory("A", one.times, one.T_world_body, np.arange(60))}) == "reference"
+    at_stances = {"A": Trajectory("A", one.times, one.T_world_body, np.arange(60))}
+    assert usual_alignment({"A": one}, {"A": one}, "A") == "team"
+    assert usual_alignment(at_stances, {"A": one}, "A") == "reference"
+    assert usual_alignment(at_stances, {"B": one}, "A") == "team"  # nobody knows where the reference was

@@ -143,29 +143,51 @@ def test_nees_counts_a_held_pose_once_and_the_worlds_own_never():
 @pytest.mark.parametrize(
     ("truth", "words"),
     [
-        (lambda team: {"A": team["A"]}, "the truth does not hold robot B"),
+        (lambda team: {"C": team["A"]}, "the truth holds C, and the estimate A, B: give the truth of a robot"),
         (
-            lambda team: team | {"B": Trajectory("B", np.empty(0), np.empty((0, 4, 4)))},
-            "the truth does not hold robot B",
-        ),
-        (
-            lambda team: team | {"B": trajectory("B", times=TIMES + 100)},
+            lambda team: {"B": trajectory("B", times=TIMES + 100)},
             "the truth of robot B is at none of its times: the estimate reaches from 1700000000.000 to "
             "1700000040.000 s, the truth from 1700000100.000",
         ),
+        (lambda team: {"B": team["B"]}, "there is no truth of the reference robot A .* align the team"),
     ],
 )
-def test_truth_that_does_not_cover_the_estimate_is_refused_in_words(team, truth, words):
+def test_truth_of_no_pose_is_refused_in_words(team, truth, words):
     with pytest.raises(InputError, match=words) as refusal:
         align(team, truth(team), "A", on_floor=True)
     assert "\n" not in str(refusal.value)
 
 
-def test_truth_that_begins_late_names_the_stance_and_not_its_place():
-    late = trajectory("A", times=TIMES[2:])
-    estimate = {"A": Trajectory("A", TIMES[1:], floor_pose(np.arange(4), 0, 0), np.array([5, 6, 7, 8]))}
-    with pytest.raises(InputError, match="reference robot A begins after stance 5"):
-        align(estimate, {"A": late}, "A", on_floor=True)
+@pytest.mark.parametrize(
+    "truth_of_b", [None, Trajectory("B", np.empty(0), np.empty((0, 4, 4))), trajectory("B", times=TIMES + 100)]
+)
+def test_a_robot_without_truth_is_named_and_the_others_are_evaluated(team, truth_of_b):
+    truth = {"A": team["A"]} | ({} if truth_of_b is None else {"B": truth_of_b})
+    accuracy = evaluate(team, align(team, truth, "A", on_floor=True), on_floor=True)
+    assert [row.robot for row in accuracy.robots] == ["A"] and accuracy.ate == 0
+    assert accuracy.warnings == ("robot B is not evaluated: there is no truth at the times of its 5 poses",)
+
+
+def test_truth_that_begins_late_is_aligned_by_the_first_pose_that_has_it():
+    covariances = np.tile(1e-4 * np.eye(6), (5, 1, 1))
+    estimate = {
+        robot: Trajectory(robot, TIMES, floor_pose(np.arange(5), y, 0), 5 + np.arange(5), covariances)
+        for robot, y in {"A": 0, "B": 1}.items()
+    }
+    late = np.array([0, 0, 1, 1, 1], bool)
+    truth = {robot: moved(one, floor_pose(3, -2, 2.5)).where(late) for robot, one in estimate.items()}
+    true = align(estimate, truth, "A", on_floor=True)
+    accuracy = evaluate(estimate, true, on_floor=True, reference="A")
+    assert accuracy.ate < 1e-12 and accuracy.robots[0].true_length == pytest.approx(2)
+    assert len(accuracy.warnings) == 3 and accuracy.warnings[0].startswith("robot A: 2 of 5 poses are left out")
+    assert "begins after the estimate: aligned by its pose at stance 7; there is no NEES" in accuracy.warnings[2]
+    assert accuracy.anees is None and accuracy.nees_poses == 0
+    # a robot that had not moved until then still defines the world
+    held = floor_pose([0, 0, 0, 1, 2], 0, 0)
+    estimate["A"] = Trajectory("A", TIMES, held, 5 + np.arange(5), covariances)
+    truth["A"] = moved(estimate["A"], floor_pose(3, -2, 2.5)).where(late)
+    accuracy = evaluate(estimate, align(estimate, truth, "A", on_floor=True), on_floor=True, reference="A")
+    assert len(accuracy.warnings) == 2 and accuracy.nees_poses > 0
 
 
 def test_the_nees_of_a_team_counts_each_pose_and_on_a_floor_heading_x_and_y_only():

@@ -237,7 +237,7 @@ def test_what_is_not_said_or_said_in_vain(refused, call, tums, result, tmp_path)
         estimate, *true, "--align", "reference"
     )
     assert "the reference robot Z" in refused(estimate, *true, "--align", "reference", "--reference", "Z")
-    assert "the truth does not hold robot B" in refused(estimate, "--truth", f"A={tums}/true/A.tum")
+    assert "the truth holds Z, and the estimate A, B, C" in refused(estimate, "--truth", f"Z={tums}/true/A.tum")
     assert "robot A is given twice" in refused("--estimate", estimate, f"A={tums}/est/B.tum", *true)
     assert "`0` is not positive; give distances in metres, as 1,2,5" in refused(result, "--rpe", "1,0")
     assert "`1;2` is not positive" in refused(result, "--rpe", "1;2")

@@ -1,6 +1,7 @@
 """A result on disk: complete, reproducible, whole or not at all, and read back."""
 
 import csv
+import dataclasses
 import json
 import shutil
 import tomllib
@@ -15,7 +16,7 @@ from coloc_graph.pipeline.batch import solve
 from coloc_graph.results.folder import read_result
 from coloc_graph.results.measurement_table import MEASUREMENT_COLUMNS
 from coloc_graph.results.writer import write_result
-from coloc_graph.run import open_run, run_id
+from coloc_graph.run import open_run, read_truth, run_id
 from coloc_graph.simulation import simulate
 from coloc_graph.team import Team
 
@@ -184,6 +185,31 @@ def test_a_run_without_truth_has_no_accuracy(short, copied, tmp_path):
     run = open_run(copied(short, tmp_path / "run.mcap"))
     assert write_result(solve(run), tmp_path / "out") is None
     assert "accuracy" not in json.loads((tmp_path / "out" / "summary.json").read_text())
+
+
+def test_truth_that_begins_late_or_misses_robots_stops_no_estimate(short, copied, tmp_path, capsys):
+    true = read_truth(short)
+    late = {"A": true["A"].where(true["A"].times > open_run(short).stances[0].start + 0.05)}
+    run = copied(short, tmp_path / "run.mcap", truth=late)
+    assert main(["solve", str(run), "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr()
+    assert "robot A: 1 of" in said.err and "1 before it begins" in said.err
+    assert "robot B is not evaluated: there is no truth" in said.err
+    tables = said.out.split("x at the end")  # of the robots without truth their last poses are printed
+    assert len(tables) == 2 and "\nB " in tables[1] and "\nA " in tables[0]
+    assert list(json.loads((tmp_path / "out" / "summary.json").read_text())["accuracy"]["robots"]) == ["A"]
+
+
+def test_truth_that_cannot_be_compared_with_is_a_warning(short, copied, tmp_path, capsys):
+    true = read_truth(short)["B"]
+    run = copied(short, tmp_path / "run.mcap", truth={"B": dataclasses.replace(true, times=true.times + 1e4)})
+    assert main(["solve", str(run), "--out", str(tmp_path / "out"), "--json"]) == 0
+    said = capsys.readouterr()
+    for summary in (json.loads(said.out), json.loads((tmp_path / "out" / "summary.json").read_text())):
+        assert "accuracy" not in summary
+        assert (
+            sum("not compared with truth: the truth of robot B is at none" in one for one in summary["warnings"]) == 1
+        )
 
 
 @pytest.mark.parametrize(
