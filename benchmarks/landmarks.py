@@ -26,7 +26,7 @@ from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.report.drawing import COLOURS, styled
 from coloc_graph.run import Detections
 from coloc_graph.simulation import Imperfections, World, build_world, scenario
-from coloc_graph.simulation.scenarios import LEAP
+from coloc_graph.simulation.scenarios import COURSE_GAIT
 from coloc_graph.simulation.world import stream
 
 FIELD = Imperfections(mount_sigma_deg=0.5, height_sigma=0.003, span_sigma=1e-4, floor_sigma_deg=0.05)
@@ -83,7 +83,7 @@ def of_seed(seed: int, mode: str, length: float, laps: int) -> Outcome:
         assert trajectory.stances is not None
         off = np.linalg.norm(trajectory.positions[:, :2] - true[robot][:, :2, 3], axis=1)
         for stance, error in zip(trajectory.stances.tolist(), off.tolist(), strict=True):
-            squares.setdefault(int(stance * LEAP / BIN), []).append(error**2)
+            squares.setdefault(int(stance * COURSE_GAIT.leap / BIN), []).append(error**2)
     last = nees_of(estimate.trajectories["A"], true["A"], [2, 3, 4])[-1]
     errors, nees = _of_landmarks(solution.estimate.landmarks, world)
     return Outcome(

@@ -26,7 +26,7 @@ LAYERS: list[tuple[str, set[str]]] = [
     ("recorded data", {"run"}),
     ("image files", {"image_file"}),
     ("measuring, estimating, devices", {"frontend", "backend", "robot_io", "evaluation", "calibration"}),
-    ("formats of others", {"exchange"}),
+    ("formats of others, plans", {"exchange", "planning"}),
     ("whole runs", {"simulation", "pipeline"}),
     ("reports and missions", {"report", "online"}),
     ("results on disk", {"results"}),

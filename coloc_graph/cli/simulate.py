@@ -1,9 +1,17 @@
 """coloc simulate SCENARIO --out RUN."""
 
 import argparse
+import math
+from typing import TYPE_CHECKING
 
 from coloc_graph.cli.place import add_out, require_run_place
 from coloc_graph.cli.printing import progress
+
+if TYPE_CHECKING:
+    from coloc_graph.planning.formation import Gait
+
+#: Scenarios with a gait, and the leap of each [m].
+GAITS = {"hallway": 0.185, "landmarks": 0.25}
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -31,9 +39,11 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     errors.add_argument("--clock-offset", type=float, default=0.0, help="offset of the other robots' clocks, s")
     errors.add_argument("--time-jitter", type=float, default=0.0, help="jitter of the instants of capture, s")
 
-    single = command.add_argument_group("scenario single-step")
-    single.add_argument("-l", type=float, help="distance between the observers, m (default: 0.8)")
-    single.add_argument("--theta", type=float, help="angle between the observers, deg (default: 35)")
+    single = command.add_argument_group("scenarios single-step, hallway and landmarks")
+    single.add_argument("-l", type=float, help="distance between the observers, m (default: 0.8; hallway 0.74)")
+    single.add_argument("--theta", type=float, help="angle between the observers, deg (default: 35; hallway 34)")
+    single.add_argument("--leap", type=float, help="advance of the team a stance, m (default: 0.185; landmarks 0.25)")
+    single.add_argument("--plan", metavar="CSV", help="hallway: follow a plan that `coloc plan --poses` wrote")
 
     team = command.add_argument_group("scenario team")
     team.add_argument("--robots", type=int, help="number of robots (default: 10)")
@@ -56,12 +66,13 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 def run(args: argparse.Namespace) -> int:
     """Simulate a scenario and write its run."""
     from coloc_graph.errors import InputError
+    from coloc_graph.planning.plan import read_plan
     from coloc_graph.simulation import Imperfections, simulate
 
     require_run_place(args.out, force=args.force)
     other = {"tracks": ("fps", "image_format"), "images": ("noise",)}[args.depth]
     for name in other:
-        if getattr(args, name) is not None:
+        if getattr(args, name) is not None and not (name == "fps" and args.plan is not None):
             raise InputError(f"--{name.replace('_', '-')} does not apply with --depth {args.depth}; leave it out")
     imperfections = Imperfections(
         mount_sigma_deg=args.mount_sigma,
@@ -81,8 +92,10 @@ def run(args: argparse.Namespace) -> int:
             points=args.points,
             stances=args.stances,
             imperfections=imperfections,
-            l=args.l,
-            theta_deg=args.theta,
+            l=args.l if args.scenario not in GAITS else None,
+            theta_deg=args.theta if args.scenario not in GAITS else None,
+            gait=gait_of(args),
+            plan=None if args.plan is None else read_plan(args.plan),
             robots=args.robots,
             at_once=args.at_once,
             length=args.length,
@@ -97,3 +110,21 @@ def run(args: argparse.Namespace) -> int:
         )
     print(args.out)
     return 0
+
+
+def gait_of(args: argparse.Namespace) -> "Gait | None":
+    """Return the gait that the arguments describe; None if they leave all of it out, or the scenario has none."""
+    from coloc_graph.errors import InputError
+    from coloc_graph.planning.formation import Gait
+
+    if args.scenario not in GAITS:
+        if args.leap is not None:
+            raise InputError(f"--leap belongs to hallway and landmarks, not to {args.scenario}; leave it out")
+        return None
+    given = {"l": args.l, "theta_deg": args.theta, "leap": args.leap}
+    if all(value is None for value in given.values()):
+        return None
+    leap = GAITS[args.scenario] if args.leap is None else args.leap
+    # without a distance the lanes stay where they are
+    apart = math.hypot(leap, 0.72) if args.l is None else args.l
+    return Gait.of_paper(apart, 34.0 if args.theta is None else args.theta, leap)

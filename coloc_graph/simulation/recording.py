@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coloc_graph.errors import InputError
+from coloc_graph.planning.formation import Gait
+from coloc_graph.planning.plan import Plan
 from coloc_graph.run import whole_run
 from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Stance
 from coloc_graph.simulation.blinking import with_codes
 from coloc_graph.simulation.mess import messy_frames
 from coloc_graph.simulation.paths import Array
+from coloc_graph.simulation.planned import planned
 from coloc_graph.simulation.rig import Imperfections, reference_team
 from coloc_graph.simulation.scenarios import TeamScenario, scenario
 from coloc_graph.simulation.scenery import Scenery, frames, make_scenery
@@ -56,6 +59,8 @@ def simulate(
     landmark_every: float | None = None,
     laps: int | None = None,
     known: bool = False,
+    gait: Gait | None = None,
+    plan: Plan | None = None,
     blink: bool = False,
     fps: float = 10.0,
     image_format: ImageFormat = "jpeg",
@@ -68,9 +73,10 @@ def simulate(
     depth images, which `messy` makes of a world of glare, mirrors, flicker and a person in the way. `l` [m] and
     `theta_deg` are single-step's; `robots`, how many move `at_once`, and whether they `blink` and markers have no names
     (2000 points then) are team's; `length` [m] in all, in how many `laps`, with a landmark every so many metres, and
-    whether the team is told where these are (`known`), are landmarks'. `progress` is called with the stances done and
-    their number. The same arguments give the same bytes. Returns what was true. Raises `InputError`, and leaves no
-    file, where an argument is wrong or the pair has no common view.
+    whether the team is told where these are (`known`), are landmarks'. `gait` is the formation of hallway and
+    landmarks; the hallway follows a `plan` instead, at `fps`, with the points that its drives bring. `progress` is
+    called with the stances done and their number. The same arguments give the same bytes. Returns what was true.
+    Raises `InputError`, and leaves no file, where an argument is wrong or the pair has no common view.
     """
     if depth not in get_args(Depth):
         raise InputError(f"`depth` is {depth!r}; use tracks or images")
@@ -84,9 +90,12 @@ def simulate(
         raise InputError(f"`image_format` is {image_format!r}; use jpeg, png or raw")
     if seed < 0:
         raise InputError(f"`seed` is {seed}; give a whole number that is not negative")
-    what = scenario(
+    if plan is not None and (scenario_name != "hallway" or stances is not None or points is not None or gait):
+        raise InputError("a plan is followed by the hallway, and has its own stances, points and gait: leave these out")
+    rng = stream(seed, "formation")
+    what = planned(plan, rng) if plan is not None else scenario(
         scenario_name, stances=stances, l=l, theta_deg=theta_deg, robots=robots, at_once=at_once,
-        length=length, landmark_every=landmark_every, laps=laps, rng=stream(seed, "formation"),
+        length=length, landmark_every=landmark_every, laps=laps, rng=rng, gait=gait,
     )  # fmt: skip
     if points is None:
         points = 250 if depth == "images" or scenario_name == "single-step" else 2000 if blink else 100

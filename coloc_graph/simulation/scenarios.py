@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
+from coloc_graph.planning.formation import PAPER, Gait
 
 #: x [m], y [m], yaw [rad] of a body on the floor.
 Pose = tuple[float, float, float]
@@ -15,7 +16,7 @@ Pose = tuple[float, float, float]
 LANE = 0.8  # m, distance between the lanes of a team
 ROW = 0.45  # m, distance between robots of one lane
 
-LEAP = 0.25  # m, advance of the pair a leap on a course
+COURSE_GAIT = Gait(leap=0.25)  # formation on a course
 CORNER = 1.2  # m, radius of the corners of a course
 WALL = 0.95  # m, distance of its outer wall
 
@@ -71,6 +72,10 @@ class Scenario:
     def standing(self, k: int) -> dict[str, int]:
         """Robot -> number of its standing pose, in stance k."""
         return {self.stander(k): k, self.stander(k + 1): k + 1}
+
+    def leaps(self, k: int) -> dict[str, int]:
+        """Observer -> number of the standing pose to which it drives between stances k-1 and k."""
+        return {self.stander(k + 1): k + 1}
 
     def heading(self, k: int) -> float:
         """Heading of the team in stance k [rad]; its box lies ahead."""
@@ -154,18 +159,32 @@ def six_step(stances: int = 6) -> Scenario:
     return Scenario("six-step", poses[: stances + 1], Box((0.3, 2.5), (-1.0, 1.0)))
 
 
-def hallway(stances: int = 40, rng: np.random.Generator | None = None) -> Scenario:
-    """Table II: a leap-frog of 0.37 m steps down a hallway, each stop off by a centimetre and a degree."""
+def hallway(stances: int | None = None, rng: np.random.Generator | None = None, gait: Gait = PAPER) -> Scenario:
+    """Simulate Table II's leap-frog down a hallway, each stop off by a centimetre and a degree.
+
+    Parameters
+    ----------
+    stances
+        Number of stances (default: 7.4 m of the `gait`).
+    rng
+        Random numbers of the stops.
+    gait
+        Leap, distance abreast and toe-in of the observers; the paper's by default.
+
+    Raises
+    ------
+    InputError
+        If there is no stance.
+    """
+    stances = max(round(40 * PAPER.leap / gait.leap), 1) if stances is None else stances
     if stances < 1:
         raise InputError(f"the hallway has {stances} stances; give at least 1")
     rng = np.random.default_rng(0) if rng is None else rng
-    k = np.arange(stances + 1)
-    side = np.where(k % 2, -1.0, 1.0)
     # row by row, so that a longer hallway begins as a shorter one does
     off = rng.standard_normal((stances + 1, 3)) * (0.01, 0.01, np.deg2rad(1.0))
-    poses = np.stack([0.185 * k, 0.36 * side, -HALF_ANGLE * side], axis=1) + off
+    poses = np.array([gait.stop(k) for k in range(stances + 1)]) + off
     places = tuple((float(x), float(y), float(w)) for x, y, w in poses)
-    return Scenario("hallway", places, Box((0.3, 2.5), (-1.0, 1.0)), meanders=True)
+    return Scenario("hallway", places, Box((max(0.3, gait.leap / 2 + 0.1), 2.5), (-1.0, 1.0)), meanders=True)
 
 
 def team_of(
@@ -194,7 +213,11 @@ def team_of(
 
 
 def course(
-    length: float = 100.0, landmark_every: float = 10.0, laps: int = 4, rng: np.random.Generator | None = None
+    length: float = 100.0,
+    landmark_every: float = 10.0,
+    laps: int = 4,
+    rng: np.random.Generator | None = None,
+    gait: Gait = COURSE_GAIT,
 ) -> CourseScenario:
     """A leap-frog of `length` [m] in all, `laps` times round a square with round corners, landmarks on its outer wall
     every so many metres; each stop is off by a centimetre and a degree."""
@@ -210,10 +233,11 @@ def course(
             f"{4 * CORNER * math.pi / 2 * laps:.0f} m"
         )
     rng = np.random.default_rng(0) if rng is None else rng
-    k = np.arange(round(length / LEAP) + 1)
+    k = np.arange(round(length / gait.leap) + 1)
     side = np.where(k % 2, -1.0, 1.0)
-    x, y, yaw = _along(LEAP * k, lap).T
-    at = np.stack([x - 0.36 * side * np.sin(yaw), y + 0.36 * side * np.cos(yaw), yaw - HALF_ANGLE * side], axis=1)
+    x, y, yaw = _along(gait.leap * k, lap).T
+    left, turn = gait.abreast / 2 * side, math.radians(gait.toe_in_deg) * side
+    at = np.stack([x - left * np.sin(yaw), y + left * np.cos(yaw), yaw - turn], axis=1)
     poses = at + rng.standard_normal(at.shape) * (0.01, 0.01, np.deg2rad(1.0))
     count = max(round(lap / landmark_every), 1)
     way = np.arange(count) * lap / count + 0.75 * (lap / 4 - CORNER * math.pi / 2)  # the first towards a straight's end
@@ -226,7 +250,7 @@ def course(
         tuple((float(x), float(y), float(w)) for x, y, w in poses),
         Box((0.3, 2.5), (-0.8, 0.8)),
         meanders=True,
-        headings=tuple(_along(LEAP * (k[:-1] + 0.5), lap)[:, 2].tolist()),
+        headings=tuple(_along(gait.leap * (k[:-1] + 0.5), lap)[:, 2].tolist()),
         landmarks=tuple((float(x), float(y), float(w)) for x, y, w in landmarks),
     )
 
@@ -260,12 +284,15 @@ def scenario(
     landmark_every: float | None = None,
     laps: int | None = None,
     rng: np.random.Generator | None = None,
+    gait: Gait | None = None,
 ) -> Scenario:
     """The scenario of a name; `InputError` where there is none, or an argument is not one of its own."""
     if name != "landmarks" and (length is not None or landmark_every is not None or laps is not None):
         raise InputError(f"`length`, `landmark_every` and `laps` belong to landmarks, not to {name}; leave them out")
     if name != "single-step" and (l is not None or theta_deg is not None):
-        raise InputError(f"`l` and `theta_deg` belong to single-step, not to {name}; leave them out")
+        raise InputError(f"`l` and `theta_deg` belong to single-step, not to {name}; give {name} a `gait`, if any")
+    if name not in ("hallway", "landmarks") and gait is not None:
+        raise InputError(f"a gait belongs to hallway and landmarks, not to {name}; leave it out")
     if name != "team" and (robots is not None or at_once is not None):
         raise InputError(f"`robots` and `at_once` belong to team, not to {name}; leave them out")
     if name == "single-step":
@@ -275,14 +302,14 @@ def scenario(
     if name == "six-step":
         return six_step(6 if stances is None else stances)
     if name == "hallway":
-        return hallway(40 if stances is None else stances, rng)
+        return hallway(stances, rng, PAPER if gait is None else gait)
     if name == "team":
         return team_of(10 if robots is None else robots, at_once, 30 if stances is None else stances, rng)
     if name == "landmarks":
         if stances is not None:
             raise InputError("the scenario landmarks is as long as its `length` [m]; give that instead of `stances`")
         return course(100.0 if length is None else length, 10.0 if landmark_every is None else landmark_every,
-                      4 if laps is None else laps, rng)  # fmt: skip
+                      4 if laps is None else laps, rng, COURSE_GAIT if gait is None else gait)  # fmt: skip
     raise InputError(f"there is no scenario `{name}`; choose one of {', '.join(SCENARIOS)}")
 
 

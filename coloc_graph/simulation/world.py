@@ -14,6 +14,7 @@ from coloc_graph.run.messages import Stance
 from coloc_graph.simulation.landmarks import drawn, in_view, standing_landmarks, unsurveyed, with_landmarks
 from coloc_graph.simulation.meander import meander
 from coloc_graph.simulation.paths import Array, Path, PathBuilder, drive, tilt_rotation
+from coloc_graph.simulation.planned import PlannedScenario
 from coloc_graph.simulation.rig import IMAGE_BIAS, MILD_LENS, Imperfections, reference_team, stated_team, true_team
 from coloc_graph.simulation.scenarios import Pose, Scenario
 from coloc_graph.simulation.tours import LONGEST_BURST, Tour, patrol, scatter
@@ -235,6 +236,8 @@ class _Builder:
         markers = self.true[self.scenario.mover].markers
         assert markers is not None
         where, rng, middle = f"stance {k}", stream(self.seed, "tour", k), self.scenario.middle(k)
+        if isinstance(self.scenario, PlannedScenario):
+            return self.scenario.tour(k, views, markers.p_body, self.fps, start, where)
         if self.depth == "images":
             frames = max(self.points // 2, 1)
             return patrol(views, markers.p_body, middle, frames, self.fps, start, rng, where, self.stopping)
@@ -256,7 +259,7 @@ class _Builder:
         Returns when both are there."""
         scenario, ends = self.scenario, []
         for robot, target, tilt in (
-            (scenario.stander(k + 1), np.array(scenario.poses[k + 1]), self.tilts[k + 1]),
+            *((robot, np.array(scenario.poses[n]), self.tilts[n]) for robot, n in scenario.leaps(k).items()),
             (scenario.mover, tour.leg.knots[0], None),
         ):
             builder = self.builders[robot]

@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 
 GRID = 0.05  # m, distance between positions that are tried
 WIDE = 1.5  # m, positions to either side
+BODY_RADIUS = 0.17  # m, of an iRobot Create
+BODY_HEIGHT = 0.30  # m, up to the lid of the laptop that it carries
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,3 +57,29 @@ def places_in_view(
     points = np.concatenate([xy[:, None] + rim, np.full((len(xy), len(rim), 1), p_markers[0, 2])], axis=-1)
     seen = np.all([view.sees(points, margin).all(axis=1) for view in views], axis=0)
     return np.asarray(xy[seen])
+
+
+def hidden(eyes: ArrayLike, points: ArrayLike, bodies: ArrayLike) -> NDArray[np.bool_]:
+    """Return whether a robot's body hides points from cameras.
+
+    Parameters
+    ----------
+    eyes, points
+        Optical centres and points (..., 3) [m] in the world; their leading axes are broadcast.
+    bodies
+        Places (..., b, 2) [m] of the robots that stand in between: upright cylinders.
+
+    Returns
+    -------
+    ndarray of bool
+        True (...) for points behind or in a body.
+    """
+    eyes, points = np.broadcast_arrays(np.asarray(eyes, float), np.asarray(points, float))
+    at = np.asarray(bodies, float)
+    ray = (points - eyes)[..., None, :2]
+    toward = at - eyes[..., None, :2]
+    along = (toward * ray).sum(-1) / np.maximum((ray * ray).sum(-1), 1e-12)
+    along = np.clip(along, 0.0, 1.0)
+    aside = np.hypot(*np.moveaxis(toward - along[..., None] * ray, -1, 0))
+    height = eyes[..., None, 2] + along * (points - eyes)[..., None, 2]
+    return np.asarray(((aside < BODY_RADIUS) & (height < BODY_HEIGHT)).any(-1))
