@@ -1,8 +1,8 @@
-"""AprilTags in images, as two markers at the height of their centre: the middles of their left and right edge.
+"""Measure AprilTags as two markers at the height of the tag's centre: the midpoints of its left and right edge.
 
-OpenCV finds a tag and reads its number; its corners scatter by half a pixel. Here the four edges are measured, each by
-many profiles across it, and lines are laid through them: these are straight in normalised coordinates, whatever the
-lens.
+OpenCV finds a tag and decodes its number, but its corners scatter by half a pixel. Here each of the four edges is
+located by several intensity profiles across it, and a line is fitted through them, in normalised coordinates, where
+edges are straight whatever the lens distortion.
 """
 
 from collections.abc import Collection
@@ -18,32 +18,32 @@ from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
 
-#: An edge is measured by so many profiles, between these shares of its length.
-PROFILES = 15
-ENDS = 0.12
-#: A profile reaches this share of a cell inwards, where white cells may follow, and outwards; no further than so [px].
-INWARDS = 0.5
-OUTWARDS = 0.8
-FARTHEST = 4.0
-#: A profile is sampled this often in a pixel, and centred on the edge so many times.
-STEPS = 4
-ROUNDS = 3
-#: So many percent of a tag are darker than what is called its black.
-DARKEST = 10.0
-#: An edge that is fainter than this is none [grey levels].
-LEAST_CONTRAST = 15.0
-#: An edge's profiles scatter by more than noise makes them where something is in front of it [px].
-MOST_SCATTER = 0.6
-#: A tag leans by no more than this [rad]: one that hangs on its side has its left edge above.
-MOST_LEAN = np.deg2rad(30.0)
+PROFILES = 15  # intensity profiles across each edge
+END_MARGIN = 0.12  # share of an edge's length left out at either end
+INWARDS = 0.5  # reach of a profile into the tag, in cells; white cells may follow
+OUTWARDS = 0.8  # reach of a profile out of the tag, in cells
+MAX_PROFILE_REACH = 4.0  # px, in either direction
+SAMPLES_PER_PIXEL = 4  # along a profile
+ROUNDS = 3  # times that the profiles are centred anew on the edges
+BLACK_PERCENTILE = 10.0  # percentile of a tag's grey levels that is taken for its black
+MIN_CONTRAST = 15.0  # grey levels, of an edge
+MAX_SCATTER = 0.6  # px, of the profiles across an edge; more means that something occludes it
+MAX_LEAN = np.deg2rad(30.0)  # rad, from upright; of a tag on its side the left edge would be on top
 
 
 @dataclass(frozen=True, eq=False)
 class FoundTag:
-    """A tag in one image: the middles of its right and of its left edge, as seen, `uv` (2, 2) [px], with the noise of
-    this image in them, `covariance` (2, 2, 2) [px^2].
+    """Tag in one image.
 
-    The right edge is at the tag's own left, +y of a landmark that faces the camera.
+    Attributes
+    ----------
+    family, id
+        AprilTag family, such as "36h11", and number.
+    uv
+        Midpoints of the right and of the left edge as the camera sees them, (2, 2) [px]. The right edge is at the
+        tag's own left, +y of a landmark that faces the camera.
+    covariance
+        Image noise of both midpoints, (2, 2, 2) [px^2].
     """
 
     family: str
@@ -53,7 +53,7 @@ class FoundTag:
 
 
 def find_tags(pixels: NDArray[np.uint8], camera: Camera, families: Collection[str]) -> list[FoundTag]:
-    """The upright tags of some families in an image, grey or BGR; what is too faint or hidden in part is left out."""
+    """Find the upright tags of the given families in an image, grey or BGR; faint or occluded ones are left out."""
     grey = pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8)
     found = []
     for family in sorted(families):
@@ -69,13 +69,31 @@ def find_tags(pixels: NDArray[np.uint8], camera: Camera, families: Collection[st
 
 
 def measure_tag(grey: NDArray[np.uint8], camera: Camera, corners: Array, cells: int) -> tuple[Array, Array]:
-    """The middles of a tag's right and left edge (2, 2) [px], and the covariance (2, 2, 2) that noise gives each.
+    """Measure the midpoints of a tag's right and left edge.
 
-    `corners` (4, 2) [px] are roughly those from its top left on, clockwise as it is read; it is so many `cells` wide.
-    Raises `DegenerateGeometry` where it hangs on its side, is hidden in part, or too faint.
+    Parameters
+    ----------
+    grey
+        Grey image.
+    camera
+        Camera that took it.
+    corners
+        Approximate corners, clockwise from the tag's top left, (4, 2) [px].
+    cells
+        Width of the tag, border included, in cells.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Both midpoints, (2, 2) [px], and the covariance of each, (2, 2, 2) [px^2].
+
+    Raises
+    ------
+    DegenerateGeometry
+        The tag hangs on its side, is partly occluded, or too faint.
     """
     down = (corners[3] + corners[2] - corners[0] - corners[1]) / 2
-    if abs(np.arctan2(down[0], down[1])) > MOST_LEAN:
+    if abs(np.arctan2(down[0], down[1])) > MAX_LEAN:
         raise DegenerateGeometry("the tag does not hang upright: turn it")
     starts, ends = corners, np.roll(corners, -1, axis=0)  # top, right, bottom, left
     for _ in range(ROUNDS):
@@ -87,7 +105,7 @@ def measure_tag(grey: NDArray[np.uint8], camera: Camera, corners: Array, cells: 
         if not (np.abs(starts - corners).max() < 0.2 * np.linalg.norm(down)):
             raise DegenerateGeometry("the tag's edges are not where its corners are: something is in front of it")
     noise = np.maximum(scatter, 0.02)
-    if noise.max() > MOST_SCATTER:
+    if noise.max() > MAX_SCATTER:
         raise DegenerateGeometry("an edge of the tag is not straight: something is in front of it, or it is bent")
     middles = _middles(camera, points, weights)
     # each edge moves and turns by itself, by what its profiles scatter; they are independent
@@ -113,29 +131,29 @@ def _detector(family: str) -> "tuple[cv2.aruco.ArucoDetector, int]":
 
 
 def _edge_points(grey: NDArray[np.uint8], starts: Array, ends: Array, cells: int) -> tuple[Array, Array]:
-    """Where the edges (4) from `starts` to `ends` are crossed: (4, n, 2) [px], and which crossings count (4, n).
+    """Points where profiles cross the edges from `starts` to `ends`, (4, n, 2) [px], and their weights, 0 or 1, (4, n).
 
-    The light of a profile, from the black inside to the white outside, tells where it would change if it did at once.
+    The integral of a profile, from the black inside to the white outside, tells where a sharp edge would lie.
     """
     way = ends - starts
     length = np.linalg.norm(way, axis=1)
     outwards = np.stack([way[:, 1], -way[:, 0]], axis=1) / length[:, None]
     # what is across an edge is along its neighbours, and less of it the more a tag is turned away
     cell = (np.roll(length, 1) + np.roll(length, -1)) / 2 / cells
-    inner, outer = (np.clip(share * cell, 1.0, FARTHEST)[:, None] for share in (INWARDS, OUTWARDS))
-    count = int(np.ceil((inner + outer).max() * STEPS)) + 1
+    inner, outer = (np.clip(share * cell, 1.0, MAX_PROFILE_REACH)[:, None] for share in (INWARDS, OUTWARDS))
+    count = int(np.ceil((inner + outer).max() * SAMPLES_PER_PIXEL)) + 1
     offsets = -inner + (inner + outer) * np.linspace(0, 1, count)
-    at = starts[:, None] + np.linspace(ENDS, 1 - ENDS, PROFILES)[:, None] * way[:, None]
+    at = starts[:, None] + np.linspace(END_MARGIN, 1 - END_MARGIN, PROFILES)[:, None] * way[:, None]
     places = (at[:, :, None] + offsets[:, None, :, None] * outwards[:, None, None]).astype(np.float32)
     u, v = (places[..., k].reshape(4 * PROFILES, count) for k in range(2))
     light = cv2.remap(grey.astype(np.float32), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     light = light.reshape(4, PROFILES, count).astype(float)
     rim = max(count // 6, 1)
     # by edge, since a margin that is white is so along all of it; the black one is too narrow for a blur to leave it so
-    inside = np.full(4, np.percentile(_across(grey, starts), DARKEST))
+    inside = np.full(4, np.percentile(_across(grey, starts), BLACK_PERCENTILE))
     outside = np.median(light[..., -rim:].reshape(4, -1), axis=1)
     contrast = outside - inside
-    if contrast.min() < LEAST_CONTRAST:
+    if contrast.min() < MIN_CONTRAST:
         raise DegenerateGeometry("an edge of the tag is too faint: give it a white margin, and light")
     share = (light - inside[:, None, None]) / contrast[:, None, None]
     area = (share[..., 1:] + share[..., :-1]).sum(axis=-1) / 2 * (inner + outer) / (count - 1)
@@ -149,7 +167,7 @@ def _edge_points(grey: NDArray[np.uint8], starts: Array, ends: Array, cells: int
 
 
 def _across(grey: NDArray[np.uint8], corners: Array) -> Array:
-    """The light of a tag at many places of it."""
+    """Grey levels of a tag on a grid over it."""
     s, t = (axis.ravel()[:, None] for axis in np.meshgrid(*[np.linspace(0.05, 0.95, 24)] * 2))
     places = (1 - t) * ((1 - s) * corners[0] + s * corners[1]) + t * ((1 - s) * corners[3] + s * corners[2])
     u, v = places.astype(np.float32).T
@@ -169,9 +187,9 @@ def _lines(points: Array, weights: Array) -> tuple[Array, Array]:
 
 
 def _middles(camera: Camera, points: Array, weights: Array) -> Array:
-    """The middles of the right and of the left edge (2, 2) [px] of a square whose edges go through points (4, n, 2).
+    """Midpoints of the right and left edge, (2, 2) [px], of a square whose edges pass through points (4, n, 2) [px].
 
-    The middle of its height is where the diagonals meet, and the line from there goes where top and bottom edge meet.
+    The diagonals meet at the centre; the line of half height goes from there to the vanishing point of top and bottom.
     """
     x = camera.normalise(points.reshape(-1, 2)).reshape(points.shape)
     lines, _ = _lines(x, weights)

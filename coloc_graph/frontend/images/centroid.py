@@ -1,4 +1,4 @@
-"""Sub-pixel centres of spots with their covariance, of many windows at once.
+"""Measure sub-pixel centres of light spots with their covariance, for many image windows at once.
 
 The centre is the fixed point of a Gaussian window that takes the spot's own shape (adaptive moments; Bernstein
 and Jarvis, "Shapes and Shears, Stars and Smears", 2002). For a Gaussian spot this is the matched filter, so it
@@ -14,24 +14,33 @@ Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 MAX_ITERATIONS = 12
-#: The search ends when centres move by less than this [px].
-CONVERGED = 1e-3
-#: No spot is narrower than this [px^2]: a lens and a pixel blur as much.
-LEAST_VARIANCE = 0.25
-#: Several spots in a window are measured in so many turns at most, until none moves by more than this [px].
-TURNS = 6
-SETTLED = 4e-3
-#: Nor wider than this [px^2].
-MOST_VARIANCE = 400.0
+CONVERGED = 1e-3  # px, step of the centre below which the search ends
+MIN_VARIANCE = 0.25  # px^2, of a spot along its short axis; lens and pixel blur as much
+MAX_VARIANCE = 400.0  # px^2, of a spot along its long axis
+DEBLENDING_ROUNDS = 6  # at most, when several spots of a window are measured in turn
+DEBLENDED = 4e-3  # px, step of a centre from round to round below which deblending ends
 
 
 @dataclass(frozen=True, eq=False)
 class Spots:
-    """Spots in n windows: `centre` (n, 2) [px in the window: u, v], `covariance` (n, 2, 2) [px^2].
+    """Spots measured in n windows.
 
-    `shape` (n, 2, 2) [px^2] are the spot's own second moments, `flux` (n,) all its light [grey levels], `signal`
-    (n, h, w) the light without background, `noise` (n,) that of a pixel [grey levels]. `found` (n,) is False where
-    there is no spot to measure.
+    Attributes
+    ----------
+    centre
+        Centres, (n, 2) [px in the window: u, v].
+    covariance
+        Covariances of the centres, (n, 2, 2) [px^2].
+    shape
+        Second moments of the spots, (n, 2, 2) [px^2].
+    flux
+        Sums of their light, (n,) [grey levels].
+    signal
+        Windows without background, (n, h, w) [grey levels].
+    noise
+        Standard deviation of a dark pixel, (n,) [grey levels].
+    found
+        False where there is no spot to measure, (n,).
     """
 
     centre: Array
@@ -44,7 +53,7 @@ class Spots:
 
 
 def gaussians(centre: Array, shape: Array, flux: Array, size: tuple[int, ...]) -> Array:
-    """The light (n, h, w) of n Gaussian spots in windows of a size (h, w)."""
+    """Render n Gaussian spots, each in a window of `size` (h, w): (n, h, w) [grey levels]."""
     dx = (np.arange(size[1]) - centre[:, :1])[:, None, :]
     dy = (np.arange(size[0]) - centre[:, 1:])[:, :, None]
     a, b, c = (shape[:, i, j, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
@@ -56,12 +65,28 @@ def gaussians(centre: Array, shape: Array, flux: Array, size: tuple[int, ...]) -
 def measure_first(
     light: Array, size: Counts, inner: NDArray[np.bool_], window: Counts, levels: float, shot_gain: float
 ) -> tuple[Spots, NDArray[np.bool_]]:
-    """Measure the first spot in each window of `light` (n, h, w), of which only `size` (n, 2) [px: u, v] is real.
+    """Measure the first spot of each window, deblending spots that share a window.
 
-    There are m spots: `window` (m,), ascending, says in which each lies, `inner` (m, h, w) by which pixels it was
-    found. Where several lie in one, each is measured in what the others, as Gaussian spots, leave of the light, in
-    turns. Also says in which windows (n,) they are so near each other that they do not settle. Otherwise as
-    `measure_spots`.
+    Each of several spots is measured in what remains of the light when Gaussian models of the others are subtracted,
+    in turns, until the centres converge.
+
+    Parameters
+    ----------
+    light
+        Windows, (n, h, w) [grey levels], padded at the right and at the bottom.
+    size
+        Size of each window without padding, (n, 2) [px: u, v].
+    inner
+        Bright pixels of each of m spots, (m, h, w).
+    window
+        Index of the window in which each spot lies, (m,), ascending.
+    levels, shot_gain
+        As in `measure_spots`.
+
+    Returns
+    -------
+    tuple
+        The `Spots`, and a mask (n,) of the windows whose spots overlap too much to converge.
     """
     first = np.flatnonzero(np.diff(window, prepend=-1))
     touching = np.zeros(len(light), bool)
@@ -71,7 +96,7 @@ def measure_first(
         centre, shape, models = _rough_models(light[window], size[window], inner[spots])
         others = _of_others(models, window)
         begin, going = None, np.arange(len(spots))
-        for _ in range(TURNS):
+        for _ in range(DEBLENDING_ROUNDS):
             own = window[going]
             found = measure_spots(light[own] - others[going], size[own], inner[spots[going]], levels, shot_gain, begin)
             flux = np.where(found.found, found.flux, 0.0)
@@ -79,7 +104,7 @@ def measure_first(
             moved = np.zeros(len(light))
             np.maximum.at(moved, own, np.abs(found.centre - centre[going]).max(axis=1))
             centre[going], shape[going] = found.centre, found.shape
-            going = going[moved[own] >= SETTLED]
+            going = going[moved[own] >= DEBLENDED]
             if not len(going):
                 break
             begin = centre[going], shape[going]
@@ -98,11 +123,27 @@ def measure_spots(
     shot_gain: float,
     begin: tuple[Array, Array] | None = None,
 ) -> Spots:
-    """Measure one spot a window: `light` (n, h, w) [grey levels], `inner` the pixels that it was found by.
+    """Measure one spot in each window.
 
-    Of a window only `size` (n, 2) [px: u, v] is real. `levels` bounds how far the background may differ from its
-    median; `shot_gain` is the variance that a grey level of light adds to a pixel. The search may `begin` with centres
-    (n, 2) and shapes (n, 2, 2) that are nearly right.
+    Parameters
+    ----------
+    light
+        Windows, (n, h, w) [grey levels], padded at the right and at the bottom.
+    size
+        Size of each window without padding, (n, 2) [px: u, v].
+    inner
+        Bright pixels of the spot, (n, h, w).
+    levels
+        Bound on the background's deviation from its median [grey levels].
+    shot_gain
+        Variance that one grey level of light adds to a pixel [grey levels].
+    begin
+        Initial centres (n, 2) [px] and shapes (n, 2, 2) [px^2]; by default from `inner`.
+
+    Returns
+    -------
+    Spots
+        Centre, covariance and shape of each spot.
     """
     background, noise = coons_background(light, size, levels)
     signal = light - background
@@ -123,8 +164,8 @@ def measure_spots(
         scale = 1 / np.maximum(flux, 1e-9)
         x, y = m[:, 0, 1] * scale, m[:, 1, 0] * scale
         seen = m[:, 0, 2] * scale - x * x, m[:, 1, 1] * scale - x * y, m[:, 2, 0] * scale - y * y
-        # of a Gaussian spot in a Gaussian window their precisions add up, and so what is seen is undone
-        spot, more = _undone(seen, window, start[going])
+        # the precisions of a Gaussian spot and of a Gaussian window add up: subtract the window's
+        spot, more = _unwindowed(seen, window, start[going])
         step = np.empty((len(going), 2))
         step[:, 0], step[:, 1] = more[:, 0] * x + more[:, 1] * y, more[:, 2] * x + more[:, 3] * y
         shape[going], gain[going], total[going] = spot, more, flux
@@ -138,8 +179,8 @@ def measure_spots(
 
     wx, wy, dx, dy = _windows(centre, shape, grid)
     shot = _moments(np.maximum(signal, 0.0), wx * wx, wy * wy, dx, dy)
-    # where there is light or none, a pixel has that noise; and the background has its own: a row (column) of it is the
-    # mean of four pixels, and off as a whole
+    # every pixel has the dark noise; so has the background, a row (column) of which is the mean of four pixels and
+    # errs as a whole
     square_x, square_y, x2, y2 = wx * wx, wy * wy, (wx * dx) ** 2, (wy * dy) ** 2
     even, dark = (square_x * dx).sum(1) * (square_y * dy).sum(1), noise**2
     xx = x2.sum(1) * (square_y.sum(1) + wy.sum(1) ** 2 / 4) * dark + shot_gain * shot[:, 0, 2]
@@ -148,7 +189,7 @@ def measure_spots(
     gain = gain.reshape(-1, 2, 2)
     covariance = gain @ _matrices(xx, xy, yy) @ gain.mT / np.maximum(total**2, 1e-9)[:, None, None]
     found = (total > 0) & np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(centre).all(axis=1)
-    # what a Gaussian window lets through of a Gaussian spot
+    # undo the share of a Gaussian spot that a Gaussian window passes
     a, b, c = shape.T
     flux = total * np.sqrt((4 * a * c - b * b) / (a * c))
     return Spots(centre, covariance, _matrices(a, b, c), flux, signal, noise, found)
@@ -156,7 +197,7 @@ def measure_spots(
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """The pixels of windows: `x` (w,), `y` (h,), and whether they are real, `in_x` (n, w), `in_y` (n, h)."""
+    """Pixel coordinates of windows, `x` (w,) and `y` (h,), and which are not padded, `in_x` (n, w), `in_y` (n, h)."""
 
     x: Array
     y: Array
@@ -173,14 +214,14 @@ class _Grid:
 
 
 def _of_others(models: Array, window: Counts) -> Array:
-    """What the other spots (m, h, w) of each one's window (m,), ascending, add to its light."""
+    """Sum of the models (m, h, w) of the other spots in each spot's window, given as indices (m,), ascending."""
     begins = np.flatnonzero(np.diff(window, prepend=-1))
     counts = np.diff(begins, append=len(window))
     return np.asarray(np.repeat(np.add.reduceat(models, begins, axis=0), counts, axis=0) - models)
 
 
 def _rough_models(light: Array, size: Counts, inner: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
-    """Centres (m, 2), shapes (m, 2, 2) and light (m, h, w) of spots, roughly, by their bright pixels."""
+    """Approximate centres (m, 2), shapes (m, 2, 2) and light (m, h, w) of spots from their bright pixels."""
     grid = _Grid.of(size, light.shape[1:])
     dark = _median(
         light.reshape(len(light), -1), (grid.in_y[:, :, None] & grid.in_x[:, None, :]).reshape(len(light), -1)
@@ -200,20 +241,20 @@ def _matrices(xx: Array, xy: Array, yy: Array) -> Array:
 
 
 def _median(values: Array, real: NDArray[np.bool_]) -> Array:
-    """The medians (n,) of rows (n, m), of the values that are real, at least one in each."""
+    """Medians (n,) of the `real` values in each row (n, m), at least one a row."""
     ordered, counts = np.sort(np.where(real, values, np.inf), axis=1), real.sum(axis=1)
     rows = np.arange(len(values))
     return np.asarray((ordered[rows, (counts - 1) // 2] + ordered[rows, counts // 2]) / 2)
 
 
 def _rough_centre(light: Array, grid: _Grid) -> Array:
-    """The centroids (n, 2) of light (n, h, w)."""
+    """Centroids (n, 2) of light (n, h, w)."""
     total = np.maximum(light.sum(axis=(1, 2)), 1e-9)
     return np.stack([(light.sum(axis=1) @ grid.x) / total, (light.sum(axis=2) @ grid.y) / total], axis=1)
 
 
 def _rough_shape(inner: NDArray[np.bool_], grid: _Grid) -> Array:
-    """Second moments (n, 3: xx, xy, yy) of the spots that these pixels are the bright part of."""
+    """Second moments (n, 3: xx, xy, yy) of spots from their bright pixels (n, h, w)."""
     lit = inner.astype(float)
     area = np.maximum(lit.sum(axis=(1, 2)), 1.0)[:, None]
     dx, dy = grid.x - lit.sum(axis=1) @ grid.x[:, None] / area, grid.y - lit.sum(axis=2) @ grid.y[:, None] / area
@@ -223,10 +264,9 @@ def _rough_shape(inner: NDArray[np.bool_], grid: _Grid) -> Array:
 
 
 def _windows(centre: Array, shape: Array, grid: _Grid) -> tuple[Array, Array, Array, Array]:
-    """A Gaussian window's factors (n, w) and (n, h), and the distances from its centre along x and y.
+    """Factors (n, w) and (n, h) of separable Gaussian windows, and the distances from their centres along x and y.
 
-    Its axes are the image's: it is then a product, and moments are two small matrix products. It is as wide as a spot
-    of a `shape` (n, 3: xx, xy, yy).
+    The windows are as wide as spots of `shape` (n, 3: xx, xy, yy), with axes along the image's.
     """
     dx, dy = grid.x - centre[:, :1], grid.y - centre[:, 1:]
     wx, wy = np.exp(-0.5 / shape[:, :1] * dx * dx), np.exp(-0.5 / shape[:, 2:] * dy * dy)
@@ -244,10 +284,11 @@ def _moments(light: Array, wx: Array, wy: Array, dx: Array, dy: Array) -> Array:
     return np.asarray(in_y @ light @ in_x)
 
 
-def _undone(seen: tuple[Array, Array, Array], window: Array, otherwise: Array) -> tuple[Array, Array]:
-    """A spot's own moments (n, 3: xx, xy, yy) from those seen through a window of such moments, of which it has no xy,
-    and by how much a shift of the spot is more than is seen of it (n, 4: a matrix's elements); `otherwise` where the
-    moments are no spot's."""
+def _unwindowed(seen: tuple[Array, Array, Array], window: Array, otherwise: Array) -> tuple[Array, Array]:
+    """Moments of a spot (n, 3: xx, xy, yy) from those `seen` through a `window`, or `otherwise` if they are no spot's.
+
+    Also returns the gain from a centroid's shift in the window to that of the spot, (n, 4), a matrix row by row.
+    """
     xx, xy, yy = seen
     det = xx * yy - xy * xy
     scale = np.where(det > 1e-6, 1 / np.where(det > 1e-6, det, 1.0), 0.0)
@@ -258,7 +299,7 @@ def _undone(seen: tuple[Array, Array, Array], window: Array, otherwise: Array) -
     spot = np.empty_like(window)
     spot[:, 0], spot[:, 1], spot[:, 2] = c * scale, -b * scale, a * scale
     half, apart = (spot[:, 0] + spot[:, 2]) / 2, np.hypot((spot[:, 0] - spot[:, 2]) / 2, spot[:, 1])
-    good = (a > 0) & (det > 0) & (half - apart >= LEAST_VARIANCE) & (half + apart < MOST_VARIANCE)
+    good = (a > 0) & (det > 0) & (half - apart >= MIN_VARIANCE) & (half + apart < MAX_VARIANCE)
     if not good.all():
         spot = np.where(good[:, None], spot, otherwise)
     gain = np.empty((len(window), 4))
@@ -268,15 +309,17 @@ def _undone(seen: tuple[Array, Array, Array], window: Array, otherwise: Array) -
 
 
 def axes(shape: Array) -> tuple[Array, Array, Array]:
-    """Lengths of the short and the long half axis (n,) [px], and the long one's direction (n, 2)."""
+    """Standard deviations along the short and the long axis, (n,) [px], and the long axis's direction (n, 2)."""
     values, vectors = np.linalg.eigh(shape)
     short, long = np.sqrt(np.maximum(values, 1e-6)).T
     return short, long, vectors[:, :, 1]
 
 
 def at_points(signal: Array, window: Counts, points: Array, size: Counts) -> Array:
-    """Bilinear values (m,) of windows (n, h, w) of a `size` (n, 2) [px: u, v] at points (m, 2) [px: u, v] of each one's
-    window (m,), held inside."""
+    """Interpolate windows (n, h, w) of `size` (n, 2) bilinearly at points (m, 2) [px: u, v] in windows of index (m,).
+
+    Points outside a window are moved to its border.
+    """
     points = np.maximum(np.minimum(points, size[window] - 1.001), 0.0)
     corner = points.astype(int)
     j, i = corner.T
@@ -287,12 +330,21 @@ def at_points(signal: Array, window: Counts, points: Array, size: Counts) -> Arr
 
 
 def coons_background(light: Array, size: Counts, levels: float) -> tuple[Array, Array]:
-    """The light (n, h, w) that would be there without the spot, and the noise (n,) of a pixel [grey levels].
+    """Estimate the background under spots by a Coons patch.
 
-    Between the borders (two pixels wide) of what of a window is real, `size` (n, 2) [px: u, v], rows and columns are
-    interpolated (a Coons patch), which is exact for whatever is a sum of a profile in x and one in y. A marker stands
-    on a robot whose dark rim often passes right behind it: with a constant background that edge pulls the centre by
-    0.04 px.
+    Rows and columns are interpolated between the window's borders, two pixels wide, which is exact for any sum of a
+    profile in x and one in y. The dark rim of a robot often passes right behind its marker: with a constant background
+    that edge biases the centre by 0.04 px.
+
+    Parameters
+    ----------
+    light, size, levels
+        As in `measure_spots`.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        Background, (n, h, w), and the standard deviation of a pixel's noise, (n,) [grey levels].
     """
     n, height, width = light.shape
     each, end_x, end_y = np.arange(n), size[:, 0] - 1, size[:, 1] - 1
@@ -313,7 +365,7 @@ def coons_background(light: Array, size: Counts, levels: float) -> tuple[Array, 
     a, b = (left[:, 0] + top[:, 0]) / 2, (right[:, 0] + top[each, end_x]) / 2
     c, d = (left[each, end_y] + bottom[:, 0]) / 2, (right[each, end_y] + bottom[each, end_x]) / 2
     a, b, c, d = (value[:, None, None] for value in (a, b, c, d))
-    # what is left of rows and columns less what both have of the corners
+    # rows and columns less the corners' share that both contain
     left, right = left[:, :, None] - a - (c - a) * y, right[:, :, None] - b - (d - b) * y
     background = left + (right - left) * x + top[:, None, :] * (1 - y) + bottom[:, None, :] * y
     steps = [np.abs(np.diff(side, axis=1)) for side in (outer_left, outer_right, outer_top, outer_bottom)]

@@ -1,8 +1,8 @@
-"""Markers in images: white LEDs by brightness, coloured markers by hue, as candidates and as measured blobs.
+"""Detect markers in images: white LEDs by brightness, coloured markers by hue.
 
-A candidate is what a tracker needs, quickly: roughly where, and the pixels around. A blob is what a measurement
-needs: the sub-pixel centre with its covariance, and what is doubtful about it. Candidates become blobs many at
-a time.
+Detection has two steps. `Detector.find` quickly returns candidates, an approximate centre and the pixels around it,
+which is all that a tracker needs. `Detector.measure` turns many candidates at once into blobs, with sub-pixel centres,
+covariances and flags (`Flag`).
 """
 
 from collections.abc import Sequence
@@ -22,27 +22,17 @@ Pixels = NDArray[np.uint8]
 #: A rectangle of an image (u0, v0, u1, v1), u1 and v1 not included.
 Box = tuple[int, int, int, int]
 
-#: How far around a box is looked at [px]: more than the radius of the largest blob, and its margin.
-BORDER = 20
-#: How far around a box is looked at first [px].
-RIM = 4
-#: A box of at most so many pixels may hold one spot and nothing else.
-LONE = 400
-#: Pixels between a candidate and the border of its window.
-MARGIN = 3
-#: Windows come in these sizes [px], so that many are measured at once.
-SIZES = (11, 15, 21, 31, 45, 63)
+BORDER = 20  # px around a search box that are examined; more than the radius of the largest blob and its margin
+RIM = 4  # px around a search box that are examined first
+MAX_SINGLE_SPOT_AREA = 400  # px, bounding box of bright pixels that may be one spot without labelling
+MARGIN = 3  # px between a candidate and the border of its window
+SIZES = (11, 15, 21, 31, 45, 63)  # px, sides of windows; a few sizes, so that many windows are measured at once
 SIZE_FOR = [next(size for size in SIZES if size >= wanted) for wanted in range(SIZES[-1] + 1)]
-#: Windows are measured with larger ones while they are no more pixels than this then.
-FEW = 1 << 16
-#: Blobs that fit into a window of this size [px] are measured together where one lies in another's.
-TOGETHER = 31
-#: Larger ones [px] are lamps, for which there is no time.
-LED = 14
-#: A blob's peak is at least this many times the noise around it.
-LEAST_CONTRAST = 4.0
-#: Two spots touch where it is darker between them than this part of the darker one.
-DIP = 0.8
+MAX_PADDED_PIXELS = 1 << 16  # windows are padded to a larger size while all together hold no more pixels
+MAX_DEBLENDING_WINDOW = 31  # px, side of the largest window in which blobs are deblended
+MAX_LED_SIZE = 14  # px, of a blob that is deblended; larger ones are lamps
+MIN_CONTRAST = 4.0  # of a blob's peak, in standard deviations of the noise around it
+DIP = 0.8  # brightness between two spots, as a share of the darker one, below which they count as two
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +54,28 @@ class Blobs:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Candidate:
-    """A blob as it was found: roughly its centre `uv` [px], and the `window` of light around it.
+    """Blob before it is measured.
 
-    `corner` is the pixel (u, v) of the window's first element; `box` (left, top, width, height) [px in the
-    window] is what the blob covers above `level` [grey levels], `others` what other blobs there do. `touched` says that
-    one of these is too large to be measured with it.
+    Attributes
+    ----------
+    uv
+        Approximate centre [px].
+    area
+        Number of pixels above `level`.
+    window
+        Light around the blob, (h, w) [grey levels].
+    corner
+        Pixel (u, v) of the window's first element.
+    box
+        Bounding box of the blob's bright pixels, (left, top, width, height) [px in the window].
+    level
+        Grey level above which a pixel is bright.
+    clipped
+        True if the blob touches the border of the image.
+    others
+        Bounding boxes of other blobs in the window.
+    touched
+        True if another blob in the window is too large to be deblended.
     """
 
     uv: tuple[float, float]
@@ -84,26 +91,36 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Threshold:
-    """What counts as a blob: so many grey levels above the background, so many pixels above that."""
+    """Thresholds on the brightness, size and shape of a blob."""
 
-    levels: float = 35.0
-    min_area: int = 2
-    max_area: int = 1000
-    saturation: int = 250
-    elongation: float = 2.5  # longer than this many times its width: blurred
-    shot_gain: float = 0.1  # variance in grey levels^2 that one grey level of light adds
+    levels: float = 35.0  # grey levels above the background
+    min_area: int = 2  # px above that threshold
+    max_area: int = 1000  # px
+    saturation: int = 250  # grey level
+    elongation: float = 2.5  # ratio of long to short axis above which a blob is flagged as blurred
+    shot_gain: float = 0.1  # variance that one grey level of light adds [grey levels]
 
 
 @dataclass(frozen=True)
 class Detector:
-    """Finds markers by brightness, or by hue where `hue_deg` is given (a grey image holds no hue, and no blob)."""
+    """Detector of markers by brightness, or by hue if `hue_deg` is given.
+
+    Attributes
+    ----------
+    threshold
+        Thresholds on brightness, size and shape.
+    hue_deg
+        Hue of the markers [deg, HSV]. In a grey image no marker with a hue is found.
+    tolerance_deg
+        Largest deviation from that hue [deg].
+    """
 
     threshold: Threshold = field(default_factory=Threshold)
     hue_deg: float | None = None
     tolerance_deg: float = 18.0
 
     def __call__(self, image: Pixels, box: Box | None = None) -> Blobs:
-        """The blobs (..., with their centres in the box, where one is given) of an image."""
+        """Detect and measure the blobs of an image, or those with their centre in `box`."""
         blobs, real = self.measure(self.find(image, box))
         if box is not None:
             u, v = blobs.uv.T
@@ -111,7 +128,7 @@ class Detector:
         return blobs[real]
 
     def light(self, part: Pixels) -> NDArray[np.uint8] | NDArray[np.float32]:
-        """What of a part of an image is a marker's light, (h, w) [grey levels]."""
+        """Return the light of markers in a part of an image, (h, w) [grey levels]: brightness, or chroma of the hue."""
         if self.hue_deg is None:
             return part if part.ndim == 2 else np.asarray(part.max(axis=2))
         if part.ndim == 2:
@@ -123,7 +140,7 @@ class Detector:
         return np.where(off <= self.tolerance_deg, chroma, 0.0).astype(np.float32)
 
     def find(self, image: Pixels, box: Box | None = None) -> list[Candidate]:
-        """Candidates in an image, or those whose centre lies in a box (a pixel more at its border)."""
+        """Find the candidates in an image, or those whose centre lies within a pixel of `box`."""
         u0, v0 = (max(box[0] - BORDER, 0), max(box[1] - BORDER, 0)) if box else (0, 0)
         light = self.light(image[v0 : box[3] + BORDER, u0 : box[2] + BORDER] if box else image)
         t = self.threshold
@@ -156,19 +173,25 @@ class Detector:
                 around = light[window[1] : window[3], window[0] : window[2]]
                 group = [own]
                 touched = False
-                if max(width, height) <= LED and np.count_nonzero(around > level) > pixels:
+                if max(width, height) <= MAX_LED_SIZE and np.count_nonzero(around > level) > pixels:
                     if everything is None:
                         everything = _components(light, level)
-                    group, touched = _together(own, [tuple(blob) for blob, _ in everything], light.shape)
+                    group, touched = _deblending_group(own, [tuple(blob) for blob, _ in everything], light.shape)
                 found.append(_cut(light, group, (u0, v0), (u, v), pixels, level, clipped, touched))
         return found
 
     def measure(self, candidates: Sequence[Candidate]) -> tuple[Blobs, NDArray[np.bool_]]:
-        """One blob a candidate, and which of them are real: the others (noise, a bright edge) mean nothing."""
+        """Measure candidates.
+
+        Returns
+        -------
+        tuple
+            One blob a candidate, and a mask (n,) that is False for noise and bright edges.
+        """
         n = len(candidates)
         uv, covariance = np.zeros((n, 2)), np.zeros((n, 2, 2))
         flags, peak, real = np.zeros(n, np.uint8), np.zeros(n), np.zeros(n, bool)
-        for rows in _alike([max(one.window.shape) for one in candidates]):
+        for rows in _batches([max(one.window.shape) for one in candidates]):
             own = [candidates[row] for row in rows]
             uv[rows], covariance[rows], flags[rows], peak[rows], real[rows] = self._measure(own)
         return Blobs(uv, covariance, flags, peak, np.array([one.area for one in candidates], float)), real
@@ -188,10 +211,10 @@ class Detector:
         pixel = np.clip(np.rint(spots.centre), 0, size - 1).astype(int)
         # a window that slid off its candidate found no spot there
         on_it = inner[n, pixel[:, 1], pixel[:, 0]]
-        real = spots.found & on_it & (peak >= LEAST_CONTRAST * spots.noise)
+        real = spots.found & on_it & (peak >= MIN_CONTRAST * spots.noise)
 
         short, long, along = axes(spots.shape)
-        # a spot, drawn out or not, has one hump along its long axis; two that touch have a dip between two
+        # one spot, even motion-blurred, has one hump along its long axis; two that touch have a dip in between
         steps = np.linspace(-1.25, 1.25, 11)
         points = spots.centre + steps[:, None, None] * (long[:, None] * along)
         humps = at_points(spots.signal, np.tile(n, len(steps)), points.reshape(-1, 2), size).reshape(len(steps), -1)
@@ -207,14 +230,14 @@ class Detector:
 
 
 def _components(light: NDArray[np.uint8] | NDArray[np.float32], level: float) -> list[tuple[list[int], list[float]]]:
-    """Connected pixels above a level: (left, top, width, height, pixels) and roughly the centre of each."""
+    """Connected pixels above a level: (left, top, width, height, pixels) and the approximate centre of each."""
     above = cv2.threshold(light, level, 255, cv2.THRESH_BINARY)[1]
     if above.dtype != np.uint8:
         above = above.astype(np.uint8)
     left, top, width, height = cv2.boundingRect(above)
     if not width:
         return []
-    if max(width, height) <= 1.5 * min(width, height) + 1 and width * height <= LONE:
+    if max(width, height) <= 1.5 * min(width, height) + 1 and width * height <= MAX_SINGLE_SPOT_AREA:
         # most patches hold one compact spot, which needs no labels: two apart would leave the box half empty
         pixels = cv2.countNonZero(above)
         if pixels >= 0.6 * width * height:
@@ -224,7 +247,7 @@ def _components(light: NDArray[np.uint8] | NDArray[np.float32], level: float) ->
 
 
 def _cut_off(blob: list[int], area: Box, shape: tuple[int, ...]) -> bool:
-    """Whether a blob ends at the border of the area searched, where the light (h, w) goes on."""
+    """Return whether a blob is cut by the border of the searched area inside the light (h, w)."""
     left, top, width, height, _ = blob
     return (
         (left == 0 and area[0] > 0)
@@ -235,7 +258,7 @@ def _cut_off(blob: list[int], area: Box, shape: tuple[int, ...]) -> bool:
 
 
 def _window(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> Box:
-    """The window of the least size that holds a box with a margin, moved to lie in the light (h, w)."""
+    """Smallest standard window that holds a box with a margin, moved to lie in the light (h, w)."""
     left, top, width, height = box
     wanted = max(width, height) + 2 * MARGIN
     size = SIZE_FOR[wanted] if wanted < len(SIZE_FOR) else wanted
@@ -245,20 +268,22 @@ def _window(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> Box:
 
 
 def _around(boxes: Sequence[tuple[int, int, int, int]]) -> tuple[int, int, int, int]:
-    """The box around boxes (left, top, width, height)."""
+    """Bounding box of boxes (left, top, width, height)."""
     left, top = min(box[0] for box in boxes), min(box[1] for box in boxes)
     return left, top, max(box[0] + box[2] for box in boxes) - left, max(box[1] + box[3] for box in boxes) - top
 
 
-def _together(
+def _deblending_group(
     own: tuple[int, int, int, int], blobs: Sequence[tuple[int, ...]], shape: tuple[int, ...]
 ) -> tuple[list[tuple[int, int, int, int]], bool]:
-    """The boxes of a blob and of all others (left, top, width, height, pixels) that must be measured with it, since
-    they lie in its window, or in that of all of them; or its own, and True, where that is too much."""
+    """Boxes of a blob and of all that must be deblended with it, since they lie in the window of the group.
+
+    Returns only its own box, and True, if the group is too large.
+    """
     group = [own]
     while True:
         window = _window(_around(group), shape)
-        if window[2] - window[0] > TOGETHER or max(max(box[2:]) for box in group) > LED:
+        if window[2] - window[0] > MAX_DEBLENDING_WINDOW or max(max(box[2:]) for box in group) > MAX_LED_SIZE:
             return [own], True
         more = [
             blob
@@ -284,7 +309,7 @@ def _cut(
     clipped: bool,
     touched: bool,
 ) -> Candidate:
-    """A candidate with its window, which holds all boxes of a group, the first of which is its own."""
+    """Candidate with a window that holds all boxes of a group, the first of which is its own."""
     x, y, end_x, end_y = _window(_around(group), light.shape)
     box, *others = ((left - x, top - y, width, height) for left, top, width, height in group)
     window = light[y:end_y, x:end_x].copy()
@@ -292,19 +317,19 @@ def _cut(
     return Candidate(uv, area, window, corner, box, level, clipped, tuple(others), touched)
 
 
-def _alike(sizes: Sequence[int]) -> list[list[int]]:
-    """Which windows of so many pixels a side are measured together, those that are few as if they were larger."""
+def _batches(sizes: Sequence[int]) -> list[list[int]]:
+    """Batches of windows, by index, that are padded to one size, from the windows' sides [px]."""
     order = sorted(range(len(sizes)), key=sizes.__getitem__)
     together: list[list[int]] = []
     for size, rows in groupby(order, key=sizes.__getitem__):
-        if not together or len(together[-1]) * size**2 > FEW:
+        if not together or len(together[-1]) * size**2 > MAX_PADDED_PIXELS:
             together.append([])
         together[-1] += rows
     return together
 
 
 def _padded(windows: Sequence[NDArray[np.uint8] | NDArray[np.float32]]) -> tuple[Array, NDArray[np.int64]]:
-    """Windows of several sizes in one array (n, h, w), and their sizes (n, 2) [px: u, v]."""
+    """Pad windows of several sizes into one array (n, h, w), and return it with their sizes (n, 2) [px: u, v]."""
     shapes = np.array([window.shape for window in windows])
     light = np.zeros((len(windows), *shapes.max(axis=0)))
     for row, window in zip(light, windows, strict=True):
@@ -313,7 +338,7 @@ def _padded(windows: Sequence[NDArray[np.uint8] | NDArray[np.float32]]) -> tuple
 
 
 def _in_boxes(shape: tuple[int, ...], boxes: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which pixels (m, h, w) of windows lie in boxes (m, 4)."""
+    """Masks (m, h, w) of the pixels of windows that lie in boxes (m, 4)."""
     left, top, width, height = boxes.T[..., None]
     x, y = np.arange(shape[2]), np.arange(shape[1])
     in_x, in_y = (x >= left) & (x < left + width), (y >= top) & (y < top + height)
@@ -321,16 +346,44 @@ def _in_boxes(shape: tuple[int, ...], boxes: NDArray[np.int64]) -> NDArray[np.bo
 
 
 def detector_for(markers: Markers | None, camera: Camera | None = None) -> Detector:
-    """The detector of a kind of marker in a camera: by brightness, or by hue where the markers have one."""
+    """Return the detector of a kind of marker in a camera: by hue if the markers have one, else by brightness."""
     threshold = Threshold(shot_gain=camera.shot_gain) if camera is not None else Threshold()
     return Detector(threshold, markers.hue_deg if markers is not None else None)
 
 
 def detect_leds(image: Pixels, box: Box | None = None, threshold: Threshold | None = None) -> Blobs:
-    """Bright blobs in a grey (or BGR) image, optionally only in a box of it."""
+    """Detect bright blobs in a grey or BGR image.
+
+    Parameters
+    ----------
+    image
+        Image, (h, w) or (h, w, 3), uint8.
+    box
+        Part of the image to search, (u0, v0, u1, v1) [px], end excluded; by default all.
+    threshold
+        Thresholds on brightness, size and shape.
+
+    Returns
+    -------
+    Blobs
+        Measured blobs.
+    """
     return Detector(threshold or Threshold())(image, box)
 
 
 def detect_hue(image: Pixels, box: Box | None = None, *, hue_deg: float, threshold: Threshold | None = None) -> Blobs:
-    """Blobs of one hue (degrees, HSV) in a BGR image: pixels whose hue is near it and that are not pale."""
+    """Detect blobs of one hue in a BGR image.
+
+    Parameters
+    ----------
+    image, box, threshold
+        As in `detect_leds`.
+    hue_deg
+        Hue [deg, HSV].
+
+    Returns
+    -------
+    Blobs
+        Measured blobs.
+    """
     return Detector(threshold or Threshold(), hue_deg)(image, box)
