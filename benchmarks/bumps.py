@@ -84,7 +84,7 @@ def one_seed(seed: int) -> dict[str, bool]:
     found = joint(wrong.estimator.graph)
     return {
         "pushed anchors named": named(bumped),
-        "pushed anchors that contradict": bool(said.rejected) or said.agreement.chance() < 1e-4,
+        "pushed anchors that contradict": bool(said.rejected) or said.agreement.p_value() < 1e-4,
         "healthy anchors named": bool(healthy.estimator.bumps()),
         "wrong homographies refused": bool(found.rejected),
         "wrong homographies taken for a push": bool(found.bumped),

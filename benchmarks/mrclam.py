@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from coloc_graph.backend.landmarks import Placed
+from coloc_graph.backend.landmarks import StaticPose
 from coloc_graph.backend.planar import filter_forward
 from coloc_graph.backend.planar.trajectory import trajectory
 from coloc_graph.evaluation import align, evaluate
@@ -116,7 +116,7 @@ def main() -> None:
                     _report_map(batch.estimate.landmarks, args.data)
 
 
-def _report_map(landmarks: Mapping[str, Placed], data: str) -> None:
+def _report_map(landmarks: Mapping[str, StaticPose], data: str) -> None:
     """How well the landmarks are found, after one rigid alignment."""
     truth = {f"L{int(row[0])}": row[1:3] for row in np.loadtxt(Path(data) / "Landmark_Groundtruth.dat")}
     p = np.array([one.planar[:2] for one in landmarks.values()])

@@ -72,7 +72,7 @@ def of_seed(seed: int, robots: int, stances: int) -> Figures:
     solution = solve(MemoryRun(world), SolveOptions())  # type: ignore[arg-type]
     graph = solution.estimate.graph
     tied = {id(step.link) for step in spanning_tree(graph, graph.links)}
-    alone = joint(replace(graph, measurements=tuple(m for m in graph.measurements if id(m) in tied)), refuse=False)
+    alone = joint(replace(graph, measurements=tuple(m for m in graph.measurements if id(m) in tied)), reject=False)
     whole, chained = (_errors(one, world) for one in (solution.estimate, alone))
     # of one robot's last pose at rest, far from the reference
     robot = world.scenario.observers(stances - 1)[-1]

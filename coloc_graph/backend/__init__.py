@@ -9,7 +9,7 @@ from coloc_graph.backend.gtsam_version import require_gtsam
 require_gtsam()
 
 from coloc_graph.backend.batch import joint, smooth  # noqa: E402
-from coloc_graph.backend.calibration import Calibration, loosened  # noqa: E402
+from coloc_graph.backend.calibration import Calibration, with_height_sigma  # noqa: E402
 from coloc_graph.backend.chain import chain  # noqa: E402  after the check, so that its sentence is what one sees
 from coloc_graph.backend.diagnosis import DisconnectedComponent, diagnose  # noqa: E402
 from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate  # noqa: E402
@@ -32,7 +32,7 @@ __all__ = [
     "chain",
     "diagnose",
     "joint",
-    "loosened",
     "replay",
     "smooth",
+    "with_height_sigma",
 ]  # fmt: skip

@@ -1,6 +1,6 @@
-"""The graph optimised in batch: checked before, fitted, and asked afterwards which measurement is wrong.
+"""Batch optimisation of a graph, with a search for outliers and for bumped anchors.
 
-`smooth` takes poses alone for unknown, `joint` the mounts, markers and clocks of the team with them.
+`smooth` estimates poses alone, `joint` the mounts, markers and clocks of the team with them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -10,9 +10,9 @@ import gtsam
 import numpy as np
 from scipy.special import chdtri
 
-from coloc_graph.backend.chi2_test import LEAST_CHANCE, UNCHECKED, Agreement, innovation
+from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, innovation
 from coloc_graph.backend.estimate import Bump, Estimate, Rejection, make_estimate
-from coloc_graph.backend.factors import Method, calibrations_in, require_rigs
+from coloc_graph.backend.factors import Method, calibrations_in, require_robot_models
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.landmarks import ALWAYS, OnMap
 from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
@@ -21,7 +21,7 @@ from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Odometry, RelativePose, Sighting
 from coloc_graph.team import Slip
 
-LEAST_CHANCE_OF_ALL = 1e-4  # probability of a fit as bad as this by noise below which outliers are searched for
+MIN_FIT_P_VALUE = 1e-4  # probability of a fit as bad as this by noise below which outliers are searched for
 CHI2_PER_DOF_OF_MODEL = 1.1  # chi2/dof up to which a fit passes in any case: no model is better than that
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)  # slip that a stay-put constraint is given to test it
 MAX_BUMPS = 3  # bumped anchors that are searched for
@@ -32,34 +32,60 @@ EQUAL_CHI2 = 9.0  # two causes explain equally well if chi2 differs by less
 MAX_ROUNDS = 20  # rounds of rejecting the worst link and taking back those that then agree
 
 
-def smooth(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None = None) -> Estimate:
-    """The most likely poses given all measurements, the floor and the stay-put constraints.
+def smooth(graph: PoseGraph, *, reject: bool = True, start: gtsam.Values | None = None) -> Estimate:
+    """Estimate the most likely poses given all measurements, the floor and the stay-put constraints.
 
-    Where they disagree, and unless `refuse` is False, measurements that all others contradict are rejected (graduated
-    non-convexity on the relative poses, everything else taken for true; then each is tested against the rest), and
-    anchors that did not stay put are named and taken to have moved. The search starts from `start`, or from the
-    composition along the surest way. Raises `EstimationError` where the optimiser's answer does not pass its check,
-    or no measurement ties anything to the reference.
+    Parameters
+    ----------
+    graph : PoseGraph
+        Stances and measurements.
+    reject : bool
+        Reject outliers and name bumped anchors where the measurements disagree.
+    start : gtsam.Values or None
+        Initial values; None: composed along the spanning tree of least variance.
+
+    Returns
+    -------
+    Estimate
+        Poses T_world_body with covariances (6, 6), outliers and bumps.
+
+    Raises
+    ------
+    EstimationError
+        The optimiser did not converge, or no measurement ties anything to the reference.
+
+    Notes
+    -----
+    Outliers are searched for by graduated non-convexity on the relative poses, with everything else taken as true;
+    then each link is tested against the rest. A bumped anchor is taken to have moved.
     """
-    return with_stack(len(graph.nodes), lambda: _optimised("smooth", graph, refuse, start))
+    return with_stack(len(graph.nodes), lambda: _optimised("smooth", graph, reject, start))
 
 
-def joint(graph: PoseGraph, *, refuse: bool = True, start: gtsam.Values | None = None) -> Estimate:
-    """The most likely poses, mounts, markers and clocks together, given what the cameras saw.
+def joint(graph: PoseGraph, *, reject: bool = True, start: gtsam.Values | None = None) -> Estimate:
+    """Estimate the most likely poses, mounts, markers and clocks together, given the images.
 
-    Each homography is a factor on two poses and two mounts; mounts and markers have what the team states of them as
-    priors, and what is stated without a tolerance is taken for exact. Otherwise as `smooth`; raises `EstimationError`
-    also where the graph does not know the robots' mounts (`PoseGraph.rigs`).
+    Parameters and results are those of `smooth`; the estimate holds a `Calibration` as well.
+
+    Raises
+    ------
+    EstimationError
+        As `smooth`, or the graph does not know the robots' mounts (`PoseGraph.robot_models`).
+
+    Notes
+    -----
+    Each homography is a factor on two poses and two mounts. The team's statements with a tolerance are priors;
+    statements without a tolerance are exact.
     """
-    require_rigs(graph.robots, graph.rigs)
-    return with_stack(len(graph.nodes), lambda: _optimised("joint", graph, refuse, start))
+    require_robot_models(graph.robots, graph.robot_models)
+    return with_stack(len(graph.nodes), lambda: _optimised("joint", graph, reject, start))
 
 
-def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Values | None) -> Estimate:
+def _optimised(method: Method, graph: PoseGraph, reject: bool, start: gtsam.Values | None) -> Estimate:
     fit = fit_graph(method, graph, start)
     rejected: tuple[Rejection, ...] = ()
     bumped: tuple[Bump, ...] = ()
-    suspects = _suspects(fit) if refuse else None
+    suspects = _suspects(fit) if reject else None
     if suspects is not None:
         warm = WarmStart(graph, fit.values, suspects) if suspects and len(fit.links) > ALL_TESTED else None
         del fit  # of a large graph it holds gigabytes
@@ -82,14 +108,16 @@ def _optimised(method: Method, graph: PoseGraph, refuse: bool, start: gtsam.Valu
 
 
 def _suspects(fit: Fit) -> tuple[Link, ...] | None:
-    """The links that contradict the others; () where all together are further off than noise puts them, None
-    where nothing is suspicious."""
+    """Return the links that contradict the others.
+
+    () where the fit as a whole is worse than noise explains, None where nothing is suspicious.
+    """
     if fit.dof <= 0:
         return None
-    if fit.chance < LEAST_CHANCE_OF_ALL and fit.chi2 > CHI2_PER_DOF_OF_MODEL * fit.dof:
+    if fit.p_value < MIN_FIT_P_VALUE and fit.chi2 > CHI2_PER_DOF_OF_MODEL * fit.dof:
         return ()
     tested = fit.agreements((*TESTED, StayPut))
-    return tuple(fit.links[index] for index, one in tested.items() if one.chance() < LEAST_CHANCE) or None
+    return tuple(fit.links[index] for index, one in tested.items() if one.p_value() < REJECTION_P_VALUE) or None
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,17 +138,17 @@ class WarmStart:
         start = gtsam.Values()
         for key, errors in calibrations_in(self.values).items():
             start.insert(key, errors)
-        for node in (*graph.nodes, *((name, ALWAYS) for name in graph.places.still())):
-            before, now = self.graph.places.key(node), graph.places.key(node)
+        for node in (*graph.nodes, *((name, ALWAYS) for name in graph.pose_keys.static())):
+            before, now = self.graph.pose_keys.key(node), graph.pose_keys.key(node)
             if self.values.exists(before) and not start.exists(now):
                 start.insert(now, self.values.atPose3(before))
         return start
 
 
 def _scale(tested: Iterable[Agreement]) -> float:
-    """How much larger variances seem to be than stated, by the median measurement; 1 at least.
+    """Ratio of actual to stated variances by the median measurement; 1 at least.
 
-    What all measurements share, such as mounts that are not as thought, is no reason to refuse a few of them.
+    An error that all measurements share, such as a wrong mount, is no reason to reject a few of them.
     """
     ratios = [one.chi2 / chdtri(one.dof, 0.5) for one in tested if one.dof]
     return max(1.0, float(np.median(ratios))) if ratios else 1.0
@@ -129,65 +157,66 @@ def _scale(tested: Iterable[Agreement]) -> float:
 def _find_outliers(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tuple[tuple[Rejection, ...], Fit]:
     """Return the outliers, and the fit without them.
 
-    The search starts from what graduated non-convexity leaves out, and, in a graph that is small enough, from nothing
-    as well: what rejects fewer measurements for the same fit is the likelier cause.
+    The search starts from the outliers of graduated non-convexity and, in a small graph, also from none: the set with
+    fewer rejections for the same fit is the likelier cause.
     """
     start = warm.start(graph) if warm else None
     if warm is not None:
-        doubted, fit = _search(method, graph, {}, start)
+        suspected, fit = _search(method, graph, {}, start)
     else:
         # poses alone for a start: GTSAM's optimiser copies its factors, which those that are Python cannot be
         first = _outliers(fit_graph("smooth", graph))
-        doubted, fit = _search(method, graph, first, start)
-        if first and len(fit.links) <= ALL_TESTED and len(doubted) > 1:
+        suspected, fit = _search(method, graph, first, start)
+        if first and len(fit.links) <= ALL_TESTED and len(suspected) > 1:
             other, other_fit = _search(method, graph, {}, start)
-            if _price(other, other_fit) < _price(doubted, fit):
-                doubted, fit = other, other_fit
+            if _price(other, other_fit) < _price(suspected, fit):
+                suspected, fit = other, other_fit
     rejected = tuple(
         Rejection(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
         for link in (*graph.measurements, *graph.on_map)
-        if id(link) in doubted
+        if id(link) in suspected
         for off in [_innovation(fit, link).sigmas]
     )
     return rejected, fit
 
 
 def _price(rejected: Mapping[int, Link], fit: Fit) -> float:
-    """Implausibility of a set of rejections: chi2 beyond what is expected, and a price for each."""
+    """Implausibility of a set of rejections: chi2 above its expected value, and a price for each."""
     return fit.chi2 - fit.dof + REJECTION_PRICE * len(rejected)
 
 
 def _search(
-    method: Method, graph: PoseGraph, doubted: dict[int, Link], start: gtsam.Values | None
+    method: Method, graph: PoseGraph, suspected: dict[int, Link], start: gtsam.Values | None
 ) -> tuple[dict[int, Link], Fit]:
-    """Reject the worst measurement and take back what then agrees, in turns; from what is doubted on."""
-    doubted = dict(doubted)
-    # twice the same set ends it, as does the last round
+    """Reject the worst measurement and take back those that then agree, in turns; start from those `suspected`."""
+    suspected = dict(suspected)
+    # ends when a set repeats, or after the last round
     for left in reversed(range(MAX_ROUNDS)):
         try:
-            fit = fit_graph(method, graph.without(doubted.values()), start)
+            fit = fit_graph(method, graph.without(suspected.values()), start)
         except EstimationError:
-            if not doubted:
+            if not suspected:
                 raise
             # without these nothing ties the robots to each other: they disagree, and it is not known which are wrong
             return {}, fit_graph(method, graph, start)
         tested = fit.agreements(SEARCHED)
         scale = _scale(tested.values())
-        worst = min(tested, key=lambda index: tested[index].log_chance(), default=None)
-        again = {key for key, link in doubted.items() if _agrees(fit, link, scale)}
-        refusing = worst is not None and tested[worst].chance(scale) < LEAST_CHANCE
+        worst = min(tested, key=lambda index: tested[index].log_p_value(), default=None)
+        again = {key for key, link in suspected.items() if _agrees(fit, link, scale)}
+        refusing = worst is not None and tested[worst].p_value(scale) < REJECTION_P_VALUE
         if not left or not (again or refusing):
             break
         for key in again:
-            del doubted[key]
+            del suspected[key]
         if worst is not None and refusing:
-            doubted[id(fit.links[worst])] = fit.links[worst]
-    return doubted, fit
+            suspected[id(fit.links[worst])] = fit.links[worst]
+    return suspected, fit
 
 
 def _outliers(fit: Fit) -> dict[int, Link]:
-    """The relative poses, and sightings of landmarks, that graduated non-convexity leaves out, by identity; everything
-    else is taken for true.
+    """Outliers among relative poses and sightings of landmarks by graduated non-convexity, by identity.
+
+    Everything else is taken as true.
 
     Source: Yang, Antonante, Tzoumas, Carlone, "Graduated Non-Convexity for Robust Spatial Perception", 2020.
     """
@@ -208,8 +237,8 @@ def _outliers(fit: Fit) -> dict[int, Link]:
 
 
 def _innovation(fit: Fit, link: Link) -> Agreement:
-    """How a link that is not in the fit agrees with it; 0 of 0 where an end of it has no pose there."""
-    i, j = map(fit.graph.places.key, link.ends)
+    """Agreement of a link that is not in the fit; `UNCHECKED` where an end of it has no pose there."""
+    i, j = map(fit.graph.pose_keys.key, link.ends)
     factor = fit.factors_of.of_link(link, i, j)
     if not all(map(fit.values.exists, factor.keys())):
         return UNCHECKED
@@ -217,41 +246,40 @@ def _innovation(fit: Fit, link: Link) -> Agreement:
 
 
 def _agrees(fit: Fit, link: Link, scale: float) -> bool:
-    """Whether a link that was left out agrees with the rest, or is all that ties one of its ends."""
-    return _innovation(fit, link).chance(scale) >= LEAST_CHANCE
+    """Return whether a rejected link agrees with the rest, or is the only one that ties one of its ends."""
+    return _innovation(fit, link).p_value(scale) >= REJECTION_P_VALUE
 
 
 def find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
-    """The anchors that did not stay put, the plainest first; none where a wrong measurement explains more.
+    """Find the anchors that did not stay put, the most significant first; none where an outlier explains more.
 
-    Where a bump and a wrong measurement explain the same, as they may in a stance that nothing has followed yet, it is
-    a bump.
+    Where a bump and an outlier explain the measurements equally well, as they may in the last stance, it is a bump.
     """
     return with_stack(len(graph.nodes), lambda: _bumps(method, graph, None))
 
 
 def _bumps(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tuple[Bump, ...]:
     robots = warm.robots.intersection(graph.robots) if warm else graph.robots
-    loose = replace(graph, slips={**dict.fromkeys(robots, TEST_SLIP), **graph.slips})
-    start = warm.start(loose) if warm else None
+    tested_graph = replace(graph, slips={**dict.fromkeys(robots, TEST_SLIP), **graph.slips})
+    start = warm.start(tested_graph) if warm else None
     bumps: list[Bump] = []
     for _ in range(MAX_BUMPS):
-        fit = fit_graph(method, loose, start)
+        fit = fit_graph(method, tested_graph, start)
         tested = fit.agreements((StayPut, *SEARCHED))
         stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
         if not stays:
             break
-        plainest = min(stays, key=lambda index: stays[index].log_chance())
-        if stays[plainest].chance() > LEAST_CHANCE:
+        plainest = min(stays, key=lambda index: stays[index].log_p_value())
+        if stays[plainest].p_value() > REJECTION_P_VALUE:
             break
         stay = fit.links[plainest]
         assert isinstance(stay, StayPut)
-        freed = _moved(loose, stay)
+        freed = _moved(tested_graph, stay)
         moved = fit_graph(method, freed, start)
-        # by what is left once it may have moved: a bump bends everything else
+        # scale of the variances once the anchor may have moved: a bump distorts all other residuals
         rest = moved.agreements(TESTED)
         scale = _scale(rest.values())
-        if stays[plainest].chance(scale) > LEAST_CHANCE:
+        if stays[plainest].p_value(scale) > REJECTION_P_VALUE:
             break
         others = {
             index: one
@@ -259,22 +287,22 @@ def _bumps(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tuple[Bu
             if index not in stays and not isinstance(fit.links[index], Odometry)
         }
         if others:
-            wrong = min(others, key=lambda index: others[index].log_chance())
-            without = fit_graph(method, loose.without([fit.links[wrong]]), start)
+            wrong = min(others, key=lambda index: others[index].log_p_value())
+            without = fit_graph(method, tested_graph.without([fit.links[wrong]]), start)
             more = Agreement(max(moved.chi2 - without.chi2, 0.0), max(moved.dof - without.dof, 1))
-            if more.chance(scale) < LEAST_CHANCE:
+            if more.p_value(scale) < REJECTION_P_VALUE:
                 break
-        before, after = (moved.values.atPose3(freed.places.key(node)) for node in stay.ends)
+        before, after = (moved.values.atPose3(freed.pose_keys.key(node)) for node in stay.ends)
         named = replace(stay, slip=graph.slips.get(stay.robot))
         bump = Bump(named, before.between(after), stays[plainest].sigmas)
-        instead = _odometry_instead(method, loose, stay, tested, fit, moved, start)
+        instead = _odometry_instead(method, tested_graph, stay, tested, fit, moved, start)
         if instead is not None:
             links, more_chi2 = instead
             if more_chi2 < -EQUAL_CHI2 * scale:
                 break  # the odometry explains more: it is rejected in the search for wrong measurements
             if more_chi2 < EQUAL_CHI2 * scale:
-                bump = replace(bump, or_else=links)
-        loose = _with_bump(loose, bump)
+                bump = replace(bump, alternative=links)
+        tested_graph = _with_bump(tested_graph, bump)
         bumps.append(bump)
     return tuple(bumps)
 
@@ -288,19 +316,19 @@ def _odometry_instead(
     moved: Fit,
     start: gtsam.Values | None,
 ) -> tuple[tuple[Odometry, ...], float] | None:
-    """Odometry of one robot that, were it wrong, would explain what a bump does, and by how much its chi2 is larger.
+    """Find odometry of one robot that, if wrong, explains the same as a bump, and by how much its chi2 is larger.
 
     None where no odometry across the stay-put contradicts anything.
     """
     by_robot: dict[str, list[Odometry]] = {}
     for index, one in tested.items():
         link = fit.links[index]
-        if isinstance(link, Odometry) and link.before < stay.after <= link.after and one.chance() < LEAST_CHANCE:
+        if isinstance(link, Odometry) and link.before < stay.after <= link.after and one.p_value() < REJECTION_P_VALUE:
             by_robot.setdefault(link.robot, []).append(link)
     best: tuple[tuple[Odometry, ...], float] | None = None
     for links in by_robot.values():
         without = fit_graph(method, graph.without(links), start)
-        # of chi2 each degree of freedom is expected to leave one
+        # the expected value of chi2 is its degrees of freedom
         more = (without.chi2 - without.dof) - (moved.chi2 - moved.dof)
         if best is None or more < best[1]:
             best = tuple(links), more
@@ -308,23 +336,23 @@ def _odometry_instead(
 
 
 def _with_bump(graph: PoseGraph, bump: Bump) -> PoseGraph:
-    """The graph in which a bumped robot was no anchor, and odometry that may be wrong instead is as uncertain."""
+    """Return the graph without the bumped anchor; odometry that may be wrong instead gets the bump as its sigma."""
     graph = _moved(graph, bump.stay_put)
-    if not bump.or_else:
+    if not bump.alternative:
         return graph
     xi = gtsam.Pose3.Logmap(bump.T_before_after)[2:5]
     loosened = {
         id(one): replace(
             one, covariance=one.covariance + np.diag(np.square(np.maximum(np.abs(xi), np.abs(xi).max() / 2)))
         )
-        for one in bump.or_else
+        for one in bump.alternative
     }
     measurements = tuple(loosened.get(id(one), one) for one in graph.measurements)
     return replace(graph, measurements=measurements)
 
 
 def _moved(graph: PoseGraph, stay: StayPut) -> PoseGraph:
-    """The graph in which a robot was no anchor at the later of two stances."""
+    """Return the graph in which a robot was no anchor at the later of two stances."""
     stances = tuple(
         replace(stance, anchors=tuple(robot for robot in stance.anchors if robot != stay.robot))
         if stance.index == stay.after

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.camera_model import BEYOND, Model, Together
+from coloc_graph.backend.camera_model import UNEVALUABLE, BatchModel, Model
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ class FactorEvaluator:
         self.variable = [(number, key) for number, key in enumerate(keys) if key is not None]
         #: Factors with which it is evaluated; None: it is evaluated alone.
         self.among: BatchedFactors | None = None
-        self._alone: Together | None = None
+        self._alone: BatchModel | None = None
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         """Whitened residual (rows,); fills the Jacobians that GTSAM passes."""
@@ -54,7 +54,7 @@ class FactorEvaluator:
     def alone(self, values: gtsam.Values) -> tuple[Array, list[Array]]:
         """Whitened residual (rows,), and its Jacobians (rows, size) by both poses and every variable."""
         if self._alone is None:
-            self._alone = self.model.together([self.model])
+            self._alone = self.model.batch([self.model])
         errors = [np.zeros((1, size)) for size in self.sizes]
         for number, key in self.variable:
             errors[number] = values.atVector(key)[None]
@@ -72,11 +72,11 @@ class BatchedFactor(gtsam.CustomFactor):
         self.evaluator = evaluator
 
 
-def _evaluated(models: Together, T_i: Array, T_j: Array, errors: Sequence[Array]) -> tuple[Array, list[Array]]:
+def _evaluated(models: BatchModel, T_i: Array, T_j: Array, errors: Sequence[Array]) -> tuple[Array, list[Array]]:
     e, by, possible = models.at(T_i, T_j, errors)
     if not possible.all():
-        # so far off that no search goes there, and flat, so that none is led on by it
-        e[~possible] = BEYOND
+        # a large residual without gradient: the search neither goes there nor is led by it
+        e[~possible] = UNEVALUABLE
         for one in by:
             one[~possible] = 0.0
     return e, by
@@ -87,7 +87,7 @@ class _Group:
 
     def __init__(self, members: Sequence[FactorEvaluator], indices: dict[int, int]) -> None:
         self.members = members
-        self._models = members[0].model.together([one.model for one in members])
+        self._models = members[0].model.batch([one.model for one in members])
         self._ends = [np.array([indices[one.poses[end]] for one in members]) for end in (0, 1)]
 
     def at(self, poses: Array, errors: dict[int, Array]) -> tuple[Array, list[Array]]:

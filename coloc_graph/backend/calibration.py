@@ -1,4 +1,4 @@
-"""What a team carries and states with a tolerance, as variables: mounts, markers, clocks, stated planes."""
+"""Calibration variables of a team: mounts, markers, clocks and planes that are stated with a tolerance."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -16,114 +16,118 @@ from coloc_graph.team import Landmark, Markers, Mount, Robot, Team
 
 Array = NDArray[np.float64]
 
-#: What is stated with a tolerance, and called exact in one of its numbers, is exact to this [m, rad, relative].
-LEAST_SIGMA = 1e-6
-#: A tilt that is known to this much is where spans can be taken apart for good [rad].
-ANCHORED = float(np.deg2rad(0.25))
-#: A calibration further than this from what is stated is warned of [its sigma].
-FAR = 3.0
+MIN_SIGMA = 1e-6  # sigma of a number stated as exact in a group that has tolerances [m, rad, relative]
+ANCHOR_TILT_SIGMA = float(np.deg2rad(0.25))  # rad, tilt sigma below which spans are linearised at the estimate
+FAR_SIGMAS = 3.0  # sigmas from the stated value above which a calibration is warned of
 
-#: Of mounts: height [m], tilt, roll [rad]. Of markers: span (relative), height [m]. Of the clocks of a pair: offset
-#: [s]. Of a plane: across it twice [rad], distance (relative).
-MOUNT, MARKERS, CLOCKS, PLANE = (ord(letter) for letter in "mkop")
-SIZES = {MOUNT: 3, MARKERS: 2, CLOCKS: 1, PLANE: 3}
+# characters of the variables' GTSAM keys
+MOUNT = ord("m")  # height [m], tilt, roll [rad]
+MARKERS = ord("k")  # span (relative), height [m]
+CLOCKS = ord("o")  # offset of the clocks of a pair [s]
+PLANE = ord("p")  # normal in two directions [rad], distance (relative)
+SIZES = {MOUNT: 3, MARKERS: 2, CLOCKS: 1, PLANE: 3}  # dimension of each
 
 
 class Variables:
-    """The calibration variables of a team: their keys, and their standard deviations before anything is measured.
+    """Calibration variables of a team: their keys and prior standard deviations.
 
-    Each is an error (n,), of what is stated. What is stated without a tolerance is exact, and no variable.
+    Each is an error (n,) of the stated value. A value that is stated without a tolerance is exact, and no variable.
     """
 
     def __init__(
-        self, robots: tuple[str, ...], rigs: Mapping[str, Robot], landmarks: Mapping[str, Landmark] | None = None
+        self,
+        robots: tuple[str, ...],
+        robot_models: Mapping[str, Robot],
+        landmarks: Mapping[str, Landmark] | None = None,
     ) -> None:
-        self.rigs = rigs
+        self.robot_models = robot_models
         self._numbers = {robot: number for number, robot in enumerate(robots, start=1)}
         self._names = {number: robot for robot, number in self._numbers.items()}
         self._landmarks = dict(landmarks or {})
-        self._order = list(self._landmarks)  # their keys have the number 0, and are told by their place here
+        self._order = list(self._landmarks)  # their keys have the number 0 and their index in this list
         self.sigmas: dict[int, Array] = {}
         self.anchors: dict[int, Array] = {}
 
     def mount(self, robot: str) -> int | None:
-        """The key of a robot's mount."""
-        m = self.rigs[robot].mount
+        """Return the key of a robot's mount; None where it is exact."""
+        m = self.robot_models[robot].mount
         return self._key(MOUNT, robot, 0, [m.height_sigma, *np.deg2rad([m.tilt_sigma_deg, m.roll_sigma_deg])])
 
     def anchor(self, robot: str) -> tuple[Array, float]:
-        """What a robot's mount is thought to be off by where spans are taken apart, and how well its tilts are known
-        there [rad]: as stated, or as `anchors` have it."""
-        m = self.rigs[robot].mount
+        """Return the mount error (3,) at which spans are linearised, and the sigma of its tilts there [rad].
+
+        From `anchors` where these have the robot's mount; otherwise as stated.
+        """
+        m = self.robot_models[robot].mount
         key = self.mount(robot)
         if key in self.anchors:
-            return self.anchors[key], ANCHORED
+            return self.anchors[key], ANCHOR_TILT_SIGMA
         return np.zeros(3), float(np.deg2rad(max(m.tilt_sigma_deg, m.roll_sigma_deg)))
 
     def is_anchored(self, values: Mapping[int, Array]) -> bool:
-        """Whether all mounts are thought to be where they turn out to be, as nearly as it matters."""
+        """Return whether the mounts in `values` are close enough to those at which spans are linearised."""
         return all(
-            np.abs((found - self.anchors.get(key, np.zeros(3)))[1:]).max() < ANCHORED
+            np.abs((found - self.anchors.get(key, np.zeros(3)))[1:]).max() < ANCHOR_TILT_SIGMA
             for key, found in values.items()
             if self.is_mount(key)
         )
 
     def markers_of(self, name: str) -> Markers:
-        """What is seen of a robot, or of a landmark."""
-        markers = self._landmarks[name].seen_as if name in self._landmarks else self.rigs[name].markers
+        """Return the markers of a robot or a landmark."""
+        markers = self._landmarks[name].seen_as if name in self._landmarks else self.robot_models[name].markers
         assert markers is not None
         return markers
 
     def markers(self, name: str) -> int | None:
-        """The key of a robot's markers, or of a landmark's."""
+        """Return the key of the markers of a robot or landmark; None where they are exact."""
         markers = self.markers_of(name)
         relative = markers.span_sigma / markers.span if markers.span else 0.0
         index = self._order.index(name) if name in self._landmarks else 0
         return self._key(MARKERS, name, index, [relative, markers.height_sigma])
 
     def clocks(self, robot_i: str, robot_j: str, sigma: float) -> tuple[int | None, float]:
-        """The key of what is left of the offset of two clocks, and its sign for this order of them."""
+        """Return the key of the residual offset of two clocks, and its sign for this order of them."""
         first, second = sorted((robot_i, robot_j), key=self._numbers.__getitem__)
         return self._key(CLOCKS, first, self._numbers[second], [sigma]), 1.0 if first == robot_i else -1.0
 
     def plane(self, robot: str, stance: int, sigmas: Array) -> int | None:
-        """The key of a plane that was stated for a stance."""
+        """Return the key of a plane that was stated for a stance."""
         return self._key(PLANE, robot, stance, sigmas.tolist())
 
     def _key(self, kind: int, name: str, index: int, sigmas: list[float]) -> int | None:
         if not any(sigmas):
             return None
         key = int(gtsam.mrsymbol(kind, self._numbers.get(name, 0), index))
-        self.sigmas[key] = np.maximum(sigmas, LEAST_SIGMA)
+        self.sigmas[key] = np.maximum(sigmas, MIN_SIGMA)
         return key
 
     def prior(self, key: int) -> gtsam.NonlinearFactor:
-        """What is stated of a variable."""
+        """Return the prior factor of a variable."""
         sigmas = self.sigmas[key]
         return gtsam.PriorFactorVector(key, np.zeros(len(sigmas)), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
     def start(self, key: int) -> Array:
-        """Where the search for a variable starts: as stated."""
+        """Return the initial value of a variable: no error."""
         return np.zeros(len(self.sigmas[key]))
 
     def is_mount(self, key: int) -> bool:
-        """Whether a key is a mount's."""
+        """Return whether a key is a mount's."""
         return bool(gtsam.mrsymbolChr(key) == MOUNT)
 
     def owner(self, key: int) -> str:
-        """Whose mount or markers a key is."""
+        """Name of the robot or landmark that a key of a mount or of markers belongs to."""
         number = int(gtsam.mrsymbolLabel(key))
         return self._names[number] if number else self._order[gtsam.mrsymbolIndex(key)]
 
 
 def is_calibration(key: int) -> bool:
-    """Whether a key is a calibration variable's, and not a pose's."""
+    """Return whether a key is that of a calibration variable, not of a pose."""
     return gtsam.mrsymbolChr(key) in SIZES
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedMount:
-    """A mount as it was stated and as it turned out: `errors` (3,) of height [m], tilt and roll [rad], `covariance`."""
+    """A mount as stated, and its estimated `errors` (3,): height [m], tilt and roll [rad], with `covariance`."""
 
     key: int
     robot: str
@@ -133,7 +137,7 @@ class CalibratedMount:
 
     @property
     def mount(self) -> Mount:
-        """The mount as it turned out, with what is left of its tolerances."""
+        """The calibrated mount, with the remaining tolerances."""
         sigmas = np.sqrt(self.covariance.diagonal())
         (height, tilt, roll), (d_height, d_tilt, d_roll) = self.errors.tolist(), sigmas.tolist()
         return with_fields(
@@ -163,7 +167,7 @@ class CalibratedMount:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedMarkers:
-    """Markers as they were stated and as they turned out: `errors` (2,) of span (relative) and height [m]."""
+    """Markers as stated, and their estimated `errors` (2,): span (relative) and height [m]."""
 
     key: int
     robot: str
@@ -173,7 +177,7 @@ class CalibratedMarkers:
 
     @property
     def markers(self) -> Markers:
-        """The markers as they turned out, with what is left of their tolerances."""
+        """The calibrated markers, with the remaining tolerances."""
         longer, higher = self.errors.tolist()
         d_span, d_height = np.sqrt(self.covariance.diagonal()).tolist()
         s = self.stated
@@ -197,12 +201,12 @@ class CalibratedMarkers:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """All that was calibrated along with the poses.
+    """Calibration estimated together with the poses.
 
     Parameters
     ----------
     variables, values, covariances
-        Of a joint estimate: its calibration variables, what was found of them and how well, by key.
+        Of a joint estimate: its calibration variables, their estimates and covariances, by key.
     sensors : mapping of str to CalibratedSensors
         Of a ranging run: wheels and range sensors by robot.
     landmarks : mapping of str to Landmark
@@ -221,15 +225,17 @@ class Calibration:
 
     @cached_property
     def mounts(self) -> dict[str, CalibratedMount]:
-        """By robot, those that were stated with a tolerance."""
+        """Mounts that were stated with a tolerance, by robot."""
         return {
-            name: CalibratedMount(key, name, variables.rigs[name].mount, self.values[key], self.covariances[key])
+            name: CalibratedMount(
+                key, name, variables.robot_models[name].mount, self.values[key], self.covariances[key]
+            )
             for key, name, variables in self._of(MOUNT)
         }
 
     @cached_property
     def markers(self) -> dict[str, CalibratedMarkers]:
-        """By robot or landmark, those that were stated with a tolerance."""
+        """Markers that were stated with a tolerance, by robot or landmark."""
         return {
             name: CalibratedMarkers(key, name, variables.markers_of(name), self.values[key], self.covariances[key])
             for key, name, variables in self._of(MARKERS)
@@ -249,7 +255,7 @@ class Calibration:
         return tuple(row for row in rows if row.stated_sigma > 0)
 
     def of_team(self, team: Team) -> Team:
-        """Return the calibrated team: with what was estimated, and the tolerances that are left."""
+        """Return the calibrated team, with the remaining tolerances."""
         robots = []
         for robot in team.robots:
             mount, markers = self.mounts.get(robot.name), self.markers.get(robot.name)
@@ -268,22 +274,22 @@ class Calibration:
 
     @property
     def far(self) -> tuple[Row, ...]:
-        """What is further from what was stated than its tolerance explains."""
-        return tuple(row for row in self.rows if row.sigmas > FAR)
+        """Numbers that are further from their stated values than their tolerances explain."""
+        return tuple(row for row in self.rows if row.sigmas > FAR_SIGMAS)
 
 
 def sigmas_of_plane(measured: RelativePose) -> Array:
-    """Standard deviations (3,) of a stated plane: across it twice [rad], and of its distance (relative)."""
+    """Standard deviations (3,) of a stated plane: normal in two directions [rad], distance (relative)."""
     assert measured.plane is not None
     turn = measured.plane.normal_sigma
     return np.array([turn, turn, measured.plane.d_sigma / measured.plane.d])
 
 
-def loosened(rigs: Mapping[str, Robot], height_sigma: float) -> dict[str, Robot]:
-    """The same robots with mounts whose heights are known no better than that [m]."""
+def with_height_sigma(robot_models: Mapping[str, Robot], height_sigma: float) -> dict[str, Robot]:
+    """Return the robots with mounts whose heights have at least this standard deviation [m]."""
     return {
         name: with_fields(
             robot, mount_if_any=with_fields(robot.mount, height_sigma=max(robot.mount.height_sigma, height_sigma))
         )
-        for name, robot in rigs.items()
+        for name, robot in robot_models.items()
     }

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Row:
-    """One number as stated and as it turned out, each with its standard deviation, in `unit`."""
+    """One calibrated number as stated and as estimated, each with its standard deviation, in `unit`."""
 
     robot: str
     what: str
@@ -17,7 +17,7 @@ class Row:
 
     @property
     def sigmas(self) -> float:
-        """How far it is from what was stated, in what that is known to; 0 where it was called exact."""
+        """Distance from the stated value in its standard deviations; 0 where it was stated as exact."""
         return abs(self.found - self.stated) / self.stated_sigma if self.stated_sigma else 0.0
 
     def __str__(self) -> str:

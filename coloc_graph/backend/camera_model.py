@@ -1,8 +1,8 @@
-"""What cameras on robots on a floor see of the marker plane, and how that changes with pose, mount and markers.
+"""Projection of the marker plane into cameras of robots on a floor, with derivatives by pose, mount and markers.
 
-Vectorised: n cameras at once. Tangents: a body's and a camera's are GTSAM's, rotation first, on the right. A mount's
-are the errors of height [m], tilt and roll [rad]; markers' those of the span (relative) and of their height [m]. Plain
-numpy, no graph.
+Vectorised over n cameras. Tangents of bodies and cameras are GTSAM's: rotation first, on the right. Those of a mount
+are errors of height [m], tilt and roll [rad]; those of markers errors of span (relative) and height [m]. Plain numpy,
+no graph.
 """
 
 import math
@@ -20,50 +20,51 @@ from coloc_graph.team import Markers, Mount
 
 Array = NDArray[np.float64]
 
-#: A residual that cannot be evaluated (a camera in the plane, a homography beyond all bounds): far, and no gradient.
-BEYOND = 1e3
+UNEVALUABLE = 1e3  # whitened residual, without gradient, of what cannot be evaluated (a camera in the plane)
 HATS = hat(np.eye(3))
 # d vee(-(hat(w) + v n^T)) by w, (8, 3), and by v for each entry of n, (3, 8, 3)
 _BY_TURN = -sl3_vee(HATS).T
 _BY_SHIFT = -np.stack([sl3_vee(np.eye(3)[:, :, None] * np.eye(3)[k]).T for k in range(3)])
 
 
-class Together(Protocol):
+class BatchModel(Protocol):
     """Residuals of n measurements of one kind, evaluated at once."""
 
     def at(
         self, T_world_i: Array, T_world_j: Array, errors: Sequence[Array]
     ) -> tuple[Array, list[Array], NDArray[np.bool_]]:
-        """The whitened residuals (n, rows) at poses (n, 4, 4) and calibration `errors` (n, size) of each variable;
-        their Jacobians by both bodies (n, rows, 6), and by each variable (n, rows, size); and which of them can be
-        evaluated (n,): the others hold no number that means anything."""
+        """Return whitened residuals (n, rows) at poses (n, 4, 4) and calibration `errors` (n, size) of each variable.
+
+        With their Jacobians by both bodies (n, rows, 6) and by each variable (n, rows, size), and a mask (n,) of those
+        that can be evaluated: the others are meaningless.
+        """
 
 
 class Model(Protocol):
-    """One measurement and what is constant of it. Models of the same `kind` are evaluated `together`."""
+    """One measurement with its constants. Models of the same `kind` are evaluated in one `batch`."""
 
     @property
     def rows(self) -> int:
-        """How many numbers it measures."""
+        """Number of its residuals."""
 
     @property
     def kind(self) -> Hashable:
-        """What it must share with others."""
+        """Key of the models that can share a batch."""
 
     @staticmethod
-    def together(models: Sequence[Any]) -> Together:
-        """Models of one kind."""
+    def batch(models: Sequence[Any]) -> BatchModel:
+        """Return the batch of models of one kind."""
 
 
 class Mounts:
-    """`T_body_camera` of n mounts that are off by (n, 3) of height, tilt, roll, and what these do to the cameras."""
+    """`T_body_camera` of n mounts as a function of their errors (n, 3): height, tilt, roll."""
 
     def __init__(self, mounts: Sequence[Mount]) -> None:
         self._yaw, self._tilt, self._roll = np.deg2rad([[m.yaw_deg, m.tilt_deg, m.roll_deg] for m in mounts]).T
         self._t: Array = np.array([(m.x, m.y, m.height) for m in mounts])
 
     def at(self, errors: Array) -> "MountedCameras":
-        """The cameras of mounts that are off by `errors` (n, 3)."""
+        """Return the cameras of mounts with `errors` (n, 3)."""
         tilt, roll = self._tilt + errors[:, 1], self._roll + errors[:, 2]
         t = self._t.copy()
         t[:, 2] += errors[:, 0]
@@ -72,8 +73,10 @@ class Mounts:
 
 @dataclass(frozen=True, eq=False)
 class MountedCameras:
-    """Cameras in their bodies: `R` (n, 3, 3) and `t` (n, 3) [m] of T_body_camera, and the axis of tilt in the camera
-    frame, `tilt_axis` (n, 3)."""
+    """Cameras in their bodies: `R` (n, 3, 3) and `t` (n, 3) [m] of T_body_camera.
+
+    `tilt_axis` (n, 3) is the axis of tilt in the camera frame.
+    """
 
     R: Array
     t: Array
@@ -81,7 +84,7 @@ class MountedCameras:
 
     @property
     def by_errors(self) -> Array:
-        """The cameras' tangents (n, 6, 3) by the mounts' errors."""
+        """Derivatives (n, 6, 3) of the cameras' tangents by the mounts' errors."""
         out = np.zeros((len(self.t), 6, 3))
         out[:, 3:, 0] = self.R[:, 2]
         out[:, :3, 1] = self.tilt_axis
@@ -90,7 +93,7 @@ class MountedCameras:
 
     @property
     def by_body(self) -> Array:
-        """The cameras' tangents (n, 6, 6) by the bodies': the adjoints of T_camera_body."""
+        """Derivatives (n, 6, 6) of the cameras' tangents by the bodies': the adjoints of T_camera_body."""
         out = np.zeros((len(self.t), 6, 6))
         Rt = self.R.mT
         out[:, :3, :3] = out[:, 3:, 3:] = Rt
@@ -100,10 +103,10 @@ class MountedCameras:
 
 @dataclass(frozen=True, eq=False)
 class SeenPlanes:
-    """The marker planes in n cameras: plane coordinates (X, Y, 1) to camera rays is `P` (n, 3, 3), and n . X = 1 there.
+    """Marker planes in n cameras: `P` (n, 3, 3) takes plane coordinates (X, Y, 1) to camera rays; n . X = 1 there.
 
-    `cameras` is where they are in their bodies, `R` (n, 3, 3) how they are turned against the plane. Where a camera is
-    in the plane it is not `seen` (n,).
+    `cameras` are their mounts, `R` (n, 3, 3) their rotations against the plane. `seen` (n,) is False where a camera is
+    in the plane.
     """
 
     P: Array
@@ -114,7 +117,7 @@ class SeenPlanes:
 
     @property
     def by_height(self) -> Array:
-        """The cameras' tangents (n, 6) by the height of the plane: a higher plane is a lower camera."""
+        """Derivatives (n, 6) of the cameras' tangents by the height of the plane: a higher plane is a lower camera."""
         out = np.zeros((len(self.R), 6))
         out[:, 3:] = -self.R[:, 2]
         return out
@@ -126,7 +129,7 @@ class SeenPlanes:
 
     @property
     def generators(self) -> Array:
-        """vee(A) (n, 8, 6) by the cameras' tangents, where P changes by A P."""
+        """Derivatives (n, 8, 6) of vee(A) by the cameras' tangents, where P changes by A P."""
         out = np.empty((len(self.R), 8, 6))
         out[:, :, :3] = _BY_TURN
         out[:, :, 3:] = np.tensordot(self.n, _BY_SHIFT, axes=1)
@@ -134,7 +137,7 @@ class SeenPlanes:
 
 
 def see(T_plane_body: Array, cameras: MountedCameras, height: Array) -> SeenPlanes:
-    """The planes z = `height` (n,) in cameras on bodies at `T_plane_body` (n, 4, 4)."""
+    """Return the planes z = `height` (n,) in cameras on bodies at `T_plane_body` (n, 4, 4)."""
     R_body = T_plane_body[:, :3, :3]
     R = R_body @ cameras.R
     x, y, z = ((R_body @ cameras.t[..., None])[..., 0] + T_plane_body[:, :3, 3]).T
@@ -151,7 +154,7 @@ def see(T_plane_body: Array, cameras: MountedCameras, height: Array) -> SeenPlan
 
 @dataclass(frozen=True, eq=False)
 class MarkersModel:
-    """The rays to two markers of a robot, as seen by another one's camera, against where they should be.
+    """Residual of the rays to two markers of a robot in another robot's camera.
 
     Variables: the observer's mount (3,), and the markers (2,).
     """
@@ -165,12 +168,12 @@ class MarkersModel:
     kind = "markers"
 
     @staticmethod
-    def together(models: Sequence["MarkersModel"]) -> "_Markers":
-        """Many of them."""
+    def batch(models: Sequence["MarkersModel"]) -> "_Markers":
+        """Return the batch of models."""
         return _Markers(models)
 
-    def place(self, mount: Array, markers: Array) -> tuple[float, float, float] | None:
-        """x, y [m] and heading [rad] of the robot in an observer that stands level; None where a ray goes up."""
+    def planar_pose(self, mount: Array, markers: Array) -> tuple[float, float, float] | None:
+        """Return x, y [m] and heading [rad] of the robot in a level observer; None where a ray goes up."""
         camera = Mounts([self.mount]).at(mount[None])
         rays = np.column_stack([self.x, np.ones(2)]) @ camera.R[0].T
         above = camera.t[0, 2] - self.markers.height - markers[1]
@@ -185,7 +188,7 @@ class MarkersModel:
 
 
 class _Markers:
-    """`Together` of sighted markers."""
+    """Batch of sighted markers."""
 
     def __init__(self, models: Sequence[MarkersModel]) -> None:
         self._x = np.array([one.x for one in models])
@@ -195,7 +198,7 @@ class _Markers:
 
     @cached_property
     def _of_markers(self) -> Array:
-        """How the markers (n, 2, 3) change with their errors, (n, 2, 3, 2)."""
+        """Derivatives (n, 2, 3, 2) of the markers (n, 2, 3) by their errors."""
         out = np.zeros((*self._nominal.shape, 2))
         out[..., :2, 0], out[..., 2, 1] = self._nominal[..., :2], 1.0
         return out

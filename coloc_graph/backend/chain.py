@@ -28,10 +28,22 @@ class Step(NamedTuple):
 
 
 def chain(graph: PoseGraph) -> Estimate:
-    """Compose the relative poses from the reference on, each robot by the surest way from there.
+    """Compose the relative poses along the spanning tree of least variance from the reference.
 
-    Covariances are propagated to first order. Anchors keep their pose exactly. Sightings and odometry are no part
-    of the paper's chain.
+    Parameters
+    ----------
+    graph : PoseGraph
+        Stances and measurements; sightings and odometry are no part of the paper's chain.
+
+    Returns
+    -------
+    Estimate
+        Poses T_world_body with covariances (6, 6), propagated to first order. Anchors keep their pose exactly.
+
+    Raises
+    ------
+    EstimationError
+        No relative pose ties a robot to the reference.
     """
     composed = [link for link in graph.links if isinstance(link, RelativePose | StayPut)]
     steps = spanning_tree(graph, composed)
@@ -51,14 +63,14 @@ def chain(graph: PoseGraph) -> Estimate:
 
 
 def spanning_tree(graph: PoseGraph, links: Sequence[Link]) -> list[Step]:
-    """The surest way from the reference to every pose that links tie to it, nearer poses first (Dijkstra).
+    """Return the shortest paths from the reference to every pose that links tie to it, nearer poses first (Dijkstra).
 
     The length of a link is its variance: of the translation, and of the heading at one metre.
     """
     neighbours: dict[int, list[tuple[int, int, bool]]] = defaultdict(list)
     lengths = []
     for index, link in enumerate(links):
-        i, j = map(graph.places.key, link.ends)
+        i, j = map(graph.pose_keys.key, link.ends)
         neighbours[i].append((j, index, True))
         neighbours[j].append((i, index, False))
         C = link_covariance(link)
@@ -83,16 +95,29 @@ def spanning_tree(graph: PoseGraph, links: Sequence[Link]) -> list[Step]:
 def compose(
     graph: PoseGraph,
     steps: Sequence[Step],
-    place: Callable[[gtsam.Pose3], gtsam.Pose3] = lambda pose: pose,
+    project: Callable[[gtsam.Pose3], gtsam.Pose3] = lambda pose: pose,
     expected: Callable[[Link], gtsam.Pose3] = pose_of,
     known: Mapping[int, gtsam.Pose3] | None = None,
 ) -> dict[int, gtsam.Pose3]:
-    """Poses T_world_body by key, of the reference and wherever the steps lead, each put where `place` says.
+    """Compose poses T_world_body, by key, from the reference along `steps`.
 
-    `expected` is the pose of a link's second end in its first: as it was measured, by default. Poses that are `known`
-    stay what they are.
+    Parameters
+    ----------
+    graph : PoseGraph
+        The graph that the steps are of.
+    steps : sequence of Step
+        Links in the order of their composition.
+    project : callable
+        Applied to each composed pose, for instance to put it on the floor.
+    expected : callable
+        Gives the pose of a link's second end in its first; by default the measured one.
+    known : mapping of int to gtsam.Pose3
+        Poses that keep these values.
 
-    Raises `EstimationError` where there are measurements and none leads anywhere.
+    Raises
+    ------
+    EstimationError
+        There are measurements and none leads from the reference.
     """
     if graph.measurements and not steps:
         raise EstimationError(
@@ -106,5 +131,5 @@ def compose(
             poses[to] = known[to]
             continue
         T_i_j = expected(link)
-        poses[to] = place(poses[via].compose(T_i_j if forwards else T_i_j.inverse()))
+        poses[to] = project(poses[via].compose(T_i_j if forwards else T_i_j.inverse()))
     return poses

@@ -1,4 +1,4 @@
-"""An estimator on disk, as JSON: what it was given, from which it can be rebuilt. No pickle."""
+"""Checkpoint of an estimator as JSON: its inputs, from which it can be rebuilt. No pickle."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -27,12 +27,12 @@ from coloc_graph.team import Floor, Landmark, Robot, Slip
 
 S = TypeVar("S", bound=msgspec.Struct)
 
-FORMAT = "coloc-graph-checkpoint-3"
+FORMAT = "coloc-graph-checkpoint-4"
 
 
 @dataclass(frozen=True, eq=False)
-class Early:
-    """A stance that came before the one it follows, which is `after`."""
+class WaitingStance:
+    """A stance that arrived before its predecessor `after`, and waits for it."""
 
     stance: Stance
     measurements: tuple[Measurement, ...]
@@ -41,8 +41,10 @@ class Early:
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """Stances with their measurements that were optimised in batch; `rejected` are reasons by the number of the
-    measurement."""
+    """Stances and measurements that were optimised in batch.
+
+    `rejected` are the reasons of outliers, by the index of the measurement.
+    """
 
     stances: tuple[Stance, ...] = ()
     measurements: tuple[Measurement, ...] = ()
@@ -51,7 +53,7 @@ class Base:
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """What one call put into the graph: a stance, or None where measurements came late, and its measurements."""
+    """Input of one call: a stance, or None where measurements came late, and its measurements."""
 
     stance: Stance | None
     measurements: tuple[Measurement, ...]
@@ -59,17 +61,17 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """What an estimator is made of: its `base`, what has come since in its order, and the stances that wait."""
+    """State of an estimator: its `base`, the `journal` of inputs since in their order, and `waiting` stances."""
 
     reference: str
     robots: tuple[str, ...]
     floor: Floor | None
     slips: dict[str, Slip]
-    rigs: dict[str, Robot]
+    robot_models: dict[str, Robot]
     landmarks: dict[str, Landmark]
     base: Base
     journal: tuple[Entry, ...]
-    early: tuple[Early, ...]
+    waiting: tuple[WaitingStance, ...]
 
 
 class _Array(msgspec.Struct, forbid_unknown_fields=True):
@@ -136,7 +138,7 @@ class _Measured(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     x_covariance: _Array | None = None
 
 
-class _Early(msgspec.Struct, forbid_unknown_fields=True):
+class _WaitingStance(msgspec.Struct, forbid_unknown_fields=True):
     stance: Stance
     measurements: list[_Measured]
     after: int
@@ -163,26 +165,32 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     robots: tuple[str, ...]
     floor: Floor | None
     slips: dict[str, Slip]
-    rigs: dict[str, Robot]
+    robot_models: dict[str, Robot]
     landmarks: dict[str, Landmark]
     base: _Base
     journal: list[_Entry]
-    early: list[_Early]
+    waiting: list[_WaitingStance]
 
 
 def write(saved: Checkpoint, path: Path) -> None:
-    """Write a checkpoint whole or not at all; `InputError` where it cannot be written. Numbers read back to the bit."""
+    """Write a checkpoint atomically; numbers read back bit for bit.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
     file = _File(
         format=FORMAT,
         reference=saved.reference,
         robots=saved.robots,
         floor=saved.floor,
         slips=saved.slips,
-        rigs=saved.rigs,
+        robot_models=saved.robot_models,
         landmarks=saved.landmarks,
         base=_Base(list(saved.base.stances), _of_all(saved.base.measurements), dict(saved.base.rejected)),
         journal=[_Entry(one.stance, _of_all(one.measurements)) for one in saved.journal],
-        early=[_Early(one.stance, _of_all(one.measurements), one.after) for one in saved.early],
+        waiting=[_WaitingStance(one.stance, _of_all(one.measurements), one.after) for one in saved.waiting],
     )
     try:
         write_whole(path, msgspec.json.encode(file), synchronise=True)
@@ -191,7 +199,13 @@ def write(saved: Checkpoint, path: Path) -> None:
 
 
 def read(path: Path) -> Checkpoint:
-    """The checkpoint in a file; `InputError` where it is none."""
+    """Read a checkpoint.
+
+    Raises
+    ------
+    InputError
+        The file is missing, damaged, or of another version.
+    """
     try:
         content = read_bytes(path, "give the path of a checkpoint")
         if msgspec.json.decode(content, type=_Format).format != FORMAT:
@@ -202,13 +216,13 @@ def read(path: Path) -> Checkpoint:
             robots=file.robots,
             floor=file.floor,
             slips=file.slips,
-            rigs=file.rigs,
+            robot_models=file.robot_models,
             landmarks=file.landmarks,
             base=Base(tuple(file.base.stances), _to_all(file.base.measurements), file.base.rejected),
             journal=tuple(Entry(one.stance, _to_all(one.measurements)) for one in file.journal),
-            early=tuple(Early(one.stance, _to_all(one.measurements), one.after) for one in file.early),
+            waiting=tuple(WaitingStance(one.stance, _to_all(one.measurements), one.after) for one in file.waiting),
         )
-        later = (*(one.measurements for one in saved.journal), *(one.measurements for one in saved.early))
+        later = (*(one.measurements for one in saved.journal), *(one.measurements for one in saved.waiting))
         for measurements in (saved.base.measurements, *later):
             require_valid(measurements, saved.floor)
         if not all(0 <= number < len(saved.base.measurements) for number in saved.base.rejected):
@@ -242,13 +256,13 @@ def _to_all(measurements: Iterable[_Measured]) -> tuple[Measurement, ...]:
 
 
 def _fields(one: Any, kind: type[S]) -> S:
-    """Those of its fields that the struct has, arrays as bytes."""
+    """Return the struct with those fields that it has, arrays as bytes."""
     values = {name: getattr(one, name) for name in kind.__struct_fields__}
     return kind(**{name: _array(value) if isinstance(value, np.ndarray) else value for name, value in values.items()})
 
 
 def _values(one: msgspec.Struct) -> dict[str, Any]:
-    """The fields of a struct, bytes as arrays."""
+    """Return the fields of a struct, bytes as arrays."""
     values = {name: getattr(one, name) for name in one.__struct_fields__}
     return {name: _numbers(value) if isinstance(value, _Array) else value for name, value in values.items()}
 

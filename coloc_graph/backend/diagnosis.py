@@ -1,4 +1,4 @@
-"""Before solving: which robots at which stances nothing ties to the reference, and what would tie them."""
+"""Connectivity check before solving: disconnected parts of a graph, and measurements that would connect them."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -10,7 +10,15 @@ from coloc_graph.measurements import Node
 
 @dataclass(frozen=True)
 class DisconnectedComponent:
-    """Nodes that hang together and by nothing on the reference, in the order of the stances, and the `remedy`."""
+    """Nodes that are connected to each other but not to the reference, in the order of the stances.
+
+    Parameters
+    ----------
+    nodes : tuple of Node
+        The robots and stances.
+    remedy : str
+        What would connect them.
+    """
 
     nodes: tuple[Node, ...]
     remedy: str
@@ -23,17 +31,17 @@ class DisconnectedComponent:
 
 
 def diagnose(graph: PoseGraph) -> tuple[DisconnectedComponent, ...]:
-    """The parts of a graph that nothing ties to the reference, each with what would tie it; () where all is tied."""
+    """Find the disconnected parts of a graph, each with a remedy; () where all is connected to the reference."""
     tied = {graph.reference_key, *(step.to for step in spanning_tree(graph, graph.links))}
     neighbours: dict[int, list[int]] = defaultdict(list)
     for link in graph.links:
-        i, j = map(graph.places.key, link.ends)
+        i, j = map(graph.pose_keys.key, link.ends)
         neighbours[i].append(j)
         neighbours[j].append(i)
     part: dict[int, int] = {}
     parts: dict[int, list[Node]] = defaultdict(list)
     for node in graph.nodes:
-        key = graph.places.key(node)
+        key = graph.pose_keys.key(node)
         if key in tied:
             continue
         if key not in part:
@@ -52,14 +60,14 @@ def _mark(start: int, number: int, neighbours: dict[int, list[int]], part: dict[
 
 
 def _remedy(graph: PoseGraph, nodes: list[Node], tied: set[int]) -> str:
-    """The nearest thing that was missing: a view shared with a tied robot, else an anchor or odometry into it."""
+    """Advise a measurement shared with a connected robot, else an anchor or odometry into the stance."""
     for robot, stance in nodes:
-        known = [r for r, s in graph.nodes if s == stance and graph.places.key((r, s)) in tied]
+        known = [r for r, s in graph.nodes if s == stance and graph.pose_keys.key((r, s)) in tied]
         if known:
             others = " or ".join(known)
             return f"a relative pose or a sighting between {robot} and {others} at stance {stance} would tie it"
     robot, stance = nodes[0]
-    before = [s for r, s in graph.nodes if r == robot and s < stance and graph.places.key((r, s)) in tied]
+    before = [s for r, s in graph.nodes if r == robot and s < stance and graph.pose_keys.key((r, s)) in tied]
     if before:
         return f"odometry of {robot} from stance {before[-1]} to {stance}, or an anchor that stays, would tie it"
     return f"an anchor that stays put into stance {stance} would tie it"

@@ -1,4 +1,4 @@
-"""What a method makes of a graph: the poses of all robots at all stances, and what is needed to doubt them."""
+"""Result of an estimation: poses of all robots at all stances, covariances, outliers and bumps."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from coloc_graph.backend.calibration import Calibration, Variables
 from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.graph import PoseGraph, StayPut
-from coloc_graph.backend.landmarks import MAP, OnMap, Placed
+from coloc_graph.backend.landmarks import MAP, OnMap, StaticPose
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.ranging import RangingProblem
 from coloc_graph.errors import EstimationError
@@ -25,7 +25,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Rejection:
-    """A measurement, or a landmark's position on the map, that was rejected as an outlier, and the reason."""
+    """A measurement, or a landmark's position on the map, that was rejected as an outlier.
+
+    Parameters
+    ----------
+    measurement : Measurement, RangeBearing or OnMap
+        The outlier itself.
+    reason : str
+        Reason in words.
+    """
 
     measurement: Measurement | RangeBearing | OnMap
     reason: str
@@ -33,20 +41,29 @@ class Rejection:
 
 @dataclass(frozen=True, eq=False)
 class Bump:
-    """An anchor that did not stay put: what the others say it did, and how many sigmas that is off its stay-put.
+    """An anchor that did not stay put.
 
-    `T_before_after` is its body after in its body before. `or_else` is odometry that, were it wrong, would explain the
-    measurements as well; it is then taken to be as uncertain as the bump is large.
+    Parameters
+    ----------
+    stay_put : StayPut
+        The constraint that it violates.
+    T_before_after : gtsam.Pose3
+        Its body after the bump in its body before, by the other measurements.
+    sigmas : float
+        Distance from the stay-put constraint in standard deviations.
+    alternative : tuple of Odometry
+        Odometry that, if wrong, would explain the measurements as well; it is then taken to be as uncertain as the
+        bump is large.
     """
 
     stay_put: StayPut
     T_before_after: gtsam.Pose3
     sigmas: float
-    or_else: tuple[Odometry, ...] = ()
+    alternative: tuple[Odometry, ...] = ()
 
     @property
-    def what(self) -> str:
-        """What happened, in words."""
+    def description(self) -> str:
+        """The event in one sentence."""
         stay, moved = self.stay_put, self.T_before_after
         far, turned = float(np.linalg.norm(moved.translation())), abs(np.rad2deg(moved.rotation().yaw()))
         return (
@@ -55,46 +72,46 @@ class Bump:
         )
 
     def __str__(self) -> str:
-        if self.or_else:
-            first = self.or_else[0]
+        if self.alternative:
+            first = self.alternative[0]
             return (
-                f"{self.what}, or else the {first} is wrong: both explain the measurements equally well, and the "
+                f"{self.description}, or else the {first} is wrong: both explain the measurements equally well and the "
                 f"estimate is as uncertain as either; check whether {self.stay_put.robot} was pushed, and the wheels "
                 f"and clock of {first.robot}"
             )
-        return f"{self.what}; do not name it as an anchor of stance {self.stay_put.after}"
+        return f"{self.description}; do not name it as an anchor of stance {self.stay_put.after}"
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Poses of all robots that are tied to the world frame, with covariances, and what was found along.
+    """Poses of all robots that are tied to the world frame, with covariances, outliers and calibration.
 
     A node is (robot, index): the index of a stance, or, of a ranging run, the number of a robot's keyframe.
 
     Parameters
     ----------
     method : {"chain", "smooth", "joint", "ranging"}
-        How it was made.
+        Method of estimation.
     source : PoseGraph or RangingProblem
-        What it was made of; `graph` and `ranging` give one or the other.
+        The estimated problem; `graph` and `ranging` give one or the other.
     trajectories : mapping of str to Trajectory
         By robot, one pose a node that has one.
     disconnected : tuple of Node
         Nodes that no measurement ties to the world frame; they have no pose.
     chi2, dof : float
-        Squared error of all that was used, and its degrees of freedom (0: nothing could contradict).
+        Squared error of all measurements used, and its degrees of freedom (0: nothing could contradict).
     iterations : int
         Iterations of the optimiser.
     rejected : tuple of Rejection
-        Measurements that the others contradict, each with its reason.
+        Outliers, each with its reason.
     bumped : tuple of Bump
         Anchors that moved.
     calibration : Calibration
-        What was found of mounts, markers and clocks, or of wheels and range sensors.
-    landmarks : mapping of str to Placed
+        Estimates of mounts, markers and clocks, or of wheels and range sensors.
+    landmarks : mapping of str to StaticPose
         By name, those that were measured, or that the team states.
-    map : Placed or None
-        Pose of the map that landmarks are on, where it was found along.
+    map : StaticPose or None
+        Pose of the map that landmarks are on, where it was estimated.
     """
 
     method: Method | Literal["ranging"]
@@ -107,8 +124,8 @@ class Estimate:
     rejected: tuple[Rejection, ...] = ()
     bumped: tuple[Bump, ...] = ()
     calibration: Calibration = field(default_factory=Calibration)
-    landmarks: Mapping[str, Placed] = field(default_factory=dict)
-    map: Placed | None = None
+    landmarks: Mapping[str, StaticPose] = field(default_factory=dict)
+    map: StaticPose | None = None
 
     @property
     def graph(self) -> PoseGraph:
@@ -211,7 +228,7 @@ class Estimate:
                 if not values.exists(key):
                     values.insert(key, gtsam.Pose3(T))
         for name, placed in {**self.landmarks, **({} if self.map is None else {MAP: self.map})}.items():
-            values.insert(self.graph.places.still()[name], placed.T_world_body)
+            values.insert(self.graph.pose_keys.static()[name], placed.T_world_body)
         for key, errors in self.calibration.values.items():
             values.insert(key, errors)
         return values
@@ -220,8 +237,8 @@ class Estimate:
     def _marginals(self) -> Marginals:
         used = self.graph.without(one.measurement for one in self.rejected)
         factors_of = Factors(self.graph.floor, self.calibration.variables)
-        factors, _, at_once = factors_of.of_graph(used, poses_in(self._values))
-        with at_once:
+        factors, _, batched = factors_of.of_graph(used, poses_in(self._values))
+        with batched:
             return Marginals(factors, self._values)
 
     @cached_property
@@ -263,7 +280,7 @@ class StanceEstimate:
         Agreement of everything that this call took in with everything before.
     residuals : tuple of float
         Of the stance's measurements, in their order: RMS in units of their noise, NaN where an end has no pose.
-    landmarks : mapping of str to Placed
+    landmarks : mapping of str to StaticPose
         Landmarks that were sighted in the stance.
     """
 
@@ -274,7 +291,7 @@ class StanceEstimate:
     rejected: tuple[Rejection, ...] = ()
     agreement: Agreement = UNCHECKED
     residuals: tuple[float, ...] = ()
-    landmarks: Mapping[str, Placed] = field(default_factory=dict)
+    landmarks: Mapping[str, StaticPose] = field(default_factory=dict)
 
 
 def make_estimate(
@@ -290,7 +307,7 @@ def make_estimate(
     rejected: tuple[Rejection, ...] = (),
     bumped: tuple[Bump, ...] = (),
 ) -> Estimate:
-    """An estimate of values, and of their covariances by key."""
+    """Return the estimate of a graph from its values, and their covariances by key."""
     poses, errors = {key: values.atPose3(key) for key in poses_in(values)}, calibrations_in(values)
     nodes: dict[str, list[int]] = {robot: [] for robot in graph.robots}
     for robot, stance in graph.nodes:
@@ -309,7 +326,9 @@ def make_estimate(
             )
     disconnected = graph.disconnected(poses)
     calibration = Calibration(variables, errors, {key: covariances[key] for key in errors})
-    still = {name: Placed(poses[key], covariances[key]) for name, key in graph.places.still().items() if key in poses}
+    still = {
+        name: StaticPose(poses[key], covariances[key]) for name, key in graph.pose_keys.static().items() if key in poses
+    }
     here = still.pop(MAP, None)
     return Estimate(
         method, graph, trajectories, disconnected, chi2, dof, iterations, rejected, bumped, calibration, still, here

@@ -10,67 +10,64 @@ from numpy.typing import NDArray
 from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors
 from coloc_graph.backend.calibration import Variables, is_calibration
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut, pose_of
-from coloc_graph.backend.homography_factor import homography_factor, markers_factor, related, sighted
+from coloc_graph.backend.homography_factor import homography_factor, homography_pose, markers_factor, sighted_pose
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import RelativePose, Sighting
 from coloc_graph.team import Floor, Robot
 
 Array = NDArray[np.float64]
 
-#: The world frame is fixed this firmly [rad, m]; far below anything that is measured.
-GAUGE_SIGMA = 1e-6
-#: A floor that is called exactly flat is taken as flat to this much [rad, m].
-LEAST_FLOOR_SIGMA = 1e-5
-#: A floor that tilts a body raises it, too: by the tilt times this [m].
-BODY_LENGTH = 0.05
+GAUGE_SIGMA = 1e-6  # rad, m: sigma of the prior that fixes the world frame, far below any measurement's
+MIN_FLOOR_SIGMA = 1e-5  # rad, m: sigma of a floor that is stated as exactly flat
+BODY_LENGTH = 0.05  # m: height by which an uneven floor raises a body, per rad of tilt
 _UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 _ORIGIN = np.zeros(3)
 
 
-#: What is unknown: the poses (`smooth`; `chain` composes the same), or mounts and the like with them (`joint`).
+#: Estimated variables: poses (`smooth`; `chain` composes the same), or calibration variables as well (`joint`).
 Method = Literal["chain", "smooth", "joint"]
 
 
 def factors_for(method: Method, graph: PoseGraph, known: gtsam.Values | None = None) -> "Factors":
-    """What makes the factors of a graph for a method; mounts may be `known` to be elsewhere than stated."""
+    """Return the factory of a graph's factors; spans are linearised at the mounts in `known`, else as stated."""
     if method != "joint":
         return Factors(graph.floor)
-    variables = Variables(graph.robots, graph.rigs, graph.landmarks)
+    variables = Variables(graph.robots, graph.robot_models, graph.landmarks)
     if known is not None:
         variables.anchors |= calibrations_in(known)
     return Factors(graph.floor, variables)
 
 
 def poses_in(values: gtsam.Values) -> list[int]:
-    """The keys of poses among all."""
+    """Return the keys of poses."""
     return [key for key in map(int, values.keys()) if not is_calibration(key)]
 
 
 def calibrations_in(values: gtsam.Values) -> dict[int, Array]:
-    """The calibration variables among all."""
+    """Return the calibration variables, by key."""
     return {key: values.atVector(key) for key in map(int, values.keys()) if is_calibration(key)}
 
 
-def require_rigs(robots: Iterable[str], rigs: Mapping[str, Robot]) -> None:
-    """Raise `EstimationError` where the mounts of a team are not known."""
+def require_robot_models(robots: Iterable[str], robot_models: Mapping[str, Robot]) -> None:
+    """Raise `EstimationError` where a robot's mount is not known."""
     for robot in robots:
-        if robot not in rigs:
+        if robot not in robot_models:
             raise EstimationError(
-                f"the mount of robot {robot} is not known, so that it cannot be calibrated: make the graph of a team "
-                "(`PoseGraph.of`), or use smooth"
+                f"the mount of robot {robot} cannot be calibrated, since it is not known: make the graph of a team "
+                "(`PoseGraph.of`), or use `smooth`"
             )
 
 
 def _share(link: Link) -> float:
-    """How much of a link's rows no other has: homographies of the same pixels share them."""
+    """Share of a link's rows that is its own: homographies of the same pixels share them."""
     return link.homography.share if isinstance(link, RelativePose) and link.homography is not None else 1.0
 
 
 class Factors:
-    """Makes the factors of a team on its floor; noise models that many share are made once.
+    """Factory of the factors of a team on its floor.
 
-    With `variables` links are taken for what the cameras saw wherever that is known (`homography_factor`), and mounts
-    and the like are variables; else every link is a between-factor.
+    With `variables` a link that holds image measurements is a factor on them and on calibration variables
+    (`homography_factor`); otherwise every link is a between-factor.
     """
 
     def __init__(self, floor: Floor | None, variables: Variables | None = None) -> None:
@@ -78,28 +75,30 @@ class Factors:
         self._ready: dict[int, gtsam.NonlinearFactor] = {}
         tilt, height = GAUGE_SIGMA, GAUGE_SIGMA
         if floor is not None:
-            tilt = max(float(np.deg2rad(floor.tilt_sigma_deg)), LEAST_FLOOR_SIGMA)
-            # tighter than that, far poses' heights bend the search: 100 iterations instead of 15 at 1,000 stances
-            height = max(floor.height_sigma, tilt * BODY_LENGTH, LEAST_FLOOR_SIGMA)
+            tilt = max(float(np.deg2rad(floor.tilt_sigma_deg)), MIN_FLOOR_SIGMA)
+            # a smaller sigma slows the search down: 100 iterations instead of 15 at 1,000 stances
+            height = max(floor.height_sigma, tilt * BODY_LENGTH, MIN_FLOOR_SIGMA)
         self.gauge_sigmas = np.array([tilt, tilt, GAUGE_SIGMA, GAUGE_SIGMA, GAUGE_SIGMA, height])
         self._level = gtsam.noiseModel.Isotropic.Sigma(2, tilt)
         self._on_floor = gtsam.noiseModel.Diagonal.Precisions(np.array([0.0, 0.0, height**-2]))
 
     def dof(self, values: gtsam.Values, links: Iterable[tuple[Link, gtsam.NonlinearFactor]]) -> int:
-        """Rows that weigh, less unknowns, of links and their factors; calibration variables have as many priors as
-        unknowns."""
+        """Return the degrees of freedom of links and their factors: rows of weight less unknowns.
+
+        Calibration variables have as many priors as unknowns.
+        """
         poses = len(poses_in(values))
         priors = 6 + (0 if self.floor is None else 3) * (poses - 1)
         return priors + round(sum(_share(link) * self.rows(link, factor) for link, factor in links)) - 6 * poses
 
     def rows(self, link: Link, factor: gtsam.NonlinearFactor) -> int:
-        """How many numbers a link measures, of its factor."""
+        """Return the number of residuals of a link, given its factor."""
         if self._as_seen(link):
             return int(factor.dim())
         return 6 if isinstance(link, RelativePose | StayPut) else 3
 
     def _as_seen(self, link: Link) -> bool:
-        """Whether a link is taken for what the cameras saw."""
+        """Return whether a link becomes a factor on image measurements."""
         if self.variables is None:
             return False
         if isinstance(link, Sighting):
@@ -107,12 +106,12 @@ class Factors:
         return isinstance(link, RelativePose) and link.homography is not None and link.plane is not None
 
     def gauge(self, key: int) -> gtsam.NonlinearFactor:
-        """The prior of the pose that defines the world."""
+        """Return the prior of the pose that defines the world."""
         noise = gtsam.noiseModel.Diagonal.Sigmas(self.gauge_sigmas)
         return gtsam.PriorFactorPose3(key, gtsam.Pose3(), noise)
 
     def of_pose(self, key: int) -> tuple[gtsam.NonlinearFactor, ...]:
-        """The priors of any other pose: it stands on the floor, where there is one."""
+        """Return the priors of any other pose: it stands on the floor, where there is one."""
         if self.floor is None:
             return ()
         return (
@@ -121,7 +120,7 @@ class Factors:
         )
 
     def of_link(self, link: Link, i: int, j: int) -> gtsam.NonlinearFactor:
-        """The factor of a link on the keys of its two poses, and of the calibration variables that it needs."""
+        """Return the factor of a link on the keys of its two poses and of its calibration variables."""
         ready = self._ready.pop(id(link), None)
         if ready is not None and list(ready.keys()[:2]) == [i, j]:
             return ready
@@ -134,28 +133,30 @@ class Factors:
 
     @staticmethod
     def between(link: Link, i: int, j: int, T_i_j: gtsam.Pose3) -> gtsam.NonlinearFactor:
-        """A link as what it says of the two poses alone, with the covariance that it has as such."""
+        """Return a link as a between-factor of the two poses alone, with its covariance as such."""
         return gtsam.BetweenFactorPose3(i, j, T_i_j, _noise(link))
 
     def expected(self, link: Link, i: int, j: int, errors: Callable[[int], Array]) -> gtsam.Pose3:
-        """The pose of a link's second end in its first, with calibration variables at `errors` of their keys.
+        """Return the pose of a link's second end in its first, with calibration variables at `errors` of their keys.
 
-        The factor that this takes is kept for when the link enters the graph.
+        The factor made for this is kept for the insertion of the link.
         """
         if self.variables is not None and self.floor is not None and self._as_seen(link):
             if isinstance(link, Sighting):
-                return sighted(link, self.variables, errors)
+                return sighted_pose(link, self.variables, errors)
             assert isinstance(link, RelativePose)
             factor = self.of_link(link, i, j)
             self._ready[id(link)] = factor
-            return related(link, factor, errors)
+            return homography_pose(link, factor, errors)
         return pose_of(link)
 
     def of_graph(
         self, graph: PoseGraph, keys: Iterable[int]
     ) -> tuple[gtsam.NonlinearFactorGraph, tuple[Link, ...], BatchedFactors]:
-        """The factors over these keys, and the links among them; the links' factors come last, in that order. With what
-        evaluates all at once that are in Python."""
+        """Return the factors on `keys`, the links among them, and the context in which they are evaluated in batches.
+
+        The links' factors come last, in the order of the links.
+        """
         wanted = set(keys)
         factors = gtsam.NonlinearFactorGraph()
         reference = graph.reference_key
@@ -164,7 +165,7 @@ class Factors:
             for factor in self.of_pose(key):
                 factors.add(factor)
         links, made = [], []
-        key_of = graph.places.key
+        key_of = graph.pose_keys.key
         for link in graph.links:
             i, j = map(key_of, link.ends)
             if i in wanted and j in wanted and i != j:
@@ -177,21 +178,21 @@ class Factors:
         return factors, tuple(links), BatchedFactors([one.evaluator for one in made if isinstance(one, BatchedFactor)])
 
     def nominal(self, key: int) -> Array:
-        """Where the search for a calibration variable starts: as stated."""
+        """Return the initial value of a calibration variable: as stated."""
         assert self.variables is not None
         return self.variables.start(key)
 
     def is_anchored(self, values: gtsam.Values) -> bool:
-        """Whether the factors were made for mounts as they turned out to be."""
+        """Return whether spans were linearised close enough to the estimated mounts."""
         return self.variables is None or self.variables.is_anchored(calibrations_in(values))
 
     def calibration_prior(self, key: int) -> gtsam.NonlinearFactor:
-        """What is stated of a calibration variable."""
+        """Return the prior factor of a calibration variable."""
         assert self.variables is not None
         return self.variables.prior(key)
 
     def start(self, pose: gtsam.Pose3) -> gtsam.Pose3:
-        """Where to start the search for a pose: on the floor, where there is one.
+        """Return the initial value of a pose: on the floor, where there is one.
 
         Bodies that start tilted couple heading and height once their linearisations differ, and ISAM2 then redoes
         the whole chain at every step (measured at stance 600: 10 ms an update against 0.16).
@@ -202,7 +203,7 @@ class Factors:
 
 
 def link_covariance(link: Link) -> Array:
-    """The covariance of a link, (6, 6), or (3, 3) of heading, x, y."""
+    """Return the covariance of a link, (6, 6), or (3, 3) of heading, x, y."""
     if isinstance(link, StayPut):
         assert link.slip is not None
         turn = np.deg2rad(link.slip.sigma_deg)
@@ -214,7 +215,7 @@ def _noise(link: Link) -> gtsam.noiseModel.Gaussian:
     C = link_covariance(link)
     if len(C) == 6:
         return gtsam.noiseModel.Gaussian.Covariance(C)
-    # heading, x and y alone weigh; the rows of roll, pitch and height are zero
+    # heading, x and y alone are measured; the rows of roll, pitch and height are zero
     R = np.zeros((6, 6))
     R[2:5, 2:5] = np.linalg.cholesky(np.linalg.inv(C)).T
     return gtsam.noiseModel.Gaussian.SqrtInformation(R)

@@ -1,4 +1,4 @@
-"""The pose graph of a team: one pose a robot and move, stay-put constraints, and what was measured between them."""
+"""Pose graph of a team: one pose per robot and move, stay-put constraints, and measurements between them."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.landmarks import ALWAYS, MAP, OnMap, landmarks_of, map_of, of_seen
+from coloc_graph.backend.landmarks import ALWAYS, MAP, OnMap, landmarks_of, map_positions, positions_of
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, MeasurementError
 from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
@@ -18,16 +18,22 @@ from coloc_graph.team import Floor, Landmark, Robot, Slip, Team
 
 Array = NDArray[np.float64]
 
-#: GTSAM's keys number the robots of a team in one byte.
-MOST_ROBOTS = 255
+MAX_ROBOTS = 255  # robots of a team: GTSAM's keys number them in one byte
 
 
 @dataclass(frozen=True)
 class StayPut:
     """The paper's constraint: an anchor's pose at stance `after` is its pose at stance `before`.
 
-    Without a `slip` it is enforced exactly: both stances share one variable, since every equality factor of
-    GTSAM 4.3 fails somewhere. With one it is a between-factor on two variables, whose residual tells a bump.
+    Parameters
+    ----------
+    robot : str
+        The anchor.
+    before, after : int
+        Indices of the two stances.
+    slip : Slip or None
+        None: the constraint is exact, and both stances share one variable (every equality factor of GTSAM 4.3 fails
+        in some graph). Otherwise a between-factor on two variables, whose residual reveals a bump.
     """
 
     robot: str
@@ -37,7 +43,7 @@ class StayPut:
 
     @property
     def ends(self) -> tuple[Node, Node]:
-        """The two nodes that are one place."""
+        """The two nodes of the same pose."""
         return (self.robot, self.before), (self.robot, self.after)
 
     @property
@@ -49,7 +55,7 @@ class StayPut:
         return f"{self.robot} staying put from stance {self.before} to {self.after}"
 
 
-#: What the graph holds between two nodes.
+#: A relation between two nodes of the graph.
 Link = Measurement | StayPut | OnMap
 
 
@@ -59,23 +65,23 @@ def pose_of(link: Link) -> gtsam.Pose3:
 
 
 class PoseKeys:
-    """Which variable each robot's pose at each stance is: stance after stance, by counting its moves.
+    """GTSAM keys of each robot's pose at each stance: the robot's number and its count of moves.
 
-    `landmarks`, and the map, never move: each is one variable, at every stance.
+    Each of the `landmarks`, and the map, is one variable for all stances.
     """
 
     def __init__(self, robots: tuple[str, ...], slips: Mapping[str, Slip], landmarks: Iterable[str] = ()) -> None:
-        if len(robots) > MOST_ROBOTS:
-            raise EstimationError(f"a team of {len(robots)} robots is too large: a graph holds {MOST_ROBOTS} at most")
+        if len(robots) > MAX_ROBOTS:
+            raise EstimationError(f"a team of {len(robots)} robots is too large: a graph holds {MAX_ROBOTS} at most")
         self.slips = slips
         self._numbers = {robot: number for number, robot in enumerate(robots, start=1)}
         self._moves = dict.fromkeys(robots, 0)
-        # robots are numbered from 1; what never moves has the number 0, and is told by its count
-        self._still = {name: int(gtsam.mrsymbol(ord("x"), 0, n)) for n, name in enumerate((MAP, *landmarks))}
+        # robots are numbered from 1; static things have the number 0 and differ by their count
+        self._static = {name: int(gtsam.mrsymbol(ord("x"), 0, n)) for n, name in enumerate((MAP, *landmarks))}
         self._keys: dict[Node, int] = {}
 
     def after(self, before: Stance | None, stance: Stance) -> dict[Node, int]:
-        """The keys of all robots at the stance that comes after `before`: who is not its anchor has moved."""
+        """Return the keys of all robots at the stance after `before`: robots that are not its anchors have moved."""
         keys = {}
         for robot, number in self._numbers.items():
             moves = self._moves[robot]
@@ -85,60 +91,85 @@ class PoseKeys:
         return keys
 
     def accept(self, keys: Mapping[Node, int]) -> None:
-        """Take in a stance's keys, as `after` gave them."""
+        """Record a stance's keys, as returned by `after`."""
         for (robot, _), key in keys.items():
             self._moves[robot] = gtsam.mrsymbolIndex(key)
         self._keys.update(keys)
 
     def forget(self, before: Stance | None, stance: Stance) -> None:
-        """Take the last stance back, which came after `before`."""
+        """Remove the last stance, which came after `before`."""
         for robot in self._numbers:
             del self._keys[robot, stance.index]
             self._moves[robot] = 0 if before is None else gtsam.mrsymbolIndex(self._keys[robot, before.index])
 
     @staticmethod
     def stays(robot: str, before: Stance, after: Stance) -> bool:
-        """Whether a robot's pose of stance `before` is that of `after`: one that was driving has left it."""
+        """Return whether a robot has the same pose at both stances: an anchor that did not move in `before`."""
         return robot in after.anchors and robot not in before.movers
 
     def stay_puts(self, before: Stance, after: Stance) -> Iterator[StayPut]:
-        """The constraints between two stances, of all anchors."""
+        """Yield the constraints between two stances, of all anchors."""
         for robot in after.anchors:
             if self.stays(robot, before, after):
                 yield StayPut(robot, before.index, after.index, self.slips.get(robot))
 
     def key(self, node: Node) -> int:
-        """GTSAM's key of a node; `KeyError` where there is no such robot or stance."""
-        still = self._still.get(node[0])
+        """Return GTSAM's key of a node; `KeyError` where there is no such robot or stance."""
+        still = self._static.get(node[0])
         return self._keys[node] if still is None else still
 
     def __contains__(self, node: Node) -> bool:
-        return node in self._keys or (node[0] in self._still and (node[1] == ALWAYS or self._is_stance(node[1])))
+        return node in self._keys or (node[0] in self._static and (node[1] == ALWAYS or self._is_stance(node[1])))
 
     def _is_stance(self, index: int) -> bool:
         return any((robot, index) in self._keys for robot in self._numbers)
 
-    def is_still(self, name: str) -> bool:
-        """Whether it is a landmark, or the map."""
-        return name in self._still
+    def is_static(self, name: str) -> bool:
+        """Return whether a name is that of a landmark, or of the map."""
+        return name in self._static
 
-    def still(self) -> dict[str, int]:
-        """The keys of the landmarks and of the map."""
-        return dict(self._still)
+    def static(self) -> dict[str, int]:
+        """Return the keys of the landmarks and of the map, by name."""
+        return dict(self._static)
 
 
 @dataclass(frozen=True, repr=False)
 class PoseGraph:
-    """What a team measured, as a graph.
+    """Measurements of a team as a graph.
 
-    Nodes are the poses T_world_body of robots at stances: of its observers, of whoever a measurement names, and of
-    anchors whose pose is a node already. Nodes that are one place share one variable (`key`). The world frame is
-    where the reference robot stands at the first stance: its body, or, where there is a `floor`, the floor beneath
-    it (the same on a level floor), x along its heading. `slips` are of the robots that stay put within a tolerance.
-    `rigs` are the robots as the team describes them, with mounts and markers: what the joint estimate calibrates.
-    `landmarks` that were sighted are one variable each, and `on_map` is what is known of where these stand.
+    Parameters
+    ----------
+    reference : str
+        Robot whose pose at the first stance is the world frame: its body, or, where there is a `floor`, the floor
+        beneath it, x along its heading.
+    robots : tuple of str
+        Names of all robots.
+    stances : tuple of Stance
+        In the order of time.
+    measurements : tuple of Measurement
+        Relative poses, sightings and odometry between nodes (robot, stance).
+    floor : Floor or None
+        Floor that the robots stand on.
+    slips : mapping of str to Slip
+        Robots that stay put within a tolerance.
+    robot_models : mapping of str to Robot
+        Mounts and markers as stated, which a joint estimate calibrates.
+    landmarks : mapping of str to Landmark
+        Landmarks of the team; those sighted are one variable each.
+    on_map : tuple of OnMap
+        Stated positions of landmarks.
 
-    Raises `EstimationError` where there is nothing to solve, and `MeasurementError` where a measurement is not one.
+    Raises
+    ------
+    EstimationError
+        There is nothing to solve.
+    MeasurementError
+        A measurement is invalid.
+
+    Notes
+    -----
+    Nodes are the poses T_world_body of observers, of the robots that a measurement names, and of anchors whose pose is
+    a node already. Nodes that share a pose share one variable (`key`).
     """
 
     reference: str
@@ -147,14 +178,14 @@ class PoseGraph:
     measurements: tuple[Measurement, ...]
     floor: Floor | None = None
     slips: Mapping[str, Slip] = field(default_factory=dict)
-    rigs: Mapping[str, Robot] = field(default_factory=dict)
+    robot_models: Mapping[str, Robot] = field(default_factory=dict)
     landmarks: Mapping[str, Landmark] = field(default_factory=dict)
     on_map: tuple[OnMap, ...] = ()
 
     @classmethod
     def of(cls, team: Team, stances: Iterable[Stance], measurements: Iterable[Measurement]) -> "PoseGraph":
-        """The graph of a team."""
-        rigs = {robot.name: robot for robot in team.robots}
+        """Return the graph of a team."""
+        robot_models = {robot.name: robot for robot in team.robots}
         landmarks = landmarks_of(team)
         return cls(
             team.reference,
@@ -163,9 +194,9 @@ class PoseGraph:
             tuple(measurements),
             team.floor,
             slips_of(team),
-            rigs,
+            robot_models,
             landmarks,
-            map_of(landmarks),
+            map_positions(landmarks),
         )
 
     def __post_init__(self) -> None:
@@ -174,32 +205,34 @@ class PoseGraph:
         twice = [after.index for before, after in zip(self.stances, self.stances[1:], strict=False)
                  if after.index <= before.index]  # fmt: skip
         if twice:
-            raise MeasurementError(f"stance {twice[0]} is there twice, or out of order; number each stance once")
+            raise MeasurementError(
+                f"stance {twice[0]} is repeated or out of order: number the stances in the order of time, each once"
+            )
         first = self.stances[0]
         require_reference(self.reference, first)
         for stance in self.stances:
             require_robots(stance, self.robots)
         for measured in self.measurements:
-            require_ends(measured, self.places, self.by_index)
+            require_ends(measured, self.pose_keys, self.by_index)
         require_valid(self.measurements, self.floor)
         instants_of(self.measurements, self.by_index)
 
     @cached_property
-    def places(self) -> PoseKeys:
-        """Which variable each node is."""
-        places = PoseKeys(self.robots, self.slips, self.landmarks)
+    def pose_keys(self) -> PoseKeys:
+        """GTSAM keys of the nodes."""
+        keys = PoseKeys(self.robots, self.slips, self.landmarks)
         for before, stance in zip((None, *self.stances), self.stances, strict=False):
-            places.accept(places.after(before, stance))
-        return places
+            keys.accept(keys.after(before, stance))
+        return keys
 
     @cached_property
     def by_index(self) -> dict[int, Stance]:
-        """The stances by their number."""
+        """Stances by index."""
         return {stance.index: stance for stance in self.stances}
 
     @cached_property
     def nodes(self) -> tuple[Node, ...]:
-        """All nodes, in the order of the stances; landmarks are none of them."""
+        """All nodes, in the order of the stances, without landmarks."""
         named: dict[int, dict[str, None]] = defaultdict(dict)
         for measured in self.measurements:
             for robot, index in measured.ends:
@@ -216,7 +249,7 @@ class PoseGraph:
 
     @cached_property
     def sighted(self) -> dict[str, tuple[Sighting, ...]]:
-        """The sightings of each landmark that was seen."""
+        """Sightings of each landmark that was seen."""
         found: dict[str, list[Sighting]] = defaultdict(list)
         for one in self.measurements:
             if isinstance(one, Sighting) and one.seen in self.landmarks:
@@ -225,12 +258,12 @@ class PoseGraph:
 
     @property
     def relative_poses(self) -> tuple[RelativePose, ...]:
-        """The measurements made of homographies."""
+        """Measurements made of homographies."""
         return tuple(m for m in self.measurements if isinstance(m, RelativePose))
 
     @cached_property
     def times(self) -> dict[Node, float]:
-        """When each node's pose was [UTC s]: at the start of the stance, or when a moving robot was sighted."""
+        """Time of each node's pose [UTC s]: the start of the stance, or the sighting of a moving robot."""
         times = {(robot, index): self.by_index[index].start for robot, index in self.nodes}
         for measured in self.measurements:
             if isinstance(measured, Sighting) and measured.seen in self.by_index[measured.stance].movers:
@@ -239,25 +272,24 @@ class PoseGraph:
 
     @cached_property
     def stay_puts(self) -> tuple[StayPut, ...]:
-        """The constraints, in the order of the stances."""
+        """Stay-put constraints, in the order of the stances."""
         nodes = set(self.nodes)
         return tuple(
             stay
             for before, after in zip(self.stances, self.stances[1:], strict=False)
-            for stay in self.places.stay_puts(before, after)
+            for stay in self.pose_keys.stay_puts(before, after)
             if nodes.issuperset(stay.ends)
         )
 
     @property
     def links(self) -> tuple[Link, ...]:
-        """All that holds two variables together: measurements, stay-put constraints with a slip, and what the map says
-        of landmarks that were seen."""
+        """Relations between variables: measurements, stay-puts with a slip, map positions of sighted landmarks."""
         slipping = (stay for stay in self.stay_puts if stay.slip is not None)
-        return (*self.measurements, *slipping, *of_seen(self.on_map, self.sighted))
+        return (*self.measurements, *slipping, *positions_of(self.on_map, self.sighted))
 
     def key(self, robot: str, stance: int) -> int:
-        """GTSAM's key of a robot's pose at a stance."""
-        return self.places.key((robot, stance))
+        """Return GTSAM's key of a robot's pose at a stance."""
+        return self.pose_keys.key((robot, stance))
 
     @property
     def reference_key(self) -> int:
@@ -265,14 +297,14 @@ class PoseGraph:
         return self.key(self.reference, self.stances[0].index)
 
     def up_to(self, stances: int) -> "PoseGraph":
-        """The graph of the first so many stances, one at least, with what was measured in them."""
+        """Return the graph of the first `stances` stances (at least one), with the measurements in them."""
         first = self.stances[: max(stances, 1)]
         within = {stance.index for stance in first}
         measured = tuple(m for m in self.measurements if all(index in within for _, index in m.ends))
         return replace(self, stances=first, measurements=measured)
 
     def without(self, rejected: Iterable[object]) -> "PoseGraph":
-        """The same nodes with fewer measurements."""
+        """Return the graph of the same nodes without the `rejected` measurements and map positions."""
         out = {id(one) for one in rejected}
         if not out:
             return self
@@ -283,9 +315,9 @@ class PoseGraph:
         return graph
 
     def disconnected(self, known: Iterable[int]) -> tuple[Node, ...]:
-        """The (robot, stance) whose pose is not among these keys, in the order of the stances."""
+        """Return the nodes whose pose is not among the `known` keys, in the order of the stances."""
         keys = set(known)
-        return tuple(node for node in self.nodes if self.places.key(node) not in keys)
+        return tuple(node for node in self.nodes if self.pose_keys.key(node) not in keys)
 
     def __repr__(self) -> str:
         kinds = {"relative pose": RelativePose, "sighting": Sighting, "odometry": Odometry}
@@ -303,7 +335,7 @@ class PoseGraph:
 
 
 def slips_of(team: Team) -> dict[str, Slip]:
-    """The robots of a team that stay put within a tolerance, with it."""
+    """Return the robots of a team that stay put within a tolerance, with that tolerance."""
     return {robot.name: robot.slip for robot in team.robots if robot.slip is not None}
 
 
@@ -334,33 +366,33 @@ def require_anchor(stance: Stance, taken: Iterable[Measurement]) -> None:
         )
 
 
-def require_ends(measured: Measurement, places: PoseKeys, stances: Mapping[int, Stance]) -> None:
-    """Raise `MeasurementError` where a measurement relates what is not there, or a robot to itself."""
+def require_ends(measured: Measurement, keys: PoseKeys, stances: Mapping[int, Stance]) -> None:
+    """Raise `MeasurementError` where a measurement names an unknown robot or stance, or relates a robot to itself."""
     for robot, index in measured.ends:
-        if (robot, index) not in places:
-            what = f"robot {robot}, which is not in the team" if index in stances else f"stance {index}, which is not"
-            raise MeasurementError(f"the {measured} names {what} there: correct it, or add that first")
+        if (robot, index) not in keys:
+            what = f"robot {robot}, which is not in the team" if index in stances else f"stance {index}, which is none"
+            raise MeasurementError(f"the {measured} names {what}: correct it, or add that first")
     (robot_i, before), (robot_j, after) = measured.ends
     if isinstance(measured, Odometry):
-        if places.is_still(robot_i):
-            raise MeasurementError(f"the {measured} names a landmark, which does not move")
+        if keys.is_static(robot_i):
+            raise MeasurementError(f"the {measured} names a landmark, which does not move: name a robot")
         if before >= after:
-            raise MeasurementError(f"the {measured} does not lead from a stance to a later one")
+            raise MeasurementError(f"the {measured} does not lead from a stance to a later one: correct its stances")
         return
     if robot_i == robot_j:
-        raise MeasurementError(f"the {measured} relates a robot to itself")
-    watching = (robot_i,) if isinstance(measured, Sighting) else (robot_i, robot_j)
-    for robot in watching:
+        raise MeasurementError(f"the {measured} relates a robot to itself: name two robots")
+    observers = (robot_i,) if isinstance(measured, Sighting) else (robot_i, robot_j)
+    for robot in observers:
         if robot not in stances[before].observers:
-            raise MeasurementError(f"the {measured} names {robot}, which does not observe there")
+            raise MeasurementError(f"the {measured} names {robot}, which is no observer of stance {before}")
 
 
 def instants_of(
     measurements: Iterable[Measurement], stances: Mapping[int, Stance], known: Mapping[Node, float] | None = None
 ) -> dict[Node, float]:
-    """Times [UTC s] at which moving robots were sighted that are not `known`.
+    """Return the times [UTC s] at which moving robots were sighted that are not `known`.
 
-    A moving robot has one pose a stance: raises `MeasurementError` where it was sighted there at two instants.
+    A moving robot has one pose per stance: raises `MeasurementError` where it was sighted there at two times.
     """
     known, found = known or {}, dict[Node, float]()
     for one in measurements:
@@ -371,9 +403,9 @@ def instants_of(
 
 
 def _require_instant(sighting: Sighting, time: float) -> None:
-    """Raise `MeasurementError` where a moving robot was sighted at another time than its pose of the stance is."""
+    """Raise `MeasurementError` where a moving robot was sighted at another time than that of its pose."""
     if abs(sighting.time - time) > 1e-3:
         raise MeasurementError(
-            f"the {sighting} is of another instant than an earlier one ({sighting.time - time:+.3f} s), and the robot "
-            "moves: give the sightings of one instant"
+            f"the {sighting} is {sighting.time - time:+.3f} s from an earlier one of this stance, and the robot moves: "
+            "give sightings of one instant"
         )

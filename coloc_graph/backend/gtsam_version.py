@@ -1,4 +1,4 @@
-"""Which GTSAM this was measured with; anything else is refused in words."""
+"""Check of GTSAM's version: other versions than the tested ones are refused."""
 
 from importlib.metadata import PackageNotFoundError, version
 

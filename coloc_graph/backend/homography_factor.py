@@ -23,31 +23,30 @@ MAX_STEPS = 8  # Gauss-Newton steps to one pose; three are usual
 
 
 def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, on_floor: bool) -> BatchedFactor:
-    """The factor of a homography, and of the spans seen with it, on poses i and j, their mounts, the movers' markers
-    and the clocks; of a plane that was stated, on the poses and that plane."""
+    """Return the factor of a homography and its spans on poses i and j, their mounts, the movers' markers and clocks.
+
+    Of a homography of a stated plane: on the poses and that plane.
+    """
     assert link.homography is not None and link.plane is not None
-    rig_i, rig_j = variables.rigs[link.robot_i], variables.rigs[link.robot_j]
+    mount_i, mount_j = (variables.robot_models[robot].mount for robot in (link.robot_i, link.robot_j))
     if not link.plane.normal_from_mount:
-        plane = StatedPlaneModel(link.homography, link.plane.N / link.plane.d, rig_i.mount, rig_j.mount)
+        plane = StatedPlaneModel(link.homography, link.plane.N / link.plane.d, mount_i, mount_j)
         key = variables.plane(link.robot_i, link.stance, sigmas_of_plane(link))
         return BatchedFactor(FactorEvaluator(plane, (i, j), (key,), (3,)))
     measured = link.homography
-    markers = {robot: rig for robot in link.movers if (rig := variables.rigs[robot].markers) is not None}
+    markers = {robot: one for robot in link.movers if (one := variables.robot_models[robot].markers) is not None}
     about, tilt_sigma = variables.anchor(link.robot_i)
     clocks, sign = variables.clocks(link.robot_i, link.robot_j, measured.time_offset_sigma)
-    model = HomographyModel(measured, link.spans, rig_i.mount, rig_j.mount, markers, on_floor, about, tilt_sigma, sign)
-    keys = (
-        variables.mount(link.robot_i),
-        variables.mount(link.robot_j),
-        *map(variables.markers, model.movers),
-        clocks,
-    )
+    model = HomographyModel(measured, link.spans, mount_i, mount_j, markers, on_floor, about, tilt_sigma, sign)
+    keys = variables.mount(link.robot_i), variables.mount(link.robot_j), *map(variables.markers, model.movers), clocks
     return BatchedFactor(FactorEvaluator(model, (i, j), keys, (3, 3, *[2] * len(model.movers), 1)))
 
 
-def related(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[[int], Array]) -> gtsam.Pose3:
-    """Most likely pose of j in i on the floor by a homography's factor, with calibration variables at `errors` of their
-    keys; the measured pose where the search diverges."""
+def homography_pose(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[[int], Array]) -> gtsam.Pose3:
+    """Return the most likely pose of j in i on the floor by a homography's factor.
+
+    Calibration variables are at `errors` of their keys. The measured pose where the search diverges.
+    """
     i, j, *variable = map(int, factor.keys())
     values = gtsam.Values()
     values.insert(i, gtsam.Pose3())
@@ -63,26 +62,26 @@ def related(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[
         if not np.abs(step).max() < 0.5:
             return gtsam.Pose3(link.T_i_j)
         T_i_j = T_i_j.compose(gtsam.Pose3(gtsam.Rot3.Yaw(step[0]), np.array([step[1], step[2], 0.0])))
-        if np.linalg.norm(planar @ step) < 1.0:  # what is left is far within the noise
+        if np.linalg.norm(planar @ step) < 1.0:  # the rest is far within the noise
             break
     return T_i_j
 
 
 def markers_factor(link: Sighting, i: int, j: int, variables: Variables) -> BatchedFactor:
-    """The factor of sighted markers on the poses of observer and seen, the observer's mount and the markers."""
+    """Return the factor of sighted markers on the poses of observer and seen, the observer's mount and the markers."""
     keys = variables.mount(link.observer), variables.markers(link.seen)
     return BatchedFactor(FactorEvaluator(_markers_model(link, variables), (i, j), keys, (3, 2)))
 
 
-def sighted(link: Sighting, variables: Variables, errors: Callable[[int], Array]) -> gtsam.Pose3:
-    """The pose of the seen robot in its observer, with mount and markers off by `errors` of their keys."""
+def sighted_pose(link: Sighting, variables: Variables, errors: Callable[[int], Array]) -> gtsam.Pose3:
+    """Return the pose of the seen robot in its observer, with mount and markers at `errors` of their keys."""
     keys = variables.mount(link.observer), variables.markers(link.seen)
     mount, markers = (np.zeros(n) if key is None else errors(key) for key, n in zip(keys, (3, 2), strict=True))
-    place = _markers_model(link, variables).place(mount, markers)
-    return gtsam.Pose3(link.T_i_j) if place is None else gtsam.Pose3(floor_pose(*place))
+    planar = _markers_model(link, variables).planar_pose(mount, markers)
+    return gtsam.Pose3(link.T_i_j) if planar is None else gtsam.Pose3(floor_pose(*planar))
 
 
 def _markers_model(link: Sighting, variables: Variables) -> MarkersModel:
     assert link.x_markers is not None and link.x_covariance is not None
     markers = variables.markers_of(link.seen)
-    return MarkersModel(link.x_markers, link.x_covariance, variables.rigs[link.observer].mount, markers)
+    return MarkersModel(link.x_markers, link.x_covariance, variables.robot_models[link.observer].mount, markers)

@@ -1,5 +1,4 @@
-"""Measured homographies against what poses, mounts and markers predict; with the spans of the movers in the same
-images.
+"""Residuals of homographies, and of the movers' spans in the same images, by poses, mounts and markers.
 
 Vectorised, with the tangents of `camera_model`. Plain numpy, no graph.
 """
@@ -20,15 +19,14 @@ Array = NDArray[np.float64]
 
 
 class HomographyModel:
-    """A measured homography, and the spans of the movers in the same images, against what poses and mounts predict.
+    """Residual of a measured homography, and of the spans of the movers in the same images.
 
     Rows 0 to 7 are the sl(3) coordinates h of log(H_measured^-1 H_predicted), whitened by the information; each span
-    adds three, see `SpanModel`: what counts of it is decided for mount i off by `about` (3,), known to `tilt_sigma`.
-    The plane is level at the markers' height: in the world where robots stand on a floor, and else in body i. `movers`
-    is whose markers they are, the first one's height being that of the plane.
+    adds three, see `SpanModel`, linearised at mount error `about` (3,) with tilts known to `tilt_sigma` [rad]. The
+    plane is level at the height of the first mover's markers: in the world where robots stand on a floor, otherwise in
+    body i. `movers` are the robots whose markers were seen.
 
-    Variables: both mounts (3,), the markers (2,) of each of the movers, and the clocks' offset (1,) [s], whose sign is
-    `clock_sign` times what is said of camera i and j.
+    Variables: both mounts (3,), the markers (2,) of each mover, and the clocks' offset (1,) [s], times `clock_sign`.
     """
 
     def __init__(
@@ -54,32 +52,32 @@ class HomographyModel:
         self.H_inverse: Array = np.asarray(np.linalg.inv(measured.H_j_i), float)
         b = measured.by_time_offset
         self.by_offset = np.zeros(8) if b is None else clock_sign * b
-        # with the offset as a variable of its own the information is that at the right offset
+        # the offset is a variable of its own: the information is that at a known offset
         own = np.linalg.inv(measured.information) - measured.time_offset_sigma**2 * np.outer(
             self.by_offset, self.by_offset
         )
         root = np.linalg.cholesky(np.linalg.inv((own + own.T) / 2)).T
-        # what is linear in h: first the whitening, then what it does to the spans
+        # linear in h: the whitening, then the effect on the spans
         self.by_h = np.vstack([root, *(one.by_h for one in self.spans)])
 
     @property
     def rows(self) -> int:
-        """How many numbers it measures."""
+        """Number of its residuals."""
         return len(self.by_h)
 
     @property
     def kind(self) -> Hashable:
-        """How many movers there are, how many spans it holds, and whether on a floor."""
+        """True on a floor, number of movers, number of spans."""
         return self.on_floor, len(self.movers), len(self.spans)
 
     @staticmethod
-    def together(models: Sequence["HomographyModel"]) -> "_Homographies":
-        """Many of them, of one kind."""
+    def batch(models: Sequence["HomographyModel"]) -> "_Homographies":
+        """Return the batch of models of one kind."""
         return _Homographies(models)
 
 
 class _Homographies:
-    """`Together` of homographies of one kind."""
+    """Batch of homographies of one kind."""
 
     def __init__(self, models: Sequence[HomographyModel]) -> None:
         self._on_floor = models[0].on_floor
@@ -88,7 +86,7 @@ class _Homographies:
         self._H_inverse = np.array([one.H_inverse for one in models])
         self._by_h = np.array([one.by_h for one in models])
         self._by_offset = np.array([one.by_offset for one in models])
-        # one span of each after the other, and which of its movers it is of
+        # spans by their index in each model, with the index of the mover that each is of
         self._spans = [
             (np.array([one.movers.index(span.mover) for one, span in zip(models, each, strict=True)]), Spans(each))
             for each in zip(*(one.spans for one in models), strict=True)
@@ -131,14 +129,16 @@ class _Homographies:
 
 
 def _by_camera(seen: SeenPlanes) -> Array:
-    """How the planes n . X = 1 (n, 3) change with the cameras' tangents, (n, 3, 6)."""
+    """Derivatives (n, 3, 6) of the planes n . X = 1 (n, 3) by the cameras' tangents."""
     n = seen.n
     return np.concatenate([hat(n), n[:, :, None] * n[:, None, :]], axis=2)
 
 
 def _off(H_measured_inverse: Array, H: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """The coordinates (n, 8) of homographies in those of the measured ones, and which are not beyond all bounds (n,):
-    the others are 0."""
+    """Return the sl(3) coordinates (n, 8) of homographies relative to the measured ones, and a mask (n,).
+
+    Coordinates outside the mask cannot be evaluated, and are 0.
+    """
     E = H_measured_inverse @ H
     scale = np.linalg.det(E)
     near = scale > 1e-9
@@ -148,7 +148,7 @@ def _off(H_measured_inverse: Array, H: Array) -> tuple[Array, NDArray[np.bool_]]
 
 
 def _adjoint(T: Array) -> Array:
-    """The adjoints (n, 6, 6) of poses (n, 4, 4)."""
+    """Return the adjoints (n, 6, 6) of poses (n, 4, 4)."""
     R = T[:, :3, :3]
     out = np.zeros((len(T), 6, 6))
     out[:, :3, :3] = out[:, 3:, 3:] = R
@@ -158,7 +158,7 @@ def _adjoint(T: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class StatedPlaneModel:
-    """A measured homography of a plane that is stated in camera i, against what two cameras and the plane predict.
+    """Residual of a measured homography of a plane that is stated in camera i.
 
     The plane's own variable is the error (3,) of n = N / d, across two directions and along the normal, relative to
     the stated |n|.
@@ -173,13 +173,13 @@ class StatedPlaneModel:
     kind = "stated plane"
 
     @staticmethod
-    def together(models: Sequence["StatedPlaneModel"]) -> "_StatedPlanes":
-        """Many of them."""
+    def batch(models: Sequence["StatedPlaneModel"]) -> "_StatedPlanes":
+        """Return the batch of models."""
         return _StatedPlanes(models)
 
 
 class _StatedPlanes:
-    """`Together` of homographies of stated planes."""
+    """Batch of homographies of stated planes."""
 
     def __init__(self, models: Sequence[StatedPlaneModel]) -> None:
         self._T_bi_ci = np.array([one.mount_i.T_body_camera for one in models])

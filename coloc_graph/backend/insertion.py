@@ -23,23 +23,35 @@ Tie = tuple[Link, int, int]
 
 @dataclass(frozen=True, eq=False)
 class InsertionPlan:
-    """Plan of what one call puts into the graph.
+    """Plan of the links that one call puts into the graph.
 
-    `start` are the initial values of new poses and `ties` the links that determine them; measurements `near` their
-    expected value are tested when all is in, those `far` from it before they enter. What is `loose` is not connected
-    to the reference yet.
+    Parameters
+    ----------
+    start : dict of int to gtsam.Pose3
+        Initial values of new poses.
+    ties : list of Tie
+        Links that determine them, and odometry.
+    near : list of Tie
+        Measurements within the innovation gate: tested after insertion.
+    far : list of Tie
+        Measurements outside it: tested before insertion.
+    disconnected : list of Link
+        Links that nothing ties to the reference yet.
     """
 
     start: dict[int, gtsam.Pose3]
     ties: list[Tie]
     near: list[Tie]
     far: list[Tie]
-    loose: list[Link]
+    disconnected: list[Link]
 
 
 class InsertionPlanner:
-    """Sorts links by what is `tied` to the reference; `ends` gives their keys, `known` the poses of tied keys, and
-    `errors` the estimates of calibration variables."""
+    """Planner of the insertion of links.
+
+    `tied` are the keys that are tied to the reference; `ends` gives the keys of a link, `known` the poses of tied keys,
+    and `errors` the estimates of calibration variables.
+    """
 
     def __init__(
         self,
@@ -61,7 +73,7 @@ class InsertionPlanner:
         ties: list[Tie] = []
         near: list[Tie] = []
         far: list[Tie] = []
-        rough: dict[int, float] = {}  # started by wheels alone, with their sigma
+        rough: dict[int, float] = {}  # keys with initial values by odometry alone, with its sigma
         # odometry first: it is seldom wrong by much, so that its prediction can reject a wrong homography
         left = sorted(links, key=lambda link: isinstance(link, RelativePose | Sighting))
         while left:

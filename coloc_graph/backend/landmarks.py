@@ -1,4 +1,4 @@
-"""What never moves, in the graph: landmarks, and the map that some of them are on."""
+"""Static nodes of the graph: landmarks, and the map that some of them are on."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -13,20 +13,28 @@ from coloc_graph.team import Landmark, Team
 
 Array = NDArray[np.float64]
 
-#: The map's own place in the graph: no robot and no landmark can have this name.
-MAP = "/map"
-#: The stance of a node that is the same at all of them.
-ALWAYS = -1
-#: What the map calls exact is exact to this [m, rad].
-LEAST_SIGMA = 1e-5
+MAP = "/map"  # name of the map's node: no robot and no landmark can have it
+ALWAYS = -1  # stance of a node that is the same at all stances
+MIN_SIGMA = 1e-5  # m, rad: sigma of a position on the map that is stated as exact
 
 
 @dataclass(frozen=True, eq=False)
 class OnMap:
-    """What the map says of a landmark: its pose there, with the covariance (3, 3) of heading, x, y.
+    """Stated pose of a landmark on the map.
 
-    The map is a frame of its own, whose pose in the world is found along: of one landmark it says nothing, of two
-    where they stand to each other, whatever the world frame is.
+    Parameters
+    ----------
+    landmark : str
+        Its name.
+    T_map_landmark : (4, 4) float
+        Its pose on the map.
+    covariance : (3, 3) float
+        Of heading [rad], x, y [m].
+
+    Notes
+    -----
+    The map is a frame of its own, whose pose in the world is estimated: one landmark says nothing of the robots, two
+    give their relative pose.
     """
 
     landmark: str
@@ -44,11 +52,11 @@ class OnMap:
         return self.T_map_landmark
 
     def __str__(self) -> str:
-        return f"place of {self.landmark} on the map"
+        return f"position of {self.landmark} on the map"
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class StaticPose:
     """Estimated pose of something that never moves.
 
     Parameters
@@ -67,7 +75,7 @@ class Placed:
 
     @property
     def planar(self) -> tuple[float, float, float]:
-        """x, y [m] and yaw [rad] in the world."""
+        """Position x, y [m] and yaw [rad] in the world."""
         T = self.T_world_body
         return float(T.x()), float(T.y()), float(T.rotation().yaw())
 
@@ -81,17 +89,17 @@ class Placed:
 
 
 def landmarks_of(team: Team) -> dict[str, Landmark]:
-    """The landmarks of a team, by name."""
+    """Return the landmarks of a team, by name."""
     return {landmark.name: landmark for landmark in team.landmarks}
 
 
-def map_of(landmarks: Mapping[str, Landmark]) -> tuple[OnMap, ...]:
-    """What the map says of the landmarks that are on it."""
+def map_positions(landmarks: Mapping[str, Landmark]) -> tuple[OnMap, ...]:
+    """Return the stated poses of the landmarks that are on the map."""
     return tuple(map(_on_map, (one for one in landmarks.values() if one.on_map)))
 
 
-def of_seen(on_map: Iterable[OnMap], seen: Iterable[str]) -> tuple[OnMap, ...]:
-    """What the map says of some landmarks."""
+def positions_of(on_map: Iterable[OnMap], seen: Iterable[str]) -> tuple[OnMap, ...]:
+    """Return the stated poses of the landmarks in `seen`."""
     names = set(seen)
     return tuple(one for one in on_map if one.landmark in names)
 
@@ -101,4 +109,4 @@ def _on_map(landmark: Landmark) -> OnMap:
     x, y = landmark.position
     sigmas = np.array([np.deg2rad(landmark.yaw_sigma_deg), landmark.position_sigma, landmark.position_sigma])
     T_map_landmark = floor_pose(x, y, np.deg2rad(landmark.yaw_deg))
-    return OnMap(landmark.name, T_map_landmark, np.diag(np.maximum(sigmas, LEAST_SIGMA) ** 2))
+    return OnMap(landmark.name, T_map_landmark, np.diag(np.maximum(sigmas, MIN_SIGMA) ** 2))

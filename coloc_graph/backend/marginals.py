@@ -1,7 +1,6 @@
-"""Covariances at the optimum: the graph is eliminated by QR, clique by clique, and the wanted part of the inverse
-follows from the root down.
+"""Marginal covariances at the optimum, by multifrontal QR and selected inversion.
 
-GTSAM's `Marginals` knows no QR, and its ISAM2 goes down the tree once for each variable, which takes hours where fifty
+GTSAM's `Marginals` has no QR, and its ISAM2 traverses the tree once for each variable, which takes hours where fifty
 robots' poses and mounts are in every clique. Sources: J. Liu, "The Multifrontal Method for Sparse Matrix Solution",
 1992; A. Erisman and W. Tinney, "On Computing Certain Elements of the Inverse of a Sparse Matrix", 1975.
 """
@@ -21,16 +20,15 @@ from coloc_graph.errors import EstimationError
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-#: Of a direction of unit length, what is less than this share of the largest is nothing: no factor sees it.
-NOTHING = 1e-14
+SINGULAR_TOLERANCE = 1e-14  # pivot relative to the largest below which a variable is undetermined
 
 
 @dataclass(eq=False)
 class _Clique:
-    """The `first` variables are eliminated together, by their places in the order; the `rest` come later.
+    """Frontal variables `first`, eliminated together, and separator variables `rest`, by their indices in the order.
 
-    Their columns begin at `begin`, `own` (f) are those of the first, `width` (f + s) all. `R` (f, f) and `T` (f, s) are
-    the rows that elimination leaves; `covariance` (f, f + s) is that of the first with all.
+    Columns of each start at `begin`; `own` (f) is the number of frontal columns, `width` (f + s) of all. `R` (f, f) and
+    `T` (f, s) are the rows that elimination leaves; `covariance` (f, f + s) is that of the frontal variables with all.
     """
 
     first: list[int]
@@ -46,7 +44,13 @@ class _Clique:
 
 
 class Marginals:
-    """Covariances of the variables of a graph at its optimum. `EstimationError` where factors leave one open."""
+    """Marginal covariances of the variables of a graph at its optimum.
+
+    Raises
+    ------
+    EstimationError
+        The factors leave a variable undetermined.
+    """
 
     def __init__(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         linear = factors.linearize(values)
@@ -64,21 +68,21 @@ class Marginals:
         self._spread()
 
     def covariance(self, key: int) -> Array:
-        """Covariance of one variable: of a pose (6, 6), rotation first, body frame."""
+        """Return the covariance of one variable: of a pose (6, 6), rotation first, body frame."""
         return self.joint([key])
 
     def covariances(self) -> dict[int, Array]:
-        """The covariances of all variables, by key."""
+        """Return the covariances of all variables, by key."""
         return {key: self.joint([key]) for key in self._place}
 
     def joint(self, keys: Sequence[int]) -> Array:
-        """Joint covariance of different variables, in the order given: (6 n, 6 n) of n poses."""
+        """Return the joint covariance of different variables, in the order given: (6 n, 6 n) of n poses."""
         at = [self._place[int(key)] for key in keys]
         known = self._known(at)
         return self._swept(at) if known is None else known
 
     def _grown(self, rows: dict[int, list[tuple[list[int], Array]]]) -> "list[_Clique]":
-        """The clique of each variable."""
+        """Return the clique of each variable."""
         count = len(self._sizes)
         later: list[set[int]] = [set() for _ in range(count)]
         for n in range(count):
@@ -107,11 +111,11 @@ class Marginals:
         return [cliques[n] for n in range(count)]
 
     def _span(self, clique: _Clique, variables: Sequence[int]) -> Index:
-        """The columns of variables, one after the other."""
+        """Return the columns of variables, one after the other."""
         return np.concatenate([clique.begin[n] + np.arange(self._sizes[n]) for n in variables])
 
     def _each(self) -> Iterator[_Clique]:
-        """Each clique, before its parent."""
+        """Iterate over the cliques, each before its parent."""
         return (clique for n, clique in enumerate(self._cliques) if clique.first[-1] == n)
 
     def _eliminate(self, rows: dict[int, list[tuple[list[int], Array]]]) -> None:
@@ -127,13 +131,13 @@ class Marginals:
                 top += len(A)
             R = np.triu(lapack.dgeqrf(stacked, overwrite_a=1)[0])[: clique.width]
             sizes = np.abs(np.diagonal(R)[:own])
-            if len(R) < own or sizes.min(initial=np.inf) <= NOTHING * sizes.max(initial=0.0):
-                raise EstimationError("the graph leaves a variable open: nothing measures it, nothing is said of it")
+            if len(R) < own or sizes.min(initial=np.inf) <= SINGULAR_TOLERANCE * sizes.max(initial=0.0):
+                raise EstimationError("a variable of the graph is undetermined: it has neither measurement nor prior")
             clique.R, clique.T, left[id(clique)] = R[:own, :own], R[:own, own:], R[own:, own:]
 
     def _spread(self) -> None:
-        """The covariances, from the roots down."""
-        # with each clique what the one above it is with itself, as long as it is wanted
+        """Compute the covariances, from the roots down."""
+        # each clique with the covariance of its parent, kept until it is used
         ready: list[tuple[_Clique, Array]] = [(one, np.empty((0, 0))) for one in self._each() if one.parent is None]
         while ready:
             clique, above = ready.pop()
@@ -150,7 +154,7 @@ class Marginals:
                 ready += [(child, whole) for child in clique.children]
 
     def _known(self, at: Sequence[int]) -> Array | None:
-        """The joint covariance of variables of which any two share a clique; None where two do not."""
+        """Return the joint covariance of variables of which any two share a clique; None where two do not."""
         sizes = [self._sizes[n] for n in at]
         begins = np.concatenate([[0], np.cumsum(sizes)])
         out = np.empty((begins[-1], begins[-1]))
@@ -169,7 +173,7 @@ class Marginals:
         return out
 
     def _swept(self, at: Sequence[int]) -> Array:
-        """The joint covariance of any variables: E^T R^-1 R^-T E, along their ways to the root."""
+        """Return the joint covariance of any variables: E^T R^-1 R^-T E, along their paths to the root."""
         wide = sum(self._sizes[n] for n in at)
         path: dict[int, _Clique] = {}
         right: dict[int, Array] = {}

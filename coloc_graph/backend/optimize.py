@@ -1,4 +1,4 @@
-"""A graph's optimum: where the search starts, and, of a joint estimate, the mounts before all else."""
+"""Optimum of a graph: initial values, and, of a joint estimate, the mounts first."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,22 +18,21 @@ from coloc_graph.backend.solver import optimise
 
 Array = NDArray[np.float64]
 
-#: In larger graphs, measurements whose residual noise exceeds more often than `LOOKED_INTO` agree as well as that says.
-ALL_TESTED = 500
-LOOKED_INTO = 1e-3
-#: Of a run of so many stances the mounts are found in the first part of this many.
-LONG_RUN = 30
-PART = 3
-#: Rounds of finding the mounts and taking spans apart there; mounts 3 degrees off take two.
-MOST_ANCHORINGS = 4
-#: From so many robots on each clique of the graph holds a hundred variables.
-MANY_ROBOTS = 20
+ALL_TESTED = 500  # links up to which each is tested with its marginal covariance
+LOOKED_INTO = 1e-3  # p-value of a residual alone below which a link of a larger graph is tested as well
+LONG_RUN_STANCES = 30  # stances from which the mounts are estimated first, by a part of the run
+LONG_RUN_PARTS = 3  # number of such parts; the first is used
+MAX_ANCHORINGS = 4  # rounds of linearising spans at the estimated mounts; mounts 3 degrees off take two
+MANY_ROBOTS = 20  # robots from which a clique holds a hundred variables, and Cholesky goes first
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A graph at its optimum; `links` are the last of its `factors`, in that order, and `at_once` evaluates together
-    those that are in Python."""
+    """A graph at its optimum.
+
+    `links` are the last of its `factors`, in that order; in the context `batched` those in Python are evaluated in
+    batches.
+    """
 
     graph: PoseGraph
     factors_of: Factors
@@ -41,37 +40,37 @@ class Fit:
     links: tuple[Link, ...]
     values: gtsam.Values
     iterations: int
-    at_once: BatchedFactors
+    batched: BatchedFactors
 
     @cached_property
     def chi2(self) -> float:
-        """Of all rows that weigh."""
-        with self.at_once:
+        """Chi-squared of all factors."""
+        with self.batched:
             return float(2 * self.factors.error(self.values))
 
     @cached_property
     def marginals(self) -> Marginals:
-        """Its covariances."""
-        with self.at_once:
+        """Marginal covariances."""
+        with self.batched:
             return Marginals(self.factors, self.values)
 
     @cached_property
     def dof(self) -> int:
-        """Rows that weigh, less unknowns."""
+        """Degrees of freedom: rows of weight less unknowns."""
         return self.factors_of.dof(self.values, [(link, self.factor(n)) for n, link in enumerate(self.links)])
 
     @property
-    def chance(self) -> float:
-        """How often noise alone makes it this bad."""
+    def p_value(self) -> float:
+        """Probability of a larger chi2 by noise alone."""
         return float(chdtrc(self.dof, self.chi2)) if self.dof > 0 else 1.0
 
     def factor(self, index: int) -> gtsam.NonlinearFactor:
-        """The factor of a link, by its index."""
+        """Return the factor of a link, by its index."""
         return self.factors.at(self.factors.size() - len(self.links) + index)
 
     def agreements(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
-        """How the links of some kinds agree with all others, by index; see `ALL_TESTED`."""
-        with self.at_once:
+        """Test the links of some kinds against all others; by index, see `ALL_TESTED`."""
+        with self.batched:
             return self._agreements(kinds)
 
     def _agreements(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
@@ -82,7 +81,7 @@ class Fit:
             factor = self.factor(index)
             if len(self.links) > ALL_TESTED:
                 alone = Agreement(2 * factor.error(self.values), self.factors_of.rows(link, factor))
-                if alone.chance() > LOOKED_INTO:
+                if alone.p_value() > LOOKED_INTO:
                     found[index] = alone
                     continue
             found[index] = agreement([factor], self.values, self.marginals.joint(list(factor.keys())))
@@ -90,10 +89,10 @@ class Fit:
 
 
 def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = None) -> Fit:
-    """A graph's optimum, from `start`, or else from the composition along the surest way.
+    """Optimise a graph from `start`, or from the composition along the spanning tree.
 
-    What a start does not hold is composed, and what nothing ties to the reference is left out. Raises `EstimationError`
-    where measurements tie nothing to it, or the optimiser's answer does not pass its check.
+    Variables that `start` lacks are composed; disconnected ones are left out. Raises `EstimationError` where
+    measurements tie nothing to the reference, or the optimiser did not converge.
     """
     if method == "joint" and start is None:
         start = _mounts_first(graph)
@@ -104,7 +103,7 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
         return mounts.get(key, factors_of.nominal(key))
 
     def expected(link: Link) -> gtsam.Pose3:
-        i, j = map(graph.places.key, link.ends)
+        i, j = map(graph.pose_keys.key, link.ends)
         return factors_of.expected(link, i, j, errors) if mounts else pose_of(link)
 
     known = {} if start is None else {key: start.atPose3(key) for key in poses_in(start)}
@@ -112,29 +111,29 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
     for key, pose in compose(graph, spanning_tree(graph, graph.links), factors_of.start, expected, known).items():
         values.insert(key, pose)
     iterations = 0
-    for left in reversed(range(MOST_ANCHORINGS)):
-        factors, links, at_once = factors_of.of_graph(graph, poses_in(values))
+    for left in reversed(range(MAX_ANCHORINGS)):
+        factors, links, batched = factors_of.of_graph(graph, poses_in(values))
         for key in map(int, factors.keyVector()):
             if not values.exists(key):
                 values.insert(key, errors(key))
-        with at_once:
+        with batched:
             values, used = optimise(factors, values, roughly_first=len(graph.robots) >= MANY_ROBOTS)
         iterations += used
-        # spans were taken apart for mounts as stated: once more where they turned out to be elsewhere
+        # spans are linearised at the mounts known before: once more where the estimate is elsewhere
         if not left or factors_of.is_anchored(values):
             break
         factors_of = factors_for(method, graph, values)
-    return Fit(graph, factors_of, factors, links, values, iterations, at_once)
+    return Fit(graph, factors_of, factors, links, values, iterations, batched)
 
 
 def _mounts_first(graph: PoseGraph) -> gtsam.Values | None:
-    """The mounts as a part of a long run has them, to compose all of it by; None where it is short.
+    """Estimate the mounts by a part of a long run, to compose all of it by them; None for a short run.
 
-    With mounts a degree off each step is composed half a degree wrong, a hundred of them are a circle the wrong way
-    round, and no search in the poses of a whole run unbends that.
+    With mounts a degree off each step is composed half a degree wrong, and a hundred steps are too bent for the search
+    to converge.
     """
-    part = graph.up_to(len(graph.stances) // PART)
-    if len(graph.stances) < LONG_RUN or not spanning_tree(part, part.links):
+    part = graph.up_to(len(graph.stances) // LONG_RUN_PARTS)
+    if len(graph.stances) < LONG_RUN_STANCES or not spanning_tree(part, part.links):
         return None
     known = gtsam.Values()
     for key, errors in calibrations_in(fit_graph("joint", part).values).items():

@@ -1,4 +1,4 @@
-"""A whole graph, fed to an estimator stance by stance as it would have come in."""
+"""Replay of a whole graph through an incremental estimator, stance by stance."""
 
 import time
 from collections import defaultdict
@@ -12,31 +12,50 @@ from coloc_graph.backend.graph import PoseGraph
 from coloc_graph.measurements import Measurement
 from coloc_graph.run import Stance
 
-#: Called after each stance with it, where its robots stand, and what was measured in it and on the way to it.
-Entered = Callable[[Stance, StanceEstimate, Sequence[Measurement]], None]
+#: Called after each stance with it, the poses of its robots, and its measurements with the odometry into it.
+OnStance = Callable[[Stance, StanceEstimate, Sequence[Measurement]], None]
 
 
 def replay(
-    graph: PoseGraph, method: Method = "smooth", entered: Entered | None = None
+    graph: PoseGraph, method: Method = "smooth", on_stance: OnStance | None = None
 ) -> tuple[Estimate, tuple[float, ...]]:
-    """The estimate at the end by `smooth` or `joint`, and how long each stance took to enter [s].
+    """Feed a graph to an incremental estimator.
 
-    A stance without an anchor, which an estimator refuses, raises `MeasurementError`.
+    Parameters
+    ----------
+    graph : PoseGraph
+        All stances and measurements.
+    method : {"smooth", "joint"}
+        Estimate poses alone, or mounts with them.
+    on_stance : callable or None
+        Called after each stance.
+
+    Returns
+    -------
+    estimate : Estimate
+        The estimate at the end.
+    seconds : tuple of float
+        Time of insertion of each stance [s].
+
+    Raises
+    ------
+    MeasurementError
+        A stance after the first has no anchor and no odometry into it.
     """
     by_stance: dict[int, list[Measurement]] = defaultdict(list)
     for measured in graph.measurements:
         by_stance[max(stance for _, stance in measured.ends)].append(measured)
-    rigs = graph.rigs if method == "joint" else None
-    estimator = Estimator(graph.reference, graph.robots, graph.floor, graph.slips, rigs, graph.landmarks)
+    robot_models = graph.robot_models if method == "joint" else None
+    estimator = Estimator(graph.reference, graph.robots, graph.floor, graph.slips, robot_models, graph.landmarks)
     seconds = []
     before = None
     for stance in graph.stances:
         started = time.perf_counter()
-        # before the first nobody can have stayed, whatever it says
+        # the first stance has no anchors, whatever it names
         here = replace(stance, anchors=()) if before is None else stance
         said = estimator.add(here, by_stance[stance.index], after=before)
         seconds.append(time.perf_counter() - started)
-        if entered is not None:
-            entered(here, said, by_stance[stance.index])
+        if on_stance is not None:
+            on_stance(here, said, by_stance[stance.index])
         before = stance.index
     return estimator.estimate(), tuple(seconds)

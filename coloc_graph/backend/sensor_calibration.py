@@ -1,4 +1,4 @@
-"""Wheels and range sensors as they were stated and as an estimate found them."""
+"""Wheels and range sensors as stated and as estimated."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class SensorErrors:
-    """What is off of a robot's wheels and range sensor, each with its covariance; None where stated as exact.
+    """Estimated errors of a robot's wheels and range sensor, each with its covariance; None where stated as exact.
 
     Parameters
     ----------
@@ -39,9 +39,9 @@ class CalibratedSensors:
     robot : Robot
         The robot as stated.
     errors : SensorErrors
-        What is off of it.
+        Its estimated errors.
     noise : sequence of float
-        What the stated standard deviations of ranges and of bearings were multiplied with.
+        Factors on the stated standard deviations of ranges and of bearings.
     """
 
     robot: Robot
@@ -50,7 +50,7 @@ class CalibratedSensors:
 
     @property
     def wheels(self) -> Wheels | None:
-        """The wheels with their estimated errors and the tolerances that are left; None where nothing was estimated."""
+        """The calibrated wheels with the remaining tolerances; None where nothing was estimated."""
         w, found = self.robot.wheels, self.errors.wheels
         if w is None or found is None:
             return None
@@ -67,7 +67,7 @@ class CalibratedSensors:
 
     @property
     def ranging(self) -> Ranging | None:
-        """The range sensor with its estimated errors and tolerances; None where nothing was estimated."""
+        """The calibrated range sensor with the remaining tolerances; None where nothing was estimated."""
         r, found = self.robot.ranging, self.errors.ranging
         if r is None or found is None:
             return None

@@ -64,8 +64,10 @@ def with_stack(poses: int, work: Callable[[], T]) -> T:
 
 
 def lm_parameters(poses: int) -> gtsam.LevenbergMarquardtParams:
-    """Parameters of Levenberg-Marquardt: QR, since Cholesky throws on healthy chains; converged to rounding, or to far
-    below noise above `LARGE_GRAPH_POSES`."""
+    """Return the parameters of Levenberg-Marquardt: QR, since Cholesky throws on healthy chains.
+
+    Converges to rounding, or, above `LARGE_GRAPH_POSES`, to far below noise.
+    """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
     parameters.setRelativeErrorTol(1e-10)
@@ -77,7 +79,7 @@ def lm_parameters(poses: int) -> gtsam.LevenbergMarquardtParams:
 
 
 def isam_parameters(*, calibrates: bool = False) -> gtsam.ISAM2Params:
-    """Parameters of ISAM2: QR for the same reason; thresholds of relinearisation by the kind of key (x is a pose)."""
+    """Return the parameters of ISAM2: QR, and thresholds of relinearisation by the kind of key (x is a pose)."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     parameters.relinearizeSkip = 1
@@ -94,20 +96,23 @@ def isam_parameters(*, calibrates: bool = False) -> gtsam.ISAM2Params:
 def optimise(
     factors: gtsam.NonlinearFactorGraph, initial: gtsam.Values, *, roughly_first: bool = False
 ) -> tuple[gtsam.Values, int]:
-    """Levenberg-Marquardt with QR; values and iterations, or `EstimationError`.
+    """Optimise by Levenberg-Marquardt with QR; return values and iterations.
 
-    `roughly_first` goes most of the way with Cholesky, which takes a thirtieth of the time where cliques are large, and
-    may get stuck: QR goes on from there.
+    `roughly_first` begins with Cholesky, which takes a thirtieth of the time where cliques are large, and may get
+    stuck; QR continues from there.
 
-    GTSAM's optimiser returns the initial values without a word when it fails, so the answer is checked: the
-    errors are finite, the error did not rise, and it iterated wherever there was something to gain.
+    Raises
+    ------
+    EstimationError
+        The optimiser failed. GTSAM's returns the initial values silently then, so the result is checked: the error is
+        finite, did not rise, and fell wherever a step lowers it.
     """
     optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, lm_parameters(initial.size()))
     before = optimiser.error()
     if before < COST_TOLERANCE:
-        return initial, 0  # nothing contradicts anything; LM would only try out its dampings
+        return initial, 0  # nothing to optimise; LM would only try out its dampings
     if not np.isfinite(before):
-        raise EstimationError("the graph's error is not finite where the search starts: a measurement holds no number")
+        raise EstimationError("the graph's error is not finite at the initial values: a measurement is not finite")
     if roughly_first:
         parameters = lm_parameters(initial.size())
         parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
@@ -127,12 +132,12 @@ def optimise(
         and before > 1e-6
         and factors.error(_one_step(factors, initial)) < before * (1 - 1e-6)
     ):
-        raise EstimationError(f"the optimiser gave up where the search starts (error {before:.6g})")
+        raise EstimationError(f"the optimiser gave up at the initial values (error {before:.6g})")
     return values, int(optimiser.iterations())
 
 
 def _one_step(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
-    """One Gauss-Newton step with QR: it leads down from everywhere but the optimum."""
+    """Take one Gauss-Newton step with QR."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     isam = gtsam.ISAM2(parameters)
@@ -141,6 +146,6 @@ def _one_step(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsa
 
 
 def joint_covariance(isam: gtsam.ISAM2, keys: Sequence[int]) -> Array:
-    """Joint covariance of different variables, in the order given; (6 n, 6 n) for n poses."""
+    """Return the joint covariance of different variables, in the order given; (6 n, 6 n) for n poses."""
     joint = isam.jointMarginalCovariance(list(keys))
     return np.block([[joint.at(a, b) for b in keys] for a in keys])

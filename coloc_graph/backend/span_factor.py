@@ -1,7 +1,7 @@
-"""Known spans of markers on a plane: a measurement of the plane's tilts and distance, and where its scale comes from.
+"""Known spans of markers on a plane as a measurement of its tilts and distance: the source of the scale.
 
-Of n instants three sums count, those that tell most about two tilts and the distance; which these are is decided at a
-plane that is nearly right, and then stays, so that the residual is a function of the plane alone.
+The residual is three weighted sums over n instants, those most informative of the two tilts and the distance. Their
+weights are fixed at a plane that is nearly right, so that the residual is a function of the plane alone.
 """
 
 import math
@@ -16,21 +16,32 @@ from coloc_graph.measurements import MarkerSpan
 
 Array = NDArray[np.float64]
 
-#: Rays that meet the plane at less than this sine, or than so many sigmas of its normal, say nothing of it.
-GRAZING = 0.02
-SIGMAS = 3.0
-#: A normal that is known to this much tells noise in a length from its own error [rad].
-KNOWN = 5e-3
-#: So many instants at least make a span.
-FEWEST = 4
+MIN_SINE = 0.02  # sine of the angle between a ray and the plane below which the ray is not used
+CLEARANCE_SIGMAS = 3.0  # the same in standard deviations of the plane's normal
+KNOWN_NORMAL = 5e-3  # rad: sigma of the normal below which the noise of a length is told from the normal's error
+MIN_INSTANTS = 4  # instants of a span
 
 
 def spans_on_plane(x_i: Array, n: Array) -> tuple[Array, Array, Array, Array]:
-    """Distances (..., k) [m] on planes n . X = 1 (n = N / d, (..., 3) [1/m]) of pairs of rays (x, y, 1), `x_i`
-    (..., k, 2, 2).
+    """Return distances on planes between the ends of pairs of rays.
 
-    With their derivatives by n (..., k, 3), the rays' ends X (..., k, 2, 3), and unit vectors (..., k, 3) from first to
-    second. Rays that do not meet the plane are taken to meet it far away.
+    Parameters
+    ----------
+    x_i : (..., k, 2, 2) float
+        Pairs of rays (x, y, 1).
+    n : (..., 3) float
+        Planes n . X = 1, n = N / d [1/m].
+
+    Returns
+    -------
+    lengths : (..., k) float
+        Distances [m]; rays that do not meet the plane are taken to meet it far away.
+    by_n : (..., k, 3) float
+        Their derivatives by n.
+    X : (..., k, 2, 3) float
+        Ends of the rays [m].
+    u : (..., k, 3) float
+        Unit vectors from the first to the second.
     """
     n = n[..., None, None, :]
     nearest = 1e-3 * np.sqrt((n * n).sum(-1))
@@ -47,15 +58,17 @@ def spans_on_plane(x_i: Array, n: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _by_rays(X: Array, u: Array, n: Array) -> Array:
-    """How the distances change with x_i, (k, 2, 2)."""
+    """Derivatives (k, 2, 2) of the distances by x_i."""
     along = X @ u[:, :, None]
     by_x = X[..., 2:] * (u[:, None, :2] - along * n[:2])
     return np.asarray(by_x * np.array([-1.0, 1.0])[:, None])
 
 
 def _lengthening(X: Array, u: Array, n: Array, covariance: Array) -> Array:
-    """What noise adds to the distances (k,), since across their line it makes each longer: (tr S - u^T S u) / 2 length,
-    with S the covariance of the line from one marker to the other."""
+    """Bias (k,) [m] of the distances by noise across their line: (tr S - u^T S u) / 2 length.
+
+    S is the covariance of the line from one marker to the other.
+    """
     J = X[..., 2, None, None] * (np.eye(3)[:, :2] - X[..., None] * n[:2])
     S = (J @ covariance @ J.mT).sum(axis=1)
     arm = np.sqrt(((X[:, 1] - X[:, 0]) ** 2).sum(-1))
@@ -64,10 +77,10 @@ def _lengthening(X: Array, u: Array, n: Array, covariance: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SpanModel:
-    """The spans of one mover as a residual (3,) of covariance 1: a function of the plane, the span and the homography.
+    """Residual (3,) of covariance 1 of the spans of one mover: a function of the plane, the span and the homography.
 
     `weights` (3, k) @ (lengths - `noise` - span) + `by_h` (3, 8) @ h, at the k instants whose rays are clear of the
-    horizon. `noise` (k,) is what noise adds to each length, `length` [m] the span as stated.
+    horizon. `noise` (k,) is the bias of each length by noise, `length` [m] the span as stated.
     """
 
     mover: str
@@ -81,19 +94,21 @@ class SpanModel:
     def near(
         cls, spans: Sequence[MarkerSpan], n: Array, normal_sigma: float, lengths: Sequence[float]
     ) -> tuple["SpanModel", ...]:
-        """Those of spans of these `lengths` [m] about the plane n . X = 1 in camera i, whose normal is known to so much
-        [rad], as far as they say anything of it."""
+        """Return the models of spans of `lengths` [m] near the plane n . X = 1 in camera i.
+
+        `normal_sigma` [rad] is that of the plane's normal. Spans with too few usable instants are left out.
+        """
         N = n / np.linalg.norm(n)
         some, clear = [], []
         for span, length in zip(spans, lengths, strict=True):
             sine = (span.x_i @ N[:2] + N[2]) / np.sqrt(1 + (span.x_i**2).sum(-1))
-            which = (sine > max(GRAZING, SIGMAS * normal_sigma)).all(axis=1)
-            if which.sum() >= FEWEST:
+            which = (sine > max(MIN_SINE, CLEARANCE_SIGMAS * normal_sigma)).all(axis=1)
+            if which.sum() >= MIN_INSTANTS:
                 some.append((span, length))
                 clear.append(which)
         if not some:
             return ()
-        # the instants of all of them, one after the other, and each one's by itself, filled up with nothing
+        # the instants of all spans, one after the other; `apart` gives them by span, padded with zeros
         x_i, covariance, by_h, shared = (
             np.concatenate([getattr(span, name)[which] for (span, _), which in zip(some, clear, strict=True)])
             for name in ("x_i", "covariance", "by_h", "shared")
@@ -109,7 +124,7 @@ class SpanModel:
 
         found, by_n, X, u = spans_on_plane(x_i, n)
         by_x = _by_rays(X, u, n)
-        if normal_sigma < KNOWN:
+        if normal_sigma < KNOWN_NORMAL:
             # weigh each length at the nearest rays that have it right: noise that makes a length longer would make
             # its weight smaller, which over hundreds of instants is a bias of a tenth of a sigma
             off = found - np.repeat([length for _, length in some], count)
@@ -120,7 +135,7 @@ class SpanModel:
         sigma = np.sqrt((by_x * (covariance @ by_x[..., None])[..., 0]).sum(axis=(1, 2)))
         J = (by_n @ np.stack([*across(N), N], axis=1)) / sigma[:, None]
         weights = np.linalg.qr(apart(J))[0].mT / np.where(own, apart(sigma), 1.0)[:, None]
-        # what all rays to one marker share, and is no noise that averages out
+        # errors that all rays to one marker share do not average out
         each = apart((by_x[:, :, None] @ shared)[:, :, 0].reshape(len(x_i), -1))
         root = weights @ each
         weights = np.linalg.solve(np.linalg.cholesky(np.eye(3) + root @ root.mT), weights)
@@ -133,13 +148,13 @@ class SpanModel:
         )
 
     def weighing(self, share: float) -> "SpanModel":
-        """The same with a part of the information, where other pairs have the rest of it."""
+        """Return the model with a share of the information, where other pairs have the rest of it."""
         root = math.sqrt(share)
         return self if share == 1 else replace(self, weights=root * self.weights, by_h=root * self.by_h)
 
 
 class Spans:
-    """As many spans of three rows each, evaluated at once; instants that some have fewer of weigh nothing."""
+    """Batch of spans of three rows each, evaluated at once; padded instants have no weight."""
 
     rows = 3
 
@@ -155,8 +170,11 @@ class Spans:
         self._by_longer = -self._length[:, None] * self._weights.sum(axis=2)
 
     def at(self, n: Array, longer: Array) -> tuple[Array, Array, Array]:
-        """The residuals (s, 3) but for h, and their derivatives by the planes n (s, 3, 3) and by how much `longer` (s,)
-        the spans are than stated, relative (s, 3)."""
+        """Return the residuals (s, 3) without the part of h.
+
+        With their derivatives by the planes n, (s, 3, 3), and by `longer` (s,), the relative errors of the spans,
+        (s, 3).
+        """
         lengths, by_n, _, _ = spans_on_plane(self._x_i, n)
         off = lengths - self._noise - (self._length * (1 + longer))[:, None]
         return (self._weights @ off[..., None])[..., 0], self._weights @ by_n, self._by_longer

@@ -1,4 +1,4 @@
-"""What cannot be a measurement is refused before it comes near a solver: GTSAM believes anything.
+"""Validation of measurements before they reach a solver, which GTSAM does not do.
 
 A NaN spoils an ISAM2 for good, and 1e150 comes back as NaN poses with finite covariances.
 """
@@ -15,26 +15,21 @@ from coloc_graph.team import Floor
 
 Array = NDArray[np.float64]
 
-#: No robot is further from another than this [m], no deviation is larger [m, rad].
-FARTHEST = 1e6
-#: No deviation is smaller than this [m, rad]: a covariance of zero is a claim that nothing supports.
-LEAST_SIGMA = 1e-9
-#: How far a rotation may be from one, and a covariance from symmetric (of its largest entry).
-ROUNDING = 1e-6
+MAX_DISTANCE = 1e6  # m: distance of two robots; m, rad: standard deviation
+MIN_SIGMA = 1e-9  # m, rad: standard deviation; a covariance of zero is not a measurement's
+ROUNDING = 1e-6  # error of a rotation, and of a covariance's symmetry relative to its largest entry
 _IDENTITY = np.eye(3)
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def require_valid(measurements: Sequence[Measurement], floor: Floor | None) -> None:
-    """Raise `MeasurementError`, naming the first measurement that is none and why; all are checked at once."""
+    """Raise `MeasurementError` for the first invalid measurement, with the reason."""
     if measurements and _all_well(measurements, floor):
         return
     for size, group in groupby(sorted(measurements, key=_size), key=_size):
         alike = list(group)
         if size == 3 and floor is None:
-            raise MeasurementError(
-                f"the {alike[0]} holds on a floor only, and the team has none: give the team a [floor]"
-            )
+            raise MeasurementError(f"the {alike[0]} needs a floor, and the team has none: add a [floor] to the team")
         for check in (_why_not_poses, _why_not_covariances):
             found = check(alike)
             if found is not None:
@@ -43,7 +38,7 @@ def require_valid(measurements: Sequence[Measurement], floor: Floor | None) -> N
 
 
 def _all_well(measurements: Sequence[Measurement], floor: Floor | None) -> bool:
-    """The same checks in one pass over all that is as it should be; what it doubts is looked into by name."""
+    """Return whether all measurements pass the checks, in one vectorised pass."""
     C = np.empty((len(measurements), 6, 6))
     C[:] = np.eye(6)
     for index, measured in enumerate(measurements):
@@ -56,18 +51,18 @@ def _all_well(measurements: Sequence[Measurement], floor: Floor | None) -> bool:
     T = np.array([m.T_i_j for m in measurements])
     R = T[:, :3, :3]
     # NaN compares as False
-    if not (np.abs(T).max() <= FARTHEST and np.abs(R.mT @ R - _IDENTITY).max() <= ROUNDING):
+    if not (np.abs(T).max() <= MAX_DISTANCE and np.abs(R.mT @ R - _IDENTITY).max() <= ROUNDING):
         return False
     if not (np.linalg.det(R).min() > 0 and np.abs(T[:, 3] - _LAST_ROW).max() <= ROUNDING):
         return False
-    if not np.abs(C).max() <= FARTHEST**2:
+    if not np.abs(C).max() <= MAX_DISTANCE**2:
         return False
     if (
         np.abs(C - C.mT).max(axis=(1, 2)) > ROUNDING * np.array([np.abs(m.covariance).max() for m in measurements])
     ).any():
         return False
     try:
-        return bool(np.linalg.cholesky(C).diagonal(axis1=1, axis2=2).min() >= LEAST_SIGMA)
+        return bool(np.linalg.cholesky(C).diagonal(axis1=1, axis2=2).min() >= MIN_SIGMA)
     except np.linalg.LinAlgError:
         return False
 
@@ -79,18 +74,18 @@ def _size(measured: Measurement) -> int:
 def _why_not_poses(measurements: Sequence[Measurement]) -> tuple[int, str] | None:
     for index, measured in enumerate(measurements):
         if measured.T_i_j.shape != (4, 4):
-            return index, f"has a pose of shape {measured.T_i_j.shape}; give (4, 4)"
+            return index, f"has a pose of shape {measured.T_i_j.shape}: give (4, 4)"
     T = np.array([m.T_i_j for m in measurements])
     finite = np.isfinite(T).all(axis=(1, 2))
     if not finite.all():
-        return int(np.argmin(finite)), "is not finite: a pose holds no number"
+        return int(np.argmin(finite)), "has a pose that is not finite"
     far = np.abs(T[:, :3, 3]).max(axis=1)
-    if far.max() > FARTHEST:
-        return int(np.argmax(far)), f"is {far.max():.3g} m away, which no robot is"
+    if far.max() > MAX_DISTANCE:
+        return int(np.argmax(far)), f"is {far.max():.3g} m away: at most {MAX_DISTANCE:.0e} m is possible"
     R = T[:, :3, :3]
     off = np.abs(R.mT @ R - np.eye(3)).max(axis=(1, 2))
     if off.max() > ROUNDING:
-        return int(np.argmax(off)), f"is no rigid motion: R^T R is off the identity by {off.max():.2g}"
+        return int(np.argmax(off)), f"is no rigid motion: R^T R differs from the identity by {off.max():.2g}"
     flipped = np.linalg.det(R) < 0
     if (np.abs(T[:, 3] - _LAST_ROW) > ROUNDING).any():
         index = int(np.argmax(np.abs(T[:, 3] - _LAST_ROW).max(axis=1)))
@@ -104,14 +99,16 @@ def _why_not_covariances(measurements: Sequence[Measurement]) -> tuple[int, str]
     size = _size(measurements[0])
     for index, measured in enumerate(measurements):
         if np.shape(measured.covariance) != (size, size):
-            return index, f"has a covariance of shape {np.shape(measured.covariance)}; give ({size}, {size})"
+            return index, f"has a covariance of shape {np.shape(measured.covariance)}: give ({size}, {size})"
     C = np.array([m.covariance for m in measurements], float)
     finite = np.isfinite(C).all(axis=(1, 2))
     if not finite.all():
         return int(np.argmin(finite)), "has a covariance that is not finite"
     largest = np.abs(C).max(axis=(1, 2))
-    if largest.max() > FARTHEST**2:
-        return int(np.argmax(largest)), f"has a covariance of {largest.max():.3g}, which says nothing"
+    if largest.max() > MAX_DISTANCE**2:
+        return int(
+            np.argmax(largest)
+        ), f"has a covariance of {largest.max():.3g}: at most {MAX_DISTANCE**2:.0e} is possible"
     uneven = np.abs(C - C.mT).max(axis=(1, 2)) > ROUNDING * largest
     if uneven.any():
         return int(np.argmax(uneven)), "has a covariance that is not symmetric"
@@ -119,6 +116,8 @@ def _why_not_covariances(measurements: Sequence[Measurement]) -> tuple[int, str]
         pivots = np.linalg.cholesky(C).diagonal(axis1=1, axis2=2).min(axis=1)
     except np.linalg.LinAlgError:
         pivots = np.sqrt(np.linalg.eigvalsh(C)[:, 0].clip(min=0))
-    if pivots.min() < LEAST_SIGMA:
-        return int(np.argmin(pivots)), "has a covariance that is not positive definite: it knows something exactly"
+    if pivots.min() < MIN_SIGMA:
+        return int(
+            np.argmin(pivots)
+        ), "has a covariance that is not positive definite: every direction needs an uncertainty"
     return None

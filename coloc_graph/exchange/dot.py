@@ -19,10 +19,10 @@ def to_dot(graph: PoseGraph) -> str:
     """
     places: dict[int, list[Node]] = defaultdict(list)
     for node in graph.nodes:
-        places[graph.places.key(node)].append(node)
-    linked = [[graph.places.key(node) for node in link.ends] for link in graph.links]
+        places[graph.pose_keys.key(node)].append(node)
+    linked = [[graph.pose_keys.key(node) for node in link.ends] for link in graph.links]
     ends = {key for keys in linked for key in keys}
-    still = {key: name for name, key in graph.places.still().items() if key in ends}
+    still = {key: name for name, key in graph.pose_keys.static().items() if key in ends}
     ids = {key: f"n{number}" for number, key in enumerate([*places, *still])}
     lines = ["graph poses {", "  node [shape=box, style=rounded, fontname=Helvetica];", "  edge [fontname=Helvetica];"]
     for key, nodes in places.items():

@@ -39,7 +39,7 @@ def write_g2o(estimate: Estimate, path: Path) -> None:
             names.setdefault(key, []).append(f"{robot}@{stance}")
     still = estimate.landmarks if estimate.map is None else {**estimate.landmarks, MAP: estimate.map}
     for name, placed in still.items():
-        key = graph.places.still()[name]
+        key = graph.pose_keys.static()[name]
         poses[key], names[key] = placed.T_world_body.matrix(), ["the map" if name == MAP else f"landmark {name}"]
     ids = {key: number for number, key in enumerate(poses)}
 
@@ -54,7 +54,7 @@ def write_g2o(estimate: Estimate, path: Path) -> None:
         if graph.key(stay.robot, stay.after) in ids
     ]
     for link in graph.without(one.measurement for one in estimate.rejected).links:
-        i, j = map(graph.places.key, link.ends)
+        i, j = map(graph.pose_keys.key, link.ends)
         if i in ids and j in ids:
             upper = " ".join(repr(float(x)) for x in _information(link_covariance(link))[np.triu_indices(6)])
             lines.append(f"EDGE_SE3:QUAT {ids[i]} {ids[j]} {_pose(link.T_i_j)} {upper}")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from coloc_graph.backend import Estimate
-from coloc_graph.backend.landmarks import Placed
+from coloc_graph.backend.landmarks import StaticPose
 from coloc_graph.errors import InputError
 from coloc_graph.input_file import read_text
 
@@ -63,7 +63,7 @@ def _on_map(estimate: Estimate) -> set[str]:
     return {one.landmark for one in estimate.graph.on_map}
 
 
-def row_of(name: str, placed: Placed, stated: bool, measurements: int) -> LandmarkRow:
+def row_of(name: str, placed: StaticPose, stated: bool, measurements: int) -> LandmarkRow:
     """A row of the file."""
     x, y, yaw = placed.planar
     C = placed.covariance_xy_yaw

@@ -15,7 +15,7 @@ def pushed(registry: RobotRegistry, bumps: Iterable[Bump]) -> Iterator[tuple[str
         T, robot = bump.T_before_after, bump.stay_put.robot
         by = T.x(), T.y(), T.rotation().yaw()
         registry.displace(robot, compose(registry[robot].tracker.pose(), by))
-        yield robot, bump.what
+        yield robot, bump.description
 
 
 def displaced(registry: RobotRegistry, view: InView, mover: Planar) -> Iterator[tuple[str, str]]:

@@ -90,7 +90,7 @@ class EstimationWorker:
         except ColocError as error:
             raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
         gc.freeze()  # the record and the estimate stay: looking through them for garbage would hold up later stances
-        if not one.estimate.rejected and one.estimate.agreement.chance() > CONTRADICTED:
+        if not one.estimate.rejected and one.estimate.agreement.p_value() > CONTRADICTED:
             return one
         # contradicted: was an anchor pushed since the stance before?
         bumped = [bump for bump in self._solver.estimator.bumps() if bump.stay_put.after == stance.index]

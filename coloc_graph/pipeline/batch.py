@@ -129,7 +129,7 @@ def _at_once(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
             pairs = [m for m in measured if m.homography.stance == stance.index]
             motions += sources.of_stance(run, stance, pairs)
     graph = PoseGraph.of(run.team, run.stances, [*poses, *motions])
-    graph = replace(graph, rigs=options.rigs(run.team) or graph.rigs)
+    graph = replace(graph, robot_models=options.robot_models(run.team) or graph.robot_models)
     _require_ties(run, graph, measured)
     assert options.method is not None  # resolved
     estimate = BATCH[options.method](graph)

@@ -14,7 +14,7 @@ from coloc_graph.frontend.pairing.plane_check import implausible
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
 
-LEAST_CHANCE = 1e-4  # probability of a chi2 by noise alone below which measurements are warned to disagree
+REJECTION_P_VALUE = 1e-4  # probability of a chi2 by noise alone below which measurements are warned to disagree
 REASONS_NAMED = 3  # kinds of reasons that are named where no measurement is usable
 
 
@@ -93,7 +93,7 @@ def warnings_of_graph(
     warnings += [str(bump) for bump in estimate.bumped]
     warnings += _far(estimate)
     chance = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
-    if chance < LEAST_CHANCE:
+    if chance < REJECTION_P_VALUE:
         warnings.append(
             f"the measurements disagree (chi2/dof {estimate.chi2 / estimate.dof:.1f} with {estimate.dof} degrees of "
             f"freedom, expected 1; noise alone does that {_once_in(chance)}): a robot moved that is called an anchor, "

@@ -161,8 +161,10 @@ class StanceSolver:
     def __init__(self, team: Team, options: SolveOptions | None = None) -> None:
         self.options = (options or SolveOptions()).resolved()
         self.team = team
-        rigs = self.options.rigs(team) or None
-        self.estimator = Estimator(team.reference, team.names, team.floor, slips_of(team), rigs, landmarks_of(team))
+        robot_models = self.options.robot_models(team) or None
+        self.estimator = Estimator(
+            team.reference, team.names, team.floor, slips_of(team), robot_models, landmarks_of(team)
+        )
         #: All pairs of all stances; those that are unusable too.
         self.measured: tuple[PairMeasurement, ...] = ()
         #: What is to be said of clocks.

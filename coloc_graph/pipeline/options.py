@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import get_args
 
-from coloc_graph.backend import Method, loosened
+from coloc_graph.backend import Method, with_height_sigma
 from coloc_graph.errors import InputError
 from coloc_graph.frontend import FrontendOptions
 from coloc_graph.team import Robot, Team
@@ -59,9 +59,9 @@ class SolveOptions:
         """Return whether the scale comes from the markers' span alone."""
         return self.frontend is not None and self.frontend.scale == "span"
 
-    def rigs(self, team: Team) -> dict[str, Robot]:
+    def robot_models(self, team: Team) -> dict[str, Robot]:
         """Return the robots that a joint estimate calibrates; none of another method."""
         if self.method != "joint":
             return {}
-        rigs = {robot.name: robot for robot in team.robots}
-        return dict(loosened(rigs, UNKNOWN_HEIGHT)) if self.by_span else rigs
+        robot_models = {robot.name: robot for robot in team.robots}
+        return dict(with_height_sigma(robot_models, UNKNOWN_HEIGHT)) if self.by_span else robot_models

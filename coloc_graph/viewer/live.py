@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coloc_graph.backend import StanceEstimate
-from coloc_graph.backend.landmarks import Placed
+from coloc_graph.backend.landmarks import StaticPose
 from coloc_graph.exchange.landmarks import row_of
 from coloc_graph.frontend import PairMeasurement
 from coloc_graph.geometry.trajectory import Trajectory
@@ -76,7 +76,7 @@ class LiveScene:
         self._stances: dict[int, Stance] = {}
         self._poses: dict[str, dict[int, tuple[float, Array, Array]]] = {robot: {} for robot in start.robots}
         self._found: dict[int, list[tuple[int, str, str, float, str]]] = {}
-        self._landmarks: dict[str, Placed] = {}
+        self._landmarks: dict[str, StaticPose] = {}
         self._sighted: dict[int, list[tuple[str, int, str]]] = {}
 
     def add(self, one: LiveStance) -> None:

@@ -14,10 +14,10 @@ from coloc_graph.measurements import RelativePose
 from coloc_graph.run import Stance
 from coloc_graph.team import Floor
 
-SIGMAS = np.array([0.004, 0.005, 0.01, 0.02, 0.015, 0.01])
+CLEARANCE_SIGMAS = np.array([0.004, 0.005, 0.01, 0.02, 0.015, 0.01])
 
 
-def relative(stance, i, j, T_i_j, sigmas=SIGMAS, covariance=None):
+def relative(stance, i, j, T_i_j, sigmas=CLEARANCE_SIGMAS, covariance=None):
     """A measurement as the front end would give it."""
     C = np.diag(np.square(sigmas)) if covariance is None else covariance
     return RelativePose(stance, i, j, T_i_j, C)
@@ -233,7 +233,10 @@ def test_the_floor_keeps_heights_and_tilts_that_the_measurements_do_not_know(rng
     poses = [relative(s.index, *s.observers, T) for s, T in zip(when, [floor_pose(0.4, 0.1, 0.3)] * 6, strict=True)]
     noisy = [
         relative(
-            p.stance, p.robot_i, p.robot_j, gtsam.Pose3(p.T_i_j).compose(gtsam.Pose3.Expmap(rng.normal(0, SIGMAS)))
+            p.stance,
+            p.robot_i,
+            p.robot_j,
+            gtsam.Pose3(p.T_i_j).compose(gtsam.Pose3.Expmap(rng.normal(0, CLEARANCE_SIGMAS))),
         )
         for p in poses
     ]
@@ -254,7 +257,7 @@ def test_a_reference_that_does_not_observe_at_first_is_refused_in_words():
 
 
 def test_a_measurement_of_a_robot_that_does_not_observe_is_refused():
-    with pytest.raises(EstimationError, match="relative pose of A and C at stance 1 names C, which does not observe"):
+    with pytest.raises(EstimationError, match="relative pose of A and C at stance 1 names C, which is no observer"):
         graph_of(leapfrog(2), [relative(1, "A", "C", np.eye(4))], robots=("A", "B", "C"))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors, FactorEvaluator
-from coloc_graph.backend.camera_model import BEYOND, MarkersModel, Mounts
+from coloc_graph.backend.camera_model import UNEVALUABLE, MarkersModel, Mounts
 from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
 from coloc_graph.backend.span_factor import SpanModel, Spans, spans_on_plane
 from coloc_graph.geometry.lie import floor_pose, se3_exp, se3_inverse, sl3_log, sl3_normalise
@@ -59,7 +59,7 @@ def model_of(rng, on_floor=True, measured=None, spans=None):
 
 def at(model, T_i, T_j, *errors):
     """The residual of one model, its Jacobian by everything, and whether it can be evaluated."""
-    e, by, possible = model.together([model]).at(T_i[None], T_j[None], [np.atleast_1d(one)[None] for one in errors])
+    e, by, possible = model.batch([model]).at(T_i[None], T_j[None], [np.atleast_1d(one)[None] for one in errors])
     return e[0], np.concatenate(by, axis=2)[0], possible[0]
 
 
@@ -226,8 +226,8 @@ def test_sighted_markers(rng):
     model = MarkersModel(x, covariance, MOUNT_I, MARKERS)
     level = floor_pose(0.3, 0.1, 0.2)
     assert np.abs(at(model, level, T_seen, np.zeros(3), np.zeros(2))[0]).max() < 1e-9
-    np.testing.assert_allclose(level @ floor_pose(*model.place(np.zeros(3), np.zeros(2))), T_seen, atol=1e-12)
-    assert model.place(np.array([0.0, -0.5, 0.0]), np.zeros(2)) is None  # it looks up
+    np.testing.assert_allclose(level @ floor_pose(*model.planar_pose(np.zeros(3), np.zeros(2))), T_seen, atol=1e-12)
+    assert model.planar_pose(np.array([0.0, -0.5, 0.0]), np.zeros(2)) is None  # it looks up
     T_off, mount, markers = (
         T_seen @ se3_exp(0.02 * rng.normal(size=6)),
         0.01 * rng.normal(size=3),
@@ -274,7 +274,7 @@ def test_factors_evaluated_at_once_are_those_evaluated_alone(rng):
     for step in (0.0, 1e-3):  # what was found at other values is not handed out at these
         values = values_of(step)
         alone = [factor.linearize(values).jacobian() for factor in factors]
-        assert (np.abs(alone[-2][1]) == BEYOND).all() and not alone[-2][0].any()
+        assert (np.abs(alone[-2][1]) == UNEVALUABLE).all() and not alone[-2][0].any()
         with together:
             for factor, (A, b) in zip(factors, alone, strict=True):
                 A_too, b_too = factor.linearize(values).jacobian()

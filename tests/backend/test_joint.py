@@ -123,16 +123,16 @@ def test_from_mounts_three_degrees_and_two_centimetres_wrong_it_comes_to_the_sam
     graph, true = solved.estimate.graph, solved.estimate.calibration
 
     def off(robot, by):
-        mount = true.mounts[robot].mount if robot in true.mounts else graph.rigs[robot].mount
+        mount = true.mounts[robot].mount if robot in true.mounts else graph.robot_models[robot].mount
         height, tilt, roll = by
         wrong = msgspec.structs.replace(
             mount, height=mount.height + 0.02 * height, tilt_deg=mount.tilt_deg + 3 * tilt,
             roll_deg=mount.roll_deg + 3 * roll, height_sigma=0.02, tilt_sigma_deg=3.0, roll_sigma_deg=3.0,
         )  # fmt: skip
-        return msgspec.structs.replace(graph.rigs[robot], mount_if_any=wrong)
+        return msgspec.structs.replace(graph.robot_models[robot], mount_if_any=wrong)
 
-    rigs = {"A": off("A", signs), "B": off("B", signs[::-1]), "C": graph.rigs["C"]}
-    estimate = joint(replace(graph, rigs=rigs))
+    robot_models = {"A": off("A", signs), "B": off("B", signs[::-1]), "C": graph.robot_models["C"]}
+    estimate = joint(replace(graph, robot_models=robot_models))
     assert not estimate.rejected and estimate.chi2 / estimate.dof < 1.3
     for robot in "AB":
         a, b = true.mounts[robot].mount, estimate.calibration.mounts[robot].mount
@@ -226,8 +226,8 @@ def test_clocks_that_differ_are_found_for_each_pair(tmp_path):
 
 
 def test_a_graph_that_knows_no_mounts_says_so(solved):
-    with pytest.raises(EstimationError, match=r"mount of robot A is not known.*PoseGraph.of.*smooth"):
-        joint(replace(solved.estimate.graph, rigs={}))
+    with pytest.raises(EstimationError, match=r"mount of robot A cannot be calibrated.*PoseGraph.of.*smooth"):
+        joint(replace(solved.estimate.graph, robot_models={}))
     with pytest.raises(InputError, match="no method `guess`; choose one of chain, smooth, joint"):
         SolveOptions(method="guess")
 
@@ -315,7 +315,7 @@ def test_nothing_that_was_exact_is_reported(solutions, tmp_path, capsys):
 def test_a_long_run_finds_its_mounts_in_its_first_part(solved, monkeypatch):
     """Composed by mounts a degree off, a hundred stances are bent too far for any search to unbend."""
     module = sys.modules["coloc_graph.backend.optimize"]
-    monkeypatch.setattr(module, "LONG_RUN", 8)
+    monkeypatch.setattr(module, "LONG_RUN_STANCES", 8)
     started = []
     genuine = module.optimise
     monkeypatch.setattr(
@@ -329,6 +329,6 @@ def test_a_long_run_finds_its_mounts_in_its_first_part(solved, monkeypatch):
     assert estimate.chi2 == pytest.approx(solved.estimate.chi2, rel=5e-3)
     with_part = started[:]
     started.clear()
-    monkeypatch.setattr(module, "LONG_RUN", 80)
+    monkeypatch.setattr(module, "LONG_RUN_STANCES", 80)
     joint(solved.estimate.graph)
     assert min(with_part[1:]) < 0.05 * started[0]  # the whole starts by far nearer

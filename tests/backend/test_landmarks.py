@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from teams import graph_of_team, largest_difference, of_stance, planar_nees, team_of
 
 from coloc_graph.backend import Estimator, PoseGraph, chain, diagnose, joint, smooth
-from coloc_graph.backend.landmarks import MAP, Placed, landmarks_of, map_of
+from coloc_graph.backend.landmarks import MAP, StaticPose, landmarks_of, map_positions
 from coloc_graph.errors import MeasurementError
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import read_g2o
@@ -47,7 +47,7 @@ def with_landmarks(team, sightings, *landmarks):
     """The graph of a team with landmarks."""
     named = {one.name: one for one in landmarks}
     made = (*team.measurements, *sightings)
-    return dataclasses.replace(graph_of_team(team), measurements=made, landmarks=named, on_map=map_of(named))
+    return dataclasses.replace(graph_of_team(team), measurements=made, landmarks=named, on_map=map_positions(named))
 
 
 def fed(graph, measurements=None):
@@ -89,11 +89,11 @@ def test_a_landmark_that_two_robots_see_at_different_stances_ties_them():
 
 
 def test_a_map_s_doubt_is_of_heading_x_and_y_and_a_place_s_along_the_world_s_axes():
-    (on_map,) = map_of({"L1": landmark("L1", (1.0, 2.0, 0.5), sigma=0.03, sigma_deg=2.0), "L2": landmark("L2")})
+    (on_map,) = map_positions({"L1": landmark("L1", (1.0, 2.0, 0.5), sigma=0.03, sigma_deg=2.0), "L2": landmark("L2")})
     np.testing.assert_allclose(on_map.covariance, np.diag(np.square([np.deg2rad(2.0), 0.03, 0.03])))
     np.testing.assert_allclose(on_map.T_i_j, floor_pose(1.0, 2.0, 0.5), atol=1e-15)
     C = np.diag([9.0, 9.0, 0.2, 4.0, 1.0, 9.0])  # surest to its own side
-    placed = Placed(gtsam.Pose3(floor_pose(1.0, 2.0, 0.5)), C)
+    placed = StaticPose(gtsam.Pose3(floor_pose(1.0, 2.0, 0.5)), C)
     assert placed.planar == pytest.approx((1.0, 2.0, 0.5))
     c, s = np.cos(0.5), np.sin(0.5)
     expected = [[4 * c * c + s * s, 3 * s * c, 0], [3 * s * c, 4 * s * s + c * c, 0], [0, 0, 0.2]]
@@ -110,7 +110,7 @@ def test_landmarks_that_nobody_saw_change_nothing_at_all(team):
 
 def test_taking_a_landmark_out_gives_what_was_there_without_it(team, loop):
     graph = with_landmarks(team, loop, landmark("L1"), landmark("L2"))
-    bare, without = smooth(graph.without(loop), refuse=False), smooth(graph_of_team(team), refuse=False)
+    bare, without = smooth(graph.without(loop), reject=False), smooth(graph_of_team(team), reject=False)
     assert largest_difference(bare, without, without.graph.nodes) == 0.0
 
 
@@ -152,7 +152,7 @@ def test_incremental_with_landmarks_is_batch(team, loop, known):
     estimator, batch = fed(graph), smooth(graph)
     whole = estimator.estimate()
     assert largest_difference(whole, batch, batch.graph.nodes) < 1e-6
-    placed = estimator.placed()
+    placed = estimator.static_poses()
     assert set(placed) == ({"L1", "L2", MAP} if known else {"L1", "L2"})
     for name, one in batch.landmarks.items():
         assert one.T_world_body.equals(whole.landmarks[name].T_world_body, 1e-6)
@@ -172,7 +172,7 @@ def test_an_estimator_with_landmarks_goes_on_where_it_was_saved(team, loop, tmp_
     for stance in graph.stances[6:]:
         resumed.add(stance, of_stance(graph.measurements, stance.index))
     assert largest_difference(resumed.estimate(), smooth(graph), graph.nodes) < 1e-6
-    assert resumed.placed().keys() == {"L1", "L2", MAP}
+    assert resumed.static_poses().keys() == {"L1", "L2", MAP}
 
 
 def test_what_is_taken_back_leaves_no_landmark_behind(team, loop):
@@ -181,14 +181,14 @@ def test_what_is_taken_back_leaves_no_landmark_behind(team, loop):
     estimator = Estimator(graph.reference, graph.robots, graph.floor, graph.slips, None, graph.landmarks)
     for stance in graph.stances[:5]:
         estimator.add(stance, of_stance(graph.measurements, stance.index))
-    assert set(estimator.placed()) == {"L1", "L2", MAP}
+    assert set(estimator.static_poses()) == {"L1", "L2", MAP}
     estimator.withdraw()
-    assert set(estimator.placed()) == {"L1", MAP}
+    assert set(estimator.static_poses()) == {"L1", MAP}
     estimator.add(graph.stances[4], of_stance(graph.measurements, 4))
     estimator.revoke(loop[2])
-    assert set(estimator.placed()) == {"L1", MAP}
+    assert set(estimator.static_poses()) == {"L1", MAP}
     estimator.insert(loop[2])
-    assert set(estimator.placed()) == {"L1", "L2", MAP}
+    assert set(estimator.static_poses()) == {"L1", "L2", MAP}
 
 
 def test_a_map_holds_landmarks_to_each_other_and_leaves_the_world_where_it_is(team, loop):
@@ -237,7 +237,7 @@ def test_a_place_on_the_map_that_is_wrong_is_refused_and_named(team, loop):
     marks = [landmark(name, place, 0.005, 0.5) for name, place in places.items()]
     marks[3] = landmark("L4", (0.4, -0.5, 1.2), 0.005, 0.5)
     estimate = smooth(with_landmarks(team, seen, *marks))
-    assert [str(one.measurement) for one in estimate.rejected] == ["place of L4 on the map"]
+    assert [str(one.measurement) for one in estimate.rejected] == ["position of L4 on the map"]
     assert not smooth(with_landmarks(team, seen, *(landmark(n, p, 0.005, 0.5) for n, p in places.items()))).rejected
 
 
@@ -307,13 +307,15 @@ def test_pixels_of_a_landmark_that_drift_has_put_behind_the_camera_close_the_loo
     rng = np.random.default_rng(4)
     wheels = [m for m in graph.measurements if isinstance(m, Odometry)]
     seen = [seen_in_pixels(team.T_world_body["A", k], k, (0.6, 0.1, 2.8), "L1", rng) for k in (0, 60)]
-    rigs = {"A": replace(reference_team()["A"], mount_if_any=Mount(height=0.4, tilt_deg=20.0, tilt_sigma_deg=0.1))}
-    graph = dataclasses.replace(graph, measurements=(*wheels, *seen), rigs=rigs)
+    robot_models = {
+        "A": replace(reference_team()["A"], mount_if_any=Mount(height=0.4, tilt_deg=20.0, tilt_sigma_deg=0.1))
+    }
+    graph = dataclasses.replace(graph, measurements=(*wheels, *seen), robot_models=robot_models)
     drift = smooth(graph.without(seen[1:]))
     expected = drift.pose("A", 60).between(drift.landmarks["L1"].T_world_body)
     off = np.linalg.norm(expected.translation() - seen[1].T_i_j[:3, 3])
     assert off > 0.4  # of a landmark 0.6 m away
-    estimator = Estimator("A", ("A",), graph.floor, {}, rigs, graph.landmarks)
+    estimator = Estimator("A", ("A",), graph.floor, {}, robot_models, graph.landmarks)
     for stance in graph.stances:
         estimator.add(stance, of_stance(graph.measurements, stance.index))
     batch = joint(graph)
@@ -329,9 +331,9 @@ def test_a_landmark_neither_watches_nor_drives(team):
     T = gtsam.Pose3()
     for wrong, words in (
         (Odometry("L1", 0, 1, T, SEEN), "which does not move"),
-        (Sighting(0, "L1", "A", 0.0, T, SEEN), "does not observe"),
+        (Sighting(0, "L1", "A", 0.0, T, SEEN), "is no observer"),
         (Sighting(0, "A", "L9", 0.0, T, SEEN), "L9, which is not in the team"),
-        (Sighting(99, "A", "L1", 0.0, T, SEEN), "stance 99, which is not there"),
+        (Sighting(99, "A", "L1", 0.0, T, SEEN), "stance 99, which is none"),
     ):
         with pytest.raises(MeasurementError, match=words):
             dataclasses.replace(graph, measurements=(wrong,))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.calibration import Calibration
 from coloc_graph.backend.estimate import Estimate, Rejection
-from coloc_graph.backend.landmarks import Placed
+from coloc_graph.backend.landmarks import StaticPose
 from coloc_graph.backend.planar.factors import DriveFactors, State
 from coloc_graph.backend.planar.trajectory import trajectory
 from coloc_graph.backend.ranging import RangingProblem
@@ -97,8 +97,8 @@ def ranging_estimate(
     )
 
 
-def _placed(position: Array, covariance: Array) -> Placed:
+def _placed(position: Array, covariance: Array) -> StaticPose:
     """Return a landmark that is a point at (2,) on the floor, with a covariance (2, 2)."""
     C = np.zeros((6, 6))
     C[3:5, 3:5] = covariance
-    return Placed(gtsam.Pose3(floor_pose(position[0], position[1], 0.0)), C, has_heading=False)
+    return StaticPose(gtsam.Pose3(floor_pose(position[0], position[1], 0.0)), C, has_heading=False)
