@@ -1,0 +1,167 @@
+"""A plan for a whole mission with what it promises: `Mission`, and `leap_frog`, which plans one of a gait."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from coloc_graph.errors import InputError
+from coloc_graph.geometry.se2 import Planar, between, wrap
+from coloc_graph.planning.belief import Belief
+from coloc_graph.planning.drive import TURN_RATE
+from coloc_graph.planning.formation import Gait
+from coloc_graph.planning.mover_path import best_drives, cells, design, patrol
+from coloc_graph.planning.plan import Plan, PlannedStance
+from coloc_graph.planning.prediction import Predictor, Promise
+
+SETTLE = 2.0  # time that all robots stand before a stance [s]
+
+
+@dataclass(frozen=True, eq=False)
+class Mission:
+    """A plan, what each of its stances promises, and the seconds that its leaps take.
+
+    Attributes
+    ----------
+    plan
+        The stances.
+    promises
+        Of each stance, the expected correspondences and the team's covariance after it.
+    leap_times
+        Time before each stance until all robots stand [s].
+    """
+
+    plan: Plan
+    promises: tuple[Promise, ...]
+    leap_times: tuple[float, ...]
+
+    @property
+    def end(self) -> Belief:
+        """The team after the last stance."""
+        return self.promises[-1].belief
+
+    @property
+    def end_sigma(self) -> float:
+        """Standard deviation of the observers' last positions [m]: root of the mean trace of their covariances."""
+        return self.end.position_sigma(self.plan.observers)
+
+    @property
+    def heading_sigma(self) -> float:
+        """Standard deviation of the observers' last headings [rad]."""
+        return self.end.heading_sigma(self.plan.observers)
+
+    @property
+    def capture_time(self) -> float:
+        """Time in which images are taken [s]."""
+        return sum(stance.duration for stance in self.plan.stances)
+
+    @property
+    def points(self) -> float:
+        """Expected number of correspondences."""
+        return sum(promise.points for promise in self.promises)
+
+    @property
+    def duration(self) -> float:
+        """Duration of the mission [s]."""
+        return self.capture_time + sum(self.leap_times)
+
+
+def leap_time(start: Planar, target: Planar, speed: float) -> float:
+    """Return the time for a robot to turn, drive straight and turn to its target, and to stand [s]."""
+    D = between(start, target)
+    first = math.atan2(D[1], D[0])
+    return math.hypot(*D[:2]) / speed + (abs(first) + abs(wrap(D[2] - first))) / TURN_RATE + SETTLE
+
+
+def stances_of(gait: Gait, length: float) -> int:
+    """Return the number of stances of a gait over a length [m]."""
+    return max(round(length / gait.leap), 1)
+
+
+def leap_frog(
+    predictor: Predictor,
+    gait: Gait,
+    length: float,
+    seconds: float,
+    pair: tuple[str, str],
+    mover: str,
+    *,
+    designed: bool = True,
+) -> Mission:
+    """Plan a leap-frog along the x axis, the mover's drive of each stance by optimal design.
+
+    Parameters
+    ----------
+    predictor
+        Predicts the stances.
+    gait
+        Formation of the pair.
+    length
+        Way of the pair [m].
+    seconds
+        Duration of each stance [s].
+    pair, mover
+        Names of the observers, the first of which stands still before the second stance, and of the mover.
+    designed
+        False for the paper's patrol from corner to corner.
+
+    Raises
+    ------
+    InputError
+        If the observers see too little of the floor together.
+    """
+    goal = (length, 0.0)
+    belief = Belief.start(predictor.team, {pair[0]: gait.stop(0), pair[1]: gait.stop(1), mover: (1.5, 0.0, 0.0)})
+    stances, promises, times = [], [], []
+    for k in range(stances_of(gait, length)):
+        anchor, leaper = pair[k % 2], pair[(k + 1) % 2]
+        target = gait.stop(k + 1)
+        times.append(leap_time(belief.poses[leaper], target, predictor.speed) if k else 0.0)
+        if k:
+            belief = belief.after_leap(leaper, target, odometry=predictor.odometry)
+        standing = {anchor: gait.stop(k), leaper: target}
+        stance, promise = best_stance(
+            predictor, belief, standing, (anchor,) if k else (), mover, seconds, goal, designed
+        )
+        stances.append(stance)
+        promises.append(promise)
+        belief = promise.belief
+    return Mission(Plan(tuple(stances)), tuple(promises), tuple(times))
+
+
+def best_stance(
+    predictor: Predictor,
+    belief: Belief,
+    standing: dict[str, Planar],
+    anchors: tuple[str, ...],
+    mover: str,
+    seconds: float,
+    goal: tuple[float, float],
+    designed: bool = True,
+) -> tuple[PlannedStance, Promise]:
+    """Choose the mover's drive in a stance of a team, `belief`, that stands there already.
+
+    Raises
+    ------
+    InputError
+        If the observers see too little of the floor together.
+    """
+    names = tuple(standing)
+    found = cells(predictor.model(names, mover), np.array(list(standing.values())), predictor.free)
+    if len(found.places) < 2:
+        raise InputError(
+            f"{' and '.join(names)} have no common view of the floor where they are to stand: "
+            "bring them nearer, or turn their cameras towards each other"
+        )
+    if not designed:
+        drives = [patrol(found.places)]
+    else:
+        rows, G = belief.rows(names, mover), np.vstack(belief.goal_rows(names, goal))
+        shares = design(found, belief.covariance, rows, G, seconds * predictor.fps)
+        drives = best_drives(
+            found, shares, belief.covariance, rows, G, duration=seconds, fps=predictor.fps, speed=predictor.speed
+        )
+    options = [PlannedStance(standing, anchors, mover, drive, seconds) for drive in drives]
+    promises = [predictor.of_stance(belief, option) for option in options]
+    best = min(range(len(options)), key=lambda n: promises[n].belief.end_variance(names, goal))
+    return options[best], promises[best]

@@ -1,0 +1,205 @@
+"""Where the mover drives in a stance: waypoints by optimal design within the common view; `MoverPlanner`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import combinations, permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.planning.drive import SPEED, drive_through, there_and_back
+from coloc_graph.planning.stance_information import StanceModel
+
+Array = NDArray[np.float64]
+Waypoint = tuple[float, float]
+
+CELL = 0.2  # distance between places that are weighed [m]
+AHEAD = (0.3, 2.6)  # the cells begin and end this far ahead of an observer [m]
+ASIDE = 1.6  # and go this far to either side [m]
+YAWS = (0.0, np.pi / 2)  # headings at which each place is weighed [rad]
+CLEARANCE = 0.45  # distance of the mover's middle from robots that stand [m]
+MARGIN = 12.0  # distance of its markers from the borders of images: about two sigmas of a slip of the robots [px]
+ROUNDS = 12  # steps of the multiplicative algorithm
+MERGED = 0.35  # places nearer to each other are one waypoint [m]
+MOST = 5  # number of places with large shares through which drives are tried
+WORTH = 0.5  # a share is large above this, relative to equal shares
+KNOTS = 8  # number of places through which drives are tried, with the outermost ones
+LONGER = 10  # number of drives through three places that are tried with a fourth
+KEPT = 3  # number of drives that are kept
+SAMPLES = 24  # instants at which a drive is compared with the places
+
+#: Returns whether places (..., 2) [m] are free of walls by a distance [m].
+Free = Callable[[Array, float], NDArray[np.bool_]]
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Places of the mover in the common view of a stance.
+
+    Attributes
+    ----------
+    places
+        Places (n, 2) [m] where all cameras see all its markers at any heading, and it is clear of robots and walls.
+    information
+        Information (n, d, d) of one image of each camera there.
+    """
+
+    places: Array
+    information: Array
+
+
+def cells(model: StanceModel, standing: Array, free: Free | None = None) -> Cells:
+    """Find the places of the common view of observers at poses (r, 3), and what an image from each brings."""
+    places = places_in_common_view(model, standing, free)
+    if not len(places):
+        return Cells(places, np.zeros((0, model.variables, model.variables)))
+    drive = np.concatenate([np.column_stack([places, np.full(len(places), yaw)]) for yaw in YAWS])
+    information = model.see(standing, drive).information
+    return Cells(places, information.reshape(len(YAWS), len(places), *information.shape[1:]).mean(axis=0))
+
+
+def places_in_common_view(model: StanceModel, standing: Array, free: Free | None = None) -> Array:
+    """Places (n, 2) [m] where all cameras see all markers of the mover at any heading, clear of robots and walls."""
+    xy = _grid(standing)
+    away = np.hypot(*np.moveaxis(xy[:, None] - standing[None, :, :2], -1, 0)).min(axis=1)
+    xy = xy[away > CLEARANCE]
+    if free is not None:
+        xy = xy[free(xy, CLEARANCE / 2)]
+    reach = float(np.hypot(*model.p_markers[:, :2].T).max())
+    rim = reach * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    points = np.concatenate([xy[:, None] + rim, np.full((len(xy), 4, 1), model.p_markers[0, 2])], axis=-1)
+    seen = model.in_view(standing, points.reshape(-1, 3), MARGIN).reshape(len(standing), len(xy), 4)
+    return np.asarray(xy[seen.all(axis=(0, 2))])
+
+
+def _grid(standing: Array) -> Array:
+    """Places (n, 2) of a grid ahead of the first observer, along its heading."""
+    x, y, yaw = standing[0]
+    ahead, aside = np.meshgrid(np.arange(*AHEAD, CELL), np.arange(-ASIDE, ASIDE + 1e-9, CELL), indexing="ij")
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.column_stack([x + c * ahead.ravel() - s * aside.ravel(), y + s * ahead.ravel() + c * aside.ravel()])
+
+
+def design(found: Cells, covariance: Array, rows: NDArray[np.int64], goal: Array, images: float) -> Array:
+    """Return the shares (n,) of a stance's images that make the goal's variance least.
+
+    Parameters
+    ----------
+    found
+        Places of the common view.
+    covariance
+        Covariance (m, m) of the team before the stance, and the `rows` of it that are the stance's variables.
+    goal
+        Derivatives (q, m) of what is to be known by the team's variables.
+    images
+        Number of images of each camera.
+
+    Notes
+    -----
+    Multiplicative algorithm for optimal designs: a share grows with the root of its sensitivity (Silvey, Titterington
+    and Torsney, 1978).
+    """
+    shares = np.full(len(found.places), 1 / len(found.places))
+    M = found.information
+    small, Gr = covariance[np.ix_(rows, rows)], goal @ covariance[:, rows]
+    for _ in range(ROUNDS):
+        total = images * np.einsum("n,nij->ij", shares, M)
+        # G C restricted to the stance's variables after it
+        after = Gr @ np.linalg.inv(np.eye(len(rows)) + total @ small)
+        gain = np.einsum("qi,nij,qj->n", after, M, after, optimize=True)
+        shares = shares * np.sqrt(np.maximum(gain, 0.0))
+        shares /= shares.sum()
+    return np.asarray(shares)
+
+
+def best_drives(
+    found: Cells,
+    shares: Array,
+    covariance: Array,
+    rows: NDArray[np.int64],
+    goal: Array,
+    *,
+    duration: float,
+    fps: float,
+    speed: float = SPEED,
+) -> list[tuple[Waypoint, ...]]:
+    """Find the drives of a `duration` [s] that leave the goal's variance least, the best one first.
+
+    The design's shares ignore that a robot must drive from place to place. Drives through two, three and four of the
+    places that matter are compared by the information of the places that they pass.
+
+    Parameters
+    ----------
+    found, shares
+        Places of the common view, and the shares of the best design.
+    covariance, rows, goal
+        As for `design`.
+    duration, fps, speed
+        Duration of the drive [s], images a second, and speed [m/s].
+    """
+    points = found.places[_knots(found.places, shares)]
+    paths = [list(pair) for pair in combinations(range(len(points)), 2)]
+    paths += [list(three) for three in permutations(range(len(points)), 3) if three[0] < three[2]]
+    value = _values(found, points, paths, covariance, rows, goal, duration, fps, speed)
+    longer = [
+        [*paths[n], more]
+        for n in np.argsort(value)[:LONGER].tolist()
+        for more in range(len(points))
+        if more not in paths[n]
+    ]
+    value = np.concatenate([value, _values(found, points, longer, covariance, rows, goal, duration, fps, speed)])
+    paths += longer
+    return [tuple((float(x), float(y)) for x, y in points[paths[n]]) for n in np.argsort(value)[:KEPT].tolist()]
+
+
+def _knots(places: Array, shares: Array) -> list[int]:
+    """Places that matter: those with the largest shares, and the outermost ones."""
+    left, chosen = shares.copy(), []
+    while len(chosen) < MOST and left.max() > WORTH / len(places):
+        chosen.append(int(np.argmax(left)))
+        left[np.hypot(*(places - places[chosen[-1]]).T) < MERGED] = 0.0
+    apart = np.min([np.hypot(*(places - places[n]).T) for n in chosen], axis=0)
+    while len(chosen) < min(KNOTS, len(places)):
+        chosen.append(int(np.argmax(apart)))
+        apart = np.minimum(apart, np.hypot(*(places - places[chosen[-1]]).T))
+    return chosen
+
+
+def _values(
+    found: Cells,
+    points: Array,
+    paths: list[list[int]],
+    covariance: Array,
+    rows: NDArray[np.int64],
+    goal: Array,
+    duration: float,
+    fps: float,
+    speed: float,
+) -> Array:
+    """Variance (n,) of the goal after each of n drives."""
+    if not paths:
+        return np.zeros(0)
+    instants = (np.arange(SAMPLES) + 0.5) / SAMPLES * duration
+    at = np.array([drive_through(there_and_back(points[p], duration, speed), speed).at(instants)[:, :2] for p in paths])
+    away = np.hypot(*np.moveaxis(at[:, :, None] - found.places, -1, 0))
+    nearest = away.argmin(axis=2)
+    seen = away.min(axis=2) < CELL
+    images = np.zeros((len(paths), len(found.places)))
+    np.add.at(images, (np.repeat(np.arange(len(paths)), SAMPLES), nearest.ravel()), seen.ravel())
+    images *= duration * fps / SAMPLES
+    size = found.information.shape[-1]
+    total = (images @ found.information.reshape(len(found.places), -1)).reshape(-1, size, size)
+    small, Gr = covariance[np.ix_(rows, rows)], goal @ covariance[:, rows]
+    drop = total @ np.linalg.inv(np.eye(size) + small @ total)
+    return np.asarray(np.trace(goal @ covariance @ goal.T) - np.einsum("qi,nij,qj->n", Gr, drop, Gr, optimize=True))
+
+
+def patrol(places: Array, heading: float = 0.0) -> tuple[Waypoint, ...]:
+    """Return the drive of the paper's missions: near, both far corners, and the middle of places (n, 2) in view.
+
+    `heading` [rad] is the direction of travel.
+    """
+    c, s = np.cos(heading), np.sin(heading)
+    directions = np.array([[-1.0, 0.0], [1.0, 1.5], [1.0, -1.5]]) @ np.array([[c, s], [-s, c]])
+    corners = places[np.argmax(places @ directions.T, axis=0)]
+    return tuple((float(x), float(y)) for x, y in np.vstack([corners, places.mean(axis=0)]))

@@ -1,0 +1,93 @@
+"""What planned stances will bring: the covariance of a team after them; `Predictor`."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.planning.belief import Belief
+from coloc_graph.planning.drive import SPEED, drive_through, there_and_back
+from coloc_graph.planning.plan import Plan, PlannedStance
+from coloc_graph.planning.stance_information import StanceModel
+from coloc_graph.team import Team
+
+Array = NDArray[np.float64]
+
+INSTANTS = 48  # instants of a drive at which its pixels are linearised; each stands for several images
+MOMENT = 0.01  # time over which the mover's velocity is taken [s]
+LEAST_POINTS = 6  # correspondences without which a stance has no homography
+
+
+@dataclass(frozen=True, eq=False)
+class Promise:
+    """What a planned stance promises: the expected number of correspondences, and the team's covariance after it."""
+
+    points: float
+    belief: Belief
+
+
+@dataclass
+class Predictor:
+    """Predicts stances of a team.
+
+    Attributes
+    ----------
+    team
+        The robots.
+    fps
+        Images a second.
+    noise_px
+        Standard deviation of a marker centre per axis [px]; None for what the cameras state.
+    odometry
+        False to predict without wheel odometry.
+    speed
+        Speed of the mover and of leaps [m/s].
+    free
+        Returns which places (..., 2) [m] are free of walls by a distance [m]; None where there are none.
+    """
+
+    team: Team
+    fps: float = 30.0
+    noise_px: float | None = None
+    odometry: bool = True
+    speed: float = SPEED
+    free: Callable[[Array, float], NDArray[np.bool_]] | None = None
+    _models: dict[tuple[tuple[str, ...], str], StanceModel] = field(default_factory=dict)
+
+    def model(self, observers: Sequence[str], mover: str) -> StanceModel:
+        """Return the model of a stance of these robots."""
+        key = tuple(observers), mover
+        if key not in self._models:
+            self._models[key] = StanceModel(self.team, observers, mover, self.noise_px)
+        return self._models[key]
+
+    def of_stance(self, before: Belief, stance: PlannedStance) -> Promise:
+        """Predict one stance, after the leaps to it."""
+        belief = before
+        for name, target in stance.standing.items():
+            if name not in stance.anchors and belief.poses[name] != target:
+                belief = belief.after_leap(name, target, odometry=self.odometry)
+        observers = tuple(stance.standing)
+        information, points = self.information(stance)
+        if points < LEAST_POINTS:
+            return Promise(points, belief)
+        return Promise(points, belief.after_stance(observers, stance.mover, information))
+
+    def information(self, stance: PlannedStance) -> tuple[Array, float]:
+        """Return the information (d, d) of a stance on its variables, and the expected number of correspondences."""
+        drive = drive_through(there_and_back(stance.waypoints, stance.duration, self.speed), self.speed)
+        instants = np.linspace(0.0, stance.duration, INSTANTS, endpoint=False) + stance.duration / INSTANTS / 2
+        images = stance.duration * self.fps / INSTANTS
+        standing = np.array(list(stance.standing.values()))
+        velocity = (drive.at(instants + MOMENT) - drive.at(instants)) / MOMENT
+        return self.model(tuple(stance.standing), stance.mover).total(standing, drive.at(instants), images, velocity)
+
+    def of_plan(self, before: Belief, plan: Plan) -> list[Promise]:
+        """Predict all stances of a plan in turn."""
+        promises, belief = [], before
+        for stance in plan.stances:
+            promise = self.of_stance(belief, stance)
+            promises.append(promise)
+            belief = promise.belief
+        return promises

@@ -1,0 +1,214 @@
+"""Information that a planned stance brings on poses, mounts and markers; `StanceModel`.
+
+The pixels of all markers at all instants are linearised about the plan with the camera model of the joint estimate
+(`backend.camera_model`). The mover's pose at each instant is eliminated. What is left is the information of the
+homography, whose latent points lie on the marker plane, and of the spans between the mover's markers.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.backend.camera_model import Mounts
+from coloc_graph.errors import InputError
+from coloc_graph.geometry.lie import floor_pose, hat
+from coloc_graph.team import Team
+from coloc_graph.team.shared_view import hidden
+
+Array = NDArray[np.float64]
+
+MARGIN = 4.0  # least distance of a marker from the border of an image [px]
+MAX_RANGE = 2.6  # largest distance at which a marker is measured [m]
+WEAK = 1e-4  # information that keeps the mover's pose regular where one marker is seen [1/m^2, 1/rad^2]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Pixels of a stance, linearised: `information` of the cameras at each instant, and what is seen.
+
+    Attributes
+    ----------
+    information
+        Information (..., n, d, d) of one image of each camera at each instant, with the mover's pose eliminated.
+        The variables are those of `StanceModel.variables`.
+    points
+        Number (..., n) of correspondences at each instant, over all pairs of cameras.
+    """
+
+    information: Array
+    points: Array
+
+
+class StanceModel:
+    """Observers and the mover of a stance, whose information is predicted for many stances at once.
+
+    The variables are, of each observer in turn, its pose (6,) in GTSAM's tangent, rotation first, body frame, and its
+    mount (3,): height [m], tilt, roll [rad]; at the end the mover's markers (2,): span (relative) and height [m].
+
+    Parameters
+    ----------
+    team
+        The robots; those that observe need a camera, the mover two markers.
+    observers, mover
+        Their names.
+    noise_px
+        Standard deviation of a marker centre per axis [px]; None for what the cameras state.
+    mounts
+        Errors (r, 3) of the observers' mounts as they are estimated; None for mounts as stated.
+
+    Raises
+    ------
+    InputError
+        If the mover has fewer than two markers.
+    """
+
+    def __init__(
+        self,
+        team: Team,
+        observers: Sequence[str],
+        mover: str,
+        noise_px: float | None = None,
+        mounts: Array | None = None,
+    ) -> None:
+        markers = team[mover].markers
+        if markers is None or len(markers.positions) < 2:
+            raise InputError(f"{mover} is to be watched and has fewer than two markers: give it two")
+        self.observers, self.mover = tuple(observers), mover
+        self.p_markers = markers.p_body[:2]
+        self._cameras = [team[name].camera for name in observers]
+        cameras = Mounts([team[name].mount for name in observers]).at(
+            np.zeros((len(observers), 3)) if mounts is None else mounts
+        )
+        self._R, self._t = cameras.R, cameras.t
+        r = len(observers)
+        self.variables = 9 * r + 2
+        by = np.zeros((6 * r + 2, self.variables))
+        for n in range(r):
+            by[6 * n : 6 * n + 6, 9 * n : 9 * n + 6] = cameras.by_body[n]
+            by[6 * n : 6 * n + 6, 9 * n + 6 : 9 * n + 9] = cameras.by_errors[n]
+        by[-2:, -2:] = np.eye(2)
+        self._by_variables = by
+        noise = np.array([noise_px or camera.noise_px for camera in self._cameras])
+        self._scale = np.array([[[c.fx], [c.fy]] for c in self._cameras]) / noise[:, None, None]
+        self._bias = np.array([camera.bias_px for camera in self._cameras]) / noise
+        self._clock_sigma = team.clock_sigma
+
+    def views(self, standing: Array) -> tuple[Array, Array]:
+        """Return rotations (..., r, 3, 3) of the cameras in the world and their optical centres (..., r, 3) [m].
+
+        `standing` (..., r, 3) are x, y [m], yaw [rad] of the observers.
+        """
+        T = floor_pose(*np.moveaxis(standing, -1, 0))
+        return T[..., :3, :3] @ self._R, (T[..., :3, :3] @ self._t[..., None])[..., 0] + T[..., :3, 3]
+
+    def in_view(self, standing: Array, points: Array, margin: float = MARGIN) -> NDArray[np.bool_]:
+        """Return which points (..., n, 3) [m] each camera sees, (..., r, n): in the image, near, and not hidden."""
+        R, eyes = self.views(standing)
+        p = (points[..., None, :, :] - eyes[..., None, :]) @ R
+        return self._visible(standing, points, eyes, p, margin)
+
+    def _visible(self, standing: Array, points: Array, eyes: Array, p: Array, margin: float) -> NDArray[np.bool_]:
+        seen = np.empty(p.shape[:-1], bool)
+        for n, camera in enumerate(self._cameras):
+            uv, inside = camera.project(p[..., n, :, :])
+            size = np.array([camera.width, camera.height])
+            with np.errstate(invalid="ignore"):
+                seen[..., n, :] = inside & (uv >= margin - 0.5).all(-1) & (uv <= size - 0.5 - margin).all(-1)
+            others = np.delete(standing[..., :2], n, axis=-2)
+            seen[..., n, :] &= ~hidden(eyes[..., n, None, :], points, others[..., None, :, :])
+        return seen & (np.linalg.norm(p, axis=-1) < MAX_RANGE)
+
+    def see(self, standing: Array, drive: Array) -> Seen:
+        """Linearise the pixels of a stance at instants of the mover's drive.
+
+        Parameters
+        ----------
+        standing
+            Poses (..., r, 3) of the observers (x [m], y [m], yaw [rad]).
+        drive
+            Poses (..., n, 3) of the mover.
+        """
+        J, points = self._pixels(standing, drive)
+        return Seen(self._by_variables.T @ _without_mover(J) @ self._by_variables, points)
+
+    def total(self, standing: Array, drive: Array, images: float, velocity: Array) -> tuple[Array, float]:
+        """Sum up a stance whose drive (n, 3) stands for `images` images at each instant.
+
+        Errors that all images share are unknowns: a bias of each marker's centre in each camera, and the offset of the
+        cameras' clocks, by which the mover's `velocity` (n, 3) [m/s, rad/s] shifts what they see.
+
+        Returns
+        -------
+        tuple
+            Information (d, d) of the variables, and the number of correspondences.
+        """
+        J, points = self._pixels(standing, drive)
+        r, rows = len(self.observers), J.shape[-2]
+        own, shared = np.arange(rows).reshape(r, -1), []
+        if self._bias.any():
+            seen = np.abs(J).max(axis=-1, keepdims=True) > 0
+            shared.append(np.repeat(self._bias, rows // r) * np.eye(rows) * seen)
+        if self._clock_sigma:
+            late = (J[..., -3:] @ velocity[..., None])[..., 0] * self._clock_sigma
+            by_clock = np.zeros((*late.shape, r - 1))
+            for k in range(1, r):
+                by_clock[..., own[k], k - 1] = late[..., own[k]]
+            shared.append(by_clock)
+        J = np.concatenate([J[..., :-3], *shared, J[..., -3:]], axis=-1)
+        total = images * _without_mover(J).sum(axis=0)
+        d = self._by_variables.shape[0]
+        nuisance = total[d:, d:] + np.eye(len(total) - d)
+        left = total[:d, :d] - total[:d, d:] @ np.linalg.solve(nuisance, total[d:, :d])
+        return self._by_variables.T @ left @ self._by_variables, images * float(points.sum())
+
+    def _pixels(self, standing: Array, drive: Array) -> tuple[Array, Array]:
+        """Whitened Jacobians (..., n, 2 r m, 6 r + 5) of pixels by cameras, markers and the mover's pose.
+
+        With the number of correspondences (..., n). Rows are ordered by camera, marker, axis; those of markers that
+        fewer than two cameras see are 0.
+        """
+        R, eyes = self.views(standing)
+        r, m, n = len(self.observers), len(self.p_markers), drive.shape[-2]
+        lead = drive.shape[:-2]
+        c, s = np.cos(drive[..., 2])[..., None], np.sin(drive[..., 2])[..., None]
+        mx, my = self.p_markers[:, 0], self.p_markers[:, 1]
+        arm = np.stack([c * mx - s * my, s * mx + c * my], axis=-1)
+        points = np.empty((*lead, n, m, 3))
+        points[..., :2] = drive[..., None, :2] + arm
+        points[..., 2] = self.p_markers[:, 2]
+        flat = points.reshape(*lead, n * m, 3)
+        p = (flat[..., None, :, :] - eyes[..., None, :]) @ R
+        seen = self._visible(standing, flat, eyes, p, MARGIN).reshape(*lead, r, n, m)
+        p = p.reshape(*lead, r, n, m, 3)
+        z = np.maximum(p[..., 2], 0.05)
+        project = np.zeros((*p.shape[:-1], 2, 3))
+        project[..., 0, 0] = project[..., 1, 1] = 1 / z
+        project[..., 0, 2], project[..., 1, 2] = -p[..., 0] / z**2, -p[..., 1] / z**2
+        project *= self._scale[:, None, None]
+        to_world = project @ R.mT[..., None, None, :, :]  # by the marker in the world, (..., r, n, m, 2, 3)
+        by_camera = np.concatenate([project @ hat(p), -project], axis=-1)
+        across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)[..., None, :, :, :, None]
+        by_yaw = to_world[..., :2] @ across
+        by_span = to_world[..., :2] @ arm[..., None, :, :, :, None]
+        J = np.zeros((*lead, n, r, m, 2, 6 * r + 5))
+        for k in range(r):
+            J[..., k, :, :, 6 * k : 6 * k + 6] = by_camera[..., k, :, :, :, :]
+        move = lambda one: np.moveaxis(one, -5, -4)  # noqa: E731  camera after instant
+        J[..., 6 * r : 6 * r + 1] = move(by_span)
+        J[..., 6 * r + 1] = move(to_world)[..., 2]
+        J[..., 6 * r + 2 : 6 * r + 4] = move(to_world)[..., :2]
+        J[..., 6 * r + 4 :] = move(by_yaw)
+        seen &= seen.sum(axis=-3, keepdims=True) >= 2
+        J *= np.moveaxis(seen, -3, -2)[..., None, None]
+        shared = seen.sum(axis=-3)
+        return J.reshape(*lead, n, r * m * 2, 6 * r + 5), (shared * (shared - 1) / 2).sum(axis=-1)
+
+
+def _without_mover(J: Array) -> Array:
+    """Information of all variables of Jacobians (..., rows, d + 3) but the last three, which are eliminated."""
+    H = J.mT @ J
+    latent = H[..., -3:, -3:] + WEAK * np.eye(3)
+    cross = H[..., :-3, -3:]
+    return np.asarray(H[..., :-3, :-3] - cross @ np.linalg.solve(latent, cross.mT))
