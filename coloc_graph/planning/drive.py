@@ -1,7 +1,6 @@
 """The mover's drive through waypoints in time, as its controller drives it: `Drive`, `drive_through`."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +27,7 @@ class Drive:
         return np.stack([np.interp(np.asarray(t, float), self.times, column) for column in self.knots.T], axis=-1)
 
 
-def there_and_back(waypoints: Sequence[tuple[float, float]], duration: float, speed: float = SPEED) -> Array:
+def there_and_back(waypoints: ArrayLike, duration: float, speed: float = SPEED) -> Array:
     """Waypoints (n, 2) of a drive back and forth through `waypoints` that lasts at least `duration` [s]."""
     once = np.asarray(waypoints, float).reshape(-1, 2)
     length = float(np.hypot(*np.diff(once, axis=0).T).sum())

@@ -103,12 +103,8 @@ class GaitSearch:
         D = [between(gait.stop(k), gait.stop(k + 2)) for k in (0, 1)]
         belief = Belief.start(self.predictor.team, {self.pair[0]: gait.stop(0)})
         leaps = [leap_model(one, belief.floor, odometry=self.predictor.odometry) for one in D]
-        return Candidate(
-            gait,
-            np.array(information),
-            (leaps[0], leaps[1]),
-            leap_time(gait.stop(0), gait.stop(2), self.predictor.speed),
-        )
+        taken = leap_time(gait.stop(0), gait.stop(2), self.predictor.speed)
+        return Candidate(gait, np.array(information), (leaps[0], leaps[1]), taken)
 
     def seconds(self, candidate: Candidate, time: float) -> float:
         """Return the duration of each stance in a mission of a whole `time` [s]; below 0 if its leaps take longer."""

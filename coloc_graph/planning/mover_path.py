@@ -154,7 +154,8 @@ def best_drives(
 
 def _knots(places: Array, shares: Array) -> list[int]:
     """Places that matter: those with the largest shares, and the outermost ones."""
-    left, chosen = shares.copy(), []
+    left = shares.copy()
+    chosen: list[int] = []
     while len(chosen) < MOST and left.max() > WORTH / len(places):
         chosen.append(int(np.argmax(left)))
         left[np.hypot(*(places - places[chosen[-1]]).T) < MERGED] = 0.0

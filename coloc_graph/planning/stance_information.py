@@ -118,7 +118,7 @@ class StanceModel:
                 seen[..., n, :] = inside & (uv >= margin - 0.5).all(-1) & (uv <= size - 0.5 - margin).all(-1)
             others = np.delete(standing[..., :2], n, axis=-2)
             seen[..., n, :] &= ~hidden(eyes[..., n, None, :], points, others[..., None, :, :])
-        return seen & (np.linalg.norm(p, axis=-1) < MAX_RANGE)
+        return np.asarray(seen & (np.linalg.norm(p, axis=-1) < MAX_RANGE))
 
     def see(self, standing: Array, drive: Array) -> Seen:
         """Linearise the pixels of a stance at instants of the mover's drive.
@@ -195,11 +195,8 @@ class StanceModel:
         J = np.zeros((*lead, n, r, m, 2, 6 * r + 5))
         for k in range(r):
             J[..., k, :, :, 6 * k : 6 * k + 6] = by_camera[..., k, :, :, :, :]
-        move = lambda one: np.moveaxis(one, -5, -4)  # noqa: E731  camera after instant
-        J[..., 6 * r : 6 * r + 1] = move(by_span)
-        J[..., 6 * r + 1] = move(to_world)[..., 2]
-        J[..., 6 * r + 2 : 6 * r + 4] = move(to_world)[..., :2]
-        J[..., 6 * r + 4 :] = move(by_yaw)
+        by_shared = np.concatenate([by_span, to_world[..., 2:], to_world[..., :2], by_yaw], axis=-1)
+        J[..., 6 * r :] = np.moveaxis(by_shared, -5, -4)
         seen &= seen.sum(axis=-3, keepdims=True) >= 2
         J *= np.moveaxis(seen, -3, -2)[..., None, None]
         shared = seen.sum(axis=-3)

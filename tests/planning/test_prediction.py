@@ -52,17 +52,14 @@ def test_the_promised_sigmas_are_those_that_the_estimator_states(tmp_path, gait,
         C = estimate.trajectories[robot].covariances[-1]
         assert end.position_sigma([robot]) == pytest.approx(math.sqrt(np.trace(C[3:5, 3:5])), rel=0.1)
         assert end.heading_sigma([robot]) == pytest.approx(math.sqrt(C[2, 2]), rel=0.1)
-        at = end.index(robot)
-        found = estimate.calibration.covariances if hasattr(estimate.calibration, "covariances") else None
-        assert found is None or at >= 0
     counts = [captures[0].recorded.sum() for captures in world.captures]
     assert np.mean([promise.points for promise in promises]) == pytest.approx(np.mean(counts), rel=0.1)
 
 
 def test_the_promised_sigma_is_the_spread_of_errors(tmp_path):
-    plan = straight_plan(3, Gait(0.7, 0.6, 10.0), 8.0)
+    plan = straight_plan(2, Gait(0.7, 0.6, 10.0), 6.0)
     squares = []
-    for seed in range(24):
+    for seed in range(16):
         world, estimate = estimated(plan, tmp_path, seed)
         times = np.array([stance.start for stance in world.stances])
         truth = {name: Trajectory(name, times, path.pose_at(times)) for name, path in world.paths.items()}
@@ -71,7 +68,7 @@ def test_the_promised_sigma_is_the_spread_of_errors(tmp_path):
         squares.append(np.mean(np.square(off).sum(axis=1)))
     promise = predicted(plan, world.team)[-1].belief.position_sigma(("A", "B"))
     ratio = promise / math.sqrt(np.mean(squares))
-    assert 0.75 < ratio < 1.33  # 24 runs know it to 11 %
+    assert 0.7 < ratio < 1.4  # 16 runs know it to 13 %; benchmarks/planning.py has more
 
 
 def test_a_leap_turns_an_error_of_the_heading_into_one_of_the_place():
