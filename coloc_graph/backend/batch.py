@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, innovation
-from coloc_graph.backend.estimate import Bump, Estimate, Rejection, make_estimate
+from coloc_graph.backend.estimate import Bump, Estimate, Rejection, contradicted, make_estimate
 from coloc_graph.backend.factors import Method, calibrations_in, require_robot_models
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.landmarks import ALWAYS, OnMap
@@ -29,6 +29,7 @@ TESTED = (RelativePose, Sighting, OnMap)  # links that are tested to see whether
 SEARCHED = (*TESTED, Odometry)  # links that may be wrong once something is
 REJECTION_PRICE = 30.0  # chi2 that one more outlier must explain
 EQUAL_CHI2 = 9.0  # two causes explain equally well if chi2 differs by less
+SIGMAS_ALONE = 12.0  # a measurement that alone ties a pose is kept up to this: a wrong one is off by many more
 MAX_ROUNDS = 20  # rounds of rejecting the worst link and taking back those that then agree
 
 
@@ -162,34 +163,33 @@ def _find_outliers(method: Method, graph: PoseGraph, warm: WarmStart | None) -> 
     """
     start = warm.start(graph) if warm else None
     if warm is not None:
-        suspected, fit = _search(method, graph, {}, start)
+        offs, fit = _search(method, graph, {}, start)
     else:
         # poses alone for a start: GTSAM's optimiser copies its factors, which those that are Python cannot be
         first = _outliers(fit_graph("smooth", graph))
-        suspected, fit = _search(method, graph, first, start)
-        if first and len(fit.links) <= ALL_TESTED and len(suspected) > 1:
+        offs, fit = _search(method, graph, first, start)
+        if first and len(fit.links) <= ALL_TESTED and len(offs) > 1:
             other, other_fit = _search(method, graph, {}, start)
-            if _price(other, other_fit) < _price(suspected, fit):
-                suspected, fit = other, other_fit
-    rejected = tuple(
-        Rejection(link, f"contradicted by the other measurements ({off:.0f} sigmas)")
-        for link in (*graph.measurements, *graph.on_map)
-        if id(link) in suspected
-        for off in [_innovation(fit, link).sigmas]
-    )
-    return rejected, fit
+            if _price(other, other_fit) < _price(offs, fit):
+                offs, fit = other, other_fit
+    links = (*graph.measurements, *graph.on_map)
+    return tuple(contradicted(link, offs[id(link)]) for link in links if id(link) in offs), fit
 
 
-def _price(rejected: Mapping[int, Link], fit: Fit) -> float:
+def _price(rejected: Mapping[int, Agreement], fit: Fit) -> float:
     """Implausibility of a set of rejections: chi2 above its expected value, and a price for each."""
     return fit.chi2 - fit.dof + REJECTION_PRICE * len(rejected)
 
 
 def _search(
     method: Method, graph: PoseGraph, suspected: dict[int, Link], start: gtsam.Values | None
-) -> tuple[dict[int, Link], Fit]:
-    """Reject the worst measurement and take back those that then agree, in turns; start from those `suspected`."""
-    suspected = dict(suspected)
+) -> tuple[dict[int, Agreement], Fit]:
+    """Reject the worst measurement and take back those that then agree, in turns; start from those `suspected`.
+
+    What alone ties a pose is taken back too, up to `SIGMAS_ALONE`. Return how far off the rejected are, by identity,
+    and the fit without them.
+    """
+    suspected, at_rejection, alone = dict(suspected), dict[int, Agreement](), set[int]()
     # ends when a set repeats, or after the last round
     for left in reversed(range(MAX_ROUNDS)):
         try:
@@ -201,16 +201,27 @@ def _search(
             return {}, fit_graph(method, graph, start)
         tested = fit.agreements(SEARCHED)
         scale = _scale(tested.values())
-        worst = min(tested, key=lambda index: tested[index].log_p_value(), default=None)
-        again = {key for key, link in suspected.items() if _agrees(fit, link, scale)}
+        kept = {index for index, off in tested.items() if id(fit.links[index]) in alone and off.sigmas < SIGMAS_ALONE}
+        worst = min(tested.keys() - kept, key=lambda index: tested[index].log_p_value(), default=None)
         refusing = worst is not None and tested[worst].p_value(scale) < REJECTION_P_VALUE
-        if not left or not (again or refusing):
+        offs = {key: _innovation(fit, link) for key, link in suspected.items()}
+        again = {key for key, off in offs.items() if off.dof and off.p_value(scale) >= REJECTION_P_VALUE}
+        untied = [key for key, off in offs.items() if not off.dof and at_rejection.get(key, off).sigmas < SIGMAS_ALONE]
+        if not left and untied:
+            for key in untied:
+                del suspected[key], offs[key]
+            fit = fit_graph(method, graph.without(suspected.values()), start)
+        if not left or not (again or untied or refusing):
             break
+        if untied:  # one at a time, the last first: it was the least off, and may contradict the others
+            again.add(untied[-1])
+            alone.add(untied[-1])
         for key in again:
             del suspected[key]
         if worst is not None and refusing:
             suspected[id(fit.links[worst])] = fit.links[worst]
-    return suspected, fit
+            at_rejection[id(fit.links[worst])] = tested[worst]
+    return {key: off if off.dof else at_rejection[key] for key, off in offs.items()}, fit
 
 
 def _outliers(fit: Fit) -> dict[int, Link]:
@@ -243,11 +254,6 @@ def _innovation(fit: Fit, link: Link) -> Agreement:
     if not all(map(fit.values.exists, factor.keys())):
         return UNCHECKED
     return innovation([factor], fit.values, fit.marginals.joint(list(factor.keys())))
-
-
-def _agrees(fit: Fit, link: Link, scale: float) -> bool:
-    """Return whether a rejected link agrees with the rest, or is the only one that ties one of its ends."""
-    return _innovation(fit, link).p_value(scale) >= REJECTION_P_VALUE
 
 
 def find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:

@@ -33,10 +33,18 @@ class Rejection:
         The outlier itself.
     reason : str
         Reason in words.
+    sigmas : float
+        Distance from what all others say; NaN of a ranging run, whose weights are robust.
     """
 
     measurement: Measurement | RangeBearing | OnMap
     reason: str
+    sigmas: float = float("nan")
+
+
+def contradicted(measurement: Measurement | OnMap, off: Agreement) -> Rejection:
+    """The rejection of a measurement that is so far `off` from what all others say."""
+    return Rejection(measurement, f"contradicted by the other measurements ({off.sigmas:.0f} sigmas)", off.sigmas)
 
 
 @dataclass(frozen=True, eq=False)

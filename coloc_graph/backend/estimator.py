@@ -14,7 +14,7 @@ from coloc_graph.backend.batch import find_bumps, joint, smooth
 from coloc_graph.backend.calibration import Variables
 from coloc_graph.backend.checkpoint import Base, Entry, WaitingStance
 from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
-from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate
+from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate, contradicted
 from coloc_graph.backend.factors import Factors, Method, require_robot_models
 from coloc_graph.backend.graph import (
     Link,
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 def _rejection(link: Link, off: Agreement) -> Rejection:
     assert isinstance(link, RelativePose | Sighting)
-    return Rejection(link, f"contradicted by the other measurements ({off.sigmas:.0f} sigmas)")
+    return contradicted(link, off)
 
 
 def _base(
@@ -234,18 +234,17 @@ class Estimator:
         return self._live.residual((measurement, i, j)) if i != j and {i, j} <= self._live.tied else float("nan")
 
     def estimate(self) -> Estimate:
-        """Return the batch estimate of all inputs, without those rejected.
+        """Return the batch estimate of all inputs.
+
+        With hindsight others may be rejected than when they came.
 
         Raises
         ------
         EstimationError
             There is no stance yet.
         """
-        graph = self.graph
-        kept = graph.without(one.measurement for one in self.rejected)
-        values = self._live.values() if self._live.tied else None
         optimised = joint if self.robot_models else smooth
-        return replace(optimised(kept, reject=False, start=values), source=graph, rejected=self.rejected)
+        return optimised(self.graph, start=self._live.values() if self._live.tied else None)
 
     def bumps(self) -> tuple[Bump, ...]:
         """Find the anchors that did not stay put, by all inputs, rejected ones included; takes a few batch fits."""

@@ -189,8 +189,8 @@ def _print(solution: "Solution", accuracy: "Accuracy | None", out: str) -> None:
         print_accuracy(accuracy)
         print_promised(estimate.trajectories)
     compared = set() if accuracy is None else {row.robot for row in accuracy.robots}
-    if others := {robot: one for robot, one in estimate.trajectories.items() if robot not in compared}:
-        print_last_poses(others)
+    if uncompared := {robot: one for robot, one in estimate.trajectories.items() if robot not in compared}:
+        print_last_poses(uncompared)
     if (online := assess_online(solution)) is not None:
         print_online(online)
     print_calibration(estimate.calibration)
@@ -200,7 +200,12 @@ def _print(solution: "Solution", accuracy: "Accuracy | None", out: str) -> None:
         print(f"{what} entered in {median:.1f} ms (median; at most {longest:.1f} ms)")
     agreement = f", chi2/dof {estimate.chi2 / estimate.dof:.2f}" if estimate.dof > 0 else ""
     count = solution.count
+    others = [
+        f", {one.rejected} of {counted(one.used + one.rejected, f'{kind} measurement')} rejected"
+        for kind, one in list(solution.counts.items())[1:]
+        if one.rejected
+    ]
     print(
-        f"{count.used} of {counted(count.used + count.rejected, 'measurement')} used{agreement}; "
+        f"{count.used} of {counted(count.used + count.rejected, 'measurement')} used{''.join(others)}{agreement}; "
         f"{out} holds trajectories, measurements.csv and report.html"
     )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from coloc_graph.frontend.homography.eq2_pose import turned_normal
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.correspondence import pair_by_time
-from coloc_graph.frontend.tracks.marker_pairs import couple_of, named_pair
+from coloc_graph.frontend.tracks.marker_pairs import couple_of, named_pair, tracks_of
 from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.geometry.lie import across, floor_pose, so3_exp
 from coloc_graph.geometry.se2 import wrap
@@ -110,7 +110,11 @@ def _marker_tracks(
     named = named_pair(tracks, seen.name, alone=alone)
     if named is not None:
         return tracks[named[0]], tracks[named[1]]
-    if any(track.marker for track in tracks) or len(tracks) < 2 or wheels is None or not len(wheels):
+    if any(track.marker for track in tracks):
+        tracks = [tracks[n] for n in tracks_of(tracks, seen.name, alone=alone)]
+        if len(tracks) != 2:
+            return None
+    if len(tracks) < 2 or wheels is None or not len(wheels):
         return None
     if len(tracks) > 2:
         assert seen.markers is not None

@@ -17,6 +17,7 @@ from coloc_graph.pipeline.explanations import (
     warnings_of_graph,
     warnings_of_ranges,
     why_disconnected,
+    without_poses,
 )
 from coloc_graph.pipeline.incremental import (
     EnteredStance,
@@ -50,6 +51,7 @@ class _Solved:
     measured: tuple[PairMeasurement, ...] = ()
     seconds_updates: tuple[float, ...] = ()
     online: Mapping[str, Trajectory] = field(default_factory=dict)
+    without_pose: Mapping[str, str] = field(default_factory=dict)
 
 
 def solve(
@@ -105,12 +107,22 @@ def solve(
         options=options,
         estimate=solved.estimate,
         measurements=solved.measured,
-        warnings=(*run.warnings, *(str(one) for one in unused if not one.asked), *solved.warnings),
+        warnings=(
+            *run.warnings,
+            *(str(one) for one in unused if not one.asked),
+            *solved.warnings,
+            *(
+                f"robot {robot} has no pose: {why}"
+                for robot, why in solved.without_pose.items()
+                if options.method != "chain" and not any(why in one for one in solved.warnings)
+            ),
+        ),
         seconds_frontend=solved.seconds_frontend,
         seconds_backend=time.perf_counter() - started - solved.seconds_frontend,
         seconds_updates=solved.seconds_updates,
         unused=unused,
         online=solved.online,
+        without_pose=solved.without_pose,
     )
 
 
@@ -134,7 +146,8 @@ def _at_once(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
     assert options.method is not None  # resolved
     estimate = BATCH[options.method](graph)
     warnings = _warnings(run, options, estimate, measured, clock_warnings, sources.doubts)
-    return _Solved(estimate, warnings, made - started, measured)
+    missing = without_poses(run, options, estimate, measured, sources.doubts)
+    return _Solved(estimate, warnings, made - started, measured, without_pose=missing)
 
 
 def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: OnUpdate | None) -> _Solved:
@@ -146,11 +159,11 @@ def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: 
             on_update(one)
     _require_poses(run, options, solver.measured)
     _require_ties(run, solver.estimator.graph, solver.measured)
-    # an estimator looks at one stance at a time: rejections may be explained by an anchor that was pushed
-    estimate = replace(solver.estimator.estimate(), bumped=solver.estimator.bumps())
+    estimate = solver.estimator.estimate()
     frontend, updates = zip(*solver.seconds, strict=True)
     warnings = _warnings(run, options, estimate, solver.measured, solver.warnings, solver.doubts)
-    return _Solved(estimate, warnings, sum(frontend), solver.measured, updates)
+    missing = without_poses(run, options, estimate, solver.measured, solver.doubts)
+    return _Solved(estimate, warnings, sum(frontend), solver.measured, updates, without_pose=missing)
 
 
 def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_update: OnUpdate | None) -> _Solved:
@@ -177,7 +190,12 @@ def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_up
         raise EstimationError(
             f"{run.path}: no robot can be placed: a robot must observe at least two landmarks with known positions"
         )
-    return _Solved(estimate, [*keyframes.warnings, *warnings_of_ranges(estimate)], seconds, (), updates, online)
+    missing = dict.fromkeys(
+        (name for name in keyframes.robots if name not in estimate.trajectories),
+        "it was never measured together with two things whose positions are known",
+    )
+    warnings = [*keyframes.warnings, *warnings_of_ranges(estimate)]
+    return _Solved(estimate, warnings, seconds, (), updates, online, missing)
 
 
 def _warnings(

@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 
 from coloc_graph.backend import DisconnectedComponent, Estimate
 from coloc_graph.backend.ranging import RangingProblem
-from coloc_graph.frontend import PairMeasurement, little_in_common
+from coloc_graph.frontend import Doubt, PairMeasurement, little_in_common
 from coloc_graph.frontend.pairing.plane_check import implausible
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
@@ -42,6 +42,43 @@ def _kind(reason: str, *robots: str) -> str:
         reason = re.sub(rf"\b{re.escape(robot)}\b", "?", reason)
     reason = re.sub(r"`[^`]*`(, `[^`]*`)*", "?", reason)
     return re.sub(r"\d+(\.\d+)?(e[+-]?\d+)?", "?", reason)
+
+
+def without_poses(
+    run: Run,
+    options: SolveOptions,
+    estimate: Estimate,
+    measurements: Iterable[PairMeasurement],
+    doubts: Iterable[Doubt],
+) -> dict[str, str]:
+    """Reason, by robot, for which robots of a team with stances have no pose."""
+    team, stances = run.team, run.stances
+    sighted = {one.landmark: one.why for one in doubts if one.is_robot}
+    disconnected = {robot for robot, _ in estimate.disconnected}
+    measured = {m.homography.stance for m in measurements if not m.homography.unusable}
+    found: dict[str, str] = {}
+    for robot in team.names:
+        if robot in estimate.trajectories:
+            continue
+        moved = [stance for stance in stances if robot in stance.movers]
+        if any(robot in stance.observers for stance in stances) or robot in disconnected:
+            why = "no measurement that is used ties it to the reference"
+        elif not moved:
+            why = "it takes part in no stance"
+        elif options.method == "chain":
+            why = "a chain places observers only, and it was watched; solve with another method"
+        elif team[robot].markers is None:
+            why = "the team states no markers of it; state where they are"
+        elif not any(stance.index in measured for stance in moved):
+            why = "no stance in which it moved could be measured"
+        elif team.floor is None:
+            why = "nothing says how it stands under its markers; state the [floor] in the team"
+        elif all(stance.index in run.planes for stance in moved):
+            why = "the marker planes are stated, and not where they are above the floor"
+        else:
+            why = sighted.get(robot, "its markers were not seen well enough")
+        found[robot] = why
+    return found
 
 
 def implausible_planes(run: Run, options: SolveOptions, measurements: Sequence[PairMeasurement]) -> Iterator[str]:
@@ -110,16 +147,9 @@ def _once_in(chance: float) -> str:
 
 
 def warnings_of_ranges(estimate: Estimate) -> list[str]:
-    """Warnings of the estimate of a ranging run: robots without poses, outliers, unlikely calibrations."""
-    problem = estimate.ranging
-    warnings = [
-        f"robot {name} has no poses: it was never measured together with two things whose positions are known"
-        for name in problem.keyframes.robots
-        if name not in estimate.trajectories
-    ]
-    if estimate.rejected:
-        warnings.append(_outliers(problem))
-    return [*warnings, *_far(estimate)]
+    """Warnings of the estimate of a ranging run: outliers, unlikely calibrations."""
+    outliers = [_outliers(estimate.ranging)] if estimate.rejected else []
+    return [*outliers, *_far(estimate)]
 
 
 def _outliers(problem: RangingProblem) -> str:

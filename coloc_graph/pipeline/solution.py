@@ -48,6 +48,8 @@ class Solution:
         Recorded data that the estimate does not use.
     online : mapping of str to Trajectory
         Of an incremental estimate of a ranging run: each pose as it was estimated at its time.
+    without_pose : mapping of str to str
+        By robot of the team that has no pose: the reason.
     """
 
     run: Run
@@ -60,6 +62,7 @@ class Solution:
     seconds_updates: tuple[float, ...] = ()
     unused: tuple[Unused, ...] = ()
     online: Mapping[str, Trajectory] = field(default_factory=dict)
+    without_pose: Mapping[str, str] = field(default_factory=dict)
 
     def why_not(self, measured: PairMeasurement) -> str | None:
         """Return why a pair's measurement is not in the estimate; None where it is."""

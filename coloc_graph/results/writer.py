@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.estimate import Rejection
 from coloc_graph.errors import ColocError
 from coloc_graph.evaluation import Accuracy, accuracy_json, align, evaluate, usual_alignment
 from coloc_graph.exchange.dot import to_dot
@@ -136,6 +137,10 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
     return accuracy
 
 
+def _rejection(one: Rejection) -> dict[str, Any]:
+    return {"measurement": str(one.measurement), "reason": one.reason, "sigmas": one.sigmas}
+
+
 def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
     """Return the content of summary.json; numbers that do not exist are null."""
     estimate, count = solution.estimate, solution.count
@@ -154,7 +159,7 @@ def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
         "poses": sum(map(len, estimate.trajectories.values())),
         "measurements": {
             "used": count.used,
-            "rejected": count.rejected,
+            "rejected": sum(one.rejected for one in solution.counts.values()),
             "kinds": {kind: dataclasses.asdict(one) for kind, one in solution.counts.items()},
         },
         "unused": unused,
@@ -162,6 +167,8 @@ def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
         "dof": estimate.dof,
         "iterations": estimate.iterations,
         "disconnected": disconnected,
+        "rejected": [] if estimate.is_ranging else [_rejection(one) for one in estimate.rejected],
+        "without_pose": dict(solution.without_pose),
         "bumped": [[one.stay_put.robot, one.stay_put.before, one.stay_put.after] for one in estimate.bumped],
         "calibration": [dataclasses.asdict(row) for row in estimate.calibration.rows],
         "landmarks": [row.as_json() for row in landmark_rows(estimate)],

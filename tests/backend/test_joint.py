@@ -332,3 +332,38 @@ def test_a_long_run_finds_its_mounts_in_its_first_part(solved, monkeypatch):
     monkeypatch.setattr(module, "LONG_RUN_STANCES", 80)
     joint(solved.estimate.graph)
     assert min(with_part[1:]) < 0.05 * started[0]  # the whole starts by far nearer
+
+
+def seen_wrong(graph, factor):
+    """The graph with the last sighting off along its span, in standard deviations, and alone in tying its robot."""
+    last = [m for m in graph.measurements if isinstance(m, Sighting)][-1]
+    span = last.x_markers[1] - last.x_markers[0]
+    along = span / np.linalg.norm(span)
+    off = factor * np.sqrt(along @ last.x_covariance[0] @ along) * along
+    bad = replace(last, x_markers=last.x_markers + np.array([np.zeros(2), off]))
+    measurements = tuple(
+        bad if m is last else m
+        for m in graph.measurements
+        if not (isinstance(m, Odometry) and (m.robot, m.after) == (last.seen, last.stance))
+    )
+    return replace(graph, measurements=measurements), (last.seen, last.stance)
+
+
+def test_a_sighting_that_alone_ties_a_pose_is_kept_unless_it_is_plainly_wrong(short_solution):
+    graph, (robot, stance) = seen_wrong(short_solution.estimate.graph, 25)
+    for estimate in (joint(graph), fed(graph).estimate()):
+        assert not estimate.rejected and estimate.pose(robot, stance)
+    graph, (robot, stance) = seen_wrong(short_solution.estimate.graph, 60)
+    for estimate in (joint(graph), fed(graph).estimate()):
+        (rejected,) = estimate.rejected
+        assert rejected.measurement.ends[1] == (robot, stance) and rejected.sigmas > 15
+        assert f"({rejected.sigmas:.0f} sigmas)" in rejected.reason
+        assert stance not in estimate.trajectories[robot].stances
+
+
+def fed(graph):
+    """An estimator that a graph was fed to, stance by stance."""
+    estimator = Estimator(graph.reference, graph.robots, graph.floor, graph.slips, graph.robot_models, graph.landmarks)
+    for stance in graph.stances:
+        estimator.add(stance, [m for m in graph.measurements if max(n for _, n in m.ends) == stance.index])
+    return estimator

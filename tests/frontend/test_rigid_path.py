@@ -18,10 +18,11 @@ from coloc_graph.frontend import (
     sight_movers,
     unsighted_movers,
 )
+from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.rigid_alignment import align_paths
 from coloc_graph.frontend.tracks.rigid_path import rigid_path
 from coloc_graph.geometry.lie import floor_pose
-from coloc_graph.run import Stance
+from coloc_graph.run import OdometrySample, Stance
 from coloc_graph.simulation.crowd import STEP, Faults, detect, lights_of, wander
 from coloc_graph.simulation.paths import SPEED
 from coloc_graph.simulation.rig import reference_team
@@ -160,6 +161,18 @@ def test_a_mover_with_named_markers_is_sighted_whatever_their_names(names):
     (sighting,) = sight_movers(one, one.stance, [measured], {})
     assert sighting.seen == "C"
     assert not unsighted_movers(one, one.stance, [measured], {}, [sighting])
+
+
+def test_wheels_tell_which_of_two_markers_with_any_names_is_which():
+    poses = arcs(20.1)
+    one = renamed(scene(20.0, SPEED, 0, poses), ("port", "starboard"))
+    measured = measure_pair(one, one.stance, "A", "B", FrontendOptions())
+    assert not sight_movers(one, one.stance, [measured], {})
+    driven = [OdometrySample("C", 1000.0 + STEP * k, pose, 1e-6 * np.eye(3)) for k, pose in enumerate(poses[:, 0])]
+    (sighting,) = sight_movers(one, one.stance, [measured], {"C": WheelTrack("C", driven)})
+    at = floor_pose(*poses[round((sighting.time - 1000.0) / STEP), 0])
+    off = np.linalg.inv(at) @ floor_pose(*POSES["AB".index(sighting.observer)]) @ sighting.T_observer_seen
+    assert np.linalg.norm(off[:2, 3]) < 0.03 and off[0, 0] > 0.99  # and not the other way round
 
 
 def test_a_mover_whose_like_lights_nothing_tells_apart_has_a_reason():

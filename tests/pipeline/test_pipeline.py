@@ -13,6 +13,7 @@ from coloc_graph.evaluation import align, evaluate
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.pipeline.batch import METHODS, SolveOptions, solve
 from coloc_graph.pipeline.inspection import inspect
+from coloc_graph.results.writer import summarise
 from coloc_graph.run import Detections, Planes, Stance, open_run, read_truth, whole_run
 from coloc_graph.simulation import reference_team
 
@@ -312,3 +313,15 @@ def test_three_observers_at_once_make_three_measurements_that_agree(tmp_path):
         assert np.linalg.norm(off) < 5 * np.linalg.norm(sigma) + 1e-6
     chained = solve(open_run(tmp_path / "three.mcap"), SolveOptions(method="chain"))
     assert set(chained.estimate.trajectories) == {"A", "B", "C"}
+
+
+def test_each_robot_of_the_team_has_a_row_or_a_reason(short, copied, tmp_path):
+    team = open_run(short).team
+    no_floor = msgspec.structs.replace(team, floor=None)
+    run = open_run(copied(short, tmp_path / "run.mcap", team=no_floor))
+    solution = solve(run)
+    assert set(solution.estimate.trajectories) == {"A", "B"}
+    assert solution.without_pose == {"C": "nothing says how it stands under its markers; state the [floor] in the team"}
+    assert any(one.startswith("robot C has no pose: nothing says how it stands") for one in solution.warnings)
+    assert solve(open_run(short), SolveOptions(method="chain")).without_pose["C"].startswith("a chain places observers")
+    assert summarise(solution, None)["without_pose"] == dict(solution.without_pose)

@@ -49,18 +49,25 @@ def couple_of(tracks: Sequence[Track], camera: Camera, plane: Plane, span: float
 def named_pair(tracks: Sequence[Track], robot: str, *, alone: bool) -> tuple[int, int] | None:
     """Numbers of the tracks of a robot's first and second marker by their names; None where they do not tell.
 
-    Names are `ROBOT/0` and `ROBOT/1`. Where one robot moves `alone`, any two names that end in numbers do, as `led0`
-    and `led1`: the smaller number is the first marker.
+    Two names that end in numbers do, as `ROBOT/0` and `ROBOT/1`: the smaller number is the first marker.
     """
+    own = tracks_of(tracks, robot, alone=alone)
     names = {track.marker: number for number, track in enumerate(tracks) if track.marker}
     first, second = (names.get(f"{robot}/{n}") for n in range(2))
     if first is not None and second is not None:
         return first, second
-    ends = {name: re.search(r"[0-9]+$", name) for name in names}
-    if not alone or len(names) != 2 or not all(ends.values()):
+    ends = {n: int(end[0]) for n in own if (end := re.search(r"[0-9]+$", tracks[n].marker))}
+    if len(own) != 2 or len(set(ends.values())) != 2:
         return None
-    order = sorted(names, key=lambda name: int(end[0]) if (end := ends[name]) else 0)
-    return names[order[0]], names[order[1]]
+    a, b = sorted(own, key=ends.__getitem__)
+    return a, b
+
+
+def tracks_of(tracks: Sequence[Track], robot: str, *, alone: bool) -> list[int]:
+    """Numbers of the named tracks of a robot: those called `ROBOT/...`, or all where it moves `alone`."""
+    named = [n for n, track in enumerate(tracks) if track.marker]
+    own = [n for n in named if tracks[n].marker.startswith(f"{robot}/")]
+    return own or (named if alone else [])
 
 
 def markers_of_movers(
