@@ -21,6 +21,7 @@ from coloc_graph.cli import (
     export,
     import_,
     info,
+    plan,
     robot,
     simulate,
     solve,
@@ -44,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in (
         *(demo, team, calibrate, simulate, import_, info, solve, evaluate, view, export, experiment),
-        *(coordinate, robot, certificates),
+        *(plan, coordinate, robot, certificates),
     ):
         module.add(commands)
     return top

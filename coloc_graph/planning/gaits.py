@@ -83,7 +83,9 @@ class GaitSearch:
             raise InputError(f"a way of {length} m is none: give a length above 0 m")
         self.predictor, self.length, self.pair, self.mover = predictor, length, pair, mover
         if gaits is None:
-            gaits = [PAPER, *(Gait(*one) for one in product(LEAPS, ABREAST, TOE_INS) if one[0] <= length)]
+            # leaps that come to the end of the way in a whole number of stances
+            leaps = sorted({length / max(math.ceil(length / leap - 0.1), 1) for leap in LEAPS})
+            gaits = [PAPER, *(Gait(*one) for one in product(leaps, ABREAST, TOE_INS) if one[0] <= LEAPS[-1])]
         made = [self._candidate(gait) for gait in gaits]
         self.candidates = [one for one in made if one is not None]
         if not self.candidates:

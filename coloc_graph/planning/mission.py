@@ -75,7 +75,7 @@ def leap_time(start: Planar, target: Planar, speed: float) -> float:
 
 def stances_of(gait: Gait, length: float) -> int:
     """Return the number of stances of a gait over a length [m]."""
-    return max(round(length / gait.leap), 1)
+    return max(math.ceil(length / gait.leap - 0.1), 1)
 
 
 def leap_frog(

@@ -1,0 +1,147 @@
+"""coloc plan TEAM.toml."""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from coloc_graph.cli.printing import print_json, print_table, warn
+
+if TYPE_CHECKING:
+    from coloc_graph.planning.formation import Gait
+    from coloc_graph.planning.mission import Mission
+
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
+
+
+def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add the command and its arguments."""
+    command = commands.add_parser(
+        "plan",
+        help="choose where the robots of a team stand and drive, and what accuracy this promises",
+        description="Choose the formation of a leap-frog, its leaps, and the mover's drives, for the least uncertainty "
+        "at the end of a straight way. Prints what the best plan and the paper's formation promise.",
+    )
+    command.add_argument("team", metavar="TEAM.toml")
+    command.add_argument("--length", type=float, default=7.2, metavar="M", help="length of the way [m] (default: 7.2)")
+    wanted = command.add_mutually_exclusive_group()
+    wanted.add_argument("--sigma-end", type=_length, metavar="S", help="wanted sigma of the last positions, as in 5mm")
+    wanted.add_argument(
+        "--time", type=_time, metavar="T",
+        help="duration of the mission, as in 10min (default: as many images as the paper's formation takes in 5 s a "
+        "stance)",
+    )  # fmt: skip
+    command.add_argument("--mover", metavar="NAME", help="robot that drives before the others' cameras (default: last)")
+    command.add_argument("--speed", type=float, default=0.2, metavar="V", help="speed of robots [m/s] (default: 0.2)")
+    command.add_argument("--fps", type=float, help="images a second (default: those of the slowest camera)")
+    command.add_argument("--noise", type=float, metavar="PX", help="noise of marker centres [px] (default: the team's)")
+    command.add_argument("--without-odometry", action="store_true", help="ignore wheel odometry")
+    command.add_argument("--poses", metavar="CSV", help="write the plan, for `coloc simulate hallway --plan CSV`")
+    command.add_argument("--draw", metavar="PNG", help="draw the plan and the paper's formation")
+    command.add_argument("--json", action="store_true", help="print figures as JSON")
+    command.set_defaults(run=run)
+
+
+def _quantity(text: str, units: tuple[str, ...], example: str) -> float:
+    for unit in sorted(units, key=len, reverse=True):
+        if text.endswith(unit):
+            number = text.removesuffix(unit)
+            break
+    else:
+        raise argparse.ArgumentTypeError(f"`{text}` has no unit; give it as in {example}")
+    try:
+        value = float(number) * UNITS[unit]
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"`{text}` is not a quantity above 0; give it as in {example}")
+    return value
+
+
+def _length(text: str) -> float:
+    return _quantity(text, ("mm", "cm", "m"), "5mm")
+
+
+def _time(text: str) -> float:
+    return _quantity(text, ("s", "min", "h"), "10min")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Search the gaits, plan the best one's drives, print, and write what is asked for."""
+    from coloc_graph.errors import InputError
+    from coloc_graph.planning.formation import PAPER
+    from coloc_graph.planning.gaits import PAPER_SECONDS, GaitSearch
+    from coloc_graph.planning.mission import stances_of
+    from coloc_graph.planning.plan import write_plan
+    from coloc_graph.planning.prediction import Predictor
+    from coloc_graph.planning.roles import pair_of
+    from coloc_graph.team import read_team
+
+    team = read_team(args.team)
+    for name, value in (("speed", args.speed), ("fps", args.fps), ("noise", args.noise)):
+        if value is not None and not 0 < value < 1e6:
+            raise InputError(f"--{name} is {value}; give a number above 0")
+    pair, mover, left = pair_of(team, args.mover)
+    if left:
+        warn([f"{', '.join(left)} stay out of this plan, which is of two observers and a mover"])
+    fps = min(team[name].camera.fps for name in pair) if args.fps is None else args.fps
+    predictor = Predictor(team, fps, args.noise, odometry=not args.without_odometry, speed=args.speed)
+    search = GaitSearch(predictor, args.length, pair, mover)
+    capture = PAPER_SECONDS * stances_of(PAPER, args.length) if args.time is None and args.sigma_end is None else None
+    time = search.shortest(args.sigma_end) if args.sigma_end is not None else args.time
+    gait, best = search.planned(search.ranked(time=time, capture=capture))
+    paper = search.of_paper(time=time, capture=capture)
+    if args.sigma_end is not None:
+        asked = f"the end known to {1e3 * args.sigma_end:g} mm"
+    else:
+        asked = f"{args.time / 60:.1f} min" if args.time is not None else f"{capture:.0f} s of images"
+    rows = [("the best plan", gait, best)] + ([("the paper's formation", PAPER, paper)] if paper is not None else [])
+    if args.json:
+        print_json({name: figures(one, mission) for name, one, mission in rows})
+    else:
+        print(f"{args.length:g} m with {asked}; {pair[0]} and {pair[1]} observe, {mover} moves")
+        print_table(
+            ["", "leap", "abreast", "toe-in", "stances", "a stance", "images", "mission", "end", "heading"],
+            [_row(name, one, mission, fps) for name, one, mission in rows],
+        )
+        print("end and heading: promised standard deviations of the observers' last poses")
+        if paper is None:
+            print(f"the paper's formation takes longer than {time / 60:.1f} min with its leaps alone")
+    if args.poses is not None:
+        write_plan(best.plan, args.poses)
+    if args.draw is not None:
+        from coloc_graph.report.plan import plan_figure
+
+        plan_figure([(name, mission) for name, _, mission in rows]).savefig(args.draw, dpi=130)
+    return 0
+
+
+def figures(gait: "Gait", mission: "Mission") -> dict[str, float]:
+    """Return what a plan is and promises, in SI units and degrees."""
+    import math
+
+    return {
+        "leap": gait.leap,
+        "abreast": gait.abreast,
+        "toe_in_deg": gait.toe_in_deg,
+        "stances": len(mission.plan.stances),
+        "capture_seconds": mission.capture_time,
+        "points": mission.points,
+        "mission_seconds": mission.duration,
+        "end_sigma": mission.end_sigma,
+        "heading_sigma_deg": math.degrees(mission.heading_sigma),
+    }
+
+
+def _row(name: str, gait: "Gait", mission: "Mission", fps: float) -> list[str]:
+    f = figures(gait, mission)
+    return [
+        name,
+        f"{f['leap']:.2f} m",
+        f"{f['abreast']:.2f} m",
+        f"{f['toe_in_deg']:.0f} deg",
+        f"{f['stances']:.0f}",
+        f"{f['capture_seconds'] / f['stances']:.1f} s",
+        f"{f['capture_seconds'] * fps:.0f}",
+        f"{f['mission_seconds']:.0f} s",
+        f"{1e3 * f['end_sigma']:.1f} mm",
+        f"{f['heading_sigma_deg']:.3f} deg",
+    ]
