@@ -47,7 +47,7 @@ def tracks_of(seen: Seen, movers: int) -> tuple[list[Track], list[int]]:
     for one in seen.images:
         tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
     plane = plane_from_mount(ROBOT.mount, ROBOT.markers)
-    kept = markers_of_movers(tracker.tracks(), ROBOT.camera, plane, [ROBOT.markers.span], movers)
+    kept = markers_of_movers(tracker.tracks(), ROBOT.camera, [plane], [ROBOT.markers.span], movers)
     number = {one.time: n for n, one in enumerate(seen.images)}
     lights = []
     for track in kept:

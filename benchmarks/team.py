@@ -136,7 +136,7 @@ class Coloured(StanceTracks):
                 tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area)[own])
             spans = [markers.span] if (markers := self.run.team[mover].markers) and markers.span else []
             plane = stance_plane(self.run, self.stance, robot)
-            own_tracks = markers_of_movers(tracker.tracks(), self.run.team[robot].camera, plane, spans, 1)
+            own_tracks = markers_of_movers(tracker.tracks(), self.run.team[robot].camera, [plane], spans, 1)
             bodies = max((track.body for track in tracks), default=-1) + 1
             tracks += [replace(one, mover=mover, body=one.body + bodies * (one.body >= 0)) for one in own_tracks]
         return tracks

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.frontend.homography.eq2_pose import turned_normal
+from coloc_graph.frontend.homography.plane import on_plane
+from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.correspondence import pair_by_time
 from coloc_graph.frontend.tracks.marker_pairs import couple_of, named_pair, tracks_of
@@ -58,10 +60,14 @@ def sight(
     uv = np.stack([pair[0].uv[shared[:, 0]], pair[1].uv[shared[:, 1]]], axis=1)
     times = pair[0].times[shared[:, 0]]
     places = _on_floor(observer, plane, uv)
-    span = np.linalg.norm(places[:, 1] - places[:, 0], axis=1)
     length = np.linalg.norm(np.diff(markers.p_body[:2, :2], axis=0))
-    with np.errstate(invalid="ignore"):
-        good = np.flatnonzero(np.abs(span / length - 1) < SPAN_TOLERANCE)
+    x = observer.camera.normalise(uv.reshape(-1, 2))
+    likely = np.zeros(len(uv), bool)
+    for one in plausible_planes(plane, observer.mount):
+        p = on_plane(x, one).reshape(-1, 2, 3)
+        with np.errstate(invalid="ignore"):
+            likely |= np.abs(np.linalg.norm(p[:, 1] - p[:, 0], axis=1) / length - 1) < SPAN_TOLERANCE
+    good = np.flatnonzero(likely & np.isfinite(places).all(axis=(1, 2)))
     if not len(good):
         return None
     # nearest is seen best: of a point on the floor the error grows with the square of the distance
@@ -118,7 +124,8 @@ def _marker_tracks(
         return None
     if len(tracks) > 2:
         assert seen.markers is not None
-        couple = couple_of(tracks, observer.camera, plane, seen.markers.span or 0.0)
+        planes = plausible_planes(plane, observer.mount)
+        couple = couple_of(tracks, observer.camera, planes, seen.markers.span or 0.0)
         if couple is None:
             return None
         tracks = [tracks[n] for n in couple]

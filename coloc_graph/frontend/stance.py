@@ -15,6 +15,7 @@ from coloc_graph.frontend.homography.fit_checks import require_agreement, requir
 from coloc_graph.frontend.homography.marker_span import marker_spans
 from coloc_graph.frontend.homography.ml_pose import most_likely_pose
 from coloc_graph.frontend.homography.plane import distance_from_span
+from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.homography.refinement import Criterion
 from coloc_graph.frontend.landmarks import SeenLandmarks
 from coloc_graph.frontend.pairing.clock_offset import (
@@ -282,7 +283,8 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
             couples[mover] = pair
         own = [n for n, track in enumerate(seen.tracks_i) if not named and (len(movers) == 1 or track.mover == mover)]
         if own:
-            couple = couple_of([seen.tracks_i[n] for n in own], robot.camera, seen.plane, markers.span)
+            planes = plausible_planes(seen.plane, robot.mount)
+            couple = couple_of([seen.tracks_i[n] for n in own], robot.camera, planes, markers.span)
             if couple is not None:
                 couples[mover] = own[couple[0]], own[couple[1]]
     return marker_spans(couples, found, fit, bias) if couples else ()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend.homography.plane import plane_from_mount
+from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.images.detection import Blobs, detector_for
 from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks
 from coloc_graph.frontend.pairing.rigid_alignment import align_paths
@@ -150,9 +151,9 @@ class StanceTracks:
             run, (mover,) = self.run, self.stance.movers
             markers = run.team[mover].markers
             assert markers is not None and markers.span is not None
-            plane = stance_plane(run, self.stance, robot)
+            planes = plausible_planes(stance_plane(run, self.stance, robot), run.team[robot].mount)
             seen = list(self._seen(robot, end))
-            self._paths[robot] = made = end, rigid_path(robot, seen, run.team[robot].camera, plane, markers.span)
+            self._paths[robot] = made = end, rigid_path(robot, seen, run.team[robot].camera, planes, markers.span)
         return made[1]
 
     def _seen(self, robot: str, end: float) -> Iterator[Detections]:
@@ -229,14 +230,14 @@ class StanceTracks:
                     if watch is not None:
                         watch.look(image)
                     self._taken[robot] = number + 1
-        plane, tracks = stance_plane(run, stance, robot), []
+        planes, tracks = plausible_planes(stance_plane(run, stance, robot), run.team[robot].mount), []
         for hue, tracker in trackers.items():
             names = self._alike.get(hue, []) if len(trackers) > 1 else list(stance.movers)
             spans = {m.span for name in names if (m := run.team[name].markers) and m.span}
             own, codes = tracker.tracks(), self._codes(names)
             if len(names) > 1 and codes is not None:
                 own = codes.each(own)
-            own = markers_of_movers(own, camera, plane, sorted(spans), len(names))
+            own = markers_of_movers(own, camera, planes, sorted(spans), len(names))
             if len(names) == 1:
                 own = [replace(track, mover=names[0]) for track in own]
             elif codes is not None:

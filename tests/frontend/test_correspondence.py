@@ -187,14 +187,14 @@ def numbers(tracks, one):
 
 def test_reflections_still_lights_and_strangers_are_not_markers_of_the_mover():
     clutter = with_clutter()
-    kept = markers_of_movers(clutter, CAMERA, PLANE, [0.25])
+    kept = markers_of_movers(clutter, CAMERA, [PLANE], [0.25])
     assert [numbers(clutter, one) for one in kept] == [0, 3]
     assert [one.body for one in kept] == [0, 0]
 
 
 def test_without_a_span_all_that_moves_is_kept():
     clutter = with_clutter()
-    kept = markers_of_movers(clutter, CAMERA, PLANE, [])
+    kept = markers_of_movers(clutter, CAMERA, [PLANE], [])
     assert [clutter.index(one) for one in kept] == [0, 1, 3, 4, 5]
     assert {one.body for one in kept} == {-1}
 

@@ -75,7 +75,7 @@ def scene(fps, speed, seed, poses=None, seconds=8.0):
 
 def path_of(one, robot):
     plane = plane_from_mount(TEAM[robot].mount, TEAM["C"].markers)
-    return rigid_path(robot, one.seen[robot], TEAM[robot].camera, plane, TEAM["C"].markers.span)
+    return rigid_path(robot, one.seen[robot], TEAM[robot].camera, [plane], TEAM["C"].markers.span)
 
 
 @pytest.mark.parametrize(("fps", "speed", "seed"), [(10.0, 0.4, 0), (10.0, 0.4, 1), (5.0, 0.5, 2), (10.0, 1.0, 3)])

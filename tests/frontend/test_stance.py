@@ -1,6 +1,7 @@
 """One stance of a real run, from its file to the relative pose, at both depths."""
 
 import dataclasses
+from contextlib import nullcontext
 
 import gtsam
 import numpy as np
@@ -111,6 +112,18 @@ def test_an_observer_that_is_bumped_while_a_stance_is_taken_is_named(tmp_path, h
     assert "was bumped, a clock stepped" in chained.homography.doubt
 
 
+def test_points_that_are_off_by_less_than_a_pixel_for_a_while_are_no_bump(hallway):
+    run = open_run(hallway)
+    found = measure_pair(run, run.stances[0], "A", "B", FrontendOptions()).correspondences
+    early = found.times < np.quantile(found.times, 0.15)
+    for off in (0.1, 10.0):  # in units of the homography's, which are of some 300 px
+        fit = fit_homography(found.pairs)
+        squared = np.where(early, (off / 300 / found.pairs.sigma) ** 2, fit.squared_residuals)
+        fit = dataclasses.replace(fit, inliers=~early, squared_residuals=squared)
+        with nullcontext() if off < 1 else pytest.raises(DegenerateGeometry, match="was bumped"):
+            require_agreement(fit, found, "A or B", "")
+
+
 @pytest.mark.parametrize("when", [1, -1])
 def test_points_of_a_robot_that_stood_are_no_homography_and_no_bump(hallway, when):
     run = open_run(hallway)
@@ -119,7 +132,9 @@ def test_points_of_a_robot_that_stood_are_no_homography_and_no_bump(hallway, whe
     stood = order[::when][: int(0.6 * n)]
     uv = found.uv_i.copy()
     uv[stood] = np.where(found.markers[stood, None] == found.markers[0], (100.0, 80.0), (140.0, 90.0))
-    fit = dataclasses.replace(fit_homography(found.pairs), inliers=np.isin(np.arange(n), stood))
+    agree = np.isin(np.arange(n), stood)
+    squared = np.where(agree, 1.0, 1e8)
+    fit = dataclasses.replace(fit_homography(found.pairs), inliers=agree, squared_residuals=squared)
     with pytest.raises(DegenerateGeometry, match="hardly moved"):
         require_agreement(fit, dataclasses.replace(found, uv_i=uv), "A or B", "")
 

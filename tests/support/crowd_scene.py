@@ -46,7 +46,7 @@ def seen_by_both(poses, seed, hidden=None, faults=None):
         tracker = MarkerTracker("AB"[n], Detector(), size=(320, 240))
         for one in seen.images:
             tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
-        tracks = markers_of_movers(tracker.tracks(), FACTS.camera, plane, [0.25], poses.shape[1])
+        tracks = markers_of_movers(tracker.tracks(), FACTS.camera, [plane], [0.25], poses.shape[1])
         both.append((tracks, [light_of(track, seen) + 2 * first for track in tracks]))
     return both
 

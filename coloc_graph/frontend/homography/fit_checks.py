@@ -17,11 +17,12 @@ DETERMINED = 1e-10
 BROKEN = 0.7
 LEAST_SIDE = 12
 FAR = 60.0
+SMALL = 1.0  # px, below which points that disagree are of an uneven floor or a biased centroid, and of no movement
 
 
 def require_agreement(fit: HomographyFit, found: Correspondences, who: str, pairing: str) -> None:
     """Raise `DegenerateGeometry` where the points do not agree on one homography; `pairing` is what paired them."""
-    _require_still(fit.inliers, found, who)
+    _require_still(fit.inliers | (_pixels_off(fit, found) < SMALL), found, who)
     if fit.inliers.mean() < LEAST_AGREEMENT:
         raise DegenerateGeometry(
             f"only {fit.inliers.sum()} of {len(found)} points agree on one homography: "
@@ -56,6 +57,13 @@ def _require_still(agree: NDArray[np.bool_], found: Correspondences, who: str) -
         f"{when:.1f} s after the first points, others begin that agree on another homography: {who} was bumped, a "
         "clock stepped, or the tracks of two lights were swapped while the stance was taken; take it again"
     )
+
+
+def _pixels_off(fit: HomographyFit, found: Correspondences) -> NDArray[np.float64]:
+    """How far points (n,) are from where the homography has them [px], both images together."""
+    pairs = found.pairs
+    per_unit = np.ptp(found.uv_i, axis=0).max() / np.ptp(pairs.x_i, axis=0).max()
+    return np.asarray(np.sqrt(fit.squared_residuals) * pairs.sigma * per_unit)
 
 
 def _travel(found: Correspondences, which: NDArray[np.int64]) -> float:

@@ -6,7 +6,6 @@ the second the markers would be another distance apart than they are.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.decomposition import decompose_with_normal, metric_scale
 from coloc_graph.frontend.homography.plane import on_plane
+from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.pairing.correspondence import pair_by_time
 from coloc_graph.frontend.tracks.marker_pairs import LEAST_SHARED
 from coloc_graph.frontend.tracks.tracking import Track
@@ -34,7 +34,6 @@ IMPROBABLE = 40.0
 #: Where two markers are seen they are their span apart to this share, at this share of the instants at least.
 SPAN_TOLERANCE = 0.45
 OFTEN = 0.5
-TILTS = (0.0, -1.0, 1.0, -2.0, 2.0, -3.0, 3.0)  # tilts of the camera that are tried, in its tolerances
 OFTEN_TILTED = 0.75  # share of the instants in which they are their span apart by a tilt other than stated
 
 
@@ -79,18 +78,11 @@ def of_some_span(tracks: Sequence[Track], robot: Robot, plane: Plane, spans: Seq
         for b in range(a + 1, len(tracks))
         if len(shared := pair_by_time(tracks[a].times, tracks[b].times)) >= LEAST_SHARED
     ]
-    sigma = np.deg2rad(robot.mount.tilt_sigma_deg)
-    for tilt in TILTS if sigma > 0 else (0.0,):
-        often = OFTEN if tilt == 0 else OFTEN_TILTED
-        places = [on_plane(x, tilted(plane, tilt * sigma)) for x in seen]
+    for number, one in enumerate(plausible_planes(plane, robot.mount)):
+        often = OFTEN if number == 0 else OFTEN_TILTED
+        places = [on_plane(x, one) for x in seen]
         for a, b, shared in pairs:
             apart = np.linalg.norm(places[a][shared[:, 0]] - places[b][shared[:, 1]], axis=1)
             if any((np.abs(apart / span - 1) < SPAN_TOLERANCE).mean() > often for span in spans):
                 return True
     return not pairs
-
-
-def tilted(plane: Plane, tilt: float) -> Plane:
-    """Return a plane as a camera sees it that looks down by `tilt` [rad] more than stated."""
-    c, s = np.cos(tilt), np.sin(tilt)
-    return replace(plane, N=np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]]) @ plane.N)

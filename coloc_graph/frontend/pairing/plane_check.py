@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.plane import on_plane
+from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.pairing.correspondence import Correspondences
-from coloc_graph.frontend.pairing.floor_checks import TILTS, tilted
 from coloc_graph.frontend.stance_tracks import stance_plane
 from coloc_graph.measurements import Plane
 from coloc_graph.run import Recorded, Stance
@@ -37,10 +37,9 @@ def implausible(run: Recorded, stance: Stance, robot: str, found: Correspondence
     if np.nanmedian(distance) > FARTHEST:
         return f"on the marker plane the markers would be {np.nanmedian(distance):.0f} m away from {robot}: {remedy}"
     span = _known_span(run, stance)
-    sigma = 0.0 if stated else np.deg2rad(run.team[robot].mount.tilt_sigma_deg)
     # by a camera that is tilted otherwise, in its tolerance, the markers may well be their span apart
-    for tilt in TILTS if sigma > 0 else ():
-        other = _seen_span(found, camera, tilted(plane, tilt * sigma))
+    for one in () if stated else plausible_planes(plane, run.team[robot].mount):
+        other = _seen_span(found, camera, one)
         if span is not None and other is not None and abs(other[0] - span) <= SPAN_TOLERANCE * span + other[1]:
             return None
     seen = _seen_span(found, camera, plane)

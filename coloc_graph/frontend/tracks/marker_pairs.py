@@ -15,13 +15,36 @@ from coloc_graph.team import Camera
 
 #: Two markers of a robot are seen together for this share of the shorter track.
 TOGETHER = 0.5
+CLEARLY_MORE = 1.05  # times the samples that a plane explains by which another explains more
 #: Samples that two tracks must share to be bound where there is a choice.
 LEAST_SHARED = 8
 
 
+#: Two tracks of one camera that may be two markers of one robot, by their numbers, with sample indices (n, 2).
+Bound = tuple[int, int, NDArray[np.int64]]
+
+
+def plane_of_spans(tracks: Sequence[Track], camera: Camera, planes: Sequence[Plane], spans: Sequence[float]) -> Plane:
+    """The plane of some, the first of which is as stated, on which most samples are of two markers of one robot.
+
+    Of a camera that is tilted otherwise than stated the markers may not be their span apart on the plane as stated, and
+    their reflections may be.
+    """
+    best, most = planes[0], 0
+    for plane in planes:
+        bound = [one for span in spans for one in span_samples(tracks, camera, plane, span)]
+        samples, free = 0, set(range(len(tracks)))
+        for a, b, shared in sorted(bound, key=lambda one: -len(one[2])):
+            if {a, b} <= free:
+                samples, free = samples + len(shared), free - {a, b}
+        if samples > CLEARLY_MORE * most:
+            best, most = plane, samples
+    return best
+
+
 def span_samples(
     tracks: Sequence[Track], camera: Camera, plane: Plane, span: float, tolerance: float = 0.35
-) -> list[tuple[int, int, NDArray[np.int64]]]:
+) -> list[Bound]:
     """Pairs of tracks of one camera that are two markers of one robot: (a, b, sample indices (n, 2)).
 
     They are where their distance on the marker plane is the robot's `span` [m] for most of the time. The
@@ -40,9 +63,9 @@ def span_samples(
     return found
 
 
-def couple_of(tracks: Sequence[Track], camera: Camera, plane: Plane, span: float) -> tuple[int, int] | None:
+def couple_of(tracks: Sequence[Track], camera: Camera, planes: Sequence[Plane], span: float) -> tuple[int, int] | None:
     """Of one robot's tracks, which may be in pieces, the two of its two markers that share most samples."""
-    bound = span_samples(tracks, camera, plane, span)
+    bound = span_samples(tracks, camera, plane_of_spans(tracks, camera, planes, [span]), span)
     return max(bound, key=lambda one: len(one[2]))[:2] if bound else None
 
 
@@ -71,16 +94,18 @@ def tracks_of(tracks: Sequence[Track], robot: str, *, alone: bool) -> list[int]:
 
 
 def markers_of_movers(
-    tracks: Sequence[Track], camera: Camera, plane: Plane, spans: Sequence[float], movers: int | None = None
+    tracks: Sequence[Track], camera: Camera, planes: Sequence[Plane], spans: Sequence[float], movers: int | None = None
 ) -> list[Track]:
     """Of all tracks of a camera those that are markers of a moving robot, with a number for each robot (`Track.body`).
 
     Lights that do not move are not. Where robots carry two markers, the tracks that are bound by a span are;
     tracks with no partner are kept only if no track has one. The pieces of a track that was lost belong to one robot
     with whatever they are bound to, as long as no more than two lights of it are seen at once; all do where it is
-    known that one robot moves. Tracks that are known to be different robots' (`Track.mover`) are not bound.
+    known that one robot moves. Tracks that are known to be different robots' (`Track.mover`) are not bound. Of `planes`
+    the first is as stated; see `plane_of_spans`.
     """
     moving = [track for track in tracks if len(track) >= 4 and track.extent > STILL]
+    plane = plane_of_spans(moving, camera, planes, spans)
     bound = [one for span in spans for one in span_samples(moving, camera, plane, span)]
     if not bound:
         alone = movers == 1 and spans and _two_at_once(moving, set(range(len(moving))))

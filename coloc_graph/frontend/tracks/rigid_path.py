@@ -23,6 +23,7 @@ from coloc_graph.team import Camera
 Array = NDArray[np.float64]
 
 SPAN_TOLERANCE = 0.35  # share of the span; a tilt that is wrong by 1 deg makes 0.15 at 2 m
+CLEARLY_MORE = 1.05  # times the likelihood of the likeliest plane by which another is likelier
 SPAN_SCALE = 0.1  # share of the span that counts as one standard deviation between rival pairs of lights
 MAX_LIGHTS = 12  # brightest lights of an image that are looked at
 CELL = 2.0  # px, side of the cells in which lights that stand still are counted
@@ -111,7 +112,9 @@ class RigidPath:
         return made
 
 
-def rigid_path(robot: str, seen: Sequence[Detections], camera: Camera, plane: Plane, span: float) -> RigidPath:
+def rigid_path(
+    robot: str, seen: Sequence[Detections], camera: Camera, planes: Sequence[Plane], span: float
+) -> RigidPath:
     """Find the path of a body with two lights in all images of one camera.
 
     Parameters
@@ -120,28 +123,17 @@ def rigid_path(robot: str, seen: Sequence[Detections], camera: Camera, plane: Pl
         Name of the robot whose camera it is.
     seen
         Detections of whole images, in the order of time.
-    camera, plane
-        The camera, and the plane of the markers in its frame.
+    camera, planes
+        The camera, and the planes that the markers' may be in its frame, the likeliest first.
     span
         Distance between the two markers [m].
     """
     images = [_moving(one, still) for still in [_static_cells(seen)] for one in seen]
     lights = np.array([len(one.uv) for one in images], np.int64)
-    # two axes of the plane make metric coordinates on it
-    axes = across(plane.N)
-    if np.cross(*axes) @ plane.N < 0:
-        axes = axes[::-1]  # the same way round in every camera
-    rows: list[tuple[int, NDArray[np.int64], Array, Array]] = []  # image, pairs (m, 2), places (m, 2, 2), costs (m,)
-    for number, one in enumerate(images):
-        if len(one.uv) < 2:
-            continue
-        places = on_plane(camera.normalise(one.uv), plane) @ axes.T
-        a, b = np.triu_indices(len(places), 1)
-        off = np.linalg.norm(places[a] - places[b], axis=1) / span - 1
-        good = np.flatnonzero(np.abs(off) < SPAN_TOLERANCE)  # not of NaN, above the horizon
-        if len(good):
-            pairs = np.stack([a[good], b[good]], axis=1)
-            rows.append((number, pairs, places[pairs], 0.5 * np.square(off[good] / SPAN_SCALE)))
+    each = [_rows(images, camera, plane, span) for plane in planes]
+    fits = [sum(float(np.exp(-row[3].min())) for row in rows) for rows in each]
+    best = int(np.argmax(fits))
+    rows = each[best] if fits[best] > CLEARLY_MORE * fits[0] else each[0]
     chosen = _likeliest(rows, span)
     own = [(images[row[0]], row[1][n], row[2][n]) for row, n in zip(rows, chosen, strict=True)]
     path = RigidPath(
@@ -155,6 +147,30 @@ def rigid_path(robot: str, seen: Sequence[Detections], camera: Camera, plane: Pl
         lights,
     )
     return path.swapped(*_ordered(path)) if len(path) else path
+
+
+#: Image, pairs of lights (m, 2), their places (m, 2, 2) [m], costs (m,).
+_Row = tuple[int, NDArray[np.int64], Array, Array]
+
+
+def _rows(images: Sequence[Detections], camera: Camera, plane: Plane, span: float) -> list[_Row]:
+    """Pairs of lights that are a span apart on a plane, image by image."""
+    # two axes of the plane make metric coordinates on it
+    axes = across(plane.N)
+    if np.cross(*axes) @ plane.N < 0:
+        axes = axes[::-1]  # the same way round in every camera
+    rows: list[_Row] = []
+    for number, one in enumerate(images):
+        if len(one.uv) < 2:
+            continue
+        places = on_plane(camera.normalise(one.uv), plane) @ axes.T
+        a, b = np.triu_indices(len(places), 1)
+        off = np.linalg.norm(places[a] - places[b], axis=1) / span - 1
+        good = np.flatnonzero(np.abs(off) < SPAN_TOLERANCE)  # not of NaN, above the horizon
+        if len(good):
+            pairs = np.stack([a[good], b[good]], axis=1)
+            rows.append((number, pairs, places[pairs], 0.5 * np.square(off[good] / SPAN_SCALE)))
+    return rows
 
 
 def _static_cells(seen: Sequence[Detections]) -> NDArray[np.int64]:
@@ -179,7 +195,7 @@ def _moving(seen: Detections, static: NDArray[np.int64]) -> Detections:
     return Detections(seen.robot, seen.time, seen.uv[which], seen.covariance[which], markers, *columns)
 
 
-def _likeliest(rows: Sequence[tuple[int, NDArray[np.int64], Array, Array]], span: float) -> list[int]:
+def _likeliest(rows: Sequence[_Row], span: float) -> list[int]:
     """One pair of lights an image: those that go on best, by dynamic programming."""
     if not rows:
         return []
