@@ -1,7 +1,7 @@
 """The table of the paper's Table II, and where the robots are with how far to trust it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from coloc_graph.cli.printing import counted, print_table
@@ -9,6 +9,7 @@ from coloc_graph.evaluation import Accuracy, Alignment, RobotAccuracy
 
 if TYPE_CHECKING:
     from coloc_graph.backend import Calibration
+    from coloc_graph.frontend.learnt_noise import NoiseRow
     from coloc_graph.geometry.trajectory import Trajectory
 
 #: What was made to agree, in words.
@@ -139,6 +140,17 @@ def print_calibration(calibration: "Calibration") -> None:
     ]
     if rows:
         print_table(["robot", "what", "stated", "found", "off by"], rows)
+
+
+def print_noise(rows: "Sequence[NoiseRow]") -> None:
+    """Print the noise of a typical marker centre of each camera, as stated and as learnt."""
+    typical = [
+        f"{row.robot} {row.stated:.3f} px stated, {row.learnt:.3f} px learnt (a factor of {row.learnt_factor:.2f})"
+        for row in rows
+        if row.what == "typical centre"
+    ]
+    if typical:
+        print(f"noise of marker centres: {'; '.join(typical)}")
 
 
 def print_promised(trajectories: "Mapping[str, Trajectory]") -> None:

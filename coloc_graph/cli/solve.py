@@ -179,6 +179,7 @@ def _print(solution: "Solution", accuracy: "Accuracy | None", out: str) -> None:
         print_accuracy,
         print_calibration,
         print_last_poses,
+        print_noise,
         print_online,
         print_promised,
     )
@@ -194,6 +195,8 @@ def _print(solution: "Solution", accuracy: "Accuracy | None", out: str) -> None:
     if (online := assess_online(solution)) is not None:
         print_online(online)
     print_calibration(estimate.calibration)
+    if solution.noise is not None:
+        print_noise(solution.noise.rows(solution.run.team))
     if solution.seconds_updates:
         median, longest = 1000 * statistics.median(solution.seconds_updates), 1000 * max(solution.seconds_updates)
         what = "a second of the run" if estimate.is_ranging else "a stance"

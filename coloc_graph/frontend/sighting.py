@@ -73,7 +73,11 @@ def sight(
     # nearest is seen best: of a point on the floor the error grows with the square of the distance
     cost = np.linalg.norm(places[good], axis=2).max(axis=1) if at is None else np.abs(times[good] - at)
     best = int(good[np.argmin(cost)])
-    noise = np.stack([pair[0].covariance[shared[best, 0]], pair[1].covariance[shared[best, 1]]])
+    stated, loads = (
+        np.stack([getattr(track, name)[row] for track, row in zip(pair, shared[best], strict=True)])
+        for name in ("covariance", "loads")
+    )
+    noise = observer.camera.centre_covariance(stated, loads)
     pose, covariance = _pose(observer, markers, plane, uv[best], noise)
     T_observer_seen = floor_pose(pose[1], pose[2], pose[0])
     bias = observer.camera.bias_px**2 * np.eye(2)
@@ -100,6 +104,7 @@ def at_rest(track: Track, time: float) -> Track:
         uv=track.uv.mean(axis=0, keepdims=True),
         covariance=track.covariance.mean(axis=0, keepdims=True) / n,
         peak=track.peak.mean(keepdims=True),
+        saturated=None if track.saturated is None else np.array([track.saturated.any()]),
     )
 
 

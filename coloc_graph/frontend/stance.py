@@ -30,6 +30,7 @@ from coloc_graph.frontend.pairing.correspondence import (
     UnpairedTracks,
     correspond,
     correspond_roughly,
+    with_noise,
 )
 from coloc_graph.frontend.pairing.floor_checks import of_some_span, on_one_floor, require_on_floor
 from coloc_graph.frontend.pairing.observer_pairs import Pair, pairs_of, share
@@ -40,7 +41,7 @@ from coloc_graph.frontend.tracks.paired_tracks import PairedTracks
 from coloc_graph.frontend.tracks.tracking import Track, TrackerOptions
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose
 from coloc_graph.run import Recorded, Stance
-from coloc_graph.team import Camera, Markers
+from coloc_graph.team import Camera, Markers, Team
 
 Array = NDArray[np.float64]
 
@@ -89,6 +90,9 @@ class PairMeasurement:
     tracks: tuple[list[Track], list[Track]] | None = None
     standing: tuple[list[Track], list[Track]] = ([], [])
     landmarks: tuple[SeenLandmarks, SeenLandmarks] = (SeenLandmarks(), SeenLandmarks())
+    fit: HomographyFit | None = None
+    cameras: tuple[Camera, Camera] | None = None
+    with_team: "Callable[[Team], PairMeasurement] | None" = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +100,7 @@ class _Seen:
     """What a pair of observers saw in one stance."""
 
     run: Recorded
+    team: Team
     stance: Stance
     robot_i: str
     robot_j: str
@@ -113,7 +118,7 @@ class _Seen:
 
     def plausible(self, H_j_i: Array, tracks: Sequence[Track]) -> bool:
         """Whether a homography has both observers on one floor, and pairs tracks that may be a robot's markers."""
-        team, plane = self.run.team, self.plane
+        team, plane = self.team, self.plane
         if not (plane.normal_from_mount and plane.d_from_mount):
             return True
         spans = [m.span for name in self.stance.movers if (m := team[name].markers) and m.span]
@@ -123,7 +128,7 @@ class _Seen:
 
     @property
     def cameras(self) -> tuple[Camera, Camera]:
-        return self.run.team[self.robot_i].camera, self.run.team[self.robot_j].camera
+        return self.team[self.robot_i].camera, self.team[self.robot_j].camera
 
 
 def little_in_common(measured: HomographyMeasurement, stance: Stance) -> bool:
@@ -165,12 +170,12 @@ def measure_pair(
         tracks_i, tracks_j = tracks.pair(robot_i, robot_j, stance.end, _window(run))
         every = tracks.all(stance.end) | {robot_i: tracks_i, robot_j: tracks_j}
         pairs = pairs or measured_pairs(tracks, stance.end)
-        seen = _Seen(run, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j, pairs, every)
+        seen = _Seen(run, run.team, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j, pairs, every)
         if run.team.clock_sigma > 0:
             made = _measure_with_clocks(seen, alone)
         else:
             found = correspond(tracks_i, tracks_j, *seen.cameras, alone=seen.alone, plausible=seen.plausible)
-            made = _measured(seen, found, fit_homography(found.pairs, options.criterion))
+            made = _measured_from(seen, found, run.team)
     except UnpairedTracks as why:
         seen_instead = tracks.why_broken(robot_i, robot_j, stance.end)
         reason = f"{why.what}; {seen_instead}" if seen_instead else str(why)
@@ -185,7 +190,7 @@ def measure_pair(
 
 
 def _measure_with_clocks(seen: _Seen, alone: bool) -> PairMeasurement:
-    prior = ClockOffset(0.0, seen.run.team.clock_sigma)
+    prior = ClockOffset(0.0, seen.team.clock_sigma)
     require_searchable(prior)
     chosen, rough = correspond_roughly(
         seen.tracks_i,
@@ -197,7 +202,7 @@ def _measure_with_clocks(seen: _Seen, alone: bool) -> PairMeasurement:
         plausible=seen.plausible,
     )
     tracks = PairedTracks(seen.tracks_i, seen.tracks_j, chosen, *seen.cameras)
-    again = partial(_measure_at_offset, seen, tracks, rough)
+    again = partial(_measure_at_offset, seen, chosen, rough)
     try:
         offset, evidence = find_offset(tracks, rough, prior)
     except DegenerateGeometry as why:
@@ -210,16 +215,35 @@ def _measure_with_clocks(seen: _Seen, alone: bool) -> PairMeasurement:
     return PairMeasurement(open_yet, None, rough, evidence, again)
 
 
-def _measure_at_offset(
-    seen: _Seen, tracks: PairedTracks, rough: Correspondences, offset: ClockOffset
-) -> PairMeasurement:
-    found = rough
+def _measured_from(seen: _Seen, found: Correspondences, team: Team) -> PairMeasurement:
+    """The measurement that points are with the cameras of a team, which may have other noise than those of `seen`."""
+    now = replace(seen, team=team)
+    again = partial(_measured_from, seen, found)
+    found = with_noise(found, seen.cameras, now.cameras)
     try:
+        made = _measured(now, found, fit_homography(found.pairs, seen.options.criterion))
+    except DegenerateGeometry as why:
+        made = PairMeasurement(_unusable(seen.stance, seen.robot_i, seen.robot_j, found, str(why)), None, found)
+    return replace(made, with_team=again)
+
+
+def _measure_at_offset(
+    seen: _Seen,
+    chosen: list[tuple[int, int]],
+    rough: Correspondences,
+    offset: ClockOffset,
+    team: Team | None = None,
+) -> PairMeasurement:
+    again = partial(_measure_at_offset, seen, chosen, rough, offset)
+    seen, found = replace(seen, team=team or seen.team), rough
+    try:
+        tracks = PairedTracks(seen.tracks_i, seen.tracks_j, chosen, *seen.cameras)
         clock = fit_at_offset(tracks, offset, seen.options.criterion)
         found = clock.found
-        return _measured(seen, found, clock.fit, clock.offset, clock.by_offset)
+        made = _measured(seen, found, clock.fit, clock.offset, clock.by_offset)
     except DegenerateGeometry as why:
-        return PairMeasurement(_unusable(seen.stance, seen.robot_i, seen.robot_j, found, str(why)), None, found)
+        made = PairMeasurement(_unusable(seen.stance, seen.robot_i, seen.robot_j, found, str(why)), None, found)
+    return replace(made, with_team=again)
 
 
 def _measured(
@@ -230,7 +254,7 @@ def _measured(
     by_offset: Array | None = None,
 ) -> PairMeasurement:
     """The measurement that a fit is; raises `DegenerateGeometry` where it is none."""
-    robot_i, robot_j, plane = seen.run.team[seen.robot_i], seen.run.team[seen.robot_j], seen.plane
+    robot_i, robot_j, plane = seen.team[seen.robot_i], seen.team[seen.robot_j], seen.plane
     pairing = "the pairing window" if offset is None else "`clock_sigma` says"
     doubt = None
     try:
@@ -246,7 +270,7 @@ def _measured(
     measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
     measurement = replace(measurement, share=own, doubt=doubt)
     if offset is not None:
-        said = seen.run.team.clock_sigma
+        said = seen.team.clock_sigma
         measurement = replace(
             measurement,
             time_offset=offset.value,
@@ -259,23 +283,25 @@ def _measured(
     # without the floor: the graph knows it, and must not count it twice
     make_pose = relative_pose if seen.options.pose == "eq2" else most_likely_pose
     pose = make_pose(measurement, robot_i.mount, robot_j.mount, plane)
-    if seen.run.team.floor is not None and seen.plane.normal_from_mount:
-        require_on_floor(pose, seen.run.team.floor)
-    marked = tuple(name for name in seen.stance.movers if seen.run.team[name].markers is not None)
+    if seen.team.floor is not None and seen.plane.normal_from_mount:
+        require_on_floor(pose, seen.team.floor)
+    marked = tuple(name for name in seen.stance.movers if seen.team[name].markers is not None)
     pose = replace(pose, homography=measurement, plane=seen.plane, movers=marked, spans=_spans(seen, found, fit))
-    return PairMeasurement(measurement, pose, found, tracks=(seen.tracks_i, seen.tracks_j))
+    return PairMeasurement(
+        measurement, pose, found, tracks=(seen.tracks_i, seen.tracks_j), fit=fit, cameras=seen.cameras
+    )
 
 
 def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[MarkerSpan, ...]:
     """The spans of the movers whose two markers can be told from all others; () where the plane is stated."""
     if not (seen.plane.normal_from_mount and seen.plane.d_from_mount):
         return ()
-    robot, movers = seen.run.team[seen.robot_i], seen.stance.movers
+    robot, movers = seen.team[seen.robot_i], seen.stance.movers
     bias = _bias_root(found.uv_i, found.pairs.x_i, robot.camera)
     named = any(track.marker for track in seen.tracks_i)
     couples: dict[str, tuple[int, int]] = {}
     for mover in movers:
-        markers = seen.run.team[mover].markers
+        markers = seen.team[mover].markers
         if markers is None or markers.span is None:
             continue
         pair = named_pair(seen.tracks_i, mover, alone=len(movers) == 1)

@@ -296,5 +296,7 @@ def named_tracks(robot: str, detections: Iterable[Detections]) -> list[Track]:
     tracks = []
     for marker in np.unique(markers[whole]).tolist():
         own = whole & (markers == marker)
-        tracks.append(Track(robot, marker, times[own], uv[own], covariance[own], peak[own].astype(float)))
+        saturated = (flags[own] & Flag.SATURATED) != 0
+        columns = times[own], uv[own], covariance[own], peak[own].astype(float)
+        tracks.append(Track(robot, marker, *columns, saturated=saturated))
     return tracks

@@ -9,6 +9,7 @@ from coloc_graph.backend.planar import Latest, optimise_keyframes
 from coloc_graph.errors import EstimationError
 from coloc_graph.frontend import Doubt, PairMeasurement, in_words, share_clock_offsets
 from coloc_graph.frontend.keyframes import keyframes_of
+from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.contents import require_applicable, unused_in
 from coloc_graph.pipeline.explanations import (
@@ -29,8 +30,12 @@ from coloc_graph.pipeline.incremental import (
 from coloc_graph.pipeline.options import METHODS, SolveOptions
 from coloc_graph.pipeline.solution import Solution
 from coloc_graph.run import Run, Stance
+from coloc_graph.run.recorded import Restated
+from coloc_graph.team import Team
 
 __all__ = ["METHODS", "EnteredStance", "Progress", "Solution", "SolveOptions", "StanceSolver", "solve"]
+
+NOISE_ROUNDS = 2  # of learning the noise and measuring again: which points are inliers depends on it
 
 BATCH = {"chain": chain, "smooth": smooth, "joint": joint}
 
@@ -52,6 +57,7 @@ class _Solved:
     seconds_updates: tuple[float, ...] = ()
     online: Mapping[str, Trajectory] = field(default_factory=dict)
     without_pose: Mapping[str, str] = field(default_factory=dict)
+    noise: NoiseBelief | None = None
 
 
 def solve(
@@ -123,14 +129,21 @@ def solve(
         unused=unused,
         online=solved.online,
         without_pose=solved.without_pose,
+        noise=solved.noise,
     )
 
 
 def _at_once(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
     """Solve all stances together."""
     started = time.perf_counter()
-    alone = [one for stance in run.stances for one in measure(stance)]
+    belief = NoiseBelief.of(run.team)
+    alone = [one for stance in run.stances for one in measure(stance, belief.used(run.team))]
     measured, clock_warnings = share_clock_offsets(alone, run.team.clock_sigma)
+    for _ in range(NOISE_ROUNDS):
+        noise = belief.updated(measured)
+        team = noise.used(run.team)
+        measured = measured_again(measured, team)
+    measured = tuple(replace(one, with_team=None) for one in measured)
     poses = [m.relative_pose for m in measured if m.relative_pose is not None]
     _require_poses(run, options, measured)
     made = time.perf_counter()
@@ -139,7 +152,7 @@ def _at_once(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
         # the paper's chain takes neither, and wheels measure on a floor only
         for stance in run.stances:
             pairs = [m for m in measured if m.homography.stance == stance.index]
-            motions += sources.of_stance(run, stance, pairs)
+            motions += sources.of_stance(Restated(run, team), stance, pairs)
     graph = PoseGraph.of(run.team, run.stances, [*poses, *motions])
     graph = replace(graph, robot_models=options.robot_models(run.team) or graph.robot_models)
     _require_ties(run, graph, measured)
@@ -147,14 +160,14 @@ def _at_once(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
     estimate = BATCH[options.method](graph)
     warnings = _warnings(run, options, estimate, measured, clock_warnings, sources.doubts)
     missing = without_poses(run, options, estimate, measured, sources.doubts)
-    return _Solved(estimate, warnings, made - started, measured, without_pose=missing)
+    return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise)
 
 
 def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: OnUpdate | None) -> _Solved:
     """Solve one stance after the other."""
     solver = StanceSolver(run.team, options)
     for stance in run.stances:
-        one = solver.enter(run, stance, solver.measure(run, stance, measure(stance)))
+        one = solver.enter(run, stance, solver.measure(run, stance, measure(stance, solver.noise.used(run.team))))
         if on_update is not None:
             on_update(one)
     _require_poses(run, options, solver.measured)
@@ -163,7 +176,7 @@ def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: 
     frontend, updates = zip(*solver.seconds, strict=True)
     warnings = _warnings(run, options, estimate, solver.measured, solver.warnings, solver.doubts)
     missing = without_poses(run, options, estimate, solver.measured, solver.doubts)
-    return _Solved(estimate, warnings, sum(frontend), solver.measured, updates, without_pose=missing)
+    return _Solved(estimate, warnings, sum(frontend), solver.measured, updates, {}, missing, solver.noise)
 
 
 def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_update: OnUpdate | None) -> _Solved:
@@ -222,8 +235,8 @@ class _Counted:
         self._run, self._options, self._progress = run, options, progress
         self._done = 0
 
-    def __call__(self, stance: Stance) -> Iterator[PairMeasurement]:
-        yield from measure_stance(self._run, stance, self._options)
+    def __call__(self, stance: Stance, team: Team) -> Iterator[PairMeasurement]:
+        yield from measure_stance(Restated(self._run, team), stance, self._options)
         self._done += 1
         if self._progress is not None:
             self._progress(self._done, len(self._run.stances))

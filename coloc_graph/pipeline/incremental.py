@@ -26,10 +26,12 @@ from coloc_graph.frontend import (
     sight_standing,
     unsighted_movers,
 )
+from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Drive, Measurement, Sighting
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import OdometrySample, Recorded, Stance
+from coloc_graph.run.recorded import Restated
 from coloc_graph.team import Team
 
 
@@ -171,6 +173,8 @@ class StanceSolver:
         self.warnings: list[str] = []
         #: How long the front end and the estimator took, stance by stance [s].
         self.seconds: list[tuple[float, float]] = []
+        #: Noise of marker centres as it is known from the stances that are in, and before the last.
+        self.noise = self._earlier_noise = self._next_noise = NoiseBelief.of(team)
         self._motions = OdometryAndSightings(team, odometry=self.options.odometry)
         self._measuring = 0.0
 
@@ -180,8 +184,11 @@ class StanceSolver:
         """What the pairs of a stance measure, by what is known so far of their clocks; `pairs` come from
         `measure_stance`, here or elsewhere."""
         started = time.perf_counter()
-        alone = list(measure_stance(run, stance, self.options) if pairs is None else pairs)
-        shared, self.warnings = share_clock_offsets(alone, self.team.clock_sigma, self.measured)
+        if pairs is None:
+            pairs = measure_stance(Restated(run, self.noise.used(self.team)), stance, self.options)
+        shared, self.warnings = share_clock_offsets(list(pairs), self.team.clock_sigma, self.measured)
+        self._next_noise = self.noise.updated(shared)
+        shared = measured_again(shared, self._next_noise.used(self.team))
         self._measuring = time.perf_counter() - started
         return shared
 
@@ -194,7 +201,8 @@ class StanceSolver:
         """
         shared = self.measure(run, stance) if measured is None else measured
         started = time.perf_counter()
-        motions = [] if self.team.floor is None else self._motions.of_stance(run, stance, shared)
+        noisy = Restated(run, self._next_noise.used(self.team))
+        motions = [] if self.team.floor is None else self._motions.of_stance(noisy, stance, shared)
         made = (*(m.relative_pose for m in shared if m.relative_pose is not None), *motions)
         entering = time.perf_counter()
         before = next(reversed(self.estimator.stances), None)
@@ -207,7 +215,8 @@ class StanceSolver:
                 self._motions.withdraw()
             raise
         self.seconds.append((self._measuring + entering - started, time.perf_counter() - entering))
-        self.measured += shared
+        self.measured += tuple(replace(one, with_team=None) for one in shared)
+        self._earlier_noise, self.noise = self.noise, self._next_noise
         return EnteredStance(here, said, made, shared)
 
     @property
@@ -218,6 +227,7 @@ class StanceSolver:
     def withdraw(self) -> None:
         """Take the last stance out again, as if it had never come; `EstimationError` where it is the first."""
         index = self.estimator.withdraw().index
+        self.noise = self._earlier_noise
         if self.team.floor is not None:
             self._motions.withdraw()
         self.measured = tuple(one for one in self.measured if one.homography.stance != index)

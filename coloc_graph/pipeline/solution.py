@@ -9,11 +9,13 @@ import numpy as np
 from coloc_graph.backend import Estimate
 from coloc_graph.backend.graph import Link
 from coloc_graph.frontend import PairMeasurement
+from coloc_graph.frontend.learnt_noise import NoiseBelief
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Odometry, RelativePose, Sighting
 from coloc_graph.pipeline.contents import Unused
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
+from coloc_graph.team import Team
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ class Solution:
         Of an incremental estimate of a ranging run: each pose as it was estimated at its time.
     without_pose : mapping of str to str
         By robot of the team that has no pose: the reason.
+    noise : NoiseBelief or None
+        Of a run with stances: the noise of marker centres as it was learnt.
     """
 
     run: Run
@@ -63,6 +67,7 @@ class Solution:
     unused: tuple[Unused, ...] = ()
     online: Mapping[str, Trajectory] = field(default_factory=dict)
     without_pose: Mapping[str, str] = field(default_factory=dict)
+    noise: NoiseBelief | None = None
 
     def why_not(self, measured: PairMeasurement) -> str | None:
         """Return why a pair's measurement is not in the estimate; None where it is."""
@@ -76,6 +81,16 @@ class Solution:
         if id(link) in self._rejected:
             return self._rejected[id(link)]
         return "not tied to the reference" if not self._disconnected.isdisjoint(link.ends) else None
+
+    @property
+    def calibrated_team(self) -> Team | None:
+        """The team with what was calibrated and learnt, to start the next run from; None if nothing was."""
+        team = self.run.team
+        if self.estimate.calibration:
+            team = self.estimate.calibration.of_team(team)
+        if self.noise is not None:
+            team = self.noise.learnt(team)
+        return None if team is self.run.team or team == self.run.team else team
 
     @cached_property
     def _rejected(self) -> dict[int, str]:

@@ -47,6 +47,7 @@ def render_report(solution: Solution, accuracy: Accuracy | None, truth: Truth | 
         accuracy_section(accuracy) if accuracy is not None else "",
         warnings_section([*solution.warnings, *(accuracy.warnings if accuracy is not None else ())]),
         _calibration_section(solution),
+        _noise_section(solution),
         _landmarks_section(solution),
         _figures_section(solution, accuracy, truth),
         _used_section(solution),
@@ -113,6 +114,28 @@ def _calibration_section(solution: Solution) -> str:
         for row in rows
     ]  # fmt: skip
     return f"<h2>Calibration</h2>\n{table(head, cells, [0, 1])}"
+
+
+def _noise_section(solution: Solution) -> str:
+    """Noise of marker centres, as stated and as learnt."""
+    rows = solution.noise.rows(solution.run.team) if solution.noise is not None else []
+    if not rows:
+        return ""
+
+    def value(number: float, factor: float, unit: str) -> str:
+        return f"{number:.4f} {unit}" + (f" ×/÷ {factor:.2f}" if factor > 1 else "")
+
+    head = ["Camera", "Noise of marker centres", "Stated", "Learnt"]
+    cells = [
+        [
+            escape(row.robot),
+            escape(row.what),
+            value(row.stated, row.stated_factor, row.unit),
+            value(row.learnt, row.learnt_factor, row.unit),
+        ]
+        for row in rows
+    ]
+    return f"<h2>Noise</h2>\n{table(head, cells, [0, 1])}"
 
 
 def _landmarks_section(solution: Solution) -> str:

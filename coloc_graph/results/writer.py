@@ -129,8 +129,8 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
         if estimate.landmarks:
             rows = landmarks_csv(landmark_rows(estimate))
             (part / LANDMARKS).write_text(rows, encoding="utf-8")
-        if estimate.calibration:
-            write_team(estimate.calibration.of_team(solution.run.team), part / CALIBRATED_TEAM)
+        if (calibrated := solution.calibrated_team) is not None:
+            write_team(calibrated, part / CALIBRATED_TEAM)
         write_config(solution.options, solution.run.team, part)
         (part / "report.html").write_text(render_report(solution, accuracy, true), encoding="utf-8")
         write_summary(summarise(solution, accuracy), solution.run.path, out, part)
@@ -181,6 +181,8 @@ def summarise(solution: Solution, accuracy: Accuracy | None) -> dict[str, Any]:
             "total": round(solution.seconds_frontend + solution.seconds_backend, 3),
         },
     }
+    if solution.noise is not None:
+        summary["centre_noise"] = [dataclasses.asdict(row) for row in solution.noise.rows(solution.run.team)]
     if estimate.is_ranging:
         noise = estimate.ranging.noise.tolist()
         summary["noise"] = dict(zip(estimate.ranging.keyframes.robots, noise, strict=True))

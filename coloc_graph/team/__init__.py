@@ -8,6 +8,7 @@ from coloc_graph.geometry.mounting import R_BODY_OPTICAL
 from coloc_graph.team.blink import IMAGES_A_BIT, Blink
 from coloc_graph.team.body import LEAST_SLIP, Devices, Markers, Mount, Slip
 from coloc_graph.team.camera import Camera
+from coloc_graph.team.centre_noise import CentreNoise
 from coloc_graph.team.file import parse_team, read_team, team_of_fields, without_none, write_team
 from coloc_graph.team.landmark import Landmark, Tag
 from coloc_graph.team.sensors import Ranging, Wheels
@@ -19,6 +20,7 @@ __all__ = [
     "R_BODY_OPTICAL",
     "Blink",
     "Camera",
+    "CentreNoise",
     "Devices",
     "Floor",
     "Landmark",

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.input_file import quoted
+from coloc_graph.team.centre_noise import CentreNoise
 from coloc_graph.team.checks import require_finite, require_not_negative
 
 Array = NDArray[np.float64]
@@ -27,6 +28,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     variance [grey levels^2] that one grey level of light adds to a pixel; it decides how sure a centre is.
     `bias_px` is the standard deviation per axis of an error that all centres of one marker share during a stance,
     and that no number of them averages away: what calibration leaves of the lens, a background that pulls.
+    `centre_noise` is what is known of the noise beyond what detections state; None for nothing but its defaults.
     """
 
     width: int
@@ -40,6 +42,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     noise_px: float = 0.3
     shot_gain: float = 0.1
     bias_px: float = 0.0
+    centre_noise: CentreNoise | None = None
 
     def __post_init__(self) -> None:
         require_finite(self)
@@ -56,6 +59,21 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             )
         if not all(map(math.isfinite, self.distortion)):
             raise ValueError("`distortion` holds a number that is not finite")
+
+    def centre_covariance(self, stated: Array, loads: Array) -> Array:
+        """Covariance (n, 2, 2) [px^2] of marker centres with the `centre_noise`.
+
+        Parameters
+        ----------
+        stated
+            Covariances that detections state, (n, 2, 2) [px^2].
+        loads
+            Parts (n, 2) of the floor's and of saturation's variance that each centre has.
+        """
+        if self.centre_noise is None:
+            return stated
+        scale, *added = self.centre_noise.variances
+        return np.asarray(scale * stated + (loads @ added)[:, None, None] * np.eye(2))
 
     @property
     def K(self) -> Array:

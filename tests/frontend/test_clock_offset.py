@@ -183,7 +183,8 @@ def test_all_stances_share_one_offset(tmp_path):
     sigma = shared[0].homography.time_offset_sigma
     assert sigma < 0.75 * min(one.homography.time_offset_sigma for one in alone)
     assert abs(offsets[0] - OFFSET) < 4 * sigma
-    assert [one.homography.time_offset for one in solve(run).measurements] == offsets
+    # a run learns the noise as well
+    assert [one.homography.time_offset for one in solve(run).measurements] == pytest.approx(offsets, abs=0.1 * sigma)
 
 
 def test_stances_that_disagree_are_told_and_trusted_less():

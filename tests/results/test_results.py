@@ -33,6 +33,7 @@ FILES = {
     "measurements.csv",
     "config.toml",
     "report.html",
+    "team.toml",
 }
 
 

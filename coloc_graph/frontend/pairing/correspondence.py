@@ -5,7 +5,7 @@ one pair by what they do (`association`).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -44,7 +44,8 @@ class Correspondences:
     """The same markers at the same instants in cameras i and j: `uv_*` (n, 2) [px], `times` (n,) of camera i.
 
     `pairs` are the same in normalised coordinates with covariances. `markers` names which track of camera i
-    each belongs to (n,).
+    each belongs to (n,). `loads_*` (n, 2) are the parts of the white floor's and of saturation's variance that each
+    point has (`team.CentreNoise`); of interpolated points they are less than 1.
     """
 
     uv_i: Array
@@ -52,6 +53,8 @@ class Correspondences:
     times: Array
     markers: NDArray[np.int64]
     pairs: PointPairs
+    loads_i: Array
+    loads_j: Array
 
     def __len__(self) -> int:
         return len(self.times)
@@ -296,6 +299,8 @@ class Candidates:
                 np.concatenate([self._x_i[a][1][m] for a, _, m, _ in parts]),
                 np.concatenate([covariance for _, covariance in seen_j]),
             ),
+            loads_i=np.concatenate([self._i[a].loads[m] for a, _, m, _ in parts]),
+            loads_j=np.concatenate([self._j[b].loads[n] for _, b, _, n in parts]),
         )
 
     def _at_j(self, a: int, b: int, m: NDArray[np.int64], n: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -328,10 +333,10 @@ def _in_view(camera: Camera, H: Array, x: Array) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=1000)  # a camera's tracks are in as many pairs as it has partners
 def normalised(track: Track, camera: Camera) -> tuple[Array, Array]:
-    """A track in normalised coordinates (n, 2), with covariances (n, 2, 2)."""
+    """A track in normalised coordinates (n, 2), with covariances (n, 2, 2) that hold the camera's `centre_noise`."""
     x = camera.normalise(track.uv)
     J = camera.per_pixel(x)
-    return x, J @ track.covariance @ J.swapaxes(1, 2)
+    return x, J @ camera.centre_covariance(track.covariance, track.loads) @ J.mT
 
 
 def _speed(times: Array, x: Array) -> Array:
@@ -348,3 +353,25 @@ def _speed(times: Array, x: Array) -> Array:
 def _finite(normalised_track: tuple[Array, Array]) -> NDArray[np.bool_]:
     x, covariance = normalised_track
     return np.asarray(np.isfinite(x).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
+
+
+def separated(C: Array, x: Array, loads: Array, camera: Camera) -> tuple[Array, Array]:
+    """Covariances (n, 2, 2) of points as detections stated them, and those of one pixel; C has the `centre_noise`."""
+    J = camera.per_pixel(x)
+    per_px = J @ J.mT
+    if camera.centre_noise is None:
+        return C, per_px
+    scale, *added = camera.centre_noise.variances
+    return (C - (loads @ added)[:, None, None] * per_px) / scale, per_px
+
+
+def with_noise(found: Correspondences, before: tuple[Camera, Camera], after: tuple[Camera, Camera]) -> Correspondences:
+    """Return the correspondences with the centre noise that their cameras have `after`, instead of that `before`."""
+    pairs = found.pairs
+    sides = (pairs.covariance_i, pairs.x_i, found.loads_i), (pairs.covariance_j, pairs.x_j, found.loads_j)
+    made = []
+    for (C, x, loads), old, new in zip(sides, before, after, strict=True):
+        stated, per_px = separated(C, x, loads, old)
+        scale, *added = new.centre_noise.variances if new.centre_noise else (1.0, 0.0, 0.0)
+        made.append(scale * stated + (loads @ added)[:, None, None] * per_px)
+    return replace(found, pairs=PointPairs(pairs.x_i, pairs.x_j, *made))

@@ -45,15 +45,18 @@ class PairedTracks:
         seen_i = {a: _finite(tracks_i[a], camera_i) for a, _ in chosen}
         seen_j = [_finite(tracks_j[b], camera_j) for b in of_j]
         self._samples = Samples([s[0] for s in seen_j], [s[1] for s in seen_j], [s[2] for s in seen_j])
-        self._uv_j = np.concatenate([s[3] for s in seen_j])
+        self._uv_j, self._loads_j = (np.concatenate([s[part] for s in seen_j]) for part in (3, 4))
         sizes = [len(seen_i[a][0]) for a, _ in chosen]
         track = np.repeat(np.array([of_j.index(b) for _, b in chosen], np.int64), sizes)
         markers = np.repeat(np.array([a for a, _ in chosen], np.int64), sizes)
-        times, x_i, covariance_i, uv_i = (np.concatenate([seen_i[a][part] for a, _ in chosen]) for part in range(4))
+        times, x_i, covariance_i, uv_i, loads_i = (
+            np.concatenate([seen_i[a][part] for a, _ in chosen]) for part in range(5)
+        )
         # in camera j's order, so that points that share its samples are neighbours
         order = np.lexsort((times, track))
         self._track, self._markers, self.times = track[order], markers[order], times[order]
         self.x_i, self.covariance_i, self._uv_i = x_i[order], covariance_i[order], uv_i[order]
+        self._loads_i = loads_i[order]
 
     def __len__(self) -> int:
         return len(self.times)
@@ -74,7 +77,10 @@ class PairedTracks:
         """The same, with pixels, instants and markers."""
         uv_j = at.interpolated.position[which] @ self._uv_j
         pairs = self.pairs(at, which)
-        return Correspondences(self._uv_i[which], uv_j, self.times[which], self._markers[which], pairs)
+        position = at.interpolated.position[which]
+        loads_j = position.multiply(position).tocsr() @ self._loads_j
+        columns = self._uv_i[which], uv_j, self.times[which], self._markers[which]
+        return Correspondences(*columns, pairs, self._loads_i[which], np.asarray(loads_j))
 
     def noise_j(self, at: Shifted, which: NDArray[np.int64]) -> Array:
         """Covariance of camera j's points `which` (k,), which share samples: the lower band (width, 2k), as LAPACK has
@@ -124,9 +130,9 @@ def _padded(rows: sparse.csr_array) -> tuple[NDArray[np.int64], Array]:
     return rows.indices[at].astype(np.int64), np.where(n < count, rows.data[at], 0.0)
 
 
-def _finite(track: Track, camera: Camera) -> tuple[Array, Array, Array, Array]:
-    """Times, normalised points, covariances and pixels of a track, where all are finite and time goes on."""
+def _finite(track: Track, camera: Camera) -> tuple[Array, Array, Array, Array, Array]:
+    """Times, normalised points, covariances, pixels and loads of a track, where all are finite and time goes on."""
     x, covariance = normalised(track, camera)
     good = np.asarray(np.isfinite(x).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
     good[1:] &= np.diff(track.times) > 1e-4
-    return track.times[good], x[good], covariance[good], track.uv[good]
+    return track.times[good], x[good], covariance[good], track.uv[good], track.loads[good]

@@ -17,7 +17,7 @@ from coloc_graph.frontend.homography.plane import on_plane
 from coloc_graph.frontend.tracks.tracking import DOUBTFUL, Track
 from coloc_graph.geometry.lie import across
 from coloc_graph.measurements import Plane
-from coloc_graph.run import Detections
+from coloc_graph.run import Detections, Flag
 from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
@@ -38,8 +38,9 @@ MAX_JUMP = 8.0  # median steps of the body between two images beyond which the p
 class RigidPath:
     """Two lights of one body in one camera, image by image.
 
-    `times` (n,) [s], `uv` (n, 2, 2) [px] with `covariance` (n, 2, 2, 2) [px^2] and `peak` (n, 2) of both lights,
-    `places` (n, 2, 2) [m] on the marker plane. Within one `piece` (n,) the order of the two lights is consistent.
+    `times` (n,) [s]; of both lights `uv` (n, 2, 2) [px] with `covariance` (n, 2, 2, 2) [px^2], `peak` (n, 2),
+    `saturated` (n, 2) and `places` (n, 2, 2) [m] on the marker plane. Within one `piece` (n,) the order of the two
+    lights is consistent.
     `images` is the number of images in all, `lights` (images,) the number of moving lights in each.
     """
 
@@ -48,6 +49,7 @@ class RigidPath:
     uv: Array
     covariance: Array
     peak: Array
+    saturated: NDArray[np.bool_]
     places: Array
     piece: NDArray[np.int64]
     lights: NDArray[np.int64]
@@ -83,6 +85,7 @@ class RigidPath:
             uv=self.uv[rows, order],
             covariance=self.covariance[rows, order],
             peak=self.peak[rows, order],
+            saturated=self.saturated[rows, order],
             places=self.places[rows, order],
             piece=piece,
         )
@@ -97,6 +100,7 @@ class RigidPath:
             uv=self.uv[keep],
             covariance=self.covariance[keep],
             peak=self.peak[keep],
+            saturated=self.saturated[keep],
             places=self.places[keep],
             piece=self.piece[keep],
         )
@@ -107,8 +111,10 @@ class RigidPath:
         for piece in np.unique(self.piece).tolist():
             own = self.piece == piece
             for light in range(2):
-                uv, covariance, peak = (one[own, light] for one in (self.uv, self.covariance, self.peak))
-                made.append(Track(self.robot, "", self.times[own], uv, covariance, peak, body=0, mover=mover))
+                columns = self.uv, self.covariance, self.peak
+                uv, covariance, peak = (one[own, light] for one in columns)
+                track = Track(self.robot, "", self.times[own], uv, covariance, peak, body=0, mover=mover)
+                made.append(replace(track, saturated=self.saturated[own, light]))
         return made
 
 
@@ -142,6 +148,7 @@ def rigid_path(
         np.array([one.uv[pair] for one, pair, _ in own]).reshape(-1, 2, 2),
         np.array([one.covariance[pair] for one, pair, _ in own]).reshape(-1, 2, 2, 2),
         np.array([one.peak[pair] for one, pair, _ in own]).reshape(-1, 2),
+        np.array([(one.flags[pair] & Flag.SATURATED) != 0 for one, pair, _ in own]).reshape(-1, 2),
         np.array([places for _, _, places in own]).reshape(-1, 2, 2),
         np.zeros(len(own), np.int64),
         lights,

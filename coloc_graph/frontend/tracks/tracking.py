@@ -52,6 +52,7 @@ class Track:
     grey levels. `marker` is its name where its identity is known ("C/0"), or "". Tracks of one camera with the same
     `body` are markers of one robot; -1 where that is not known. `mover` is that robot's name where its colour, or how
     it blinks, tells it. `missed` (k,) [s] are the images in between in which it should have been, and was not.
+    `saturated` (n,) marks samples whose core is at the sensor's limit; None where that is not known.
     """
 
     robot: str
@@ -63,9 +64,16 @@ class Track:
     body: int = -1
     mover: str = ""
     missed: Array = field(default_factory=lambda: np.zeros(0))
+    saturated: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.times)
+
+    @property
+    def loads(self) -> Array:
+        """How much of the variances beyond the stated one each sample has: of the white floor, of saturation (n, 2)."""
+        saturated = np.zeros(len(self)) if self.saturated is None else self.saturated
+        return np.stack([np.ones(len(self)), saturated], axis=1)
 
     @property
     def extent(self) -> float:
@@ -145,7 +153,7 @@ class MarkerTracker:
         self._live: list[_Live] = []  # in the order of the filters
         self._ended: list[_Live] = []
         self._parked: list[_Live] = []
-        self._taken: list[tuple[Array, Array, float]] = []
+        self._taken: list[tuple[Array, Array, float, bool]] = []
         self._searched = -math.inf  # when the full frame was searched last
 
     def step(self, image: Image) -> None:
@@ -163,7 +171,8 @@ class MarkerTracker:
         self._filters.predict(time)
         whole = blobs[(blobs.flags & DOUBTFUL) == 0]
         numbers = range(len(self._taken), len(self._taken) + len(whole))
-        self._taken += zip(whole.uv, whole.covariance, whole.peak.tolist(), strict=True)
+        saturated = (whole.flags & Flag.SATURATED) != 0
+        self._taken += zip(whole.uv, whole.covariance, whole.peak.tolist(), saturated.tolist(), strict=True)
         self._advance(time, whole.uv, whole.covariance, list(numbers), births=True)
 
     def tracks(self) -> list[Track]:
@@ -189,14 +198,15 @@ class MarkerTracker:
                     blobs.covariance[own][good],
                     blobs.peak[own][good],
                     missed=_between(live),
+                    saturated=(blobs.flags[own][good] & Flag.SATURATED) != 0,
                 )
             )
         return [track for track in tracks if len(track)]
 
-    def _track(self, live: _Live, samples: list[tuple[Array, Array, float]]) -> Track:
-        uv, covariance, peak = zip(*samples, strict=True)
+    def _track(self, live: _Live, samples: list[tuple[Array, Array, float, bool]]) -> Track:
+        uv, covariance, peak, saturated = zip(*samples, strict=True)
         fields = np.array(live.times), np.array(uv), np.array(covariance), np.array(peak)
-        return Track(self.robot, "", *fields, missed=_between(live))
+        return Track(self.robot, "", *fields, missed=_between(live), saturated=np.array(saturated))
 
     def _search_all(self, time: float) -> bool:
         return (

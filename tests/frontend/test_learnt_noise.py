@@ -1,0 +1,125 @@
+"""Noise of marker centres is learnt from residuals, with the stated one as a prior."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coloc_graph.frontend.homography.noise_components import NoiseEvidence, learn_components
+from coloc_graph.frontend.learnt_noise import NoiseBelief
+from coloc_graph.pipeline.batch import SolveOptions, StanceSolver, solve
+from coloc_graph.results.writer import write_result
+from coloc_graph.run import RunWriter, open_run
+from coloc_graph.simulation import Imperfections, simulate
+from coloc_graph.team import CentreNoise, read_team
+
+PRIOR = np.zeros(2), np.diag([4.0, 4.0])
+
+
+def evidence(rng, n, variances, p=8):
+    """Residuals of a fit of p unknowns to n points with two components, of which the second differs by point."""
+    design = rng.standard_normal((n, 2, p))
+    loads = np.stack([np.ones(n), rng.uniform(0, 4, n)])
+    sigma = np.sqrt(variances @ loads)
+    residual = sigma[:, None] * rng.standard_normal((n, 2))
+    flat, weights = design.reshape(-1, p), np.repeat(sigma**-2, 2)
+    h = np.linalg.solve(flat.T @ (weights[:, None] * flat), flat.T @ (weights * residual.ravel()))
+    return NoiseEvidence(residual - design @ h, design, loads[:, :, None, None] * np.eye(2), np.arange(2))
+
+
+def test_components_are_unbiased_though_fits_leave_few_degrees_of_freedom():
+    # eight unknowns from ten points: without counting them variances would come out at 0.6 of what they are
+    rng, true = np.random.default_rng(0), np.array([0.5, 2.0])
+    logs, covariance = learn_components([evidence(rng, 10, true) for _ in range(400)], *PRIOR)
+    off = (logs - np.log(true)) / np.sqrt(covariance.diagonal())
+    assert np.abs(off).max() < 3
+    assert np.sqrt(covariance.diagonal()).max() < 0.25
+
+
+def test_one_fit_after_the_other_gives_what_all_together_do():
+    rng = np.random.default_rng(1)
+    every = [evidence(rng, 60, np.array([0.5, 2.0])) for _ in range(12)]
+    together = learn_components(every, *PRIOR)
+    belief = PRIOR
+    for one in every:
+        belief = learn_components([one], *belief)
+    sigmas = np.sqrt(together[1].diagonal())
+    assert np.abs(belief[0] - together[0]).max() < 0.7 * sigmas.max()
+    assert np.sqrt(belief[1].diagonal()) == pytest.approx(sigmas, rel=0.2)
+
+
+@pytest.fixture(scope="module")
+def hallway(tmp_path_factory):
+    path = tmp_path_factory.mktemp("noise") / "run.mcap"
+    simulate("hallway", path, imperfections=Imperfections(noise_px=0.3), stances=6, points=100, seed=3)
+    return path
+
+
+def restated(path, out, factor):
+    """The run with all stated covariances of detections changed by a factor on their sigmas."""
+    run = open_run(path)
+    with RunWriter(out, run.team) as writer:
+        for robot in run.team.names:
+            if run.has_detections(robot):
+                for one in run.detections(robot):
+                    writer.write(replace(one, covariance=factor**2 * one.covariance))
+        for stance in run.stances:
+            writer.write(stance)
+    return open_run(out)
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0, 3.0])
+def test_noise_is_found_whatever_is_stated(hallway, tmp_path, factor):
+    run = restated(hallway, tmp_path / "run.mcap", factor)
+    solution = solve(run, SolveOptions(odometry=False))
+    noise = solution.noise
+    for robot in ("A", "B"):
+        sigma, within = noise.sigma(robot)
+        assert within < 1.2
+        assert sigma == pytest.approx(0.3, rel=0.15)
+    used = [one.homography for one in solution.measurements]
+    assert sum(one.chi2 for one in used) / sum(one.dof for one in used) == pytest.approx(1, abs=0.15)
+
+
+def test_a_short_run_keeps_what_is_stated_and_is_wide(hallway, tmp_path):
+    run = open_run(hallway)
+    nothing, one = NoiseBelief.of(run.team), solve(run, SolveOptions(odometry=False)).noise
+    stated = nothing.noise("A")
+    assert stated.floor_px == pytest.approx(CentreNoise().floor_px)
+    # of a floor that is known within a factor of three the variance is expected eleven times its median
+    assert nothing.used(run.team)["A"].camera.centre_noise.variances[1] == pytest.approx(11.2 * 0.03**2, rel=0.01)
+    assert one.noise("C") == nothing.noise("C")  # whose camera saw nothing
+    assert one.noise("A").floor_factor > 1.5  # 0.3 px of stated noise tell little of a floor of 0.03
+
+
+def test_learnt_noise_is_in_the_team_that_a_result_writes_and_the_next_run_starts_from_it(hallway, tmp_path):
+    run = restated(hallway, tmp_path / "run.mcap", 0.1)
+    first = solve(run, SolveOptions(odometry=False))
+    write_result(first, tmp_path / "out")
+    learnt = read_team(tmp_path / "out" / "team.toml")
+    noise = learnt["A"].camera.centre_noise
+    assert noise == first.noise.noise("A")
+    assert noise.floor_px == pytest.approx(0.3, rel=0.2)
+    assert NoiseBelief.of(learnt).noise("A").floor_factor == pytest.approx(noise.floor_factor)
+    rows = json.loads((tmp_path / "out" / "summary.json").read_text())["centre_noise"]
+    assert {row["what"] for row in rows} == {"typical centre", "stated sigma times", "white floor"}
+    assert "Noise of marker centres" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_stance_by_stance_learns_about_the_same_as_all_at_once(hallway, tmp_path):
+    run = restated(hallway, tmp_path / "run.mcap", 0.1)
+    batch, online = (solve(run, SolveOptions(odometry=False, incremental=one)).noise for one in (False, True))
+    for robot in ("A", "B"):
+        assert online.sigma(robot)[0] == pytest.approx(batch.sigma(robot)[0], rel=0.1)
+
+
+def test_a_stance_that_is_withdrawn_takes_what_it_taught_with_it(hallway):
+    run = open_run(hallway)
+    solver = StanceSolver(run.team, SolveOptions(odometry=False))
+    beliefs = []
+    for stance in run.stances[:2]:
+        solver.enter(run, stance)
+        beliefs.append(solver.noise)
+    solver.withdraw()
+    assert solver.noise is beliefs[0]
