@@ -18,7 +18,7 @@ import numpy as np
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend import MarkerTracker, Track, plane_from_mount
 from coloc_graph.frontend.images.detection import Blobs, Detector
-from coloc_graph.frontend.pairing.association import SURE, Association, associate
+from coloc_graph.frontend.pairing.association import MIN_POSTERIOR, Association, associate
 from coloc_graph.frontend.pairing.correspondence import Candidates
 from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers
 from coloc_graph.geometry.lie import floor_pose
@@ -63,7 +63,7 @@ def verdict(found: Association | None, lights: Sequence[Sequence[int]]) -> str:
     """Right, wrong though sure, ambiguous, or nothing."""
     if found is None:
         return "nothing"
-    if found.posterior < SURE:
+    if found.posterior < MIN_POSTERIOR:
         return "ambiguous"
     return "right" if all(lights[0][a] == lights[1][b] for a, b in found.chosen) else "wrong"
 

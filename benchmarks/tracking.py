@@ -142,9 +142,9 @@ def whose(
                     columns = (one[within] for one in (track.times, track.uv, track.covariance, track.peak))
                     piece = Track("A", "", *columns, missed=missed)
                     pieces.setdefault(light // 2, []).append(piece)
-                    verdicts.append((length, 1, _verdict(codes.whose([piece]), names, light // 2)))
+                    verdicts.append((length, 1, _verdict(codes.robot_of([piece]), names, light // 2)))
                 verdicts += [
-                    (length, 2, _verdict(codes.whose(two), names, robot))
+                    (length, 2, _verdict(codes.robot_of(two), names, robot))
                     for robot, two in pieces.items()
                     if len(two) == 2 and robot >= 0
                 ]

@@ -11,7 +11,7 @@ from coloc_graph.frontend.homography.plane import on_plane, plane_from_mount
 from coloc_graph.frontend.images.apriltags import find_tags
 from coloc_graph.frontend.images.detection import Detector, Pixels, detector_for
 from coloc_graph.frontend.sighting import Marked, at_rest, sight
-from coloc_graph.frontend.tracks.tracking import DOUBTFUL, Track
+from coloc_graph.frontend.tracks.tracking import UNRELIABLE, Track
 from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.measurements import Sighting
 from coloc_graph.run import Image, Recorded, Stance
@@ -103,7 +103,7 @@ class LandmarkWatch:
     def _lights(self, landmark: Landmark, detector: Detector, pixels: Pixels) -> tuple[Array, Array] | None:
         """The landmark's first and second light, if they are seen; raises where others might be they."""
         blobs = detector(pixels)
-        blobs = blobs[(blobs.flags & DOUBTFUL) == 0]
+        blobs = blobs[(blobs.flags & UNRELIABLE) == 0]
         if len(blobs) < 2:
             return None
         if len(blobs) > 2:

@@ -11,7 +11,7 @@ from coloc_graph.frontend.homography.plane import on_plane
 from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.correspondence import pair_by_time
-from coloc_graph.frontend.tracks.marker_pairs import couple_of, named_pair, tracks_of
+from coloc_graph.frontend.tracks.marker_pairs import longest_pair, named_pair, tracks_of
 from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.geometry.lie import across, floor_pose, so3_exp
 from coloc_graph.geometry.se2 import wrap
@@ -130,7 +130,7 @@ def _marker_tracks(
     if len(tracks) > 2:
         assert seen.markers is not None
         planes = plausible_planes(plane, observer.mount)
-        couple = couple_of(tracks, observer.camera, planes, seen.markers.span or 0.0)
+        couple = longest_pair(tracks, observer.camera, planes, seen.markers.span or 0.0)
         if couple is None:
             return None
         tracks = [tracks[n] for n in couple]

@@ -33,10 +33,10 @@ from coloc_graph.frontend.pairing.correspondence import (
     with_noise,
 )
 from coloc_graph.frontend.pairing.floor_checks import of_some_span, on_one_floor, require_on_floor
-from coloc_graph.frontend.pairing.observer_pairs import Pair, pairs_of, share
+from coloc_graph.frontend.pairing.observer_pairs import Pair, information_weight, pairs_of
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
-from coloc_graph.frontend.tracks.interpolation import LONGEST_GAP
-from coloc_graph.frontend.tracks.marker_pairs import couple_of, named_pair, span_samples
+from coloc_graph.frontend.tracks.interpolation import MAX_GAP
+from coloc_graph.frontend.tracks.marker_pairs import longest_pair, named_pair, span_samples
 from coloc_graph.frontend.tracks.paired_tracks import PairedTracks
 from coloc_graph.frontend.tracks.tracking import Track, TrackerOptions
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose
@@ -143,7 +143,7 @@ def measured_pairs(tracks: StanceTracks, end: float) -> list[Pair]:
 
 
 def _window(run: Recorded) -> float:
-    return PAIRING_WINDOW if run.team.clock_sigma == 0 else LONGEST_GAP / 2
+    return PAIRING_WINDOW if run.team.clock_sigma == 0 else MAX_GAP / 2
 
 
 def measure_pair(
@@ -265,7 +265,7 @@ def _measured(
         doubt = str(why)  # the paper's chain composes every homography that it can fit
     fit = persisting(fit, found.pairs, found.markers, found.times)
     require_determined(fit)
-    own = share(found, (seen.robot_i, seen.robot_j), seen.pairs, seen.tracks, _window(seen.run))
+    own = information_weight(found, (seen.robot_i, seen.robot_j), seen.pairs, seen.tracks, _window(seen.run))
     fit = replace(fit, information=own * fit.information)
     measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
     measurement = replace(measurement, share=own, doubt=doubt)
@@ -310,7 +310,7 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
         own = [n for n, track in enumerate(seen.tracks_i) if not named and (len(movers) == 1 or track.mover == mover)]
         if own:
             planes = plausible_planes(seen.plane, robot.mount)
-            couple = couple_of([seen.tracks_i[n] for n in own], robot.camera, planes, markers.span)
+            couple = longest_pair([seen.tracks_i[n] for n in own], robot.camera, planes, markers.span)
             if couple is not None:
                 couples[mover] = own[couple[0]], own[couple[1]]
     return marker_spans(couples, found, fit, bias) if couples else ()

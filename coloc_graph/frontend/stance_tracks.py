@@ -15,7 +15,7 @@ from coloc_graph.frontend.images.detection import Blobs, detector_for
 from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks
 from coloc_graph.frontend.pairing.rigid_alignment import align_paths
 from coloc_graph.frontend.tracks.blink_codes import BlinkCodes
-from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers, of_named
+from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers, merge_named
 from coloc_graph.frontend.tracks.rigid_path import RigidPath, rigid_path
 from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.measurements import Plane
@@ -236,12 +236,12 @@ class StanceTracks:
             spans = {m.span for name in names if (m := run.team[name].markers) and m.span}
             own, codes = tracker.tracks(), self._codes(names)
             if len(names) > 1 and codes is not None:
-                own = codes.each(own)
+                own = codes.name_tracks(own)
             own = markers_of_movers(own, camera, planes, sorted(spans), len(names))
             if len(names) == 1:
                 own = [replace(track, mover=names[0]) for track in own]
             elif codes is not None:
-                own = of_named(codes.bodies(own))
+                own = merge_named(codes.name_bodies(own))
             bodies = max((track.body for track in tracks), default=-1) + 1
             tracks += [replace(t, body=t.body + bodies * (t.body >= 0)) for t in own]
         return tracks

@@ -8,7 +8,7 @@ from crowd_scene import FACTS, lockstep, movers, right, seen_by_both
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend import correspond
-from coloc_graph.frontend.pairing.association import SURE, associate
+from coloc_graph.frontend.pairing.association import MIN_POSTERIOR, associate
 from coloc_graph.frontend.pairing.correspondence import Candidates
 
 
@@ -21,7 +21,7 @@ def found(both, **options):
 def test_however_many_robots_move_each_marker_is_found_again(n, seed):
     both = seen_by_both(movers(n, seed), seed)
     one = found(both)
-    assert one.posterior > SURE
+    assert one.posterior > MIN_POSTERIOR
     assert right(one, both)
     assert len({both[0][1][a] for a, _ in one.chosen}) >= 2 * n - 1
 
@@ -31,18 +31,18 @@ def test_however_many_robots_move_each_marker_is_found_again(n, seed):
 def test_robots_in_lock_step_are_ambiguous_and_not_guessed(seed, hidden):
     both = seen_by_both(lockstep(seed), seed, hidden)
     one = found(both)
-    assert one.posterior < SURE
+    assert one.posterior < MIN_POSTERIOR
     assert one.rivals
     assert one.posterior + sum(chance for _, chance in one.rivals) == pytest.approx(1.0)
     assert one.posterior >= max(chance for _, chance in one.rivals)
-    with pytest.raises(DegenerateGeometry, match=r"ambiguous: \d pairings .* drive apart, or give markers names"):
+    with pytest.raises(DegenerateGeometry, match=r"ambiguous: \d pairings .* drive apart, or name the markers"):
         correspond(both[0][0], both[1][0], FACTS.camera, FACTS.camera)
 
 
 def test_a_robot_that_only_one_camera_sees_is_left_out():
     both = seen_by_both(movers(3, 5), 5, hidden=1)
     one = found(both)
-    assert one.posterior > SURE
+    assert one.posterior > MIN_POSTERIOR
     assert right(one, both)
     assert not {0, 1} & {both[1][1][b] for _, b in one.chosen}
 
@@ -51,7 +51,7 @@ def test_nothing_is_made_of_tracks_that_have_nothing_in_common():
     here, there = seen_by_both(movers(1, 3), 3), seen_by_both(movers(1, 4), 4)
     mixed = [here[0], there[1]]
     one = found(mixed)
-    assert one is None or one.posterior < SURE or len(one.chosen) < 2
+    assert one is None or one.posterior < MIN_POSTERIOR or len(one.chosen) < 2
 
 
 def test_the_one_robot_that_moves_is_the_one_that_both_see():

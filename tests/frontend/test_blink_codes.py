@@ -42,7 +42,7 @@ def test_a_track_of_some_seconds_says_whose_it_is_and_a_short_one_does_not(fps):
     whose = {length: [] for length in (0.5, 2.0, 8.0)}
     for name, (length, found), _ in itertools.product(NAMES, whose.items(), range(6)):
         times = 1.7e9 + rng.uniform() + np.arange(round(fps * length)) / fps
-        said = CODES.whose([track_of(lit(name, times, rng, fast=2e-3 * rng.standard_normal()), times, rng)])
+        said = CODES.robot_of([track_of(lit(name, times, rng, fast=2e-3 * rng.standard_normal()), times, rng)])
         assert said in ("", name)
         found.append(said)
     assert not any(whose[0.5])
@@ -58,12 +58,12 @@ def test_what_blinks_as_nobody_does_is_nobodys():
     half = np.where(times < 10, lit("A", times, rng), lit("B", times, rng))  # two lights in one track
     steady, flicker = np.ones(1000, bool), np.repeat(rng.uniform(size=200) < 0.8, 5)
     for on in (stranger, too_slow, half, steady, flicker):
-        assert CODES.whose([track_of(on, times, rng)]) == ""
+        assert CODES.robot_of([track_of(on, times, rng)]) == ""
     for code in ("0110111101", "11010101", "111110110"):  # over 8 s nearly as C, B and A do with a few wrong bits
         on = Blinking(Blink(code=code), 0.3, 0.0).on(times[:400])
-        assert CODES.whose([track_of(on, times[:400], np.random.default_rng(1))]) == ""
+        assert CODES.robot_of([track_of(on, times[:400], np.random.default_rng(1))]) == ""
     hidden = lit("C", times, rng) & ((times % 4.0) > 0.25)  # a quarter of a second now and then
-    assert CODES.whose([track_of(hidden, times, rng)]) == "C"
+    assert CODES.robot_of([track_of(hidden, times, rng)]) == "C"
 
 
 def test_two_lights_of_one_body_know_together_what_neither_knows_alone():
@@ -73,9 +73,9 @@ def test_two_lights_of_one_body_know_together_what_neither_knows_alone():
         times = rng.uniform() + np.arange(33) / 25
         on = lit("A", times, rng)
         two = [replace(track_of(on, times, rng, missed=0.1), body=0) for _ in range(2)]
-        each = CODES.each(two)
+        each = CODES.name_tracks(two)
         alone += sum(one.mover == "A" for one in each) / 2
-        together += [one.mover for one in CODES.bodies(each)] == ["A", "A"]
+        together += [one.mover for one in CODES.name_bodies(each)] == ["A", "A"]
     assert together > alone + 3
 
 
@@ -83,8 +83,8 @@ def test_a_clock_that_is_off_by_what_a_clock_may_be_off_is_found_along():
     rng = np.random.default_rng(4)
     times = np.arange(1000) / 25
     for fast in (-4.5e-3, 4.5e-3):
-        assert CODES.whose([track_of(lit("D", times, rng, fast), times, rng)]) == "D"
-    assert CODES.whose([track_of(lit("D", times, rng, 0.03), times, rng)]) == ""
+        assert CODES.robot_of([track_of(lit("D", times, rng, fast), times, rng)]) == "D"
+    assert CODES.robot_of([track_of(lit("D", times, rng, 0.03), times, rng)]) == ""
 
 
 def test_as_likely_as_each_other_is_undecided():
@@ -93,8 +93,8 @@ def test_as_likely_as_each_other_is_undecided():
     times = np.arange(500) / 50
     alike = BlinkCodes({"A": "110", "B": "101"}, 0.1)
     seen = [track_of(lit("A", times, rng), times, rng)]
-    assert alike.chances(seen) == pytest.approx([0.5, 0.5], abs=1e-3)
-    assert alike.whose(seen) == ""
+    assert alike.posteriors(seen) == pytest.approx([0.5, 0.5], abs=1e-3)
+    assert alike.robot_of(seen) == ""
 
 
 def test_white_movers_that_blink_are_told_apart_in_images_even_in_lock_step(tmp_path):

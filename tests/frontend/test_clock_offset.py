@@ -11,7 +11,7 @@ from planar_scene import CAMERA, Scene
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend import ClockOffset, FrontendOptions, measure_pair, share_clock_offsets
 from coloc_graph.frontend.pairing.clock_offset import fuse, require_searchable
-from coloc_graph.frontend.tracks.interpolation import LONGEST_GAP, Samples
+from coloc_graph.frontend.tracks.interpolation import MAX_GAP, Samples
 from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.pipeline.batch import solve
 from coloc_graph.run import Detections, RunWriter, Stance, open_run
@@ -49,7 +49,7 @@ def test_a_cubic_and_its_derivative_are_interpolated_exactly():
 
 
 def test_neither_gaps_nor_what_lies_outside_a_track_are_bridged():
-    gap = LONGEST_GAP + 0.05
+    gap = MAX_GAP + 0.05
     t = np.concatenate([np.arange(4) * 0.05, 0.15 + gap + np.arange(4) * 0.05])
     x, found = at(samples(t, np.stack([t, -t], axis=1)), [-0.02, 0.02, 0.15, 0.2, 0.15 + gap - 0.02, 0.15 + gap, 0.6])
     assert found.valid.tolist() == [False, True, True, False, False, True, False]

@@ -152,7 +152,7 @@ def test_no_baseline_is_refused_in_words(noise):
 def test_a_homography_that_is_too_noisy_for_a_baseline_is_not_called_a_rotation():
     scene = Scene()
     information = 1e-5 * information_of(scene)
-    with pytest.raises(DegenerateGeometry, match=r"between A and B, made of .* points, is too noisy .*record more"):
+    with pytest.raises(DegenerateGeometry, match=r"between A and B, fitted to .* points, is too noisy .*record more"):
         relative_pose(measurement(scene.H_j_i, information), MOUNT, MOUNT, plane_from_mount(MOUNT, MARKERS))
 
 

@@ -81,7 +81,10 @@ def mirrored_run(path, names):
 
 @pytest.mark.parametrize(
     ("names", "why"),
-    [(("C/0", "C/1"), "and both stand on one floor: it is of reflections"), (("", ""), "no pairing of the tracks")],
+    [
+        (("C/0", "C/1"), "although both stand on one floor: it shows reflections"),
+        (("", ""), "no pairing of the tracks"),
+    ],
 )
 def test_a_stance_of_lights_and_mirror_images_measures_nothing(tmp_path, names, why):
     run = mirrored_run(tmp_path / "run.mcap", names)

@@ -31,8 +31,8 @@ def test_covariances_tell_the_truth():
         filters.predict(k * dt)
         if k % 7:  # and each seventh image shows nothing
             filters.update(np.arange(n), seen[k], R)
-    off = true[-1] - filters.place
-    nees = np.einsum("nc,ncd,nd->n", off, np.linalg.inv(filters.place_covariance), off)
+    off = true[-1] - filters.position
+    nees = np.einsum("nc,ncd,nd->n", off, np.linalg.inv(filters.position_covariance), off)
     assert chi2.ppf(5e-4, 2 * n) < nees.sum() < chi2.ppf(1 - 5e-4, 2 * n)
 
 
@@ -44,8 +44,8 @@ def test_a_point_at_constant_speed_is_found_where_it_will_be():
         filters.predict(0.1 * k)
         filters.update(np.array([0]), np.array([[10.0 + 3 * k, 20.0 - k]]), np.array([0.01 * np.eye(2)]))
     filters.predict(2.0)
-    assert filters.place[0] == pytest.approx([70.0, 0.0], abs=1e-3)
-    assert filters.speed[0] == pytest.approx([30.0, -10.0], abs=1e-2)
+    assert filters.position[0] == pytest.approx([70.0, 0.0], abs=1e-3)
+    assert filters.velocity[0] == pytest.approx([30.0, -10.0], abs=1e-2)
 
 
 def test_what_changes_its_speed_at_once_is_nearer_in_units_of_that():
@@ -57,12 +57,12 @@ def test_what_changes_its_speed_at_once_is_nearer_in_units_of_that():
         filters.predict(0.05 * k)
         filters.update(np.array([0]), np.zeros((1, 2)), R)
     filters.predict(2.0)
-    squared, _, jerked = filters.against(np.array([[5.0, 0.0]]), R)
+    squared, _, jerked = filters.distances(np.array([[5.0, 0.0]]), R)
     assert squared[0, 0] > 100
     assert jerked[0, 0] < 6
     filters.jerk(np.array([0]))
     filters.update(np.array([0]), np.array([[5.0, 0.0]]), R)
-    assert filters.speed[0, 0] == pytest.approx(100.0, rel=0.1)
+    assert filters.velocity[0, 0] == pytest.approx(100.0, rel=0.1)
 
 
 def test_an_earlier_time_changes_nothing():
@@ -71,4 +71,4 @@ def test_an_earlier_time_changes_nothing():
     filters.add(np.zeros((1, 2)), np.array([np.eye(2)]))
     filters.predict(0.5)
     assert filters.time == 1.0
-    assert filters.place_covariance[0] == pytest.approx(np.eye(2))
+    assert filters.position_covariance[0] == pytest.approx(np.eye(2))

@@ -12,7 +12,7 @@ from msgspec.structs import replace as msgspec_replace
 from coloc_graph.backend import Estimator, joint
 from coloc_graph.errors import InputError
 from coloc_graph.frontend import FrontendOptions, StanceTracks, Track, correspond, little_in_common, measure_pair
-from coloc_graph.frontend.pairing.observer_pairs import PARTNERS, pairs_of, share
+from coloc_graph.frontend.pairing.observer_pairs import MIN_PARTNERS, information_weight, pairs_of
 from coloc_graph.measurements import Sighting
 from coloc_graph.pipeline import incremental as stance_solver
 from coloc_graph.pipeline.batch import SolveOptions, solve
@@ -86,7 +86,9 @@ def test_a_team_is_solved_and_its_covariances_are_believable(ten):
     # the graph has loops, and nobody is warned of robots that are far from each other
     stance = ten.stances[0]
     pairs = [m for m in solution.measurements if m.homography.stance == 0]
-    assert len(stance.observers) * PARTNERS / 2 <= len(pairs) <= len(list(itertools.combinations(stance.observers, 2)))
+    assert (
+        len(stance.observers) * MIN_PARTNERS / 2 <= len(pairs) <= len(list(itertools.combinations(stance.observers, 2)))
+    )
     apart = [m for m in pairs if little_in_common(m.homography, stance)]
     assert apart
     assert len(stance.observers) <= sum(m.relative_pose is not None for m in pairs) < len(pairs)
@@ -158,7 +160,7 @@ def test_pixels_that_three_observers_share_count_once():
     def of(*others, pairs=None, tracks_i=in_i):
         tracks = {"A": tracks_i, "B": in_j} | {f"C{n}": other for n, other in enumerate(others)}
         every = list(itertools.combinations(tracks, 2))
-        return share(found, ("A", "B"), every if pairs is None else pairs, tracks, 0.005)
+        return information_weight(found, ("A", "B"), every if pairs is None else pairs, tracks, 0.005)
 
     assert of() == 1.0
     assert of(in_j) == pytest.approx(2 / 3, abs=0.02)
@@ -181,7 +183,7 @@ def test_of_many_observers_each_is_measured_with_those_that_see_most_of_the_same
     # two groups that watch different movers
     many = {f"{group}{n}": [track(f"{group}/0", 100), track("Z/0", 5)] for group in "XY" for n in range(10)}
     pairs = pairs_of(tuple(many), many, 0.005)
-    assert all(sum(name in pair for pair in pairs) >= PARTNERS for name in many)
+    assert all(sum(name in pair for pair in pairs) >= MIN_PARTNERS for name in many)
     assert len(pairs) < 90
     assert all(i[0] == j[0] for i, j in pairs)
 

@@ -21,11 +21,27 @@ def metric_scale(H: ArrayLike) -> Array:
 
 
 def decompose_with_normal(H: ArrayLike, N: ArrayLike, d: ArrayLike) -> tuple[Array, Array]:
-    """Eq. (2): R (..., 3, 3) and T (..., 3) [m] of H (..., 3, 3), known normal N (..., 3) and distance d [m].
+    """Decompose homographies with a known plane normal, by the paper's eq. (2).
 
-    v2 is the right singular vector of H for its middle singular value. Without noise N is orthogonal to v2 and
-    W U^T is a rotation. With noise N is made orthogonal for U; T is made of W U^T as the paper prints it, and R
-    is the rotation nearest to it.
+    Parameters
+    ----------
+    H
+        Homographies, x2 ~ H x1 in normalised coordinates, (..., 3, 3), of any scale.
+    N
+        Unit normal of the plane in camera 1, from the camera to the plane, (..., 3).
+    d
+        Distance of camera 1 from the plane [m].
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        R (..., 3, 3) and T (..., 3) [m] of T_c2_c1.
+
+    Notes
+    -----
+    v2 is the right singular vector of H for its middle singular value. Without noise N is orthogonal to v2 and W U^T is
+    a rotation. With noise N is made orthogonal for U; T is computed from W U^T as the paper prints it, and R is the
+    rotation nearest to it.
     """
     N, d, scaled = np.asarray(N, float), np.asarray(d, float), np.asarray(H, float)
     # the middle eigenvector and eigenvalue of H^T H are the middle right singular vector and value, squared
@@ -40,10 +56,18 @@ def decompose_with_normal(H: ArrayLike, N: ArrayLike, d: ArrayLike) -> tuple[Arr
 
 
 def decompose_svd(H: ArrayLike) -> tuple[Array, Array, Array]:
-    """Both solutions without a known normal: R (2, ..., 3, 3), T/d (2, ..., 3), N (2, ..., 3).
+    """Decompose homographies without a known normal.
 
-    Of the four of the textbook the two whose plane lies in front of camera 1 (N_z > 0 here, since the cameras
-    look at the plane). Where H is a pure rotation (no baseline) T/d is 0 and N is not determined.
+    Parameters
+    ----------
+    H
+        Homographies, (..., 3, 3), of any scale.
+
+    Returns
+    -------
+    tuple of numpy.ndarray
+        R (2, ..., 3, 3), T/d (2, ..., 3) and N (2, ..., 3) of both solutions. Of the textbook's four these are the two
+        whose plane lies in front of camera 1 (N_z > 0). If H is a pure rotation, T/d is 0 and N is undetermined.
     """
     H = metric_scale(H)
     _, s, Vt = np.linalg.svd(H)
@@ -59,7 +83,7 @@ def decompose_svd(H: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def _turn(H: Array, v2: Array, u: Array, N: Array) -> Array:
-    """W U^T (..., 3, 3), the rotation that takes v2, u and N to what H makes of the two first and across them."""
+    """Rotation W U^T (..., 3, 3) that maps v2, u and N to H v2, H u and their cross product."""
     U = np.stack(np.broadcast_arrays(v2, u, N), axis=-1)
     W = H @ U
     W[..., 2] = cross(W[..., 0], W[..., 1])
@@ -67,7 +91,7 @@ def _turn(H: Array, v2: Array, u: Array, N: Array) -> Array:
 
 
 def choose_by_normal(N_solutions: ArrayLike, N: ArrayLike) -> tuple[NDArray[np.int64], Array]:
-    """Which of two solutions' normals (2, ..., 3) agrees with N (..., 3), and the angle between them [rad]."""
+    """Index of the solution whose normal (2, ..., 3) is nearer to N (..., 3), and the angle between them [rad]."""
     cosine = np.sum(np.asarray(N_solutions, float) * np.asarray(N, float), axis=-1)
     which = cosine.argmax(axis=0)
     return which, np.arccos(np.clip(np.take_along_axis(cosine, which[None], axis=0)[0], -1.0, 1.0))

@@ -1,4 +1,4 @@
-"""From a homography measurement to the pose of observer j in observer i, with a 6x6 covariance."""
+"""Relative pose of two observers from a homography measurement by the paper's eq. (2), with a 6x6 covariance."""
 
 from dataclasses import replace
 
@@ -25,24 +25,38 @@ from coloc_graph.team import Mount
 
 Array = NDArray[np.float64]
 
-# The unknowns of a relative pose, in this order: the homography's h (8), the normal's rotation about two
-# axes across it (2), the distance (1), and of each mount height, tilt, roll (3 + 3).
-_H = slice(0, 8)
-_NORMAL = slice(8, 10)
-_D = 10
-_MOUNT_I = slice(11, 14)
-_MOUNT_J = slice(14, 17)
+# columns of the unknowns of a relative pose, (n, 17)
+_H = slice(0, 8)  # sl(3) coordinates of the homography
+_NORMAL = slice(8, 10)  # rad, rotation of the normal about two axes across it
+_D = 10  # m, distance of the plane
+_MOUNT_I = slice(11, 14)  # height [m], tilt, roll [rad]
+_MOUNT_J = slice(14, 17)  # height [m], tilt, roll [rad]
 
-#: A baseline that is certainly shorter than this share of the plane's distance is none.
-SHORT_BASELINE = 0.2
+SHORT_BASELINE = 0.2  # of the plane's distance; a baseline certainly shorter is called a pure rotation
 
 
 def relative_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount, plane: Plane) -> RelativePose:
-    """Eq. (2) on a homography measurement, both SVD solutions beside it, and a first-order covariance.
+    """Compute the relative pose by eq. (2), with a first-order covariance.
 
-    `plane` is that of the markers in camera i. The covariance carries the homography's information, what is
-    uncertain of the plane, and the tolerances of both mounts. Raises `DegenerateGeometry` where there is no
-    baseline between the cameras.
+    Parameters
+    ----------
+    measurement
+        Homography from camera i to camera j.
+    mount_i, mount_j
+        Mounts of both cameras.
+    plane
+        Marker plane in camera i.
+
+    Returns
+    -------
+    RelativePose
+        T_i_j of the bodies. The covariance (6, 6), rotation first, body frame j, carries the homography's information,
+        the uncertainty of the plane, and the tolerances of both mounts.
+
+    Raises
+    ------
+    DegenerateGeometry
+        There is no baseline between the cameras.
     """
     start = eq2_pose(measurement, mount_i, mount_j, plane)
     H = metric_scale(measurement.H_j_i)
@@ -60,7 +74,7 @@ def relative_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: M
 
 
 def eq2_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount, plane: Plane) -> RelativePose:
-    """The same without a covariance (NaN)."""
+    """Compute the relative pose by eq. (2) without a covariance (NaN)."""
     H = metric_scale(measurement.H_j_i)
     _require_baseline(measurement, H)
     _, _, N_both = decompose_svd(H)
@@ -79,7 +93,7 @@ def eq2_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount,
 
 
 def _require_baseline(measurement: HomographyMeasurement, H: Array) -> None:
-    """H of a pure rotation is a rotation: v2 and with it eq. (2) are then undetermined."""
+    """Raise `DegenerateGeometry` for the homography of a pure rotation, which leaves v2 and eq. (2) undetermined."""
     s = np.linalg.svd(H, compute_uv=False)
     baseline = s[0] - s[2]  # in units of the plane's distance d
     noise = 3 * np.sqrt(np.linalg.eigvalsh(np.linalg.inv(measurement.information)).max())
@@ -88,18 +102,17 @@ def _require_baseline(measurement: HomographyMeasurement, H: Array) -> None:
     pair = f"the homography between {measurement.robot_i} and {measurement.robot_j}"
     if baseline + noise < SHORT_BASELINE:
         raise DegenerateGeometry(
-            f"{pair} is that of a pure rotation, so "
-            "that there is no baseline to measure: place the two observers further apart"
+            f"{pair} is that of a pure rotation: there is no baseline; place the two observers further apart"
         )
     raise DegenerateGeometry(
-        f"{pair}, made of {measurement.points} points, is too noisy to tell a baseline (it seems "
-        f"{baseline:.2g} of the camera's distance from the marker plane long, give or take {noise:.2g}): record more "
-        "points, spread over the plane, detect them better, or place the observers further apart"
+        f"{pair}, fitted to {measurement.points} points, is too noisy to determine the baseline ({baseline:.2g} +- "
+        f"{noise:.2g} of the camera's distance from the marker plane): record more points, spread over the plane, "
+        "detect them better, or place the observers further apart"
     )
 
 
 def _root_covariance(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount, plane: Plane) -> Array:
-    """A square root (17, 17) of the unknowns' covariance."""
+    """Square root (17, 17) of the unknowns' covariance."""
     root = np.zeros((17, 17))
     root[_H, _H] = np.linalg.inv(np.linalg.cholesky(measurement.information)).T
     root[_NORMAL, _NORMAL] = plane.normal_sigma * np.eye(2)
@@ -123,9 +136,9 @@ def _poses(unknowns: Array, H: Array, mount_i: Mount, mount_j: Mount, plane: Pla
 
 
 def turned_normal(plane: Plane, mount: Mount, T_body_camera: Array) -> Array:
-    """The plane's normal (m, 3) in cameras that sit on the body as `T_body_camera` (m, 4, 4), not as thought.
+    """Normal of the plane (m, 3) in cameras mounted as `T_body_camera` (m, 4, 4) instead of as `mount` says.
 
-    Where the normal was computed from the mount, the body's vertical is what stays.
+    A normal that was computed from the mount stays vertical in the body; a stated one stays fixed in the camera.
     """
     if not plane.normal_from_mount:
         return np.broadcast_to(plane.N, (len(T_body_camera), 3))

@@ -1,9 +1,9 @@
-"""The homography between two images of points on a plane: robust first, then a fit on SL(3) to the inliers.
+"""Fit the homography between two images of points on a plane: robustly first, then on SL(3) to the inliers.
 
 Two criteria (Hartley and Zisserman, "Multiple View Geometry", section 4.2):
 
-- "transfer" is the paper's, and OpenCV's: least squares in image j, which takes image i for exact.
-- "reprojection" is maximum likelihood: x_i = z + noise, x_j = pi(H z) + noise with z the true place of each
+- "transfer" is the paper's, and OpenCV's: least squares in image j, with image i taken as exact.
+- "reprojection" is maximum likelihood: x_i = z + noise, x_j = pi(H z) + noise with z the true position of each
   point in image i. Both images' noise counts; z is eliminated in closed form at each Gauss-Newton step.
 
 The coordinates of a homography are those of sl(3) on the right: H exp(h), `lie.SL3_BASIS`.
@@ -29,33 +29,37 @@ from coloc_graph.geometry.lie import sl3_normalise
 
 Array = NDArray[np.float64]
 
-#: 99.9 % of a chi-square variable with 2 degrees of freedom: the gate of a point's squared residual.
-INLIER_GATE = 13.8
-#: Its median.
-MEDIAN_CHI2 = 1.386
-#: How much larger than stated the points' variance may turn out to be.
-WIDEST_SCALE = 25.0
-#: Points that lie within this many sigmas of one line count as collinear.
-COLLINEAR_SIGMAS = 5.0
-#: The share of the points that have to lie off it.
-LEAST_OFF_LINE = 0.15
-#: A spread across that is less than this share of the spread along is a straight line, whatever the noise.
-STRAIGHT = 0.03
-#: Fewer points give no homography worth the name: eight unknowns, two equations a point.
-MINIMUM_POINTS = 6
-#: MAGSAC++ marginalises over noise up to this many times the stated one.
-MAGSAC_SIGMAS = 10.0
-#: A correlation of n residuals stands out of chance above so many times 1 / sqrt(n).
-CHANCE = 3.5
+INLIER_GATE = 13.8  # squared residual of a point; 99.9 % of chi-square with 2 degrees of freedom
+MEDIAN_CHI2 = 1.386  # median of chi-square with 2 degrees of freedom
+MAX_VARIANCE_SCALE = 25.0  # factor by which the points' variance may exceed the stated one
+COLLINEAR_SIGMAS = 5.0  # standard deviations from a line within which points count as collinear
+MIN_OFF_LINE = 0.15  # share of the points that must lie off the line
+STRAIGHT = 0.03  # ratio of the spreads across and along below which a track is straight, whatever the noise
+MIN_POINTS = 6  # two equations a point for eight unknowns, and some to check
+MAGSAC_SIGMAS = 10.0  # standard deviations up to which MAGSAC++ marginalises the noise
+CORRELATION_SIGMAS = 3.5  # standard deviations, 1 / sqrt(n), above which n residuals count as correlated
 
 
 @dataclass(frozen=True, eq=False)
 class HomographyFit:
-    """A fitted homography: `H` (3, 3) with x_j ~ H x_i and determinant 1.
+    """Fitted homography.
 
-    `information` (8, 8) is that of the sl(3) coordinates on the right. `squared_residuals` (n,) are both
-    images' reprojection errors in units of the noise; `chi2` sums them over the `inliers` (n,) and has `dof`
-    degrees of freedom. `persistence` is how many points on end err alike (`persisting`): so much less the points say.
+    Attributes
+    ----------
+    H
+        Homography, x_j ~ H x_i in normalised coordinates, determinant 1, (3, 3).
+    information
+        Information of its sl(3) coordinates on the right, (8, 8).
+    inliers
+        Mask of the points that it explains, (n,).
+    squared_residuals
+        Squared reprojection errors of both images together, in units of the noise, (n,).
+    chi2, dof
+        Their sum over the inliers, and its degrees of freedom.
+    iterations
+        Number of Gauss-Newton steps.
+    persistence
+        Number of successive points that count as one, since their errors are correlated (`persisting`).
     """
 
     H: Array
@@ -69,11 +73,30 @@ class HomographyFit:
 
 
 def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection") -> HomographyFit:
-    """MAGSAC++ to start, then the criterion's fit over its inliers, until they are its own.
+    """Fit a homography to point pairs that may contain outliers.
 
-    Where the residuals are larger than the stated covariances explain, the gate and the information are scaled
-    to what is seen (never the other way); `chi2` is not, so that it tells. Raises `DegenerateGeometry` where
-    the points do not determine a homography, with the remedy.
+    Parameters
+    ----------
+    pairs
+        The same points in two images, with covariances.
+    criterion
+        "reprojection" (maximum likelihood) or "transfer" (the paper's).
+
+    Returns
+    -------
+    HomographyFit
+        The fit. If residuals exceed the stated covariances, its information is scaled down accordingly (never up);
+        its `chi2` is not scaled.
+
+    Raises
+    ------
+    DegenerateGeometry
+        The points do not determine a homography; the message names the remedy.
+
+    Notes
+    -----
+    MAGSAC++ (Barath et al., 2020) gives the start; the criterion is then minimised over the inliers until their set no
+    longer changes.
     """
     _require_points(len(pairs), len(pairs))
     sigma = pairs.sigma
@@ -99,35 +122,60 @@ def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection") -> 
 
 
 def persisting(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64], times: Array) -> HomographyFit:
-    """The fit with its information as points allow whose errors last, along each group's (n,) points in time (n,) [s].
+    """Reduce the information of a fit by the autocorrelation of its residuals.
 
-    A mover that tilts on an uneven floor lifts its markers for as long as it stands there; a background pulls a marker
-    for as long as it passes. The integrated autocorrelation of the residuals, as far as it stands out of chance, says
-    how many points are as good as one. Source: A. Sokal, "Monte Carlo Methods in Statistical Mechanics", 1989.
+    A mover that tilts on an uneven floor lifts its markers while it stands there; a bright background biases a marker
+    while it passes.
+
+    Parameters
+    ----------
+    fit, pairs
+        Fit, and the points that it was made of.
+    groups
+        Track of each point, (n,).
+    times
+        Time of each point, (n,) [s].
+
+    Returns
+    -------
+    HomographyFit
+        The fit with its information divided by `persistence`.
+
+    Notes
+    -----
+    The integrated autocorrelation time, summed while it exceeds chance, is the number of points that count as one:
+    A. Sokal, "Monte Carlo Methods in Statistical Mechanics", 1989.
     """
     kept = np.flatnonzero(fit.inliers)
     kept = kept[np.lexsort((times[kept], groups[kept]))]
     at = linearise(fit.H, pairs.x_i[kept], pairs[kept])
     e, group = np.stack([at.e0, at.e1], axis=1), groups[kept]
-    # lags reach a third of a group at most: of longer ones there are too few pairs to tell
+    # lags up to a third of a group; longer ones have too few pairs
     most = int(np.bincount(np.unique(group, return_inverse=True)[1]).max()) // 3
     variance, total = float((e**2).mean()), 1.0
     for lag in range(1, most + 1):
         alike = group[lag:] == group[:-lag]
         n = 2 * int(alike.sum())
         rho = float((e[lag:][alike] * e[:-lag][alike]).sum()) / (n * variance) if n and variance > 0 else 0.0
-        if rho < CHANCE / math.sqrt(max(n, 1)):
+        if rho < CORRELATION_SIGMAS / math.sqrt(max(n, 1)):
             break
         total += 2 * rho
     return replace(fit, information=fit.information / total, persistence=total)
 
 
 def shared_error(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64], roots: tuple[Array, Array]) -> Array:
-    """Covariance (8, 8) that errors add which all points of a group (n,) share, in each image.
+    """Covariance (8, 8) of the homography due to errors that all points of a group share in each image.
 
-    `roots` (n, 2, q) are square roots of such an error's covariance in image i and j at each point, normalised
-    coordinates. Many points average noise away, but not this: a lens that is calibrated to 0.02 px, a marker
-    whose background pulls it.
+    Averaging over points does not reduce such errors: a lens calibrated to 0.02 px, a bias by a marker's background.
+
+    Parameters
+    ----------
+    fit, pairs
+        Fit, and the points that it was made of.
+    groups
+        Track of each point, (n,).
+    roots
+        Square roots (n, 2, q) of the shared error's covariance in image i and in image j, normalised coordinates.
     """
     added = np.zeros((8, 8))
     if not any(root.shape[2] for root in roots):
@@ -148,19 +196,19 @@ def shared_error(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64
 
 
 def _inliers(squared: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Points within the gate, which widens where those that agree so far are off by more than noise and chance."""
+    """Mask of points within the gate, which widens if residuals `among` the inliers exceed noise and chance."""
     own = squared[among]
     scale = np.partition(own, len(own) // 2)[len(own) // 2] / MEDIAN_CHI2 if len(own) else 1.0
     # a median of n has a relative spread of about 1.4 / sqrt(n); three times that is no longer chance
-    scale = min(scale, WIDEST_SCALE) if scale > 1 + 4.3 / math.sqrt(len(own) + 1) else 1.0
+    scale = min(scale, MAX_VARIANCE_SCALE) if scale > 1 + 4.3 / math.sqrt(len(own) + 1) else 1.0
     return np.asarray(squared < INLIER_GATE * scale)
 
 
 @dataclass(frozen=True)
 class _Spread:
-    """How points lie about the line that most of them fit best.
+    """Spread of points about the line that fits 80 % of them best.
 
-    `off` counts those off it, `across` and `along` are the RMS spreads of the most.
+    `off` is the number of points off it; `across` and `along` are the RMS spreads of those that fit.
     """
 
     off: int
@@ -169,7 +217,7 @@ class _Spread:
 
 
 def _spread(x: Array, sigma: float) -> _Spread:
-    """The spread of points (n, 2) about a line, `sigma` being their noise."""
+    """Measure the spread of points (n, 2) with noise `sigma` about a line."""
     near = x
     for _ in range(2):
         centre = near.mean(axis=0)
@@ -187,34 +235,34 @@ def _spread(x: Array, sigma: float) -> _Spread:
 
 
 def _require_points(n: int, of: int) -> None:
-    if n < MINIMUM_POINTS:
+    if n < MIN_POINTS:
         what = f"{n} points are seen by both" if n == of else f"only {n} of {of} points agree on one homography"
-        raise DegenerateGeometry(f"{what}, at least {MINIMUM_POINTS} are needed: record for longer")
+        raise DegenerateGeometry(f"{what}, at least {MIN_POINTS} are needed: record for longer")
 
 
 def _require_spread(pairs: PointPairs, sigma: float) -> None:
-    # a few false pairs off a line must not pass for a spread: much of what decides has to be off it
-    least = max(4, math.ceil(LEAST_OFF_LINE * len(pairs)))
+    # a few false pairs off a line must not pass for a spread
+    least = max(4, math.ceil(MIN_OFF_LINE * len(pairs)))
     # points on a line in one image are on a line in the other
     spread = _spread(pairs.x_i, sigma)
     if spread.off < least:
         if spread.along < COLLINEAR_SIGMAS * sigma:
             raise DegenerateGeometry(
-                f"the markers hardly moved (they spread by {spread.along / sigma:.1f} sigma of their noise): "
+                f"the markers hardly moved (their spread is {spread.along / sigma:.1f} sigma of their noise): "
                 "let the moving robot drive further, and turn, or detect them better"
             )
         if spread.across < STRAIGHT * spread.along:
             raise DegenerateGeometry("the tracks lie on one line (the moving robot drove a straight line): let it turn")
         raise DegenerateGeometry(
-            f"{len(pairs)} points are too few or too noisy for a homography: they spread by "
-            f"{spread.across / sigma:.1f} sigma of their noise across the line that most fit best, and {spread.off} "
-            f"of them lie more than {COLLINEAR_SIGMAS:.0f} sigma off it, where {least} must: record more points, "
-            "spread over the plane, or detect them better"
+            f"{len(pairs)} points are too few or too noisy for a homography: their spread across the best line is "
+            f"{spread.across / sigma:.1f} sigma of their noise, and {spread.off} of them lie more than "
+            f"{COLLINEAR_SIGMAS:.0f} sigma off it, where {least} are needed: record more points, spread on the plane, "
+            "or detect them better"
         )
 
 
 def _magsac(pairs: PointPairs, sigma: float) -> Array:
-    # in units of the noise, and OpenCV's numerics like pixel-sized numbers
+    # in units of the noise: OpenCV's numerics want coordinates of the size of pixels
     H, _ = cv2.findHomography(pairs.x_i / sigma, pairs.x_j / sigma, cv2.USAC_MAGSAC, MAGSAC_SIGMAS)
     if H is None or not abs(np.linalg.det(H)) > 1e-12:
         raise DegenerateGeometry("no homography explains the tracks: let the moving robot turn and drive further")

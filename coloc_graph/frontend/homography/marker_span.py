@@ -1,4 +1,4 @@
-"""Two markers of a robot at the same instants in both images: what the joint estimate takes scale and tilt from."""
+"""Measure the span between two markers of a mover, which gives the joint estimate its scale and tilts."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.frontend.homography.fit import HomographyFit
-from coloc_graph.frontend.homography.refinement import PointPairs, linearise, point_rows
+from coloc_graph.frontend.homography.refinement import PointPairs, linearise, projection
 from coloc_graph.frontend.pairing.correspondence import Correspondences
 from coloc_graph.measurements import MarkerSpan
 
@@ -16,10 +16,21 @@ Array = NDArray[np.float64]
 def marker_spans(
     couples: Mapping[str, tuple[int, int]], found: Correspondences, fit: HomographyFit, bias: Array
 ) -> tuple[MarkerSpan, ...]:
-    """The spans of the markers of movers, by name, which are two of camera i's tracks; of those that some instant shows
-    both of.
+    """Measure marker spans of movers whose two markers are seen at the same instants.
 
-    `bias` (n, 2, q) is the square root of the covariance of what all points of one track share in camera i.
+    Parameters
+    ----------
+    couples
+        Tracks of camera i of each mover's first and second marker, by the mover's name.
+    found, fit
+        Correspondences, and the homography fitted to them.
+    bias
+        Square root (n, 2, q) of the covariance of the error that all points of one track share in camera i.
+
+    Returns
+    -------
+    tuple of MarkerSpan
+        Spans, of those movers only that some instant shows with both markers.
     """
     instants = {mover: _same_instants(found, fit, tracks) for mover, tracks in couples.items()}
     x, C, by_h = _from_both_images(found.pairs, fit)
@@ -29,25 +40,25 @@ def marker_spans(
 
 
 def _same_instants(found: Correspondences, fit: HomographyFit, tracks: Sequence[int]) -> NDArray[np.int64]:
-    """Which points (n, 2) are the two tracks' at the same instants."""
+    """Indices (n, 2) of the two tracks' points at the same instants."""
     first, second = (np.flatnonzero(fit.inliers & (found.markers == track)) for track in tracks)
     _, a, b = np.intersect1d(found.times[first], found.times[second], return_indices=True)
     return np.stack([first[a], second[b]], axis=1)
 
 
 def _from_both_images(pairs: PointPairs, fit: HomographyFit) -> tuple[Array, Array, Array]:
-    """Where points are in image i by both images, x (n, 2), covariance (n, 2, 2), and what h adds to x (n, 2, 8).
+    """Positions x (n, 2) in image i fused from both images, covariances (n, 2, 2), and derivatives by h (n, 2, 8).
 
-    The homography's own error comes from what the two images say differently, and this from what they say alike: at
-    the true h the two are independent.
+    The error of the homography comes from the difference of the two images and the error of x from their weighted mean:
+    at the true h the two are independent.
     """
     C_i, C_j = pairs.covariance_i, pairs.covariance_j
     if fit.dof > 0 and fit.chi2 > fit.dof + 3 * np.sqrt(2 * fit.dof):  # as the fit did with its information
         C_i, C_j = C_i * (fit.chi2 / fit.dof), C_j * (fit.chi2 / fit.dof)
     C_i, C_j = C_i * fit.persistence, C_j * fit.persistence
     at = linearise(fit.H, pairs.x_i, pairs)
-    B = at.by_z
+    _, B, by_h = projection(fit.H, pairs.x_i)
     gain = C_i @ B.mT @ np.linalg.inv(C_j + B @ C_i @ B.mT)
     x = pairs.x_i + (gain @ at.residual_j[..., None])[..., 0]
     C = C_i - gain @ B @ C_i
-    return x, (C + C.mT) / 2, -gain @ point_rows(at, pairs.x_i)
+    return x, (C + C.mT) / 2, -gain @ by_h

@@ -1,7 +1,7 @@
-"""The relative pose that explains a homography best, given what is known of mounts, plane and floor.
+"""Maximum-likelihood relative pose of two observers from a homography and the tolerances of mounts, plane and floor.
 
-Eq. (2) takes the rotation from two columns of H and the translation from a third. Here all eight coordinates of
-H count, weighed by their information, against the few unknowns that are left where mounts and floor are known.
+Eq. (2) takes the rotation from two columns of H and the translation from a third. Here all eight coordinates of H
+count, weighted by their information, against the few unknowns that remain if mounts and floor are known.
 """
 
 from collections.abc import Callable
@@ -29,16 +29,14 @@ from coloc_graph.team import Floor, Mount
 
 Array = NDArray[np.float64]
 
-#: A floor, or a mount, that is called exact is taken as exact to this much [rad, m].
-LEAST_SIGMA = 1e-5
+MIN_SIGMA = 1e-5  # rad and m, of a floor that is stated as exact
 MAX_ITERATIONS = 20
-#: A search has converged where a step is shorter than this in sigmas; what is left is about the square of it.
-CONVERGED = 1e-2
+CONVERGED = 1e-2  # sigmas, length of a step below which the search ends; the remaining error is about its square
 
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Unknowns with priors (`sigmas`, inf where there is none), and what they make: T_i_j, T_ci_cj, N, d."""
+    """Unknowns with standard deviations of their priors (inf: none), and the map from them to T_i_j, T_ci_cj, N, d."""
 
     sigmas: Array
     build: Callable[[Array], tuple[Array, Array, Array, Array]]
@@ -47,12 +45,29 @@ class _Model:
 def most_likely_pose(
     measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount, plane: Plane, floor: Floor | None = None
 ) -> RelativePose:
-    """The pose of body j in body i by maximum likelihood, with a 6x6 covariance.
+    """Estimate the relative pose by maximum likelihood.
 
-    With a `floor` both robots stand on it, so that x, y and heading are all that is free: roll, pitch and height
-    keep within its tolerances, which are then part of the measurement. Without one all six are free; a graph
-    that knows the floor takes this form. Tolerances of mounts and plane are priors of unknowns that are
-    estimated along. Raises `DegenerateGeometry` where there is no baseline, or the search does not converge.
+    Parameters
+    ----------
+    measurement
+        Homography from camera i to camera j.
+    mount_i, mount_j
+        Mounts of both cameras; their tolerances are priors of unknowns that are estimated too.
+    plane
+        Marker plane in camera i, with its tolerances.
+    floor
+        Floor that both robots stand on, which leaves x, y and heading free and keeps roll, pitch and height within its
+        tolerances. Without it all six are free, which is the form for a graph that has its own floor factors.
+
+    Returns
+    -------
+    RelativePose
+        T_i_j of the bodies, with its covariance (6, 6), rotation first, body frame j.
+
+    Raises
+    ------
+    DegenerateGeometry
+        There is no baseline, or the search does not converge.
     """
     start = eq2_pose(measurement, mount_i, mount_j, plane)
     model = (
@@ -79,7 +94,7 @@ def most_likely_pose(
         A = np.concatenate([J, np.diag(precision)])
         r = np.concatenate([residuals[0], precision * unknowns[free]])
         if not (np.isfinite(A).all() and np.isfinite(r).all()):
-            break  # so far off that it has no logarithm
+            break  # too far for a logarithm
         step = -np.linalg.lstsq(A, r, rcond=None)[0]
         if not np.abs(step).max() < 1.0:
             break
@@ -123,7 +138,7 @@ def _mount_sigmas(mount: Mount) -> list[float]:
 
 
 def _free(start: RelativePose, mount_i: Mount, mount_j: Mount, plane: Plane) -> _Model:
-    """Unknowns: the pose's tangent (6), the normal across itself (2), d (1), both mounts (3 + 3)."""
+    """Model with unknowns: tangent of the pose (6), rotation of the normal (2), d (1), both mounts (3 + 3)."""
     T_start = start.T_i_j
     sides = across(plane.N)
 
@@ -140,7 +155,7 @@ def _free(start: RelativePose, mount_i: Mount, mount_j: Mount, plane: Plane) -> 
 
 
 def _on_floor(start: RelativePose, mount_i: Mount, mount_j: Mount, plane: Plane, floor: Floor) -> _Model:
-    """Unknowns: x, y, heading (3), tilt of i and of j on the floor (2 + 2), height of j over i (1), d, mounts."""
+    """Model with unknowns: x, y, heading (3), tilts of i and j on the floor (2 + 2), height of j over i, d, mounts."""
     T_start = start.T_i_j
     x, y, heading = T_start[0, 3], T_start[1, 3], float(yaw(T_start))
     down = np.array([0.0, 0.0, -1.0])
@@ -159,7 +174,7 @@ def _on_floor(start: RelativePose, mount_i: Mount, mount_j: Mount, plane: Plane,
         d = plane.d + u[:, 8] + (u[:, 9] if plane.d_from_mount else 0.0)
         return T_i_j, se3_inverse(T_bi_ci) @ T_i_j @ T_bj_cj, N, d
 
-    level = max(float(np.deg2rad(floor.tilt_sigma_deg)), LEAST_SIGMA)
-    height = max(np.sqrt(2) * floor.height_sigma, LEAST_SIGMA)
+    level = max(float(np.deg2rad(floor.tilt_sigma_deg)), MIN_SIGMA)
+    height = max(np.sqrt(2) * floor.height_sigma, MIN_SIGMA)
     sigmas = [np.inf] * 3 + [level] * 4 + [height, plane.d_sigma]
     return _Model(np.array([*sigmas, *_mount_sigmas(mount_i), *_mount_sigmas(mount_j)]), build)

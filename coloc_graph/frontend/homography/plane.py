@@ -1,4 +1,4 @@
-"""The plane of the markers in a camera's frame: from the mount, and its distance from a known marker span."""
+"""Marker plane in a camera's frame, from the mount, and its distance from a known marker span."""
 
 from dataclasses import replace
 
@@ -13,15 +13,32 @@ Array = NDArray[np.float64]
 
 
 def plane_from_mount(mount: Mount, markers: Markers, floor: Floor | None = None) -> Plane:
-    """The plane at the markers' height above the floor that the robot stands on.
+    """Compute the marker plane of a camera from its mount.
 
-    Raises `DegenerateGeometry` where the camera is not above the markers.
+    Parameters
+    ----------
+    mount
+        Mount of the camera.
+    markers
+        Markers, all at one height above the floor.
+    floor
+        Tolerances of the floor; by default it is flat.
+
+    Returns
+    -------
+    Plane
+        Normal and distance in the camera frame, with standard deviations.
+
+    Raises
+    ------
+    DegenerateGeometry
+        The camera is not above the markers.
     """
     d = mount.height - markers.height
     if d <= 0:
         raise DegenerateGeometry(
-            f"the camera ({mount.height} m) is not above the markers ({markers.height} m), so that their plane's "
-            "distance d is not positive: mount the camera higher or the markers lower"
+            f"the camera ({mount.height} m) is not above the markers ({markers.height} m), so the distance d of their "
+            "plane is not positive: mount the camera higher or the markers lower"
         )
     floor = floor or Floor()
     return Plane(
@@ -35,9 +52,19 @@ def plane_from_mount(mount: Mount, markers: Markers, floor: Floor | None = None)
 
 
 def on_plane(x: Array, plane: Plane) -> Array:
-    """Points (n, 3) [m] in the camera frame where the rays (x, y, 1) of `x` (n, 2) meet the plane.
+    """Intersect rays with the plane.
 
-    Rays that do not meet it in front of the camera come back as NaN.
+    Parameters
+    ----------
+    x
+        Normalised image coordinates, (n, 2).
+    plane
+        Plane in the camera frame.
+
+    Returns
+    -------
+    numpy.ndarray
+        Points in the camera frame, (n, 3) [m]; NaN for rays that do not meet the plane in front of the camera.
     """
     rays = np.concatenate([x, np.ones((len(x), 1))], axis=1)
     along = rays @ plane.N
@@ -45,14 +72,29 @@ def on_plane(x: Array, plane: Plane) -> Array:
 
 
 def distance_from_span(plane: Plane, x_a: Array, x_b: Array, markers: Markers) -> Plane:
-    """The plane with `d` such that two markers, seen at the same n instants, lie their known span apart.
+    """Scale the plane's distance so that two markers lie their known span apart.
 
-    `x_a`, `x_b` (n, 2) are normalised coordinates in one camera. The spread over the instants is the noise
-    that `d_sigma` carries, besides the tolerance of the span. Raises `DegenerateGeometry` with fewer than two
-    markers or instants.
+    Parameters
+    ----------
+    plane
+        Plane in the camera frame; its distance is replaced.
+    x_a, x_b
+        Both markers at the same n instants, normalised image coordinates, (n, 2).
+    markers
+        Markers with a known span.
+
+    Returns
+    -------
+    Plane
+        Plane whose `d_sigma` carries the scatter over the instants and the tolerance of the span.
+
+    Raises
+    ------
+    DegenerateGeometry
+        There are fewer than two markers or instants.
     """
     if markers.span is None:
-        raise DegenerateGeometry("the robot carries one marker, so that there is no span to take the scale from")
+        raise DegenerateGeometry("the robot carries one marker: there is no span to take the scale from")
     spans = np.linalg.norm(on_plane(x_a, plane) - on_plane(x_b, plane), axis=1) / plane.d
     spans = spans[np.isfinite(spans)]
     if len(spans) < 2:

@@ -1,7 +1,7 @@
-"""Homographies fitted to point pairs without outliers: least squares and maximum likelihood, many at once.
+"""Fit homographies to point pairs without outliers, by least squares or maximum likelihood, many at once.
 
 Everything is vectorised over leading axes. Coordinates of a homography are those of sl(3) on the right,
-`lie.SL3_BASIS`; `homography` says what the two criteria are.
+`lie.SL3_BASIS`; `homography.fit` explains the two criteria.
 """
 
 from dataclasses import dataclass
@@ -16,14 +16,13 @@ from coloc_graph.geometry.lie import sl3_hat, sl3_normalise
 Array = NDArray[np.float64]
 Criterion = Literal["transfer", "reprojection"]
 
-#: A fit has converged when a step lowers chi2 by less than this. The next one would lower it by about the square
-#: of it times 1e-4 (measured); the first one, from z = x_i, does not count.
-CONVERGED = 0.3
+# the next step would lower chi2 by about the square of this times 1e-4 (measured); the first, from z = x_i, is ignored
+CONVERGED = 0.3  # decrease of chi2 by a step below which a fit has converged
 
 
 @dataclass(frozen=True, eq=False)
 class PointPairs:
-    """The same n points in two images: normalised coordinates (n, 2) and their covariances (n, 2, 2)."""
+    """The same n points in images i and j: normalised coordinates (n, 2) and their covariances (n, 2, 2)."""
 
     x_i: Array
     x_j: Array
@@ -45,9 +44,9 @@ class PointPairs:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """pi(H z) against both images at each point, with the latent z eliminated and whitened.
+    """Reprojection residuals of both images at each point, linearised, with the latent z eliminated, and whitened.
 
-    `e0`, `e1` (..., n) is the whitened residual; the whitening is (g0, -k g0 g1, g1). `b` are the six entries of
+    `e0`, `e1` (..., n) are the whitened residuals; the whitening is (g0, -k g0 g1, g1). `b` are the six entries of
     d pi(D z) / dD at D = H, of which the first two of each row are also d pi / dz (`by_z`).
     """
 
@@ -61,20 +60,19 @@ class Linearised:
 
     @property
     def by_z(self) -> Array:
-        """d pi(H z) / dz at each point, (..., n, 2, 2)."""
-        b00, b01, _, b10, b11, _ = self.b
-        return np.stack([np.stack([b00, b01], -1), np.stack([b10, b11], -1)], -2)
+        """Derivative of pi(H z) by z at each point, (..., n, 2, 2)."""
+        return _by_z(self.b)
 
     @property
     def residual_j(self) -> Array:
-        """What image j says of each point less what the homography says where image i saw it, (..., n, 2)."""
+        """Positions in image j less those that the homography predicts from image i, (..., n, 2)."""
         e0 = self.e0 / self.g0
         return np.stack([e0, self.e1 / self.g1 + self.k * self.e0], -1)
 
 
 def _project(H: Array, z: Array) -> tuple[Array, Array, tuple[Array, ...]]:
-    """pi(H z), x and y (..., n) apart, and the six entries (..., n) of d pi(D z) / dD at D = H, row by row."""
-    # component by component: numpy's stacks of 2x2 products cost more than all of this
+    """Compute x and y (..., n) of pi(H z), and the six entries (..., n) of d pi(D z) / dD at D = H, row by row."""
+    # component by component, since numpy's stacked 2x2 products would cost more than the rest
     h = [[H[..., i, j, None] for j in range(3)] for i in range(3)]
     x, y = z[..., 0], z[..., 1]
     w = 1 / (h[2][0] * x + h[2][1] * y + h[2][2])
@@ -85,8 +83,19 @@ def _project(H: Array, z: Array) -> tuple[Array, Array, tuple[Array, ...]]:
     return p0, p1, (*b0, *b1)
 
 
+def _by_z(b: tuple[Array, ...]) -> Array:
+    b00, b01, _, b10, b11, _ = b
+    return np.stack([np.stack([b00, b01], -1), np.stack([b10, b11], -1)], -2)
+
+
+def projection(H: Array, z: Array) -> tuple[Array, Array, Array]:
+    """Compute pi(H z) (n, 2), its derivative by z (n, 2, 2), and by h of H exp(h) at h = 0 (n, 2, 8)."""
+    p0, p1, b = _project(H, z)
+    return np.stack([p0, p1], -1), _by_z(b), _by_h(b, z)
+
+
 def linearise(H: Array, z: Array, pairs: PointPairs) -> Linearised:
-    """H (..., 3, 3) against pairs (..., n), with the true places in image i thought to be at z (..., n, 2)."""
+    """Linearise the residuals of H (..., 3, 3) on pairs (..., n) at latent positions z (..., n, 2) in image i."""
     p0, p1, b = _project(H, z)
     b00, b01, _, b10, b11, _ = b
     r0, r1 = pairs.x_i[..., 0] - z[..., 0], pairs.x_i[..., 1] - z[..., 1]
@@ -97,7 +106,7 @@ def linearise(H: Array, z: Array, pairs: PointPairs) -> Linearised:
 
 
 def _whitening(b: tuple[Array, ...], pairs: PointPairs) -> tuple[Array, Array, Array]:
-    """g0, g1, k (..., n): the Cholesky factor's inverse of both images' noise as image j sees it."""
+    """Inverse Cholesky factor g0, g1, k (..., n) of both images' noise, propagated to image j."""
     b00, b01, _, b10, b11, _ = b
     c_i, c_j = pairs.covariance_i, pairs.covariance_j
     c00, c01, c11 = c_i[..., 0, 0], c_i[..., 0, 1], c_i[..., 1, 1]
@@ -111,7 +120,7 @@ def _whitening(b: tuple[Array, ...], pairs: PointPairs) -> tuple[Array, Array, A
 
 
 def _rows(b: tuple[Array, ...], z: Array) -> Array:
-    """d pi(H exp(h) z) / dh at h = 0, (..., 8, 2n): first all x, then all y. `lie.SL3_BASIS`'s order."""
+    """Derivative of pi(H exp(h) z) by h at h = 0, in the order of `lie.SL3_BASIS`, (..., 8, 2n): all x, then all y."""
     x, y = z[..., 0], z[..., 1]
     n = z.shape[-2]
     rows = np.empty((*z.shape[:-2], 8, 2 * n))
@@ -122,21 +131,20 @@ def _rows(b: tuple[Array, ...], z: Array) -> Array:
     return rows
 
 
-def point_rows(at: Linearised, z: Array) -> Array:
-    """d pi(H exp(h) z) / dh at h = 0, (n, 2, 8), at each of n points."""
-    n = z.shape[-2]
-    return np.moveaxis(_rows(at.b, z).reshape(8, 2, n), 0, -1).swapaxes(0, 1)
+def _by_h(b: tuple[Array, ...], z: Array) -> Array:
+    """`_rows` at each of n points, (n, 2, 8)."""
+    return np.ascontiguousarray(np.moveaxis(_rows(b, z).reshape(8, 2, len(z)), 0, -1).swapaxes(0, 1))
 
 
 def whitened_rows(at: Linearised, z: Array) -> Array:
-    """`_rows` over the noise."""
+    """Whitened `_rows`, (..., 8, 2n)."""
     upper = [entry * at.g0 for entry in at.b[:3]]
     lower = [(entry - at.k * above) * at.g1 for entry, above in zip(at.b[3:], upper, strict=True)]
     return _rows((*upper, *lower), z)
 
 
 def _latent_step(at: Linearised, left: Array, pairs: PointPairs) -> Array:
-    """The best change (..., n, 2) of z, given what is left (..., 2n) of the whitened residual."""
+    """Optimal change (..., n, 2) of z, given the remaining whitened residual (..., 2n)."""
     n = pairs.x_i.shape[-2]
     f1 = left[..., n:] * at.g1
     f0 = (left[..., :n] - at.k * f1) * at.g0
@@ -153,7 +161,7 @@ def _latent_step(at: Linearised, left: Array, pairs: PointPairs) -> Array:
 
 
 def _solve(normal: Array, right: Array) -> Array:
-    """A Gauss-Newton step; `DegenerateGeometry` where it leads nowhere (points beyond the horizon, wrong pairs)."""
+    """Gauss-Newton step; raises `DegenerateGeometry` if it diverges (points beyond the horizon, wrong pairs)."""
     try:
         step = np.linalg.solve(normal, right[..., None])[..., 0]
     except np.linalg.LinAlgError:
@@ -166,10 +174,29 @@ def _solve(normal: Array, right: Array) -> Array:
 def refine(
     pairs: PointPairs, H: Array, criterion: Criterion = "reprojection", max_iterations: int = 20
 ) -> tuple[Array, Array, int]:
-    """The criterion's fit to all the points from a start H (..., 3, 3): H, its information (..., 8, 8), iterations.
+    """Minimise a criterion over all points from a start.
 
-    Vectorised over leading axes: m fits to n points each in one call. The information is that under both images'
-    noise, whatever the criterion weighs.
+    Parameters
+    ----------
+    pairs
+        Point pairs, (..., n).
+    H
+        Start, (..., 3, 3).
+    criterion
+        "reprojection" or "transfer".
+    max_iterations
+        Number of Gauss-Newton steps at most.
+
+    Returns
+    -------
+    tuple
+        H (..., 3, 3), its information (..., 8, 8) under both images' noise whatever the criterion, and the number of
+        iterations.
+
+    Raises
+    ------
+    DegenerateGeometry
+        The search diverges.
     """
     return (_reprojection if criterion == "reprojection" else _transfer)(pairs, H, max_iterations)
 
@@ -192,7 +219,7 @@ def _reprojection(pairs: PointPairs, H: Array, max_iterations: int) -> tuple[Arr
 
 def _transfer(pairs: PointPairs, H: Array, max_iterations: int) -> tuple[Array, Array, int]:
     H, iterations, b, rows = _least_squares(pairs, H, max_iterations)
-    # unweighted least squares is not efficient: its covariance is the sandwich of the noise it did not weigh
+    # unweighted least squares is not efficient: its covariance is a sandwich
     normal = rows @ rows.mT
     g0, g1, k = (part[..., None, :] for part in _whitening(b, pairs))
     n = pairs.x_i.shape[-2]
@@ -203,12 +230,12 @@ def _transfer(pairs: PointPairs, H: Array, max_iterations: int) -> tuple[Array, 
 
 
 def least_squares(pairs: PointPairs) -> Array:
-    """The paper's homographies (..., 3, 3) of points without outliers, many at once: "transfer", determinant 1."""
+    """Fit the paper's homographies, criterion "transfer", determinant 1, (..., 3, 3), to points without outliers."""
     return _least_squares(pairs, direct(pairs), 20)[0]
 
 
 def _least_squares(pairs: PointPairs, H: Array, max_iterations: int) -> tuple[Array, int, tuple[Array, ...], Array]:
-    limit = 30 * pairs.sigma**2  # what is then left is a fiftieth of the estimate's own sigma (measured)
+    limit = 30 * pairs.sigma**2  # the remaining error is a fiftieth of the estimate's sigma (measured)
     for iteration in range(1, max_iterations + 1):
         p0, p1, b = _project(H, pairs.x_i)
         rows = _rows(b, pairs.x_i)
@@ -222,18 +249,15 @@ def _least_squares(pairs: PointPairs, H: Array, max_iterations: int) -> tuple[Ar
 
 
 def squared_residuals(H: Array, pairs: PointPairs) -> Array:
-    """Squared reprojection errors (..., n) of both images together, in units of the noise.
-
-    To the first order in the noise (Sampson), which for points a thousandth of the image off is exact enough.
-    """
+    """Squared reprojection errors (..., n) of both images together, in units of the noise, to first order (Sampson)."""
     at = linearise(H, pairs.x_i, pairs)
     return np.asarray(at.e0**2 + at.e1**2)
 
 
 def direct(pairs: PointPairs) -> Array:
-    """A start for `refine` where there are no outliers: the normalised direct linear transform, (..., 3, 3).
+    """Normalised direct linear transform (..., 3, 3) of points without outliers: a start for `refine`.
 
-    Hartley, "In Defense of the Eight-Point Algorithm", 1997. Vectorised over leading axes.
+    Source: Hartley, "In Defense of the Eight-Point Algorithm", 1997.
     """
     S_i, (u, v) = _similarity(pairs.x_i)
     S_j, (x, y) = _similarity(pairs.x_j)
@@ -249,7 +273,7 @@ def direct(pairs: PointPairs) -> Array:
 
 
 def _similarity(points: Array) -> tuple[Array, tuple[Array, Array]]:
-    """What moves points (..., n, 2) to the origin and to a spread of one, (..., 3, 3), and the moved x and y."""
+    """Similarity (..., 3, 3) that moves points (..., n, 2) to the origin with unit spread, and the moved x and y."""
     x, y = points[..., 0], points[..., 1]
     mean_x, mean_y = x.mean(axis=-1, keepdims=True), y.mean(axis=-1, keepdims=True)
     x, y = x - mean_x, y - mean_y

@@ -1,4 +1,4 @@
-"""One offset of two clocks for all stances of a run: clocks drift slowly, and one stance alone may not tell."""
+"""Fuse the clock offset of a pair of robots over all stances of a run, since one stance alone may not determine it."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -11,11 +11,21 @@ from coloc_graph.frontend.stance import LEAST_OBSERVED, NOT_OBSERVABLE, PairMeas
 def share_clock_offsets(
     measurements: Sequence[PairMeasurement], clock_sigma: float, before: Sequence[PairMeasurement] = ()
 ) -> tuple[tuple[PairMeasurement, ...], list[str]]:
-    """Measurements made once more with the offset that all stances of a pair know together, and warnings.
+    """Repeat measurements at the clock offset fused over all stances of each pair.
 
-    `clock_sigma` [s] is how well the clocks are said to agree; where it is 0 nothing changes. A pair's offset is
-    the weighted mean of what its stances and the prior know, and its uncertainty is in each homography's information.
-    What was measured `before` has its say in it, and is not measured again.
+    Parameters
+    ----------
+    measurements
+        Measurements, with the evidence of each on the offset.
+    clock_sigma
+        Standard deviation of the clocks' agreement [s]; 0 changes nothing.
+    before
+        Earlier measurements, which contribute evidence and are not repeated.
+
+    Returns
+    -------
+    tuple
+        The repeated measurements, whose information contains the offset's uncertainty, and warnings.
     """
     if clock_sigma == 0:
         return tuple(measurements), []
@@ -30,9 +40,8 @@ def share_clock_offsets(
         if chance < DISAGREEMENT:
             values = [1e3 * one.value for one in known_by_stances]
             warnings.append(
-                f"the stances disagree on the offset of the clocks of {pair[0]} and {pair[1]} ({min(values):.1f} to "
-                f"{max(values):.1f} ms): the clocks drift or were set during the run: synchronise them, "
-                "or split the run"
+                f"the stances disagree on the clock offset of {pair[0]} and {pair[1]} ({min(values):.1f} to "
+                f"{max(values):.1f} ms): the clocks drift or were set during the run; synchronise them, or split it"
             )
         if fused[pair].sigma > LEAST_OBSERVED * clock_sigma:
             warnings.append(f"{pair[0]} and {pair[1]}: {NOT_OBSERVABLE}")
@@ -46,7 +55,7 @@ def share_clock_offsets(
 
 
 def _in_order(one: PairMeasurement, offset: ClockOffset | None) -> tuple[tuple[str, str], ClockOffset | None]:
-    """The pair's names in alphabetical order, and the offset of the second's clock from the first's."""
+    """Names of the pair in alphabetical order, and the offset of the second's clock from the first's."""
     i, j = one.homography.robot_i, one.homography.robot_j
     if i < j:
         return (i, j), offset

@@ -1,13 +1,13 @@
-"""The offset between two cameras' clocks as the ninth parameter of their homography.
+"""Estimate the offset between two cameras' clocks as the ninth parameter of their homography.
 
 A marker that camera i sees at t by its clock is seen by camera j at t + offset by j's: offset = clock_j - clock_i.
-Tracks of j are interpolated at i's instants plus the offset; how fast they move there is the offset's Jacobian.
+Tracks of j are interpolated at i's instants plus the offset; their velocity there is the offset's Jacobian.
 
-Samples bring noise to that speed, and a speed that is nothing but noise would pass for knowledge of the offset. So
-the equations are solved with a smoothed speed as instrument, what noise alone contributes to them is drawn and taken
-off, and the offset counts as observed only where more is left than noise can make. A motion whose shift in time is a
-homography itself (a straight line or an arc at constant speed) leaves nothing: the offset then stays at its prior,
-and the homography's covariance says what that means for it.
+The velocity is noisy, and noise alone would look like information on the offset. Therefore the equations are solved
+with a smoothed velocity as instrument, the contribution of noise is estimated by Monte Carlo and subtracted, and the
+offset counts as observed only if the rest exceeds what noise can make. A motion whose shift in time is itself a
+homography (a straight line or an arc at constant speed) leaves nothing: the offset then stays at its prior, and the
+homography's covariance contains its uncertainty.
 """
 
 from collections.abc import Sequence
@@ -21,50 +21,55 @@ from scipy.special import chdtrc
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.fit import (
     INLIER_GATE,
+    MAX_VARIANCE_SCALE,
     MEDIAN_CHI2,
-    MINIMUM_POINTS,
-    WIDEST_SCALE,
+    MIN_POINTS,
     HomographyFit,
     fit_homography,
 )
-from coloc_graph.frontend.homography.refinement import Criterion, PointPairs, squared_residuals
+from coloc_graph.frontend.homography.refinement import Criterion, PointPairs, projection, squared_residuals
 from coloc_graph.frontend.pairing.correspondence import Correspondences
-from coloc_graph.frontend.tracks.paired_tracks import PairedTracks, Shifted
-from coloc_graph.geometry.lie import SL3_BASIS, sl3_exp
+from coloc_graph.frontend.tracks.paired_tracks import PairedTracks, ShiftedTracks
+from coloc_graph.geometry.lie import sl3_exp
 
 Array = NDArray[np.float64]
 Used = NDArray[np.bool_]
 
-#: Clocks that agree no better than this are not searched for their offset [s].
-WORST_CLOCKS = 0.25
-#: How far from its prior an offset is searched, in sigmas, and in how many places at most.
-SEARCH_SIGMAS = 4.0
-SEARCH_PLACES = 41
-#: How many standard deviations of what noise makes the information on the offset has to exceed.
-NOISE_SIGMAS = 4.0
-#: Chance below which stances that disagree on the offset are said to.
-DISAGREEMENT = 1e-3
+MAX_CLOCK_SIGMA = 0.25  # s, of clocks whose offset is searched for
+SEARCH_SIGMAS = 4.0  # standard deviations of the prior within which the offset is searched
+MAX_SEARCH_STEPS = 41  # offsets that are tried at most
+NOISE_SIGMAS = 4.0  # standard deviations of noise that the information on the offset must exceed
+DISAGREEMENT = 1e-3  # p-value below which stances are reported to disagree on the offset
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """What is known of clock_j - clock_i: `value` and its standard deviation `sigma` [s]."""
+    """Offset clock_j - clock_i with its standard deviation [s]."""
 
     value: float
     sigma: float
 
     def reversed(self) -> "ClockOffset":
-        """clock_i - clock_j."""
+        """Return the offset clock_i - clock_j."""
         return ClockOffset(-self.value, self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class ClockFit:
-    """A homography fitted together with the offset of the clocks.
+    """Homography fitted together with the clock offset.
 
-    `fit.information` is that of H alone, with the offset's uncertainty in it; `information` (9, 9) that of H and
-    the offset [s]; H changes by `by_offset` (8,) where the offset grows by 1 s. `found` has camera j's points at the
-    instants of camera i's. `offset` is what is known of it.
+    Attributes
+    ----------
+    fit
+        Homography; its information has the offset marginalised.
+    found
+        Correspondences, with camera j's points interpolated at camera i's instants.
+    information
+        Joint information of H and the offset [s], (9, 9).
+    offset
+        Clock offset.
+    by_offset
+        Derivative of the coordinates of H by the offset, (8,) [1/s].
     """
 
     fit: HomographyFit
@@ -77,11 +82,26 @@ class ClockFit:
 def find_offset(
     tracks: "PairedTracks", start: Correspondences, prior: ClockOffset
 ) -> tuple[ClockOffset, ClockOffset | None]:
-    """The offset by maximum likelihood, from a search over the prior: with the prior, and what the tracks alone say
-    (None: nothing).
+    """Estimate the clock offset of one stance by maximum likelihood, after a search over its prior.
 
-    `start` are correspondences whose covariances allow for the prior's sigma. Raises `DegenerateGeometry` where
-    the clocks may differ by more than is searched, or the points do not determine a homography.
+    Parameters
+    ----------
+    tracks
+        Tracks of both cameras, paired.
+    start
+        Correspondences whose covariances allow for the prior's standard deviation.
+    prior
+        Prior of the offset.
+
+    Returns
+    -------
+    tuple
+        The offset with the prior, and the evidence of the tracks alone, None if there is none.
+
+    Raises
+    ------
+    DegenerateGeometry
+        The clocks may differ by more than is searched, or the points do not determine a homography.
     """
     require_searchable(prior)
     guess, H = _search(tracks, fit_homography(start.pairs).H, prior)
@@ -90,11 +110,11 @@ def find_offset(
 
 
 def require_searchable(prior: ClockOffset) -> None:
-    """Raises `DegenerateGeometry` where clocks may differ by more than is searched."""
-    if prior.sigma > WORST_CLOCKS:
+    """Raise `DegenerateGeometry` if clocks may differ by more than is searched."""
+    if prior.sigma > MAX_CLOCK_SIGMA:
         raise DegenerateGeometry(
-            f"the clocks are said to agree to {prior.sigma:g} s only, and offsets are searched for up to a sigma of "
-            f"{WORST_CLOCKS:g} s: synchronise the clocks"
+            f"`clock_sigma` of the team is {prior.sigma:g} s, and clock offsets are estimated up to a sigma of "
+            f"{MAX_CLOCK_SIGMA:g} s: synchronise the clocks"
         )
 
 
@@ -103,7 +123,27 @@ def fit_at_offset(
     offset: ClockOffset,
     criterion: Criterion = "reprojection",
 ) -> ClockFit:
-    """H with the offset at a value known to its sigma, which H's information then contains."""
+    """Fit the homography at a known clock offset, whose uncertainty its information then contains.
+
+    Parameters
+    ----------
+    tracks
+        Tracks of both cameras, paired.
+    offset
+        Clock offset with its standard deviation.
+    criterion
+        "reprojection" or "transfer".
+
+    Returns
+    -------
+    ClockFit
+        The fit.
+
+    Raises
+    ------
+    DegenerateGeometry
+        The points do not determine a homography.
+    """
     at = tracks.at(offset.value)
     valid = np.flatnonzero(at.interpolated.valid)
     found = tracks.correspondences(at, valid)
@@ -112,7 +152,7 @@ def fit_at_offset(
     system = _System(tracks, at, fit.H, kept)
     H, chi2, iterations = fit.H, fit.chi2, fit.iterations
     if criterion == "reprojection":
-        # the robust fit takes points for independent; points between the same samples are not
+        # the robust fit takes points as independent; those interpolated from the same samples are not
         for iterations in range(1, 11):
             step = np.asarray(np.linalg.solve(system.by_H, system.score_H), float)
             H = H @ sl3_exp(step)
@@ -138,9 +178,20 @@ def fit_at_offset(
 
 
 def fuse(evidence: Sequence[ClockOffset], prior: ClockOffset) -> tuple[ClockOffset, float]:
-    """One offset from what several stances know of it, and how likely they disagree as much by chance.
+    """Fuse the offsets of several stances with a prior.
 
-    Where they disagree beyond chance the sigma is as much larger as they do (never smaller).
+    Parameters
+    ----------
+    evidence
+        Offset by each stance alone.
+    prior
+        Prior of the offset.
+
+    Returns
+    -------
+    tuple
+        The fused offset, and the p-value of the stances' disagreement. If they disagree beyond chance, the standard
+        deviation is enlarged accordingly.
     """
     if not evidence:
         return prior, 1.0
@@ -159,30 +210,17 @@ def _combined(prior: ClockOffset, evidence: ClockOffset | None) -> ClockOffset:
     return ClockOffset((a * prior.value + b * evidence.value) / (a + b), float((a + b) ** -0.5))
 
 
-def _parts(H: Array, z: Array) -> tuple[Array, Array, Array]:
-    """pi(H z) (n, 2), its derivative by z (n, 2, 2), and by the coordinates of H on the right (n, 2, 8)."""
-    z1 = np.concatenate([z, np.ones((len(z), 1))], axis=1)
-    Y = z1 @ H.T
-    w = 1 / Y[:, 2]
-    p = Y[:, :2] * w[:, None]
-    J = np.zeros((len(z), 2, 3))
-    J[:, 0, 0] = J[:, 1, 1] = w
-    J[:, :, 2] = -p * w[:, None]
-    by_h = ((J @ H)[..., None] * z1[:, None, None, :]).reshape(len(z), 2, 9) @ SL3_BASIS.reshape(8, 9).T
-    return p, J @ H[:, :2], by_h
-
-
 class _System:
-    """The equations of H and the offset, linearised at k points `which` and their true places z (k, 2) in image i.
+    """Equations of H and the offset, linearised at k points `which` and their latent positions z (k, 2) in image i.
 
-    Residual = A h - speed * offset, with a covariance in which points that share samples are correlated.
+    Residual = A h - velocity * offset, with a covariance in which points that share samples are correlated.
     """
 
     def __init__(
-        self, tracks: PairedTracks, at: Shifted, H: Array, which: NDArray[np.int64], z: Array | None = None
+        self, tracks: PairedTracks, at: ShiftedTracks, H: Array, which: NDArray[np.int64], z: Array | None = None
     ) -> None:
         self._z = tracks.x_i[which] if z is None else z
-        p, self._by_z, self.A = _parts(H, self._z)
+        p, self._by_z, self.A = projection(H, self._z)
         self._r_i, self._C_i = tracks.x_i[which] - self._z, tracks.covariance_i[which]
         self.residual = (at.x[which] - p - (self._by_z @ self._r_i[..., None])[..., 0]).ravel()
         from_i = self._by_z @ self._C_i @ self._by_z.swapaxes(1, 2)
@@ -202,7 +240,7 @@ class _System:
         return np.asarray(cho_solve_banded((self._factor, True), right, check_finite=False))
 
     def moved(self, step: Array, offset: float = 0.0, speed: Array | None = None) -> Array:
-        """The points' places z (k, 2) once H and the offset have taken a step."""
+        """Latent positions z (k, 2) after a step of H and of the offset."""
         left = self.residual - self.A.reshape(-1, 8) @ step
         if speed is not None:
             left = left + offset * speed.ravel()
@@ -210,8 +248,10 @@ class _System:
         return np.asarray(self._z + self._r_i + (self._C_i @ back)[..., 0])
 
     def offset_equation(self, speed: Array, drawn: tuple[Array, Array, Array]) -> tuple[float, float, float, float]:
-        """With H eliminated: the offset's score and information, the score's variance, and the standard deviation
-        of the information that noise makes. What noise makes of the first two on average is taken off."""
+        """Score and information of the offset with H eliminated, variance of the score, and noise of the information.
+
+        The mean contribution of noise is subtracted from the first two; the last is its standard deviation.
+        """
         flat = self.A.reshape(-1, 8)
         instrument = self.slope.ravel()
         gain = np.linalg.solve(self.by_H, self.by_H_offset)
@@ -226,21 +266,21 @@ class _System:
 
 
 def _scale(chi2: float, dof: int) -> float:
-    """What the information is multiplied by where residuals are larger than the noise explains."""
+    """Factor of the information if residuals exceed the noise beyond chance, else 1."""
     return dof / chi2 if chi2 > dof + 3 * np.sqrt(2 * dof) else 1.0
 
 
 def _gated(squared: Array, valid: Used, among: Used) -> Used:
-    """Points within the gate, which widens with the typical residual of those that agree so far."""
+    """Mask of points within the gate, which widens with the median residual of the inliers `among` them."""
     agree = among & valid
     scale = np.median(squared[agree]) / MEDIAN_CHI2 if agree.any() else 1.0
-    return np.asarray(valid & (squared < INLIER_GATE * np.clip(scale, 1.0, WIDEST_SCALE)))
+    return np.asarray(valid & (squared < INLIER_GATE * np.clip(scale, 1.0, MAX_VARIANCE_SCALE)))
 
 
 def _evidence(
     tracks: PairedTracks, H: Array, offset: float, prior: ClockOffset, rounds: int = 15
 ) -> ClockOffset | None:
-    """What the tracks alone say of the offset; None where it is no more than noise says."""
+    """Offset by the tracks alone; None if the information on it does not exceed the noise."""
     used = np.ones(len(tracks), bool)
     z_all, draws = tracks.x_i.copy(), tracks.draws()
     for round_ in range(rounds):
@@ -249,7 +289,7 @@ def _evidence(
             squared = squared_residuals(H, tracks.pairs(at, np.arange(len(tracks))))
             used = _gated(squared, at.interpolated.valid, used)
         which = np.flatnonzero(used)
-        if len(which) < MINIMUM_POINTS:
+        if len(which) < MIN_POINTS:
             return None
         system = _System(tracks, at, H, which, z_all[which])
         speed = tracks.speed(at, which)
@@ -270,37 +310,36 @@ def _evidence(
 
 
 def _search(tracks: PairedTracks, H: Array, prior: ClockOffset) -> tuple[float, Array]:
-    """The offset within the prior's reach at which one homography explains most, and that homography."""
+    """Offset within reach of the prior at which one homography explains most points, and that homography."""
     at = tracks.at(prior.value)
     sigma = tracks.pairs(at, np.arange(len(tracks))).sigma
     valid = at.interpolated.valid
     fastest = float(np.quantile(np.hypot(*at.slope[valid].T), 0.9)) if valid.any() else 0.0
     reach = SEARCH_SIGMAS * prior.sigma
-    # half a step must not take a point further than the gate is wide
-    places = int(np.clip(2 * np.ceil(reach * fastest / (4 * sigma)) + 1, 3, SEARCH_PLACES))
+    # half a step must not move a point by more than the gate
+    places = int(np.clip(2 * np.ceil(reach * fastest / (4 * sigma)) + 1, 3, MAX_SEARCH_STEPS))
     offsets = prior.value + np.linspace(-reach, reach, places)
     candidates = []
     for offset in offsets:
         at = tracks.at(float(offset))
         which = np.flatnonzero(at.interpolated.valid)
-        if len(which) >= MINIMUM_POINTS:
+        if len(which) >= MIN_POINTS:
             refined, cost = _robust(H, tracks.pairs(at, which))
             candidates.append((float(offset), len(which), cost, refined))
     if not candidates:
         raise DegenerateGeometry(
-            "no track of one observer goes on while the other sees the marker: record at 10 or more images a second, "
-            "and check the clocks"
+            "the observers' tracks do not overlap in time: record 10 or more images a second, and check the clocks"
         )
     most = max(n for _, n, _, _ in candidates)
-    enough = [c for c in candidates if c[1] >= max(MINIMUM_POINTS, most // 3)]
+    enough = [c for c in candidates if c[1] >= max(MIN_POINTS, most // 3)]
     best = min(enough, key=lambda c: most * c[2] + ((c[0] - prior.value) / prior.sigma) ** 2)
     return best[0], best[3]
 
 
 def _robust(H: Array, pairs: PointPairs) -> tuple[Array, float]:
-    """H and its mean cost, which grows no more once a point is beyond the gate (Geman and McClure's)."""
+    """Fit H robustly (Geman-McClure, graduated) and return it with the mean cost, bounded at the gate."""
     for gate in (2500.0, 400.0, 80.0, INLIER_GATE, INLIER_GATE):
-        p, by_z, A = _parts(H, pairs.x_i)
+        p, by_z, A = projection(H, pairs.x_i)
         S = pairs.covariance_j + by_z @ pairs.covariance_i @ by_z.swapaxes(1, 2)
         residual = pairs.x_j - p
         weighted = np.linalg.solve(S, np.concatenate([A, residual[..., None]], axis=2))

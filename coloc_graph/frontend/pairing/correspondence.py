@@ -1,7 +1,7 @@
-"""Which samples of two cameras show the same marker at the same instant.
+"""Find the samples of two cameras that show the same marker at the same instant.
 
-Samples are paired by time (5 ms, paper section V). Tracks whose marker has a name pair by name. Tracks without
-one pair by what they do (`association`).
+Samples are paired by time (5 ms, paper section V). Named tracks are paired by name, unnamed ones by their motion
+(`association`).
 """
 
 from collections.abc import Callable, Sequence
@@ -13,26 +13,21 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.refinement import PointPairs
-from coloc_graph.frontend.pairing.association import HIDDEN, HIDDEN_ALONE, LEAST_ALONE, SURE, associate
-from coloc_graph.frontend.tracks.interpolation import LONGEST_GAP
+from coloc_graph.frontend.pairing.association import HIDDEN, HIDDEN_ALONE, MIN_POSTERIOR, MIN_SHARE_ALONE, associate
+from coloc_graph.frontend.tracks.interpolation import MAX_GAP
 from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
 
-#: Time difference up to which two samples count as one instant [s].
-PAIRING_WINDOW = 5e-3
-
-#: A light whose track stays in a box of this diagonal stands still [px].
-STILL = 8.0
-#: A marker nearer to the border than this may not be seen [px].
-BORDER = 6.0
-#: More than a float64 of UTC seconds is rounded by: a gap of the window itself is within it [s].
-CLOCK_GRAIN = 1e-6
+PAIRING_WINDOW = 5e-3  # s, time difference up to which two samples are of one instant
+STILL = 8.0  # px, diagonal of the bounding box of a light at rest
+BORDER = 6.0  # px from the border of the image, within which a marker may be missed
+CLOCK_GRAIN = 1e-6  # s, more than the rounding of UTC seconds in float64
 
 
 class UnpairedTracks(DegenerateGeometry):
-    """No tracks of two cameras are certainly the same markers: `what` is so, and what may help."""
+    """No association of two cameras' tracks is certain; `what` is the reason without the remedy."""
 
     def __init__(self, what: str, remedy: str) -> None:
         super().__init__(f"{what}: {remedy}")
@@ -41,11 +36,21 @@ class UnpairedTracks(DegenerateGeometry):
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """The same markers at the same instants in cameras i and j: `uv_*` (n, 2) [px], `times` (n,) of camera i.
+    """The same markers at the same instants in cameras i and j.
 
-    `pairs` are the same in normalised coordinates with covariances. `markers` names which track of camera i
-    each belongs to (n,). `loads_*` (n, 2) are the parts of the white floor's and of saturation's variance that each
-    point has (`team.CentreNoise`); of interpolated points they are less than 1.
+    Attributes
+    ----------
+    uv_i, uv_j
+        Pixels, (n, 2).
+    times
+        Times by camera i's clock, (n,) [s].
+    markers
+        Index of camera i's track, (n,).
+    pairs
+        Normalised coordinates with covariances.
+    loads_i, loads_j
+        Parts of the white floor's and of saturation's variance in each point (`team.CentreNoise`), (n, 2); less than 1
+        for interpolated points.
     """
 
     uv_i: Array
@@ -61,7 +66,20 @@ class Correspondences:
 
 
 def pair_by_time(times_i: Array, times_j: Array, window: float = PAIRING_WINDOW) -> NDArray[np.int64]:
-    """Indices (n, 2) of the samples nearest to each other in two ascending series, at most `window` [s] apart."""
+    """Pair the samples of two ascending series that are nearest to each other in time.
+
+    Parameters
+    ----------
+    times_i, times_j
+        Ascending times [s].
+    window
+        Largest time difference [s].
+
+    Returns
+    -------
+    numpy.ndarray
+        Indices of paired samples, (n, 2).
+    """
     if not len(times_i) or not len(times_j):
         return np.empty((0, 2), np.int64)
     after = np.searchsorted(times_j, times_i)
@@ -85,10 +103,8 @@ def pair_by_time(times_i: Array, times_j: Array, window: float = PAIRING_WINDOW)
 def pair_each_by_time(
     series: Sequence[tuple[Array, Array]], window: float = PAIRING_WINDOW
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """`pair_by_time` of many pairs of series at once: which of them (m,), and the indices (m, 2) in it.
-
-    Laid one behind the other, so far apart that no sample is near one of another pair.
-    """
+    """Apply `pair_by_time` to many pairs of series at once: index of the pair (m,), and indices (m, 2) in it."""
+    # lay the pairs one behind the other, too far apart for samples of different pairs to be near each other
     lengths = np.array([(len(a), len(b)) for a, b in series]).reshape(-1, 2)
     if not lengths.all(axis=1).any():
         return np.empty(0, np.int64), np.empty((0, 2), np.int64)
@@ -103,7 +119,7 @@ def pair_each_by_time(
     return which, pairs - first[which]
 
 
-#: Whether a homography, and the tracks of camera i that it pairs, can be right, by what else is known.
+#: Predicate of a homography and the tracks of camera i that it pairs: False if other knowledge contradicts them.
 Plausible = Callable[[Array, Sequence[Track]], bool]
 
 
@@ -116,10 +132,28 @@ def correspond(
     alone: bool = False,
     plausible: Plausible | None = None,
 ) -> Correspondences:
-    """The correspondences between two cameras' tracks; raises `DegenerateGeometry` where there are none.
+    """Find the correspondences between the tracks of two cameras whose clocks agree.
 
-    Where one robot moves `alone`, what both cameras see at the same time is that. What is not `plausible` is no pairing
-    of tracks without names.
+    Parameters
+    ----------
+    tracks_i, tracks_j
+        Tracks of both cameras.
+    camera_i, camera_j
+        The cameras.
+    alone
+        True if one robot moves only, so that both cameras see the same one at any time.
+    plausible
+        Predicate that associations of unnamed tracks must satisfy.
+
+    Returns
+    -------
+    Correspondences
+        The same markers at the same instants.
+
+    Raises
+    ------
+    DegenerateGeometry
+        There are none, or the association is ambiguous.
     """
     candidates = Candidates(tracks_i, tracks_j, camera_i, camera_j, alone=alone, plausible=plausible)
     return _chosen(candidates, tracks_i, tracks_j)[1]
@@ -136,10 +170,26 @@ def correspond_roughly(
     alone: bool = False,
     plausible: Plausible | None = None,
 ) -> tuple[list[tuple[int, int]], Correspondences]:
-    """The same for clocks that differ by `offset`, known to `sigma` [s]: which tracks (a, b) are one marker's.
+    """Find the correspondences between the tracks of two cameras whose clocks differ by an uncertain offset.
 
-    Nearest samples are paired and moved to the same instant; what the sigma makes of a marker's speed is in
-    camera j's covariances. Raises `DegenerateGeometry` as `correspond` does.
+    The nearest samples are paired and extrapolated to the same instant.
+
+    Parameters
+    ----------
+    tracks_i, tracks_j, camera_i, camera_j, alone, plausible
+        As in `correspond`.
+    offset, sigma
+        Clock offset and its standard deviation [s], which enlarges camera j's covariances by the markers' velocity.
+
+    Returns
+    -------
+    tuple
+        Pairs of track indices, and the correspondences.
+
+    Raises
+    ------
+    DegenerateGeometry
+        There are none, or the association is ambiguous.
     """
     clock = offset, sigma
     candidates = Candidates(tracks_i, tracks_j, camera_i, camera_j, clock, alone=alone, plausible=plausible)
@@ -150,31 +200,31 @@ def _chosen(
     candidates: "Candidates", tracks_i: Sequence[Track], tracks_j: Sequence[Track]
 ) -> tuple[list[tuple[int, int]], Correspondences]:
     if not candidates.indices:
-        raise UnpairedTracks(*_why_none(tracks_i, tracks_j, candidates.window))
+        raise UnpairedTracks(*_reason_for_none(tracks_i, tracks_j, candidates.window))
     if all(track.marker for track in (*tracks_i, *tracks_j)):
         return list(candidates.indices), candidates.join(list(candidates.indices))
     found = associate(candidates)
     pair = f"{tracks_i[0].robot} and {tracks_j[0].robot}"
     if found is None:
         raise UnpairedTracks(
-            f"no pairing of the tracks of {pair} is explained by one homography",
+            f"no pairing of the tracks of {pair} fits one homography",
             "let the moving robot turn and drive further, look for reflections, and calibrate the lenses",
         )
-    if found.posterior < SURE:
+    if found.posterior < MIN_POSTERIOR:
         raise UnpairedTracks(
-            f"which tracks of {pair} are the same markers is ambiguous: {len(found.rivals) + 1} pairings are explained "
-            f"by one homography each, and the likeliest is right with a chance of {100 * found.posterior:.1f} % only",
-            "let the moving robots turn and drive apart, or give markers names",
+            f"the association of the tracks of {pair} is ambiguous: {len(found.rivals) + 1} pairings each fit a "
+            f"homography, and the most probable one has a probability of only {100 * found.posterior:.1f} %",
+            "let the moving robots turn and drive apart, or name the markers",
         )
     return list(found.chosen), candidates.join(found.chosen)
 
 
-def _why_none(tracks_i: Sequence[Track], tracks_j: Sequence[Track], window: float) -> tuple[str, str]:
+def _reason_for_none(tracks_i: Sequence[Track], tracks_j: Sequence[Track], window: float) -> tuple[str, str]:
     if not tracks_i or not tracks_j:
         seeing = next((track.robot for track in (*tracks_i, *tracks_j)), None)
-        who = "both saw none" if seeing is None else f"{seeing} alone saw one"
+        who = "neither saw one" if seeing is None else f"only {seeing} saw one"
         return (
-            f"the observers never see a marker at the same instant, since {who}",
+            f"the observers never see a marker at the same instant: {who}",
             "bring the mover into both fields of view, and check the cameras",
         )
     i, j = tracks_i[0].robot, tracks_j[0].robot
@@ -196,9 +246,9 @@ def _listed(names: set[str]) -> str:
 
 
 class Candidates:
-    """All pairs of tracks that may be one marker: they share instants, and their names, where they have some.
+    """All pairs of tracks that may be one marker: they share instants, and names if both have one.
 
-    `clock` is the clocks' offset and its sigma [s], None for clocks that agree.
+    `clock` is the clock offset and its standard deviation [s], None for clocks that agree.
     """
 
     def __init__(
@@ -215,15 +265,15 @@ class Candidates:
         self._i, self._j = list(tracks_i), list(tracks_j)
         self._cameras = camera_i, camera_j
         self._alone, self._plausible = alone, plausible
-        self.hidden, self.least = (HIDDEN_ALONE, LEAST_ALONE) if alone else (HIDDEN, 0.0)
+        self.hidden, self.least = (HIDDEN_ALONE, MIN_SHARE_ALONE) if alone else (HIDDEN, 0.0)
         self.bodies = [track.body for track in tracks_i], [track.body for track in tracks_j]
         self._x_i = [normalised(track, camera_i) for track in self._i]
         self._x_j = [normalised(track, camera_j) for track in self._j]
-        # where a lens cannot be inverted there is no ray, and one NaN would spoil the whole stance
+        # where a lens cannot be inverted there is no ray, and one NaN would invalidate the whole stance
         finite_i, finite_j = [_finite(x) for x in self._x_i], [_finite(x) for x in self._x_j]
         self.indices: dict[tuple[int, int], NDArray[np.int64]] = {}
         self._clock = clock
-        offset, window = (0.0, PAIRING_WINDOW) if clock is None else (clock[0], LONGEST_GAP / 2)
+        offset, window = (0.0, PAIRING_WINDOW) if clock is None else (clock[0], MAX_GAP / 2)
         self.window = window
         self._slopes = [np.empty((0, 2))] * len(self._j)
         if clock is not None:
@@ -244,11 +294,11 @@ class Candidates:
                 self.indices[a, b] = shared
 
     def points(self, chosen: Sequence[tuple[int, int]]) -> PointPairs:
-        """All samples that some pairs of tracks share."""
+        """All samples that the chosen pairs share."""
         return self.join(chosen).pairs
 
     def visible(self, H_j_i: Array) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.bool_]]]:
-        """Of each sample of each track of i whether j would have seen it, and of those of j whether i would."""
+        """Masks of each track's samples, of i and of j, that the other camera would see."""
         camera_i, camera_j = self._cameras
         if self._alone:
             return _while_seen(self._i, self._j), _while_seen(self._j, self._i)
@@ -258,11 +308,11 @@ class Candidates:
         )
 
     def plausible(self, H_j_i: Array, chosen: Sequence[tuple[int, int]]) -> bool:
-        """Whether a homography, and what it pairs, can be right by what else is known."""
+        """Return whether a homography and its pairs agree with everything else that is known."""
         return self._plausible is None or self._plausible(H_j_i, [self._i[a] for a, _ in chosen])
 
     def covered(self, chosen: Sequence[tuple[int, int]]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.bool_]]]:
-        """Of each sample of each track of i, and of j, whether it lies between those that a chosen pair shares."""
+        """Masks of each track's samples, of i and of j, between the first and last that a chosen pair shares."""
         in_i, in_j = ([np.zeros(len(track), bool) for track in tracks] for tracks in (self._i, self._j))
         for a, b in chosen:
             m, n = self.indices[a, b].T
@@ -271,7 +321,7 @@ class Candidates:
         return in_i, in_j
 
     def claimed(self, residuals: dict[tuple[int, int], float]) -> list[tuple[int, int]]:
-        """Of some pairs of tracks those that do not claim a sample that one with a smaller residual has."""
+        """Select pairs, smallest residual first, that share no sample with one selected before."""
         free_i = [np.ones(len(track), bool) for track in self._i]
         free_j = [np.ones(len(track), bool) for track in self._j]
         chosen: list[tuple[int, int]] = []
@@ -283,7 +333,7 @@ class Candidates:
         return sorted(chosen)
 
     def join(self, chosen: Sequence[tuple[int, int]]) -> Correspondences:
-        """What some pairs of tracks share."""
+        """Correspondences of the chosen pairs."""
         parts = [(a, b, *self.indices[a, b].T) for a, b in chosen]
         uv_i = np.concatenate([self._i[a].uv[m] for a, _, m, _ in parts])
         uv_j = np.concatenate([self._j[b].uv[n] for _, b, _, n in parts])
@@ -304,7 +354,7 @@ class Candidates:
         )
 
     def _at_j(self, a: int, b: int, m: NDArray[np.int64], n: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Samples n (k,) of track b, where they are at the instants of samples m (k,) of track a."""
+        """Extrapolate samples n (k,) of track b to the instants of samples m (k,) of track a."""
         x, covariance = self._x_j[b][0][n], self._x_j[b][1][n]
         if self._clock is None:
             return x, covariance
@@ -315,7 +365,7 @@ class Candidates:
 
 
 def _while_seen(tracks: Sequence[Track], others: Sequence[Track]) -> list[NDArray[np.bool_]]:
-    """Of each sample of some tracks whether any of the others goes on at the time."""
+    """Masks of each track's samples during which any of the other tracks lasts."""
     return [
         np.any([(track.times >= one.times[0]) & (track.times <= one.times[-1]) for one in others], axis=0)
         for track in tracks
@@ -323,7 +373,7 @@ def _while_seen(tracks: Sequence[Track], others: Sequence[Track]) -> list[NDArra
 
 
 def _in_view(camera: Camera, H: Array, x: Array) -> NDArray[np.bool_]:
-    """Which points x (n, 2) of another camera come to lie within a camera's image, and not at its border, by H."""
+    """Mask of points x (n, 2) of another camera that H maps into a camera's image, and not to its border."""
     uv, inside = camera.project(np.column_stack([x, np.ones(len(x))]) @ H.T)
     with np.errstate(invalid="ignore"):
         return np.asarray(
@@ -333,18 +383,18 @@ def _in_view(camera: Camera, H: Array, x: Array) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=1000)  # a camera's tracks are in as many pairs as it has partners
 def normalised(track: Track, camera: Camera) -> tuple[Array, Array]:
-    """A track in normalised coordinates (n, 2), with covariances (n, 2, 2) that hold the camera's `centre_noise`."""
+    """Normalised coordinates of a track (n, 2), with covariances (n, 2, 2) that contain the camera's `centre_noise`."""
     x = camera.normalise(track.uv)
     J = camera.per_pixel(x)
     return x, J @ camera.centre_covariance(track.covariance, track.loads) @ J.mT
 
 
 def _speed(times: Array, x: Array) -> Array:
-    """Roughly how fast a track (n, 2) moves at its samples [1/s]; 0 where a sample stands alone."""
+    """Approximate velocities (n, 2) of a track at its samples [1/s]; 0 at isolated samples."""
     if len(times) < 2:
         return np.zeros_like(x)
     step = np.diff(times)
-    joined = (step > 1e-4) & (step < LONGEST_GAP)
+    joined = (step > 1e-4) & (step < MAX_GAP)
     between = np.where(joined[:, None], np.diff(x, axis=0) / np.where(joined, step, 1.0)[:, None], 0.0)
     count = np.maximum(np.append(joined, 0) + np.append(0, joined), 1)
     return np.asarray((np.vstack([between, np.zeros(2)]) + np.vstack([np.zeros(2), between])) / count[:, None])

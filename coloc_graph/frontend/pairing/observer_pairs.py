@@ -1,4 +1,4 @@
-"""Which pairs of observers are measured, and what several of them measure of the same pixels, which counts once."""
+"""Select the pairs of observers to measure, and weight pairs that measure the same pixels, which count once."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -8,16 +8,15 @@ import numpy as np
 from coloc_graph.frontend.pairing.correspondence import Correspondences, pair_each_by_time
 from coloc_graph.frontend.tracks.tracking import Track
 
-#: Of many observers each is measured with so many others at least: those with which it has most in common.
-PARTNERS = 4
+MIN_PARTNERS = 4  # pairs of each of many observers that are measured: with those that share most samples
 
 Pair = tuple[str, str]
 
 
 def pairs_of(observers: Sequence[str], tracks: Mapping[str, Sequence[Track]], window: float) -> list[Pair]:
-    """The pairs of observers that are measured: all, or of many those that have most samples in common."""
+    """Select the pairs of observers to measure: all, or of many those that share most samples."""
     every = list(itertools.combinations(observers, 2))
-    if len(observers) <= PARTNERS + 1:
+    if len(observers) <= MIN_PARTNERS + 1:
         return every
     series, of = [], []
     for number, (i, j) in enumerate(every):
@@ -31,22 +30,39 @@ def pairs_of(observers: Sequence[str], tracks: Mapping[str, Sequence[Track]], wi
     best: set[Pair] = set()
     for one in observers:
         own = sorted((pair for pair in every if one in pair), key=lambda pair: -common[pair])
-        best.update(own[:PARTNERS])
+        best.update(own[:MIN_PARTNERS])
     return [pair for pair in every if pair in best]
 
 
-def share(
+def information_weight(
     found: Correspondences,
     pair: Pair,
     pairs: Sequence[Pair],
     tracks: Mapping[str, Sequence[Track]],
     window: float,
 ) -> float:
-    """The part of a pair's information that is its own, of all `pairs` that are measured.
+    """Weight of a pair's information, since the pixels of one image enter the homographies of several pairs.
 
-    A point that n observers see is in up to n (n - 1) / 2 homographies, each made of two images' noise. What is known
-    of it altogether is the sum of all of them times 2 / n: sum_i |x_i - mean|^2 = sum_{i<j} |x_i - x_j|^2 / n; of
-    m of them, n - 1 images' worth. Markers without names may be any.
+    Parameters
+    ----------
+    found, pair
+        Correspondences of a pair of observers.
+    pairs
+        All pairs that are measured in the stance.
+    tracks
+        Tracks of all observers by name; unnamed tracks may be any marker.
+    window
+        Time difference up to which two samples are of one instant [s].
+
+    Returns
+    -------
+    float
+        Weight in (0, 1].
+
+    Notes
+    -----
+    A point that n observers see is in up to n (n - 1) / 2 homographies, each with the noise of two images. Their total
+    information is that of n - 1 images: sum_i |x_i - mean|^2 = sum_{i<j} |x_i - x_j|^2 / n.
     """
     if len(pairs) < 2:
         return 1.0

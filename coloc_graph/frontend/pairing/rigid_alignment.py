@@ -1,9 +1,9 @@
-"""Decide with two cameras which of a body's two equal lights is which, where one camera alone cannot tell.
+"""Order a body's two equal lights consistently with two cameras, if one camera alone cannot.
 
-Both cameras see the same body on the same plane. On the plane their views differ by a turn and a shift: the directions
-of the line through both lights give the turn modulo half a turn, and the way of its middle decides which half. Then
-every image that both cameras took at one instant ties the order of the lights in one camera to that in the other, and
-pieces of a path that were cut in one camera are joined by what the other saw meanwhile.
+Both cameras see the same body on the same plane, where their views differ by a rotation and a shift. The directions of
+the line through both lights give the rotation modulo half a turn; the path of its midpoint decides the half. Then each
+pair of images taken at one instant ties the order of the lights in one camera to that in the other, and pieces of a
+path that were cut in one camera are joined by what the other saw meanwhile.
 """
 
 import cv2
@@ -16,8 +16,8 @@ from coloc_graph.frontend.tracks.rigid_path import RigidPath
 Array = NDArray[np.float64]
 
 MIN_SHARED = 5  # instants at which both cameras see both lights
-MIN_COHERENCE = 0.8  # length of the mean direction, modulo half a turn, of what should be one turn
-MIN_CONTRAST = 3.0  # ratio of the misfits of both halves above which the smaller one is right
+MIN_COHERENCE = 0.8  # length of the mean direction, modulo half a turn, of samples of one rotation
+MIN_CONTRAST = 3.0  # ratio of the misfits of both halves above which the smaller one is accepted
 UNANIMOUS = 0.9  # share of the instants of two pieces that must agree
 OUTLIER = 6.0  # median residuals of one homography beyond which a sample is another light
 MIN_RESIDUAL = 0.01  # m, residual below which no sample is an outlier
@@ -25,10 +25,9 @@ MIN_INLIERS = 0.7  # share of the samples that the homography must explain to ju
 
 
 def align_paths(path_i: RigidPath, path_j: RigidPath, window: float) -> tuple[RigidPath, RigidPath]:
-    """Order the lights of two paths of one body alike, and join their pieces where that ties them.
+    """Order the lights of two paths of one body consistently, and join their pieces.
 
-    Samples that contradict what they are tied to are left out. Where the views do not decide the turn between them,
-    as of a body that turns on the spot, the paths come back as they are.
+    Samples that contradict the common order are rejected.
 
     Parameters
     ----------
@@ -36,6 +35,11 @@ def align_paths(path_i: RigidPath, path_j: RigidPath, window: float) -> tuple[Ri
         The paths that two cameras saw.
     window
         Time difference up to which two images are of one instant [s].
+
+    Returns
+    -------
+    tuple of RigidPath
+        Both paths; unchanged if the rotation between the views is undetermined, as for a body that turns on the spot.
     """
     shared = pair_by_time(path_i.times, path_j.times, window)
     if len(shared) < MIN_SHARED:
@@ -67,7 +71,7 @@ def align_paths(path_i: RigidPath, path_j: RigidPath, window: float) -> tuple[Ri
 
 
 def _outliers(places_i: Array, places_j: Array, tied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Samples (n,) of which one homography between the places (n, 2, 2) does not explain a light, of those `tied`."""
+    """Mask (n,) of `tied` samples with a light that the homography between the views (n, 2, 2) does not explain."""
     none = np.zeros(len(tied), bool)
     if 2 * tied.sum() < 2 * MIN_SHARED:
         return none
@@ -89,7 +93,7 @@ def _direction(path: RigidPath) -> Array:
 
 
 def _turn(turned: Array, middle_i: Array, middle_j: Array) -> float | None:
-    """The turn [rad] from i's view to j's; None where it is not decided."""
+    """Rotation [rad] from i's view to j's; None if it is undetermined."""
     kept = np.ones(len(turned), bool)
     for _ in range(3):
         mean = np.exp(2j * turned[kept]).mean()

@@ -1,7 +1,7 @@
-"""Whose lights some tracks are, by how they blink: the likelihood of all that was seen and missed, under each code.
+"""Identify the robot of a track by its blink code, from the likelihood of every detection and miss under each code.
 
-When a code began, and how fast the robot's clock goes, is not known: both are summed over. So is that the lights are
-nobody's, whose bits are any: a code that does no better than this is not believed.
+The phase of a code and the drift of the robot's clock are unknown and marginalised. Lights of no robot, with arbitrary
+bits or an unknown code, are alternatives that a code must beat.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,77 +15,68 @@ from coloc_graph.frontend.tracks.tracking import Track
 
 Array = NDArray[np.float64]
 
-#: A robot that is less likely than this is not named.
-SURE = 0.999
-#: Of a light that is on, the chance that it is missed; of one that is off, that something else is taken for it.
-MISSED = 0.05
-FALSE = 0.02
-#: The chance that a whole bit is not what it seems: hidden, or another light's.
-WRONG_BIT = 0.02
-#: A robot's clock may go wrong by this share, and images so near to the ends of a bit [bits] may be of the next one.
-CLOCK = 5e-3
-EDGE = 0.125
-#: Longer than that nothing is looked back at [s].
-LONGEST = 60.0
-#: A code may begin at so many instants in a bit.
-PHASES = 8
-#: What share of its bits a light is on that blinks as none of the robots does, the last one all the time.
-DUTIES = np.array([0.5, 0.7, 0.85, 0.95, 1.0])
-#: The chance that a light blinks by a code, of up to so many bits, that no robot is said to have.
-STRANGER = 1e-4
-STRANGERS_BITS = 16
+MIN_POSTERIOR = 0.999  # probability below which no robot is named
+MISS_RATE = 0.05  # probability that a light that is on is not detected
+FALSE_RATE = 0.02  # probability that something else is taken for a light that is off
+BIT_ERROR_RATE = 0.02  # probability that a whole bit is wrong, since the light is hidden or another's
+MAX_DRIFT = 5e-3  # relative error of a robot's clock
+BIT_EDGE = 0.125  # bits; images nearer to a transition are not used
+MAX_DURATION = 60.0  # s, of a track's most recent part that is evaluated
+PHASES = 8  # phases of a code that are tried in each bit
+DUTY_CYCLES = np.array([0.5, 0.7, 0.85, 0.95, 1.0])  # of lights with random bits; the last one is always on
+UNKNOWN_CODE_PRIOR = 1e-4  # probability of a code that no robot of the team has
+MAX_UNKNOWN_CODE_BITS = 16  # length of such a code
 
 
 @dataclass(frozen=True, eq=False)
 class BlinkCodes:
-    """The codes of robots by their names; a bit lasts `bit` [s]."""
+    """Blink codes of robots by name; a bit lasts `bit` [s]."""
 
     codes: Mapping[str, str]
     bit: float
 
     @property
     def rate(self) -> float:
-        """How often a light that is on goes off [1/s]."""
+        """Largest rate at which a light that is on goes off [1/s]."""
         return max(code.count("0") / code.count("1") for code in self.codes.values()) / self.bit
 
-    def each(self, tracks: Sequence[Track]) -> list[Track]:
-        """Tracks with the names of their robots (`Track.mover`), each by itself; "" where it is not sure."""
-        return [replace(track, mover=self.whose([track])) for track in tracks]
+    def name_tracks(self, tracks: Sequence[Track]) -> list[Track]:
+        """Name the robot of each track (`Track.mover`) by its own blinking; "" if it is uncertain."""
+        return [replace(track, mover=self.robot_of([track])) for track in tracks]
 
-    def bodies(self, tracks: Sequence[Track]) -> list[Track]:
-        """The same for those that have no name yet, by all tracks of their body together."""
+    def name_bodies(self, tracks: Sequence[Track]) -> list[Track]:
+        """Name the robots of tracks without one by all tracks of the same body (`Track.body`)."""
         unsure = {track.body for track in tracks if not track.mover and track.body >= 0}
-        together = {body: self.whose([track for track in tracks if track.body == body]) for body in unsure}
+        together = {body: self.robot_of([track for track in tracks if track.body == body]) for body in unsure}
         return [replace(track, mover=track.mover or together.get(track.body, "")) for track in tracks]
 
-    def whose(self, tracks: Sequence[Track]) -> str:
-        """The robot that blinks as tracks do, which are one's; "" where it is not sure."""
-        chances = self.chances(tracks)
-        best = int(np.argmax(chances))
-        return tuple(self.codes)[best] if chances[best] >= SURE else ""
+    def robot_of(self, tracks: Sequence[Track]) -> str:
+        """Name of the robot whose code tracks of one body show; "" if it is uncertain."""
+        posteriors = self.posteriors(tracks)
+        best = int(np.argmax(posteriors))
+        return tuple(self.codes)[best] if posteriors[best] >= MIN_POSTERIOR else ""
 
-    def chances(self, tracks: Sequence[Track]) -> Array:
-        """How likely each robot is the one whose tracks these are, (n,); what is left is the chance that none is."""
+    def posteriors(self, tracks: Sequence[Track]) -> Array:
+        """Posterior probability (n,) of each robot, given tracks of one body; the rest to 1 is that of none."""
         on, off = self._bits(tracks)
         with np.errstate(divide="ignore"):
-            log_on, log_off = np.log(DUTIES)[:, None, None], np.log1p(-DUTIES)[:, None, None]
+            log_on, log_off = np.log(DUTY_CYCLES)[:, None, None], np.log1p(-DUTY_CYCLES)[:, None, None]
         of_none = _mean(np.logaddexp(log_on + on, log_off + off).sum(axis=2))
-        strangers = [
+        unknown = [
             _mean(np.logaddexp(np.log(0.75) + _folded(on, n), np.log(0.25) + _folded(off, n)).sum(axis=1))
-            for n in range(2, STRANGERS_BITS + 1)
+            for n in range(2, MAX_UNKNOWN_CODE_BITS + 1)
         ]
         of_codes = (self._evidence(code, on, off) for code in self.codes.values())
-        evidence = np.array([*of_codes, of_none, _mean(np.array(strangers)) + np.log(STRANGER)])
+        evidence = np.array([*of_codes, of_none, _mean(np.array(unknown)) + np.log(UNKNOWN_CODE_PRIOR)])
         return np.asarray(np.exp(evidence - logsumexp(evidence)))[:-2]
 
     def _bits(self, tracks: Sequence[Track]) -> tuple[Array, Array]:
-        """The logarithms of the likelihood of each bit, were it on and were it off, (k, b): at each of k rates and
-        phases of the robot's clock."""
+        """Log likelihoods (k, b) of each of b bits being on and being off, for k drifts and phases of the clock."""
         end = max(track.times[-1] for track in tracks)
-        length = min(end - min(track.times[0] for track in tracks), LONGEST)
-        # a step of the rate is less than the edge of a bit at either end of it all
-        rates = np.linspace(-CLOCK, CLOCK, 2 * int(np.ceil(4 * CLOCK * length / self.bit)) + 1)
-        first = (1 + CLOCK) * length / 2 / self.bit + np.arange(PHASES)[:, None] / PHASES
+        length = min(end - min(track.times[0] for track in tracks), MAX_DURATION)
+        # steps of the drift move either end by less than the edge of a bit
+        rates = np.linspace(-MAX_DRIFT, MAX_DRIFT, 2 * int(np.ceil(4 * MAX_DRIFT * length / self.bit)) + 1)
+        first = (1 + MAX_DRIFT) * length / 2 / self.bit + np.arange(PHASES)[:, None] / PHASES
         bits = int(np.ceil(2 * first.max()))
         on, off = np.zeros((2, len(rates) * PHASES, bits))
         row = np.arange(len(on)).reshape(len(rates), PHASES, 1) * bits
@@ -95,14 +86,14 @@ class BlinkCodes:
                 ago = end - times[(times >= end - length) & (times <= end)]
                 at = first + (1 + rates[:, None, None]) * (length / 2 - ago) / self.bit
                 number = np.floor(at)
-                sharp = np.abs(at - number - 0.5) < 0.5 - EDGE
+                sharp = np.abs(at - number - 0.5) < 0.5 - BIT_EDGE
                 flat = (row + number.astype(np.int64))[sharp]
                 count.append(np.bincount(flat, minlength=on.size).reshape(on.shape))
             seen, missed = count
-            as_on = seen * np.log(1 - MISSED) + missed * np.log(MISSED)
-            as_off = seen * np.log(FALSE) + missed * np.log(1 - FALSE)
-            on += np.logaddexp(np.log(1 - WRONG_BIT) + as_on, np.log(WRONG_BIT) + as_off)
-            off += np.logaddexp(np.log(1 - WRONG_BIT) + as_off, np.log(WRONG_BIT) + as_on)
+            as_on = seen * np.log(1 - MISS_RATE) + missed * np.log(MISS_RATE)
+            as_off = seen * np.log(FALSE_RATE) + missed * np.log(1 - FALSE_RATE)
+            on += np.logaddexp(np.log(1 - BIT_ERROR_RATE) + as_on, np.log(BIT_ERROR_RATE) + as_off)
+            off += np.logaddexp(np.log(1 - BIT_ERROR_RATE) + as_off, np.log(BIT_ERROR_RATE) + as_on)
         return on, off
 
     def _evidence(self, code: str, on: Array, off: Array) -> float:
@@ -113,11 +104,11 @@ class BlinkCodes:
 
 
 def _folded(bits: Array, n: int) -> Array:
-    """What is known of the same bits of a code of length n, together: (k, n) of (k, b)."""
+    """Sum log likelihoods (k, b) over repetitions of a code of n bits: (k, n)."""
     padded = np.pad(bits, ((0, 0), (0, -bits.shape[1] % n)))
     return np.asarray(padded.reshape(len(bits), -1, n).sum(axis=1))
 
 
 def _mean(logarithms: Array) -> float:
-    """The logarithm of the mean of what some are the logarithms of."""
+    """Logarithm of the mean of exponentials."""
     return float(logsumexp(logarithms)) - float(np.log(logarithms.size))

@@ -1,30 +1,35 @@
-"""Whether lights that blink are on: what the images say of many at once, as it goes on."""
+"""Filter the blink states of many lights, on or off, from image to image."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: In so many steps a bit passes.
-STEPS = 16
+STEPS = 16  # time steps in a bit
 
 
-class Lit:
-    """Of n lights the chance that each is on, `on` (n,), at the last prediction.
+class BlinkFilter:
+    """Bayes filter of the blink states of n lights; `on` (n,) are the probabilities that they are on.
 
-    They go off for a `bit` [s], and then on for one at least: `rate` times a second of the time after that. Where `bit`
-    is 0 they never go off.
+    A light goes off for one bit and is then on for at least one.
+
+    Parameters
+    ----------
+    bit
+        Duration of a bit [s]; 0 for lights that never go off.
+    rate
+        Rate at which a light goes off after that [1/s].
     """
 
     def __init__(self, bit: float, rate: float) -> None:
         self._bit, self._rate = bit, rate
         self._time: float | None = None
         self.on = np.zeros(0)
-        # how likely each is off, or on again, and so much of the bit has passed; and on for longer
+        # probabilities by the elapsed steps of the bit: off, on again; and last, on for longer than a bit
         self._stage = np.zeros((0, 2 * STEPS + 1))
 
     def predict(self, time: float) -> None:
-        """Go on to a later time [s]."""
+        """Predict to a later time [s]."""
         dt = 0.0 if self._time is None else time - self._time
         self._time = time if self._time is None else max(time, self._time)
         if not self._bit or dt <= 0 or not len(self.on):
@@ -40,21 +45,21 @@ class Lit:
         self._stage = np.concatenate([passing, np.maximum(long, 0.0)[:, None]], axis=1)
         self.on = np.clip(self._stage[:, STEPS:].sum(axis=1), 1e-9, 1.0)
 
-    def see(self, seen: NDArray[np.bool_], detected: float) -> None:
-        """Which lights (n,) were seen, where one that is on is `detected` with that chance."""
+    def update(self, seen: NDArray[np.bool_], detected: float) -> None:
+        """Update by which lights were seen, (n,); `detected` is the detection probability of one that is on."""
         if not self._bit:
             return
         self._stage[:, STEPS:] *= np.where(seen, 1.0, 1 - detected)[:, None]
         self._stage[:, :STEPS] *= ~seen[:, None]
         whole = self._stage.sum(axis=1)
-        self._stage[whole < 1e-12, -1] = 1.0  # on against all odds
+        self._stage[whole < 1e-12, -1] = 1.0  # impossible by the model, and seen: on
         self._stage /= self._stage.sum(axis=1)[:, None]
 
     def add(self, n: int) -> None:
-        """So many more, which are on."""
+        """Add n lights that are on."""
         self.on = np.append(self.on, np.ones(n))
         self._stage = np.concatenate([self._stage, np.eye(1, 2 * STEPS + 1, 2 * STEPS).repeat(n, axis=0)])
 
     def keep(self, which: NDArray[np.bool_]) -> None:
-        """Forget all others."""
+        """Remove all lights but those of a mask (n,)."""
         self.on, self._stage = self.on[which], self._stage[which]

@@ -1,7 +1,7 @@
-"""Tracks between their samples: position at any instant as a linear combination of samples, and its noise.
+"""Interpolate tracks: the position at any instant as a linear combination of samples, so that noise propagates.
 
-The cubic through the four samples about an instant (the parabola of three where there are no more), never over a
-gap longer than `LONGEST_GAP`, never outside a stretch of samples, never across a jerk that the samples cannot follow.
+The interpolant is the cubic through the four samples about an instant (the parabola of three if there are no more). It
+never bridges a gap longer than `MAX_GAP` or a jerk that the samples do not resolve, and never extrapolates.
 """
 
 from collections.abc import Sequence
@@ -14,26 +14,28 @@ from scipy import sparse
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-#: Samples further apart than this are not joined [s].
-LONGEST_GAP = 0.15
-#: How far beyond the ends of a stretch an instant may lie: a share of the samples' spacing, and at most [s].
-EDGE_SHARE = 0.1
-EDGE = 5e-3
-#: The speed is the slope over this long to either side [s].
-SLOPE_REACH = 0.1
-#: A sample that its neighbours predict worse than this (chi2, 2 degrees of freedom) is where the motion jerks.
-JERK_GATE = 25.0
-
-# keeps the tracks' times apart in one ascending series [s]; a stance is shorter
-_APART = 1e5
+MAX_GAP = 0.15  # s, between samples that are interpolated
+EDGE_SHARE = 0.1  # of the samples' spacing: reach beyond the ends of a stretch of samples
+EDGE = 5e-3  # s, upper bound of that reach
+SLOPE_REACH = 0.1  # s to either side, over which the velocity is fitted
+JERK_GATE = 25.0  # squared Mahalanobis distance of a sample from its neighbours' prediction that means a jerk
+_APART = 1e5  # s between the tracks in one ascending series of times; longer than any stance
 
 
 @dataclass(frozen=True, eq=False)
 class Interpolated:
-    """Tracks at m instants, as combinations of n samples: `position` and `slope` (m, n) take samples to positions
-    and to speeds smoothed over `SLOPE_REACH` [1/s]; `derivative` (m, n) is the exact one of `position` by time.
+    """Linear maps from n samples to m instants.
 
-    `valid` (m,) says where the samples allow it; the other rows mean nothing.
+    Attributes
+    ----------
+    position
+        Map to positions, (m, n).
+    derivative
+        Exact derivative of `position` by time, (m, n) [1/s].
+    slope
+        Map to velocities smoothed over `SLOPE_REACH`, (m, n) [1/s].
+    valid
+        True where the samples allow interpolation, (m,); other rows are meaningless.
     """
 
     position: sparse.csr_array
@@ -43,16 +45,21 @@ class Interpolated:
 
 
 class Samples:
-    """The samples of several tracks of one camera: `x` (n, 2) with `covariance` (n, 2, 2), in any units.
+    """Samples of several tracks of one camera.
 
-    `times` has an ascending series [s] for each track; `x` and `covariance` likewise.
+    Parameters
+    ----------
+    times
+        Ascending times of each track [s].
+    x, covariance
+        Positions (n, 2) and covariances (n, 2, 2) of each track, in any unit.
     """
 
     def __init__(self, times: Sequence[Array], x: Sequence[Array], covariance: Sequence[Array]) -> None:
         self.origin = float(min(series[0] for series in times))
         self.x, self.covariance = np.concatenate(x), np.concatenate(covariance)
         self._key = np.concatenate([series - self.origin + _APART * k for k, series in enumerate(times)])
-        breaks = np.flatnonzero(np.diff(self._key) > LONGEST_GAP) + 1
+        breaks = np.flatnonzero(np.diff(self._key) > MAX_GAP) + 1
         firsts, ends = np.append(0, breaks), np.append(breaks, len(self._key))
         self._first, self._last = np.repeat(firsts, ends - firsts), np.repeat(ends - 1, ends - firsts)
         self._smooth = self._follows()
@@ -61,7 +68,7 @@ class Samples:
         return len(self.x)
 
     def at(self, track: Indices, times: Array) -> Interpolated:
-        """All at instants `times` (m,) [s] of the tracks numbered `track` (m,)."""
+        """Interpolate the tracks of index `track` (m,) at `times` (m,) [s]."""
         key = times - self.origin + _APART * track
         after = np.clip(np.searchsorted(self._key, key), 1, max(len(self) - 1, 1))
         nearest = np.where(
@@ -86,7 +93,7 @@ class Samples:
         )
 
     def _slope(self, key: Array, start: Indices, count: Indices, first: Indices, last: Indices) -> sparse.csr_array:
-        """Slopes (m, n) of straight lines through the samples about each instant."""
+        """Slopes (m, n) of lines fitted to the samples about each instant."""
         low = np.minimum(np.maximum(np.searchsorted(self._key, key - SLOPE_REACH), first), start)
         high = np.maximum(
             np.minimum(np.searchsorted(self._key, key + SLOPE_REACH, side="right") - 1, last), start + count - 1
@@ -99,7 +106,7 @@ class Samples:
         return _sparse(columns, weights, there, (len(key), len(self)))
 
     def _follows(self) -> NDArray[np.bool_]:
-        """Which samples (n,) the cubic through four neighbours predicts, as far as the noise lets it."""
+        """Mask (n,) of the samples that the cubic through four neighbours predicts within the noise."""
         own = np.arange(len(self))
         good = np.ones(len(self), bool)
         enough = self._last - self._first >= 4
@@ -114,7 +121,7 @@ class Samples:
 
 
 def _window(start: Indices, count: Indices, width: int) -> tuple[Indices, NDArray[np.bool_]]:
-    """Columns (m, width) from `start` (m,) on, and which of them are among the `count` (m,)."""
+    """Columns (m, width) from `start` (m,) on, and a mask of the first `count` (m,) of them."""
     there = np.arange(width) < count[:, None]
     return np.where(there, start[:, None] + np.arange(width), start[:, None]), there
 
@@ -125,7 +132,7 @@ def _sparse(columns: Indices, values: Array, there: NDArray[np.bool_], shape: tu
 
 
 def _lagrange(nodes: Array, t: Array, there: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Weights (m, k) of values at `nodes` (m, k) for the polynomial at t (m,), and for its derivative."""
+    """Lagrange weights (m, k) of values at `nodes` (m, k) for the polynomial at t (m,), and for its derivative."""
     k = nodes.shape[1]
     used = there[:, :, None] & there[:, None, :] & ~np.eye(k, dtype=bool)
     between = np.where(used, nodes[:, :, None] - nodes[:, None, :], 1.0)

@@ -1,4 +1,4 @@
-"""Which tracks of one camera are markers of one robot: by the distance between them on the marker plane."""
+"""Group the tracks of one camera into robots, by the distance between two markers on the marker plane."""
 
 import re
 from collections.abc import Sequence
@@ -13,22 +13,21 @@ from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.measurements import Plane
 from coloc_graph.team import Camera
 
-#: Two markers of a robot are seen together for this share of the shorter track.
-TOGETHER = 0.5
-CLEARLY_MORE = 1.05  # times the samples that a plane explains by which another explains more
-#: Samples that two tracks must share to be bound where there is a choice.
-LEAST_SHARED = 8
+MIN_SHARED_PART = 0.5  # of the shorter track, during which two markers of a robot are both seen
+CLEARLY_MORE = 1.05  # ratio of the samples that two planes explain above which the second is preferred
+MIN_SHARED_SAMPLES = 8  # of two tracks, to be grouped if there is a choice
+MOMENT = 0.02  # s, overlap of two tracks that does not count as being seen at the same time
 
 
-#: Two tracks of one camera that may be two markers of one robot, by their numbers, with sample indices (n, 2).
+#: Indices of two tracks of one camera that may be two markers of one robot, and indices (n, 2) of shared samples.
 Bound = tuple[int, int, NDArray[np.int64]]
 
 
 def plane_of_spans(tracks: Sequence[Track], camera: Camera, planes: Sequence[Plane], spans: Sequence[float]) -> Plane:
-    """The plane of some, the first of which is as stated, on which most samples are of two markers of one robot.
+    """Select the plane on which most samples show two markers at a span's distance; the first is the stated one.
 
-    Of a camera that is tilted otherwise than stated the markers may not be their span apart on the plane as stated, and
-    their reflections may be.
+    If a camera is tilted otherwise than stated, the markers may not be their span apart on the stated plane, and their
+    reflections may be.
     """
     best, most = planes[0], 0
     for plane in planes:
@@ -45,34 +44,49 @@ def plane_of_spans(tracks: Sequence[Track], camera: Camera, planes: Sequence[Pla
 def span_samples(
     tracks: Sequence[Track], camera: Camera, plane: Plane, span: float, tolerance: float = 0.35
 ) -> list[Bound]:
-    """Pairs of tracks of one camera that are two markers of one robot: (a, b, sample indices (n, 2)).
+    """Find pairs of tracks of one camera that are the two markers of one robot.
 
-    They are where their distance on the marker plane is the robot's `span` [m] for most of the time. The
-    tolerance is wide because a tilt that is wrong by a degree is 15 % of the distance at 2 m; a reflection in
-    the floor, seen as if on the marker plane, is off by more than half.
+    Their distance on the marker plane is the robot's span most of the time.
+
+    Parameters
+    ----------
+    tracks, camera, plane
+        Tracks, the camera, and the marker plane in its frame.
+    span
+        Distance between the two markers [m].
+    tolerance
+        Relative error of that distance. It is wide, since a tilt that is wrong by 1 deg makes 15 % at 2 m; a
+        reflection in the floor is off by more than half.
+
+    Returns
+    -------
+    list of tuple
+        Indices of both tracks, and the indices (n, 2) of samples taken at the same time.
     """
     on_floor = [on_plane(camera.normalise(track.uv), plane) for track in tracks]
     found = []
     for a in range(len(tracks)):
         for b in range(a + 1, len(tracks)):
             shared = pair_by_time(tracks[a].times, tracks[b].times)
-            if len(shared) >= max(2, TOGETHER * min(len(tracks[a]), len(tracks[b]))):
+            if len(shared) >= max(2, MIN_SHARED_PART * min(len(tracks[a]), len(tracks[b]))):
                 distance = np.linalg.norm(on_floor[a][shared[:, 0]] - on_floor[b][shared[:, 1]], axis=1)
                 if (np.abs(distance / span - 1) < tolerance).mean() > 0.8:  # NaN, above the horizon, is not close
                     found.append((a, b, shared))
     return found
 
 
-def couple_of(tracks: Sequence[Track], camera: Camera, planes: Sequence[Plane], span: float) -> tuple[int, int] | None:
-    """Of one robot's tracks, which may be in pieces, the two of its two markers that share most samples."""
+def longest_pair(
+    tracks: Sequence[Track], camera: Camera, planes: Sequence[Plane], span: float
+) -> tuple[int, int] | None:
+    """Indices of the tracks of a robot's two markers that share most samples, if tracks are in pieces."""
     bound = span_samples(tracks, camera, plane_of_spans(tracks, camera, planes, [span]), span)
     return max(bound, key=lambda one: len(one[2]))[:2] if bound else None
 
 
 def named_pair(tracks: Sequence[Track], robot: str, *, alone: bool) -> tuple[int, int] | None:
-    """Numbers of the tracks of a robot's first and second marker by their names; None where they do not tell.
+    """Indices of the tracks of a robot's first and second marker by their names; None if names do not tell.
 
-    Two names that end in numbers do, as `ROBOT/0` and `ROBOT/1`: the smaller number is the first marker.
+    Names that end in numbers tell, such as `ROBOT/0` and `ROBOT/1`: the smaller number is the first marker.
     """
     own = tracks_of(tracks, robot, alone=alone)
     names = {track.marker: number for number, track in enumerate(tracks) if track.marker}
@@ -87,7 +101,7 @@ def named_pair(tracks: Sequence[Track], robot: str, *, alone: bool) -> tuple[int
 
 
 def tracks_of(tracks: Sequence[Track], robot: str, *, alone: bool) -> list[int]:
-    """Numbers of the named tracks of a robot: those called `ROBOT/...`, or all where it moves `alone`."""
+    """Indices of the named tracks of a robot: those called `ROBOT/...`, or all if it moves `alone`."""
     named = [n for n, track in enumerate(tracks) if track.marker]
     own = [n for n in named if tracks[n].marker.startswith(f"{robot}/")]
     return own or (named if alone else [])
@@ -96,13 +110,27 @@ def tracks_of(tracks: Sequence[Track], robot: str, *, alone: bool) -> list[int]:
 def markers_of_movers(
     tracks: Sequence[Track], camera: Camera, planes: Sequence[Plane], spans: Sequence[float], movers: int | None = None
 ) -> list[Track]:
-    """Of all tracks of a camera those that are markers of a moving robot, with a number for each robot (`Track.body`).
+    """Select the tracks that are markers of moving robots and number the robots (`Track.body`).
 
-    Lights that do not move are not. Where robots carry two markers, the tracks that are bound by a span are;
-    tracks with no partner are kept only if no track has one. The pieces of a track that was lost belong to one robot
-    with whatever they are bound to, as long as no more than two lights of it are seen at once; all do where it is
-    known that one robot moves. Tracks that are known to be different robots' (`Track.mover`) are not bound. Of `planes`
-    the first is as stated; see `plane_of_spans`.
+    Lights at rest are dropped. Tracks at the distance of a marker span are grouped; tracks without a partner are kept
+    only if no track has one. Pieces of an interrupted track are grouped with the same robot as long as no more than two
+    of its lights are seen at once. Tracks of different named robots (`Track.mover`) are never grouped.
+
+    Parameters
+    ----------
+    tracks, camera
+        Tracks of one camera, and the camera.
+    planes
+        Possible marker planes in its frame, the stated one first (`plane_of_spans`).
+    spans
+        Distances between the two markers of the robots that move [m].
+    movers
+        Number of robots that move, if it is known.
+
+    Returns
+    -------
+    list of Track
+        Tracks of movers.
     """
     moving = [track for track in tracks if len(track) >= 4 and track.extent > STILL]
     plane = plane_of_spans(moving, camera, planes, spans)
@@ -116,7 +144,8 @@ def markers_of_movers(
         joined = bodies[of[a]] | bodies[of[b]]
         if len({moving[n].mover for n in joined} - {""}) > 1:
             continue
-        if of[a] == of[b] or (len(joined) > 2 and (len(shared) < LEAST_SHARED or not _two_at_once(moving, joined))):
+        too_many = len(joined) > 2 and (len(shared) < MIN_SHARED_SAMPLES or not _two_at_once(moving, joined))
+        if of[a] == of[b] or too_many:
             continue
         bodies[of[a]], bodies[of[b]] = joined, set()
         for index in joined:
@@ -128,9 +157,8 @@ def markers_of_movers(
     return [replace(track, body=robots.index(of[n])) for n, track in enumerate(moving) if of[n] in robots]
 
 
-def of_named(tracks: Sequence[Track]) -> list[Track]:
-    """Tracks that are known to be one robot's (`Track.mover`), in pieces or not bound, are one body, if no more than
-    two are seen at once."""
+def merge_named(tracks: Sequence[Track]) -> list[Track]:
+    """Make one body of all tracks that are known to be one robot's (`Track.mover`), if at most two are seen at once."""
     out = list(tracks)
     free = max((track.body for track in tracks), default=-1) + 1
     for name in dict.fromkeys(track.mover for track in tracks if track.mover):
@@ -142,10 +170,9 @@ def of_named(tracks: Sequence[Track]) -> list[Track]:
 
 
 def _two_at_once(tracks: Sequence[Track], which: set[int]) -> bool:
-    """Whether never more than two of some tracks go on at the same time, a moment apart."""
-    moment = 0.02
+    """Return whether no more than two tracks overlap in time, but for a moment."""
     steps = sorted(
-        step for n in which for step in ((tracks[n].times[0] + moment, 1), (tracks[n].times[-1] - moment, -1))
+        step for n in which for step in ((tracks[n].times[0] + MOMENT, 1), (tracks[n].times[-1] - MOMENT, -1))
     )
     going = 0
     for _, step in steps:

@@ -1,4 +1,4 @@
-"""Tracks of two cameras whose clocks differ, at any offset: camera j's where camera i's samples are."""
+"""Pair tracks of two cameras at any clock offset, by interpolating camera j's at the instants of camera i's samples."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,13 +15,16 @@ from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
 
-#: Draws of the noise.
-DRAWS = 64
+DRAWS = 64  # Monte Carlo draws of the noise
 
 
 @dataclass(frozen=True, eq=False)
-class Shifted:
-    """Camera j's tracks at one offset: `interpolated` at camera i's n points, and `covariance` (n, 2, 2) there."""
+class ShiftedTracks:
+    """Camera j's tracks at one clock offset [s], interpolated at camera i's n points.
+
+    `x` and `slope` (n, 2) are positions and smoothed velocities [1/s], normalised; `covariance` (n, 2, 2) is that of
+    the positions.
+    """
 
     offset: float
     interpolated: Interpolated
@@ -31,7 +34,7 @@ class Shifted:
 
 
 class PairedTracks:
-    """Tracks of two cameras that are known to show the same markers: pairs (a, b) of their numbers in `chosen`."""
+    """Tracks of two cameras that show the same markers, by pairs of indices in `chosen`."""
 
     def __init__(
         self,
@@ -61,20 +64,20 @@ class PairedTracks:
     def __len__(self) -> int:
         return len(self.times)
 
-    def at(self, offset: float) -> Shifted:
-        """Camera j's tracks where camera i's points (n,) are, should the clocks differ by `offset` [s]."""
+    def at(self, offset: float) -> ShiftedTracks:
+        """Interpolate camera j's tracks at camera i's instants plus `offset` (clock_j - clock_i) [s]."""
         between = self._samples.at(self._track, self.times + offset)
         x, slope = between.position @ self._samples.x, between.slope @ self._samples.x
         squares = between.position.multiply(between.position).tocsr()
         covariance = (squares @ self._samples.covariance.reshape(-1, 4)).reshape(-1, 2, 2)
-        return Shifted(offset, between, x, slope, covariance)
+        return ShiftedTracks(offset, between, x, slope, covariance)
 
-    def pairs(self, at: Shifted, which: NDArray[np.int64]) -> PointPairs:
-        """Points `which` (k,) with camera j's interpolated."""
+    def pairs(self, at: ShiftedTracks, which: NDArray[np.int64]) -> PointPairs:
+        """Point pairs of index `which` (k,), camera j's interpolated."""
         return PointPairs(self.x_i[which], at.x[which], self.covariance_i[which], at.covariance[which])
 
-    def correspondences(self, at: Shifted, which: NDArray[np.int64]) -> Correspondences:
-        """The same, with pixels, instants and markers."""
+    def correspondences(self, at: ShiftedTracks, which: NDArray[np.int64]) -> Correspondences:
+        """Correspondences of index `which` (k,), camera j's interpolated."""
         uv_j = at.interpolated.position[which] @ self._uv_j
         pairs = self.pairs(at, which)
         position = at.interpolated.position[which]
@@ -82,9 +85,8 @@ class PairedTracks:
         columns = self._uv_i[which], uv_j, self.times[which], self._markers[which]
         return Correspondences(*columns, pairs, self._loads_i[which], np.asarray(loads_j))
 
-    def noise_j(self, at: Shifted, which: NDArray[np.int64]) -> Array:
-        """Covariance of camera j's points `which` (k,), which share samples: the lower band (width, 2k), as LAPACK has
-        it."""
+    def noise_j(self, at: ShiftedTracks, which: NDArray[np.int64]) -> Array:
+        """Covariance of camera j's points `which` (k,), correlated by shared samples: LAPACK lower band (w, 2k)."""
         columns, weights = _padded(at.interpolated.position[which])
         C, k = self._samples.covariance[columns], len(which)
         blocks = []
@@ -103,18 +105,18 @@ class PairedTracks:
                 band[2 * apart - 1, 1:there:2] = M[:, 0, 1]
         return band
 
-    def speed(self, at: Shifted, which: NDArray[np.int64]) -> Array:
-        """The exact derivative (k, 2) of points by the offset, with all its noise [1/s]."""
+    def speed(self, at: ShiftedTracks, which: NDArray[np.int64]) -> Array:
+        """Exact derivative (k, 2) of points `which` by the offset, noise included [1/s]."""
         return np.asarray(at.interpolated.derivative[which] @ self._samples.x)
 
     def draws(self) -> Array:
-        """Noise of camera j's n samples, (n, 2 `DRAWS`): the same each time."""
+        """Draw noise of camera j's n samples, (n, 2 `DRAWS`), from a fixed seed."""
         roots = np.linalg.cholesky(self._samples.covariance)
         standard = np.random.default_rng(0).standard_normal((DRAWS, len(self._samples), 2, 1))
         return np.moveaxis((roots @ standard)[..., 0], 0, -1).reshape(len(self._samples), 2 * DRAWS)
 
-    def drawn(self, at: Shifted, which: NDArray[np.int64], draws: Array) -> tuple[Array, Array, Array]:
-        """What `draws` of the noise make of position, derivative and slope of points `which`: (2k, `DRAWS`) each."""
+    def drawn(self, at: ShiftedTracks, which: NDArray[np.int64], draws: Array) -> tuple[Array, Array, Array]:
+        """Propagate `draws` of the noise to position, derivative and slope of points `which`, (2k, `DRAWS`) each."""
         position, derivative, slope = (
             (matrix[which] @ draws).reshape(2 * len(which), DRAWS)
             for matrix in (at.interpolated.position, at.interpolated.derivative, at.interpolated.slope)
@@ -123,7 +125,7 @@ class PairedTracks:
 
 
 def _padded(rows: sparse.csr_array) -> tuple[NDArray[np.int64], Array]:
-    """Columns and values (k, w) of rows with up to w entries; where a row has fewer, a column again, with 0."""
+    """Columns and values (k, w) of sparse rows with up to w entries, padded with zeros."""
     first, count = rows.indptr[:-1, None], np.diff(rows.indptr)[:, None]
     n = np.arange(int(count.max(initial=1)))
     at = first + np.minimum(n, np.maximum(count - 1, 0))
@@ -131,7 +133,7 @@ def _padded(rows: sparse.csr_array) -> tuple[NDArray[np.int64], Array]:
 
 
 def _finite(track: Track, camera: Camera) -> tuple[Array, Array, Array, Array, Array]:
-    """Times, normalised points, covariances, pixels and loads of a track, where all are finite and time goes on."""
+    """Times, normalised points, covariances, pixels and loads of a track, where all are finite and times ascend."""
     x, covariance = normalised(track, camera)
     good = np.asarray(np.isfinite(x).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
     good[1:] &= np.diff(track.times) > 1e-4

@@ -1,10 +1,9 @@
-"""Track one robot's two markers with hindsight, however far they move from image to image.
+"""Track one robot's two markers in a batch, however far they move from image to image.
 
-Two equal lights on one rigid body, whose span on the marker plane is known, are found image by image: no motion model
-is needed for that. Which light is which then follows from the heading of the line through both: an image tells it
-modulo half a turn, and neighbouring images decide the rest where the robot turns by clearly less than a quarter between
-them. Where they do not decide, the path is cut in two. `pairing.rigid_alignment` joins the pieces with what another
-camera saw at the same instants.
+Two equal lights of one rigid body are found in each image by their known span on the marker plane, without a motion
+model. Their order then follows from the heading of the line through both: one image gives it modulo half a turn, and
+neighbouring images resolve the rest if the robot turns by clearly less than a quarter between them; otherwise the path
+is cut in two. `pairing.rigid_alignment` joins the pieces by what another camera saw at the same instants.
 """
 
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.frontend.homography.plane import on_plane
-from coloc_graph.frontend.tracks.tracking import DOUBTFUL, Track
+from coloc_graph.frontend.tracks.tracking import UNRELIABLE, Track
 from coloc_graph.geometry.lie import across
 from coloc_graph.measurements import Plane
 from coloc_graph.run import Detections, Flag
@@ -23,14 +22,14 @@ from coloc_graph.team import Camera
 Array = NDArray[np.float64]
 
 SPAN_TOLERANCE = 0.35  # share of the span; a tilt that is wrong by 1 deg makes 0.15 at 2 m
-CLEARLY_MORE = 1.05  # times the likelihood of the likeliest plane by which another is likelier
-SPAN_SCALE = 0.1  # share of the span that counts as one standard deviation between rival pairs of lights
-MAX_LIGHTS = 12  # brightest lights of an image that are looked at
-CELL = 2.0  # px, side of the cells in which lights that stand still are counted
-STATIC_SHARE = 0.5  # share of the images in which a light that stands still is seen in one cell, at least
+CLEARLY_MORE = 1.05  # ratio of the likelihoods of two planes above which the second is preferred
+SPAN_SCALE = 0.1  # share of the span, standard deviation by which rival pairs of lights are compared
+MAX_LIGHTS = 12  # lights of an image that are considered, brightest first
+CELL = 2.0  # px, side of the cells in which lights at rest are counted
+STATIC_SHARE = 0.5  # minimum share of the images in which a light at rest is seen in one cell
 MAX_GAP = 4.0  # median image intervals over which a heading is extrapolated
-MIN_HEADING_SIGMA = 0.05  # rad, least scale of the heading's prediction error
-LINK_LOG_RATIO = 12.0  # least logarithm of the likelihood ratio of a heading against its opposite
+MIN_HEADING_SIGMA = 0.05  # rad, lower bound of the heading's prediction error
+LINK_LOG_RATIO = 12.0  # minimum log likelihood ratio of a heading against its opposite
 MAX_JUMP = 8.0  # median steps of the body between two images beyond which the path is cut
 
 
@@ -38,10 +37,22 @@ MAX_JUMP = 8.0  # median steps of the body between two images beyond which the p
 class RigidPath:
     """Two lights of one body in one camera, image by image.
 
-    `times` (n,) [s]; of both lights `uv` (n, 2, 2) [px] with `covariance` (n, 2, 2, 2) [px^2], `peak` (n, 2),
-    `saturated` (n, 2) and `places` (n, 2, 2) [m] on the marker plane. Within one `piece` (n,) the order of the two
-    lights is consistent.
-    `images` is the number of images in all, `lights` (images,) the number of moving lights in each.
+    Attributes
+    ----------
+    robot
+        Robot that carries the camera.
+    times
+        Times of the samples, (n,) [s].
+    uv, covariance, peak
+        Both lights, (n, 2, 2) [px], their covariances, (n, 2, 2, 2) [px^2], and brightness, (n, 2) [grey levels].
+    saturated
+        True for lights whose core is at the sensor's limit, (n, 2).
+    places
+        Both lights on the marker plane, (n, 2, 2) [m].
+    piece
+        Number of the piece of each sample, (n,), within which the order of the two lights is consistent.
+    lights
+        Number of moving lights in each image, seen together or not, (images,).
     """
 
     robot: str
@@ -77,7 +88,7 @@ class RigidPath:
         return int(self.piece[-1]) + 1 if len(self) else 0
 
     def swapped(self, which: NDArray[np.bool_], piece: NDArray[np.int64]) -> "RigidPath":
-        """The path with both lights exchanged at some samples (n,), in other pieces (n,)."""
+        """Return the path with its lights exchanged at samples of a mask (n,), and other pieces (n,)."""
         order = np.where(which[:, None], [1, 0], [0, 1])
         rows = np.arange(len(self))[:, None]
         return replace(
@@ -91,7 +102,7 @@ class RigidPath:
         )
 
     def without(self, samples: NDArray[np.int64]) -> "RigidPath":
-        """The path without some samples, by their numbers (k,)."""
+        """Return the path without samples of given indices (k,)."""
         keep = np.ones(len(self), bool)
         keep[samples] = False
         return replace(
@@ -106,7 +117,7 @@ class RigidPath:
         )
 
     def tracks(self, mover: str) -> list[Track]:
-        """Two tracks a piece, all of one body."""
+        """Two tracks for each piece, all of one body."""
         made = []
         for piece in np.unique(self.piece).tolist():
             own = self.piece == piece
@@ -128,11 +139,16 @@ def rigid_path(
     robot
         Name of the robot whose camera it is.
     seen
-        Detections of whole images, in the order of time.
+        Detections of whole images, in order of time.
     camera, planes
-        The camera, and the planes that the markers' may be in its frame, the likeliest first.
+        The camera, and possible marker planes in its frame, the most probable first.
     span
         Distance between the two markers [m].
+
+    Returns
+    -------
+    RigidPath
+        The path, empty if no image shows two lights at that distance.
     """
     images = [_moving(one, still) for still in [_static_cells(seen)] for one in seen]
     lights = np.array([len(one.uv) for one in images], np.int64)
@@ -181,7 +197,7 @@ def _rows(images: Sequence[Detections], camera: Camera, plane: Plane, span: floa
 
 
 def _static_cells(seen: Sequence[Detections]) -> NDArray[np.int64]:
-    """Cells (m, 2) of the image in which a light is seen most of the time."""
+    """Cells (m, 2) of the image in which a light at rest is seen."""
     every = [np.unique(np.floor(one.uv / CELL).astype(np.int64), axis=0) for one in seen if len(one.uv)]
     if not every:
         return np.zeros((0, 2), np.int64)
@@ -190,8 +206,8 @@ def _static_cells(seen: Sequence[Detections]) -> NDArray[np.int64]:
 
 
 def _moving(seen: Detections, static: NDArray[np.int64]) -> Detections:
-    """Detections that may be of the body: not doubtful, not of lights that stand still, the brightest."""
-    keep = (seen.flags & DOUBTFUL) == 0
+    """Select detections that may be of the body: reliable, not of lights at rest, the brightest."""
+    keep = (seen.flags & UNRELIABLE) == 0
     if len(static) and len(seen.uv):
         cells = np.floor(seen.uv / CELL).astype(np.int64)
         keep &= np.abs(cells[:, None] - static[None]).max(axis=2).min(axis=1) > 1
@@ -203,7 +219,7 @@ def _moving(seen: Detections, static: NDArray[np.int64]) -> Detections:
 
 
 def _likeliest(rows: Sequence[_Row], span: float) -> list[int]:
-    """One pair of lights an image: those that go on best, by dynamic programming."""
+    """Index of one pair of lights in each image, the smoothest sequence, by dynamic programming."""
     if not rows:
         return []
     middles = [row[2].mean(axis=1) for row in rows]
@@ -224,10 +240,10 @@ def _likeliest(rows: Sequence[_Row], span: float) -> list[int]:
 
 
 def _ordered(path: RigidPath) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Which samples' lights to exchange so that their order is consistent, and the piece of each sample.
+    """Mask (n,) of samples whose lights must be exchanged for a consistent order, and the piece (n,) of each sample.
 
     The heading's prediction error (constant rate, or no turn, whichever predicts better) is known modulo half a turn.
-    Its robust scale over the stance says how sure the choice of the nearer half is.
+    Its robust scale over the stance tells how certain the choice of the nearer half is.
     """
     n = len(path)
     if n < 2:

@@ -1,11 +1,11 @@
-"""Markers followed through the images of one camera (paper, section V), however many there are.
+"""Track any number of markers through the images of one camera (paper, section V).
 
-Each track is a Kalman filter of nearly constant speed. The detections of an image go to the tracks by the most likely
-assignment of all at once, where a detection may be false and a marker missed. Where two assignments are about as
-likely, both tracks end there, and others begin: what passes for one marker is one.
+Each track is a Kalman filter of nearly constant velocity. Detections are assigned to tracks globally, by the most
+likely assignment, which allows for false detections and missed markers. If two assignments are about equally likely,
+both tracks end and new ones begin, so that a track never mixes two markers.
 
-In images each track searches a patch (40x40 by default) centred where its marker should be; the full frame is searched
-to start, after a loss, and from time to time for markers that came into view.
+In images each track searches a patch (40x40 by default) at its predicted position. The full frame is searched at the
+start, after a loss, and periodically for markers that came into view.
 """
 
 import math
@@ -18,41 +18,47 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from coloc_graph.frontend.images.detection import Blobs, Candidate, Detector, Pixels
-from coloc_graph.frontend.tracks.blink_filter import Lit
+from coloc_graph.frontend.tracks.blink_filter import BlinkFilter
 from coloc_graph.frontend.tracks.kalman import PointFilters
 from coloc_graph.run.messages import Flag, Image
 
 Array = NDArray[np.float64]
 
-#: Detections that no track takes.
-DOUBTFUL = np.uint8(Flag.CLIPPED | Flag.MERGED)
-#: A light that keeps within so many pixels stands still.
-STILL_PX = 3.0
-#: Squared distance, in units of what is uncertain, beyond which a detection is not a track's.
-GATE = 25.0
-#: By how much a detection must be nearer, so measured, had the speed changed at once, to be taken for that.
-JERKS = 12.0
-#: Logarithms of likelihood ratios: above, a track is of a light and of no false detections; below, two assignments are
-#: about as likely as each other.
-CONFIRMED = 22.0
-AMBIGUOUS = 3.0
-#: Two lights this near to each other may be seen as one [px].
-TOUCHING = 6.0
-#: A light that is missed so near to the border of the image has left it [px].
-RIM = 3.0
-#: How well a candidate's place is known before it is measured [px].
-ROUGHLY = 0.5
+UNRELIABLE = np.uint8(Flag.CLIPPED | Flag.MERGED)  # flags of detections that no track takes
+STILL_PX = 3.0  # px, extent of a light at rest
+GATE = 25.0  # squared Mahalanobis distance of a detection from a track's prediction
+JERK_PENALTY = 12.0  # reduction of that squared distance by which a sudden change of velocity must pay
+CONFIRMED = 22.0  # log likelihood ratio of a light against false detections, above which a track is confirmed
+AMBIGUOUS = 3.0  # log likelihood ratio of two assignments below which neither is trusted
+OVERLAP_PX = 6.0  # px between two lights that may be seen as one
+RIM = 3.0  # px from the border of the image, within which a missed light has left it
+ROUGH_SIGMA = 0.5  # px, of a candidate's approximate centre
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One marker followed through time in one camera.
+    """One marker through time in one camera.
 
-    `uv` (n, 2) [px] with `covariance` (n, 2, 2) [px^2] at `times` (n,) [s, the camera's clock]; `peak` (n,)
-    grey levels. `marker` is its name where its identity is known ("C/0"), or "". Tracks of one camera with the same
-    `body` are markers of one robot; -1 where that is not known. `mover` is that robot's name where its colour, or how
-    it blinks, tells it. `missed` (k,) [s] are the images in between in which it should have been, and was not.
-    `saturated` (n,) marks samples whose core is at the sensor's limit; None where that is not known.
+    Attributes
+    ----------
+    robot
+        Robot that carries the camera.
+    marker
+        Name of the marker, such as "C/0", or "" if it is unknown.
+    times
+        Times of the samples by the camera's clock, (n,) [s].
+    uv, covariance
+        Positions, (n, 2) [px], and their covariances, (n, 2, 2) [px^2].
+    peak
+        Peak brightness, (n,) [grey levels].
+    body
+        Number shared by the tracks of one robot in this camera, -1 if it is unknown.
+    mover
+        Name of that robot, if its colour or its blink code tells it, or "".
+    missed
+        Times of images in which the marker was expected and not detected, (k,) [s].
+    saturated
+        True for samples whose core is at the sensor's limit, (n,); None if it is unknown.
     """
 
     robot: str
@@ -77,42 +83,35 @@ class Track:
 
     @property
     def extent(self) -> float:
-        """Diagonal of the box the track stays in [px]; near 0 for a light that does not move."""
+        """Diagonal of the track's bounding box [px], near 0 for a light at rest."""
         return float(np.linalg.norm(np.ptp(self.uv, axis=0))) if len(self) else 0.0
 
 
 @dataclass(frozen=True)
 class TrackerOptions:
-    """`patch` [px] is the side of the search patch; a track ends that is unseen for more than `patience` frames and
-    `patience_s`.
+    """Parameters of `MarkerTracker`."""
 
-    Of a marker's image `detected` is the chance that it is found; false detections come `clutter` [1/px^2] an image.
-    `acceleration` [px^2/s^3] is the spectral density of how markers change their speed, `jerk` [px/s] how they do at
-    once, now and then, `speed` [px/s] what is usual. Markers that blink go off for `off` [s] each time, `off_rate`
-    times a second that they are on.
-    """
-
-    patch: int = 40
-    patience: int = 3
-    reacquire_every: float = 0.25  # s, at which the full frame is searched for markers that came into view
-    markers: int = 2  # with fewer live tracks than this the full frame is searched
-    still_after: int = 50  # frames, and `still_s`, after which a light that stands still is parked
-    still_s: float = 4.5
-    patience_s: float = 0.3
-    detected: float = 0.95
-    clutter: float = 5e-5
-    acceleration: float = 3e3
-    jerk: float = 60.0
-    speed: float = 200.0
-    off: float = 0.0
-    off_rate: float = 0.0
+    patch: int = 40  # px, side of the search patch
+    patience: int = 3  # frames; a track ends that is not seen for longer, and for `patience_s`
+    reacquire_every: float = 0.25  # s between searches of the full frame for markers that came into view
+    markers: int = 2  # expected number of markers; with fewer live tracks the full frame is searched
+    still_after: int = 50  # frames, and `still_s`, after which a light at rest is parked
+    still_s: float = 4.5  # s
+    patience_s: float = 0.3  # s
+    detected: float = 0.95  # probability of detection of a marker in an image
+    clutter: float = 5e-5  # 1/px^2, density of false detections in an image
+    acceleration: float = 3e3  # px^2/s^3, spectral density of the markers' acceleration
+    jerk: float = 60.0  # px/s, standard deviation of occasional sudden changes of velocity
+    speed: float = 200.0  # px/s, standard deviation of a new track's velocity
+    off: float = 0.0  # s, for which blinking markers go off each time
+    off_rate: float = 0.0  # 1/s, at which a blinking marker that is on goes off
 
 
 @dataclass(slots=True)
 class _Live:
-    """A track that goes on: rough centres, and what each sample is measured from in the end.
+    """Live track: approximate centres, and the candidates or taken blobs that its samples are measured from.
 
-    `score` is the logarithm of how much more likely it is of a light than of false detections.
+    `score` is the log likelihood ratio of a light against false detections.
     """
 
     times: list[float] = field(default_factory=list)
@@ -131,11 +130,21 @@ class _Live:
 
 
 class MarkerTracker:
-    """Follows every blob of one camera; which of them are markers of a mover is decided later, with all in view.
+    """Tracker of all blobs of one camera; `markers_of_movers` later selects the markers of robots.
 
-    Feed it images with `step`, or what was detected elsewhere with `take`, not both; then the `size` of the images
-    (width, height) [px] tells when a marker has left. Lights that stand still for long are parked: they are no longer
-    searched for, and reported as they were.
+    Feed it images with `step`, or detections from elsewhere with `take`, not both. Lights at rest for long are parked:
+    no longer searched for, and reported as they were.
+
+    Parameters
+    ----------
+    robot
+        Robot that carries the camera.
+    detector
+        Detector of the markers.
+    options
+        Parameters of tracking.
+    size
+        Size of the images, (width, height) [px], which tells when a marker has left; with `step` it is known.
     """
 
     def __init__(
@@ -149,7 +158,7 @@ class MarkerTracker:
         self._detector = detector
         self._options = options or TrackerOptions()
         self._filters = PointFilters(self._options.acceleration, self._options.jerk, self._options.speed)
-        self._lit = Lit(self._options.off, self._options.off_rate)
+        self._blink = BlinkFilter(self._options.off, self._options.off_rate)
         self._live: list[_Live] = []  # in the order of the filters
         self._ended: list[_Live] = []
         self._parked: list[_Live] = []
@@ -164,26 +173,26 @@ class MarkerTracker:
         found = self._detector.find(image.pixels) if full else self._in_patches(image.pixels)
         found = [one for one in found if not one.clipped]
         uv = np.array([one.uv for one in found]).reshape(-1, 2)
-        self._advance(image.time, uv, np.broadcast_to(ROUGHLY**2 * np.eye(2), (len(uv), 2, 2)), found, births=full)
+        self._advance(image.time, uv, np.broadcast_to(ROUGH_SIGMA**2 * np.eye(2), (len(uv), 2, 2)), found, births=full)
 
     def take(self, time: float, blobs: Blobs) -> None:
-        """Take in what a detector elsewhere found in the whole of the next image."""
+        """Take in the detections of the whole next image from a detector elsewhere."""
         self._filters.predict(time)
-        whole = blobs[(blobs.flags & DOUBTFUL) == 0]
+        whole = blobs[(blobs.flags & UNRELIABLE) == 0]
         numbers = range(len(self._taken), len(self._taken) + len(whole))
         saturated = (whole.flags & Flag.SATURATED) != 0
         self._taken += zip(whole.uv, whole.covariance, whole.peak.tolist(), saturated.tolist(), strict=True)
         self._advance(time, whole.uv, whole.covariance, list(numbers), births=True)
 
     def tracks(self) -> list[Track]:
-        """All tracks so far, ended or live, oldest first; their samples are measured now, all at once."""
+        """Measure the samples of all tracks, ended or live, and return them, oldest first."""
         lives = [live for live in self._ended + self._parked + self._live if live.confirmed and live.times]
         lives.sort(key=lambda live: live.times[0])
         candidates = [one for live in lives for one in live.samples if isinstance(one, Candidate)]
         if not candidates:
             return [self._track(live, [self._taken[one] for one in live.samples]) for live in lives]  # type: ignore[index]
         blobs, real = self._detector.measure(candidates)
-        real &= (blobs.flags & DOUBTFUL) == 0
+        real &= (blobs.flags & UNRELIABLE) == 0
         tracks, begin = [], 0
         for live in lives:
             own = slice(begin, begin + len(live.samples))
@@ -219,7 +228,7 @@ class MarkerTracker:
         height, width = pixels.shape[:2]
         half = self._options.patch // 2
         found: list[Candidate] = []
-        for centre in self._filters.place.tolist():
+        for centre in self._filters.position.tolist():
             u, v = round(centre[0]), round(centre[1])
             box = (max(u - half, 0), max(v - half, 0), min(u + half, width), min(v + half, height))
             if box[2] - box[0] >= 3 and box[3] - box[1] >= 3:
@@ -238,7 +247,7 @@ class MarkerTracker:
         free = [index for index, place in enumerate(places) if not self._is_parked(place)]
         if len(free) < len(places):
             uv, covariance = uv[free], covariance[free]
-        self._lit.predict(time)
+        self._blink.predict(time)
         tracks, found, doubtful = self._assigned(uv, covariance)
         self._miss(time, tracks)
         if len(tracks):
@@ -250,7 +259,7 @@ class MarkerTracker:
             new = [index for index in range(len(free)) if index not in taken]
             if new:
                 self._filters.add(uv[new], covariance[new])
-                self._lit.add(len(new))
+                self._blink.add(len(new))
                 for index in new:
                     self._live.append(_Live())
                     self._live[-1].take(time, places[free[index]], samples[free[index]])
@@ -258,10 +267,12 @@ class MarkerTracker:
         self._end(time, births=births)
 
     def _assigned(self, uv: Array, covariance: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Tracks (k,) and the detections (k,) that they go on with; what that means for their scores; and detections
-        (l,) that may be two tracks' in one."""
+        """Assign detections to tracks and update the tracks' scores.
+
+        Returns tracks (k,) and their detections (k,), and detections (l,) that may be two markers in one.
+        """
         options, n = self._options, len(self._live)
-        seen = options.detected * self._lit.on  # how likely each is
+        seen = options.detected * self._blink.on  # probability that each is seen
         missed = np.log(1 - seen)
         none = np.zeros(0, np.int64)
         if not n or not len(uv):
@@ -269,11 +280,11 @@ class MarkerTracker:
                 track.misses += 1
                 track.score += one
             return none, none, none
-        squared, density, jerked = self._filters.against(uv, covariance)
-        off = np.minimum(squared, jerked + JERKS)
+        squared, density, jerked = self._filters.distances(uv, covariance)
+        off = np.minimum(squared, jerked + JERK_PENALTY)
         near = jerked < GATE
         gain = np.log(seen / options.clutter)[:, None] + density + 0.5 * (squared - off)
-        worth = np.where(near, gain - missed[:, None], 0.0)  # against a missed marker and a false detection
+        worth = np.where(near, gain - missed[:, None], 0.0)  # log ratio to a missed marker and a false detection
         tracks, found = linear_sum_assignment(worth, maximize=True)
         good = near[tracks, found] & (worth[tracks, found] > AMBIGUOUS)
         tracks, found, doubtful = tracks[good], found[good], none
@@ -287,7 +298,7 @@ class MarkerTracker:
         gained[tracks] = gain[tracks, found]
         for row, (one, is_seen) in enumerate(zip(gained.tolist(), there.tolist(), strict=True)):
             if is_seen and self._live[row].confirmed and self._live[row].score < 0:
-                self._begin_anew(row)  # unseen for so long that it may be anything
+                self._begin_anew(row)  # not seen for long enough to be anything
             track = self._live[row]
             track.misses += not is_seen
             track.score = min(track.score + one, 2 * CONFIRMED)
@@ -296,17 +307,17 @@ class MarkerTracker:
         return tracks, found, doubtful
 
     def _miss(self, time: float, tracks: NDArray[np.int64]) -> None:
-        """All but some tracks are not seen now; where one might be another's blob that says nothing of it."""
+        """Record that all but some tracks are not seen, except those that may overlap with another."""
         seen = np.zeros(len(self._live), bool)
         seen[tracks] = True
-        self._lit.see(seen, self._options.detected)
+        self._blink.update(seen, self._options.detected)
         for row in np.flatnonzero(~seen).tolist():
-            apart = np.abs(self._filters.place - self._filters.place[row]).max(axis=1)
-            if (apart < TOUCHING).sum() == 1:  # itself
+            apart = np.abs(self._filters.position - self._filters.position[row]).max(axis=1)
+            if (apart < OVERLAP_PX).sum() == 1:  # itself
                 self._live[row].missed.append(time)
 
     def _cut(self, worth: Array, tracks: NDArray[np.int64], found: NDArray[np.int64]) -> None:
-        """End the tracks that could as well have gone on with each other's detections; others go on in their place."""
+        """End tracks that could as well have taken each other's detections, and begin new ones in their place."""
         own = worth[tracks, found]
         other = worth[tracks[:, None], found[None]]
         lost = own[:, None] + own[None] - other - other.T
@@ -316,7 +327,7 @@ class MarkerTracker:
             self._begin_anew(row)
 
     def _begin_anew(self, row: int) -> None:
-        """End a track where its filter goes on, perhaps with another light."""
+        """End a track and begin another with its filter, perhaps of another light."""
         if self._live[row].confirmed:
             self._ended.append(self._live[row])
         self._live[row] = _Live()
@@ -324,20 +335,22 @@ class MarkerTracker:
     def _apart(
         self, worth: Array, tracks: NDArray[np.int64], found: NDArray[np.int64], near: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Which assignments hold: a detection that may be two markers in one, or as well another's, is neither's."""
+        """Mask (k,) of assignments that hold; a detection that may be two markers, or as well another's, is dropped."""
         missing = np.ones(len(self._live), bool)
         missing[tracks] = False
         keep = np.ones(len(tracks), bool)
         for row in np.flatnonzero(missing).tolist():
             if self._live[row].confirmed:
-                if self._lit.on[row] > 0.5:
-                    touching = np.abs(self._filters.place[tracks] - self._filters.place[row]).max(axis=1) < TOUCHING
+                if self._blink.on[row] > 0.5:
+                    touching = (
+                        np.abs(self._filters.position[tracks] - self._filters.position[row]).max(axis=1) < OVERLAP_PX
+                    )
                     keep &= ~(touching & near[row, found])
                 keep &= ~(worth[tracks, found] - worth[row, found] < AMBIGUOUS)
         return keep
 
     def _end(self, time: float, *, births: bool) -> None:
-        """End the tracks that have not been seen for long, and park the lights that have not moved for long."""
+        """End tracks that were not seen for long, and park lights that have not moved for long."""
         options, keep = self._options, np.ones(len(self._live), bool)
         left = self._beyond()
         for row, track in enumerate(self._live):
@@ -353,19 +366,19 @@ class MarkerTracker:
                 keep[row] = False
         if not keep.all():
             self._filters.keep(keep)
-            self._lit.keep(keep)
+            self._blink.keep(keep)
             self._live = [track for track, kept in zip(self._live, keep.tolist(), strict=True) if kept]
 
     def _beyond(self) -> list[bool]:
-        """Whether each light is so near to the border that it may have left the image, and another may come."""
+        """Return for each light whether it is near enough to the border to have left the image."""
         if self._size is None:
             return [False] * len(self._live)
-        place, size = self._filters.place, np.array(self._size)
-        out = np.any((place <= RIM - 0.5) | (place >= size - RIM - 0.5), axis=1)
+        position, size = self._filters.position, np.array(self._size)
+        out = np.any((position <= RIM - 0.5) | (position >= size - RIM - 0.5), axis=1)
         return [bool(one) for one in out]
 
     def _still(self, track: _Live) -> bool:
-        """Whether a track has not moved for long."""
+        """Return whether a track has not moved for long."""
         options = self._options
         if len(track.uv) < options.still_after or track.times[-1] - track.times[0] < options.still_s:
             return False
@@ -382,6 +395,6 @@ class MarkerTracker:
 
 
 def _between(live: _Live) -> Array:
-    """The images [s] in which a track was missed before it was seen for the last time."""
+    """Times of images in which a track was missed between its first and its last sample, (k,) [s]."""
     missed = np.array(live.missed)
     return missed[(missed > live.times[0]) & (missed < live.times[-1])]
