@@ -13,7 +13,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from coloc_graph.frontend.homography.noise_components import NoiseEvidence, learn_components
-from coloc_graph.frontend.homography.refinement import linearise, point_rows
+from coloc_graph.frontend.homography.refinement import linearise, projection
 from coloc_graph.frontend.pairing.correspondence import separated
 from coloc_graph.frontend.stance import PairMeasurement
 from coloc_graph.team import CentreNoise, Team
@@ -93,7 +93,7 @@ class NoiseBelief:
             seen.append((robot, len(kept), np.array([variance, loads[kept, 1].mean()])))
         components = np.array([len(COMPONENTS) * robot + n for robot in robots for n in range(len(COMPONENTS))])
         weight = measured.homography.share / fit.persistence
-        rows = point_rows(at, pairs.x_i)
+        rows = projection(fit.H, pairs.x_i)[2]
         return NoiseEvidence(at.residual_j, rows, np.array(parts), components, weight), seen
 
     def _of(self, robot: str) -> tuple[Array, Array]:
