@@ -1,8 +1,12 @@
 """coloc solve GRAPH.g2o --out DIR."""
 
 import argparse
+from typing import TYPE_CHECKING
 
 from coloc_graph.cli.printing import counted, print_json, warn
+
+if TYPE_CHECKING:
+    from coloc_graph.pipeline.pose_graph import PoseGraphSolution
 
 
 def solve_graph(args: argparse.Namespace) -> int:
@@ -15,7 +19,7 @@ def solve_graph(args: argparse.Namespace) -> int:
 
     given = [
         name
-        for name in ("method", "scale", "incremental", "view", "without_odometry", "without_robots", "processes")
+        for name in ("method", "scale", "incremental", "without_odometry", "without_robots", "processes")
         if getattr(args, name)
     ]
     if given:
@@ -33,12 +37,23 @@ def solve_graph(args: argparse.Namespace) -> int:
         ])  # fmt: skip
     if args.json:
         print_json(summarise_pose_graph(solution))
-        return 0
+    else:
+        _print(solution, args.out)
+    if args.view:
+        from coloc_graph.cli.view import show, take_port
+        from coloc_graph.viewer import Viewer, scene_of_pose_graph
+
+        with take_port(args.port) as listener, Viewer(scene_of_pose_graph(args.out), listener=listener) as viewer:
+            show(viewer, browser=not args.no_browser)
+    return 0
+
+
+def _print(solution: "PoseGraphSolution", out: str) -> None:
+    graph = solution.graph
     agreement = f", chi2/dof {solution.chi2 / solution.dof:.3f}" if solution.dof > 0 else ""
     print(
         f"{counted(graph.values.size(), 'pose')} in {'2D' if graph.planar else '3D'}, "
         f"{counted(graph.factors.size() - len(graph.fixed), 'edge')}: chi2 {solution.chi2_before:.6g} before and "
         f"{solution.chi2:.6g} after {counted(solution.iterations, 'iteration')}{agreement}; {solution.seconds:.1f} s; "
-        f"{args.out} holds graph.g2o and summary.json"
+        f"{out} holds graph.g2o and summary.json"
     )
-    return 0

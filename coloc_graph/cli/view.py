@@ -1,4 +1,4 @@
-"""coloc view RUN|DIR."""
+"""coloc view RUN|DIR|GRAPH.g2o."""
 
 import argparse
 from typing import TYPE_CHECKING
@@ -14,11 +14,11 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     """The command's arguments."""
     command = commands.add_parser(
         "view",
-        help="see a result, or a run that is solved for it, in the browser",
-        description="See a result, or a run that is solved for it, in the browser: robots, graph, covariances, and "
-        "what is behind each edge. Ctrl-C ends it.",
+        help="see a result, or a run or pose graph that is solved for it, in the browser",
+        description="See a result, or a run or pose graph that is solved for it, in the browser: robots, graph, "
+        "covariances, and what is behind each edge. Ctrl-C ends it.",
     )
-    command.add_argument("path", metavar="RUN|DIR", help="a run (.mcap), or a result of `coloc solve`")
+    command.add_argument("path", metavar="RUN|DIR|GRAPH", help="a run (.mcap), a result of `coloc solve`, or a .g2o")
     command.add_argument("--run", dest="run_path", metavar="RUN", help="the run of a result, if it is no longer there")
     command.add_argument("--compare", metavar="DIR2", help="another result of the same run, beside the first")
     command.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, this machine)")
@@ -70,9 +70,21 @@ def run(args: argparse.Namespace) -> int:
 def _scene(args: argparse.Namespace) -> "Scene":
     """Scene of the arguments."""
     from coloc_graph.cli.printing import progress
+    from coloc_graph.errors import InputError
     from coloc_graph.run import open_run
-    from coloc_graph.viewer import is_run, scene_of_result, scene_of_run, with_other
+    from coloc_graph.viewer import (
+        is_pose_graph,
+        is_run,
+        scene_of_pose_graph,
+        scene_of_result,
+        scene_of_run,
+        with_other,
+    )
 
+    if is_pose_graph(args.path):
+        if args.compare or args.run_path:
+            raise InputError(f"{args.path} is a pose graph; --compare and --run are for results of runs")
+        return scene_of_pose_graph(args.path)
     if is_run(args.path):
         with progress("stances measured") as report:
             scene = scene_of_run(open_run(args.path), report)

@@ -8,7 +8,7 @@ import gtsam
 
 from coloc_graph._version import __version__
 from coloc_graph.geometry.lie import quaternion
-from coloc_graph.input_file import read_text
+from coloc_graph.input_file import read_json, read_text
 from coloc_graph.pipeline.pose_graph import PoseGraphSolution
 from coloc_graph.results.folder import SUMMARY, whole_result
 
@@ -25,6 +25,13 @@ def write_pose_graph_result(solution: PoseGraphSolution, out: str | Path) -> Non
         (part / "trajectories").rmdir()
         (part / "graph.g2o").write_text(_solved_text(solution), encoding="utf-8")
         (part / SUMMARY).write_text(json.dumps(summarise_pose_graph(solution), indent=2) + "\n", encoding="utf-8")
+
+
+def read_pose_graph_summary(out: str | Path) -> dict[str, Any]:
+    """Return the fields of summary.json in a folder, `kind` being `KIND` of a pose graph; {} where there is none."""
+    path = Path(out) / SUMMARY
+    found = read_json(path, "solve the graph again") if path.is_file() else {}
+    return found if isinstance(found, dict) else {}
 
 
 def summarise_pose_graph(solution: PoseGraphSolution) -> dict[str, Any]:
