@@ -1,8 +1,8 @@
-"""What passes between the front end and the back end; defined once, below both.
+"""Measurements that the front end passes to the back end; defined once, below both.
 
 Frames: `T_a_b` is the pose of b in a. Covariances are in GTSAM's tangent order, rotation [rad] first, then
-translation [m], in the body frame of the right-hand side: T_true = T_measured exp(xi). What is known on the floor
-alone has a covariance (3, 3) of the tangent's heading, x and y.
+translation [m], in the body frame of the right-hand side: T_true = T_measured exp(xi). Measurements on the floor have a
+covariance (3, 3) of the tangent's heading, x and y.
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from coloc_graph.errors import MeasurementError
 
 Array = NDArray[np.float64]
 
-#: A robot at a stance: a node of the graph.
+#: Node of the graph: a robot and the index of a stance (or keyframe).
 Node = tuple[str, int]
 
 
 def _as_arrays(measured: Any, *names: str) -> None:
-    """Make float arrays of these fields of a measurement; a field that has a `matrix()` gives that."""
+    """Convert fields of a measurement to float arrays; a field with a `matrix()` gives that."""
     for name in names:
         value = getattr(measured, name)
         try:
@@ -32,10 +32,18 @@ def _as_arrays(measured: Any, *names: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """The plane of the markers in a camera frame: N . X = d, N a unit normal (3,) from the camera to the plane.
+    """Plane of the markers in a camera frame: N . X = d.
 
-    `normal_sigma` [rad] and `d_sigma` [m] are what is uncertain besides the mount. Where the normal or the
-    distance was computed from the mount, its error is the mount's error too: `*_from_mount` say so.
+    Parameters
+    ----------
+    N : (3,) float
+        Unit normal from the camera to the plane.
+    d : float
+        Distance from the camera [m].
+    normal_sigma, d_sigma : float
+        Standard deviations of the normal [rad] and the distance [m] besides those of the mount.
+    normal_from_mount, d_from_mount : bool
+        They were computed from the mount, and share its error.
     """
 
     N: Array
@@ -48,19 +56,37 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class HomographyMeasurement:
-    """The homography that the marker plane induces between two observers at rest in one stance.
+    """Homography that the marker plane induces between two observers at rest in one stance.
 
-    `H_j_i` (3, 3) takes normalised coordinates in camera i to camera j, determinant 1. `information` (8, 8) is
-    that of its sl(3) coordinates on the right: H_true = H_j_i exp(sum of h_a SL3_BASIS[a]). `chi2` has `dof`
-    degrees of freedom. `overlap_px` is how many pixels of image i see what image j sees of the plane.
-    `unusable` is None, or why this is not a measurement, in words; the numbers then mean nothing.
-
-    What i's clock calls t, j's calls t + `time_offset` [s]; `time_offset_sigma` [s] is its standard deviation, which
-    `information` contains (both 0 where the clocks are said to agree); `by_time_offset` (8,) is what the true
-    homography is off by, in those coordinates, for each second that the true offset is larger. `warning` is None, or
-    what about the measurement is weaker than it looks, in words; `doubt` is None, or a reason for which it is used by
-    the paper's chain alone. Where more than two observers saw the same markers
-    their homographies are not independent: `share` is the part of what the pair's points say that `information` takes.
+    Parameters
+    ----------
+    stance : int
+        Index of the stance.
+    robot_i, robot_j : str
+        The two observers.
+    H_j_i : (3, 3) float
+        Takes normalised coordinates in camera i to camera j; determinant 1.
+    information : (8, 8) float
+        Of its sl(3) coordinates h on the right: H_true = H_j_i exp(sum of h_a SL3_BASIS[a]).
+    points, inliers : int
+        Number of corresponding points, and of those that the fit kept.
+    chi2, dof : float
+        Squared residuals of the points in units of their noise, and degrees of freedom.
+    overlap_px : float
+        Pixels of image i that see the part of the plane that image j sees.
+    time_offset, time_offset_sigma : float
+        Clock j minus clock i [s] and its standard deviation, which `information` contains; 0 of agreeing clocks.
+    unusable : str or None
+        Reason for which this is not a measurement; its numbers are then meaningless.
+    by_time_offset : (8,) float or None
+        Derivative of h by the clock offset [1/s].
+    warning : str or None
+        Reason for which the measurement is weaker than it looks.
+    share : float
+        Share of the points' information that `information` holds: homographies of more than two observers of the same
+        markers are not independent.
+    doubt : str or None
+        Reason for which only the paper's chain uses it.
     """
 
     stance: int
@@ -89,12 +115,20 @@ class HomographyMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class MarkerSpan:
-    """Two markers of `mover`, a known span apart, at n instants at which both observers of a pair saw both.
+    """Two markers of a mover, a known span apart, at n instants at which both observers of a pair saw both.
 
-    `x_i` (n, 2, 2) are the rays (x, y, 1) to both in camera i, by what both images say alike; `covariance`
-    (n, 2, 2, 2) is theirs. They hold for the homography as it was measured: by `by_h` (n, 2, 2, 8) they change with
-    its coordinates h, and at the true h they are independent of its error. `shared` (n, 2, 2, q) is a square root of
-    the covariance of what all rays to one marker share besides.
+    Parameters
+    ----------
+    mover : str
+        Robot that carries the markers.
+    x_i : (n, 2, 2) float
+        Rays (x, y, 1) to both markers in camera i, estimated from both images and the measured homography.
+    covariance : (n, 2, 2, 2) float
+        Covariances of the rays; at the true homography they are independent of its error.
+    by_h : (n, 2, 2, 8) float
+        Derivatives of the rays by the homography's coordinates h.
+    shared : (n, 2, 2, q) float
+        Square root of the covariance of errors that all rays to one marker share.
     """
 
     mover: str
@@ -111,17 +145,17 @@ class RelativePose:
     Parameters
     ----------
     stance
-        Number of the stance.
+        Index of the stance.
     robot_i, robot_j
         Names of the two observers.
     T_i_j
-        Pose of body j in body i, (4, 4); a `gtsam.Pose3` is taken, too.
+        Pose of body j in body i, (4, 4), or a `gtsam.Pose3`.
     covariance
         Covariance (6, 6): rotation [rad] first, then translation [m], in the frame of body j.
     T_ci_cj
         Pose of camera j in camera i, (4, 4), where a homography gave it.
     solution
-        Number of the SVD solution whose normal is nearest to the known one.
+        Number of the SVD solution with the normal nearest to the known one.
     normal_error
         Angle [rad] between these two normals.
     homography, plane, spans, movers
@@ -161,13 +195,13 @@ class Sighting:
     Parameters
     ----------
     stance
-        Number of the stance.
+        Index of the stance.
     observer, seen
-        Names of the robot that sees, and of the robot or landmark that is seen.
+        Names of the observing robot, and of the robot or landmark that it sees.
     time
-        When [UTC s, observer's clock]; the pose at this stance of a robot that moves during it is its pose then.
+        Time of the image [UTC s, observer's clock]; a moving robot's pose of this stance is that at this time.
     T_observer_seen
-        Pose of body `seen` in body `observer`, (4, 4); a `gtsam.Pose3` is taken, too.
+        Pose of body `seen` in body `observer`, (4, 4), or a `gtsam.Pose3`.
     covariance
         Covariance (3, 3) of heading [rad], x, y [m], in the frame of `seen`: both stand on the floor.
     x_markers, x_covariance
@@ -210,9 +244,9 @@ class Odometry:
     robot
         Name of the robot.
     before, after
-        Numbers of the two stances, in the order of time.
+        Indices of the two stances, in the order of time.
     T_before_after
-        Pose of its body at `after` in its body at `before`, (4, 4); a `gtsam.Pose3` is taken, too.
+        Pose of its body at `after` in its body at `before`, (4, 4), or a `gtsam.Pose3`.
     covariance
         Covariance (3, 3) of heading [rad], x, y [m], in the frame of the body at `after`.
     """
@@ -240,20 +274,25 @@ class Odometry:
         return f"odometry of {self.robot} from stance {self.before} to {self.after}"
 
 
-#: What ties two nodes of the graph.
+#: Measurement between two nodes of the graph.
 Measurement = RelativePose | Sighting | Odometry
 
 
-#: Keyframes of a robot are no further apart [s]: a long step with turns in it is no arc.
-LONGEST_STEP = 1.0
+MAX_KEYFRAME_INTERVAL = 1.0  # s, between keyframes of a robot: a long step with turns in it is no arc
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """One robot's way from each of its n keyframes to the next, by its odometry.
+    """Odometry of one robot between its n keyframes.
 
-    `twists` (delays, n - 1, 3) are the SE(2) logarithms (x [m], y [m], heading [rad]) of the steps that odometry says,
-    at each of some `delays` (d,) [s] of it, ascending; `covariances` (n - 1, 3, 3) are of the second pose in the first.
+    Parameters
+    ----------
+    delays : (d,) float
+        Delays of the odometry [s], ascending, at which the steps were evaluated.
+    twists : (d, n - 1, 3) float
+        SE(2) logarithms of the steps at each delay: x [m], y [m], heading [rad].
+    covariances : (n - 1, 3, 3) float
+        Covariances of each step's second pose in the first.
     """
 
     delays: Array
@@ -263,11 +302,20 @@ class Steps:
 
 @dataclass(frozen=True, eq=False)
 class RangeBearings:
-    """Measurements of range and bearing as columns, in the order of time [UTC s].
+    """Columns of n measurements of range and bearing, in the order of time.
 
-    `robot` and `keyframe` say who measured where, `target` whom: a robot's number, with its keyframe in
-    `target_keyframe`, or the number of robots plus a landmark's, with -1 there. `share` (n, 2) is the part of a range's
-    and of a bearing's information that is new: the errors of the same target's next measurement are much alike.
+    Parameters
+    ----------
+    time : (n,) float
+        Time [UTC s].
+    robot, keyframe : (n,) int
+        Number of the observer and of its keyframe.
+    target, target_keyframe : (n,) int
+        Number of the measured robot and of its keyframe; of a landmark the number of robots plus its own, and -1.
+    range, bearing : (n,) float
+        Range [m] and bearing [rad].
+    share : (n, 2) float
+        Share of the information of range and bearing that is new: successive errors of a target are correlated.
     """
 
     time: Array
@@ -287,7 +335,7 @@ class RangeBearings:
 class RangeBearing:
     """One measurement of range [m] and bearing [rad] at a time [UTC s], of `target` by `robot`, each at a keyframe.
 
-    `row` is its place among the `RangeBearings` of the run; a landmark's `target_keyframe` is -1.
+    `row` is its index in the `RangeBearings` of the run; a landmark's `target_keyframe` is -1.
     """
 
     row: int
@@ -310,9 +358,20 @@ class RangeBearing:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """All of a team's keyframes: `times` [UTC s] of each robot's, ascending, its `steps`, and the `measured`.
+    """Keyframes of a team with their odometry and measurements.
 
-    `warnings` are sentences on what was left out.
+    Parameters
+    ----------
+    robots, landmarks : tuple of str
+        Names by number.
+    times : tuple of (n,) float
+        Times of each robot's keyframes [UTC s], ascending.
+    steps : tuple of Steps
+        Odometry between each robot's keyframes.
+    measured : RangeBearings
+        Ranges and bearings.
+    warnings : tuple of str
+        Sentences on recorded data that was left out.
     """
 
     robots: tuple[str, ...]

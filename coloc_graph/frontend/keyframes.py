@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.frontend.sensor_delay import SensorDelay, sensor_delay
-from coloc_graph.measurements import LONGEST_STEP, Drive, RangeBearings, Steps
+from coloc_graph.measurements import MAX_KEYFRAME_INTERVAL, Drive, RangeBearings, Steps
 from coloc_graph.run import OdometrySample, Ranges, Run
 from coloc_graph.team import Ranging, Wheels
 
@@ -206,7 +206,7 @@ def _instants(
 def _filled(times: Array) -> Array:
     """Ascending times, and as many in between as it takes to leave no gap too long."""
     parts = [
-        np.linspace(before, after, int(np.ceil((after - before) / LONGEST_STEP)), endpoint=False)
+        np.linspace(before, after, int(np.ceil((after - before) / MAX_KEYFRAME_INTERVAL)), endpoint=False)
         for before, after in itertools.pairwise(times.tolist())
     ]
     return np.concatenate([*parts, times[-1:]])

@@ -14,13 +14,13 @@ from scipy.linalg import lapack
 
 from coloc_graph.backend.planar.factors import DriveFactors, Rows
 from coloc_graph.errors import EstimationError
-from coloc_graph.measurements import LONGEST_STEP
+from coloc_graph.measurements import MAX_KEYFRAME_INTERVAL
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 #: A little more than the longest step [s], which then ends in the next slice at the latest.
-SLICE = 1.01 * LONGEST_STEP
+SLICE = 1.01 * MAX_KEYFRAME_INTERVAL
 
 
 def slices_of(factors: DriveFactors) -> Index:
