@@ -18,7 +18,7 @@ from pathlib import Path
 from distributed import LocalCluster
 
 from coloc_graph.results.executors import workers
-from coloc_graph.results.many_runs import places_of, runs_in, solve_runs
+from coloc_graph.results.many_runs import result_folders, runs_in, solve_runs
 from coloc_graph.simulation import simulate
 
 
@@ -26,7 +26,7 @@ def seconds(folder: Path, out: Path, executors: Callable[[], AbstractContextMana
     """How long all runs of a folder take."""
     runs = runs_in(folder)
     started = time.perf_counter()
-    outcomes = solve_runs(runs, places_of(runs, folder, out), executors=executors)
+    outcomes = solve_runs(runs, result_folders(runs, folder, out), executors=executors)
     assert not any(one.failed for one in outcomes)
     return time.perf_counter() - started
 

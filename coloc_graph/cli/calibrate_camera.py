@@ -38,12 +38,12 @@ def _run(args: argparse.Namespace) -> int:
         figures = None
     else:
         from coloc_graph.calibration.summary import summarise_camera
-        from coloc_graph.report.calibration import require_place, write_camera_calibration
+        from coloc_graph.report.calibration import require_output_folder, write_camera_calibration
 
         if not args.images or not args.board or not args.square:
             raise InputError("give images, --board and --square, or a calibration with --from-camera-info")
         if args.out:
-            require_place(Path(args.out), force=args.force)
+            require_output_folder(Path(args.out), force=args.force)
         calibration = _calibrated(args)
         camera, figures = calibration.camera, summarise_camera(calibration)
         if args.out:

@@ -38,13 +38,13 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.cli.printing import progress, warn
     from coloc_graph.pipeline.batch import solve
     from coloc_graph.report import hero_figure
-    from coloc_graph.results.folder import require_place
+    from coloc_graph.results.folder import require_output_folder
     from coloc_graph.results.writer import assess, write_result
     from coloc_graph.run import open_run
     from coloc_graph.simulation import Imperfections, simulate
 
     out = Path(args.out)
-    require_place(out / "result")
+    require_output_folder(out / "result")
     out.mkdir(parents=True, exist_ok=True)
     run_path = out / "hallway.mcap"
     try:

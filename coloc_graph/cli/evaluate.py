@@ -42,7 +42,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "--pairs-from-truth", action="store_true", help="distances of the RPE are those of the true path"
     )
     command.add_argument(
-        "--longest-gap", type=_seconds, metavar="S", help="truth is interpolated over no longer a gap (0.25)"
+        "--max-gap", type=_seconds, metavar="S", help="truth is interpolated over no longer a gap (0.25)"
     )
     command.add_argument("--plot", metavar="FILE|DIR", help="pictures: one (.png, .svg, .pdf), or a folder of three")
     command.add_argument("--force", action="store_true", help="replace pictures that are already there")
@@ -65,8 +65,8 @@ def run(args: argparse.Namespace) -> int:
     comparison = _comparison(args)
     if args.robots:
         comparison = comparison.only([robot for robot in args.robots.split(",") if robot])
-    if args.longest_gap is not None:
-        comparison = replace(comparison, longest_gap=args.longest_gap)
+    if args.max_gap is not None:
+        comparison = replace(comparison, max_gap=args.max_gap)
     accuracy, true = comparison.compare(args.rpe or RPE_DISTANCES, "truth" if args.pairs_from_truth else "estimate")
     warn(accuracy.warnings)
     written = []

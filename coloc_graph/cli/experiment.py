@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.experiments.output import as_json
 
     out = args.out or f"experiment-{args.name}"
-    experiments.require_place(out, args.name)  # before the work, not after it
+    experiments.require_output_folder(out, args.name)  # before the work, not after it
     options: dict[str, Any] = {key: getattr(args, key) for key in ("depth", "seed", "processes", "cluster")}
     options |= {key: value for key in ("runs", "draws") if (value := getattr(args, key)) is not None}
     single_step = args.name in ("fig4", "fig5")

@@ -79,7 +79,7 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.pipeline.batch import EnteredStance, SolveOptions
     from coloc_graph.pipeline.contents import require_applicable
-    from coloc_graph.results.folder import require_place
+    from coloc_graph.results.folder import require_output_folder
     from coloc_graph.run import open_run
 
     options = SolveOptions(
@@ -98,7 +98,7 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
         return solve_folder(args, options)
     if args.processes is not None or args.cluster is not None:
         raise InputError(f"{args.run_path} is not a folder of runs; --processes and --cluster are for one")
-    require_place(args.out)  # before the work, not after it
+    require_output_folder(args.out)  # before the work, not after it
     with _earlier_result_named(args.out):
         logged = open_run(args.run_path)
         kind = require_applicable(logged, options)

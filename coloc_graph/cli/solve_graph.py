@@ -13,7 +13,7 @@ def solve_graph(args: argparse.Namespace) -> int:
     """Solve a pose graph, write it, print."""
     from coloc_graph.errors import InputError
     from coloc_graph.pipeline.pose_graph import solve_pose_graph
-    from coloc_graph.results.folder import require_place
+    from coloc_graph.results.folder import require_output_folder
     from coloc_graph.results.pose_graph import summarise_pose_graph, write_pose_graph_result
     from coloc_graph.run.output_lock import locked_output
 
@@ -24,7 +24,7 @@ def solve_graph(args: argparse.Namespace) -> int:
     ]
     if given:
         raise InputError(f"{args.run_path} is a pose graph; --{given[0].replace('_', '-')} is for runs")
-    require_place(args.out)
+    require_output_folder(args.out)
     with locked_output(args.out):
         solution = solve_pose_graph(args.run_path, lenient=args.lenient)
         write_pose_graph_result(solution, args.out)

@@ -18,17 +18,17 @@ def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
 
     from coloc_graph.errors import InputError
     from coloc_graph.results.executors import workers
-    from coloc_graph.results.many_runs import places_of, runs_in, solve_runs
+    from coloc_graph.results.many_runs import result_folders, runs_in, solve_runs
     from coloc_graph.run.output_lock import locked_output
 
     if args.view:
         raise InputError("--view shows one run; solve the folder without it, and view one of its results")
     runs = runs_in(args.run_path)
-    places = places_of(runs, args.run_path, args.out)
+    places = result_folders(runs, args.run_path, args.out)
     processes = min(os.cpu_count() or 1 if args.processes is None else args.processes, len(runs))
     done = 0
 
-    def told(outcome: "Outcome") -> None:
+    def on_outcome(outcome: "Outcome") -> None:
         nonlocal done
         done += 1
         what = outcome.failed or ("is there already" if outcome.resumed else "solved")
@@ -37,7 +37,7 @@ def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
 
     executors = partial(workers, processes, args.cluster)
     with locked_output(args.out):
-        outcomes = solve_runs(runs, places, options, executors=executors, told=told)
+        outcomes = solve_runs(runs, places, options, executors=executors, on_outcome=on_outcome)
     failed = [one for one in outcomes if one.failed]
     if args.json:
         print_json([_as_json(one) for one in outcomes])

@@ -14,12 +14,12 @@ from coloc_graph.evaluation.pose_errors import (
     absolute_errors,
     relative_errors,
 )
-from coloc_graph.evaluation.truth import LONGEST_TRUTH_GAP, left_out, true_poses, with_truth
+from coloc_graph.evaluation.truth import MAX_TRUTH_GAP, left_out, true_poses, with_truth
 
 __all__ = [
     "ALIGNMENTS",
     "FREE",
-    "LONGEST_TRUTH_GAP",
+    "MAX_TRUTH_GAP",
     "PLANAR",
     "RPE_DISTANCES",
     "Accuracy",

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.evaluation.truth import LONGEST_TRUTH_GAP, first_with_truth, require_some, true_poses, with_truth
+from coloc_graph.evaluation.truth import MAX_TRUTH_GAP, first_with_truth, require_some, true_poses, with_truth
 from coloc_graph.geometry.lie import closest_rotation, floor_pose, se3, se3_inverse, yaw
 from coloc_graph.geometry.trajectory import Trajectory
 
@@ -43,7 +43,7 @@ def align(
     *,
     on_floor: bool,
     alignment: Alignment = "reference",
-    longest_gap: float = LONGEST_TRUTH_GAP,
+    max_gap: float = MAX_TRUTH_GAP,
 ) -> dict[str, Array]:
     """The true poses T_world_body (n, 4, 4) at each robot's estimated poses, in the estimate's world; NaN without.
 
@@ -51,7 +51,7 @@ def align(
     robot that defines the world, where that is what is aligned: by its first pose that has a true one. Raises
     `InputError` where no pose has a true one, and where what is to be aligned says too little.
     """
-    at = {robot: true_poses(truth, one, longest_gap) for robot, one in estimated.items()}
+    at = {robot: true_poses(truth, one, max_gap) for robot, one in estimated.items()}
     require_some(truth, estimated, at)
     if alignment == "none":
         return at

@@ -12,15 +12,15 @@ from coloc_graph.geometry.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 #: True poses further apart in time than this are not joined [s].
-LONGEST_TRUTH_GAP = 0.25
+MAX_TRUTH_GAP = 0.25
 #: Instants no further apart than this are the same [s]: times of floats and of nanoseconds differ in the last digits.
 SAME_TIME = 1e-6
 
 
-def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, longest_gap: float = LONGEST_TRUTH_GAP) -> Array:
+def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, max_gap: float = MAX_TRUTH_GAP) -> Array:
     """The true poses (n, 4, 4) at an estimate's times, interpolated between two that are near; NaN without truth.
 
-    Near is at most `longest_gap` [s] apart. In a longer gap a robot of an estimate with stances stood where it was
+    Near is at most `max_gap` [s] apart. In a longer gap a robot of an estimate with stances stood where it was
     before, since robots stand while they observe and truth may be sparse then; of one without, nothing is known.
     """
     true = truth.get(estimated.robot)
@@ -32,7 +32,7 @@ def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, longest_g
     index = index.clip(min=0)
     after = np.minimum(index + 1, len(true) - 1)
     gap = true.times[after] - true.times[index]
-    near = (gap > 0) & (gap <= longest_gap)
+    near = (gap > 0) & (gap <= max_gap)
     if estimated.stances is None:
         known &= near | (times <= true.times[index] + SAME_TIME)
     share = np.where(near, ((times - true.times[index]) / np.where(near, gap, 1.0)).clip(0, 1), 0.0)[:, None]

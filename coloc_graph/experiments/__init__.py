@@ -6,7 +6,7 @@ Both depths go the same road: a run is simulated to a file, opened, and measured
 """
 
 from coloc_graph.experiments.multi_step_results import Table1, Table2, table1, table2
-from coloc_graph.experiments.output import Experiment, draw, require_place, save
+from coloc_graph.experiments.output import Experiment, draw, require_output_folder, save
 from coloc_graph.experiments.single_step import CELLS, Cell, measure_cells
 from coloc_graph.experiments.single_step_results import Fig4, Fig5, fig4, fig5
 
@@ -22,7 +22,7 @@ __all__ = [
     "fig4",
     "fig5",
     "measure_cells",
-    "require_place",
+    "require_output_folder",
     "save",
     "table1",
     "table2",

@@ -39,7 +39,7 @@ def as_json(experiment: Experiment) -> dict[str, Any]:
     return {"experiment": experiment.name, "version": __version__, **experiment.numbers()}
 
 
-def require_place(out: str | Path, name: str) -> None:
+def require_output_folder(out: str | Path, name: str) -> None:
     """Raise `InputError` where an experiment's files cannot go to `out`, or something else is there."""
     out = Path(out)
     if out.exists() and not out.is_dir():
@@ -62,7 +62,7 @@ def save(experiment: Experiment, out: str | Path) -> tuple[Path, Path, Path]:
     from coloc_graph.report import figure_svg
 
     out = Path(out)
-    require_place(out, experiment.name)
+    require_output_folder(out, experiment.name)
     png, svg, numbers = (out / f"{experiment.name}.{kind}" for kind in ("png", "svg", "json"))
     figure = draw(experiment)
     picture, text = png_bytes(figure), figure_svg(figure, experiment.name)

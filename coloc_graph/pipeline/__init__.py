@@ -1,1 +1,1 @@
-"""From a run to an estimate: in batch, incrementally, and what is wrong with a run."""
+"""From a run to an estimate, in batch and incrementally; inspection of runs."""

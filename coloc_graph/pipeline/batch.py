@@ -1,4 +1,4 @@
-"""From a run to an estimate, whatever the run holds: `solve`. Stances read like sections III and IV of the paper."""
+"""From a run to an estimate, whatever the run holds: `solve`. Stances as in sections III and IV of the paper."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,7 +39,7 @@ NOISE_ROUNDS = 2  # of learning the noise and measuring again: which points are 
 
 BATCH = {"chain": chain, "smooth": smooth, "joint": joint}
 
-#: Called with what is done and of how much: stances that are measured, or seconds of a ranging run.
+#: Called with the number done and the total: of measured stances, or of seconds of a ranging run.
 Progress = Callable[[int, int], None]
 
 #: Called with each update of an incremental estimate: a stance, or the newest poses of a ranging run.
@@ -48,7 +48,7 @@ OnUpdate = Callable[[EnteredStance | Latest], None]
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """An estimate, what it was made of, its warnings, and the durations of the front end and of each update [s]."""
+    """An estimate, its measurements and warnings, and the durations of the front end and of each update [s]."""
 
     estimate: Estimate
     warnings: Sequence[str]
@@ -76,18 +76,18 @@ def solve(
     Parameters
     ----------
     run : Run
-        What was recorded, by `open_run`.
+        The recording, by `open_run`.
     options : SolveOptions, optional
         Defaults depend on what the run holds.
     progress : callable, optional
-        Called with what is done and of how much.
+        Called with the number of stances (or seconds) done and the total.
     on_update : callable, optional
         Called with each update of an incremental estimate: `EnteredStance`, or `Latest` of a ranging run.
 
     Returns
     -------
     Solution
-        The estimate with its measurements. `warnings` and `unused` name whatever was left out.
+        The estimate with its measurements. `warnings` and `unused` name recorded data that was left out.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def solve(
         options = options.resolved()
         measure = _Counted(run, options, progress)
         solved = (
-            _by_stance(run, options, measure, on_update) if options.incremental else _at_once(run, options, measure)
+            _by_stance(run, options, measure, on_update) if options.incremental else _in_batch(run, options, measure)
         )
     return Solution(
         run=run,
@@ -115,7 +115,7 @@ def solve(
         measurements=solved.measured,
         warnings=(
             *run.warnings,
-            *(str(one) for one in unused if not one.asked),
+            *(str(one) for one in unused if not one.requested),
             *solved.warnings,
             *(
                 f"robot {robot} has no pose: {why}"
@@ -133,7 +133,7 @@ def solve(
     )
 
 
-def _at_once(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
+def _in_batch(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
     """Solve all stances together."""
     started = time.perf_counter()
     belief = NoiseBelief.of(run.team)
@@ -149,7 +149,7 @@ def _at_once(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
     made = time.perf_counter()
     motions, sources = [], OdometryAndSightings(run.team, odometry=options.odometry)
     if options.method != "chain" and run.team.floor is not None:
-        # the paper's chain takes neither, and wheels measure on a floor only
+        # the paper's chain uses neither, and wheels measure on a floor only
         for stance in run.stances:
             pairs = [m for m in measured if m.homography.stance == stance.index]
             motions += sources.of_stance(Restated(run, team), stance, pairs)
@@ -201,11 +201,11 @@ def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_up
         estimate = optimise_keyframes(run.team, keyframes)
     if not estimate.trajectories:
         raise EstimationError(
-            f"{run.path}: no robot can be placed: a robot must observe at least two landmarks with known positions"
+            f"{run.path}: no robot can be localised: a robot must observe at least two landmarks with known positions"
         )
     missing = dict.fromkeys(
         (name for name in keyframes.robots if name not in estimate.trajectories),
-        "it was never measured together with two things whose positions are known",
+        "it must be measured together with two robots or landmarks of known positions",
     )
     warnings = [*keyframes.warnings, *warnings_of_ranges(estimate)]
     return _Solved(estimate, warnings, seconds, (), updates, online, missing)
@@ -229,7 +229,7 @@ def _warnings(
 
 
 class _Counted:
-    """Measures stances, and reports how many are done."""
+    """Iterator over the measurements of a stance that reports progress."""
 
     def __init__(self, run: Run, options: SolveOptions, progress: Progress | None) -> None:
         self._run, self._options, self._progress = run, options, progress

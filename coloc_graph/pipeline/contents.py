@@ -1,4 +1,4 @@
-"""What a run holds, which of it a solve uses, and which options apply to it."""
+"""Contents of a run: the kind of its solution, unused data, and applicable options."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
 
-#: What a run is solved by: leap-frog stances, or ranges and bearings of robots that measure while they drive.
+#: Kind of measurements that a run is solved by: leap-frog stances, or ranges and bearings of driving robots.
 Kind = Literal["stances", "ranges"]
 
 #: Topics of measurements by kind, each with the noun for one message.
@@ -31,27 +31,27 @@ class Unused:
     count : int
         Number of messages; of landmarks, how many the team has.
     what : str
-        The noun for what was counted, with its count.
+        Count with its noun.
     reason : str
         Why they are not used.
-    asked : bool
-        The options name this kind, and leave it out: no warning is needed.
+    requested : bool
+        The options exclude this kind: no warning is needed.
     """
 
     kind: str
     count: int
     what: str
     reason: str
-    asked: bool = False
+    requested: bool = False
 
     def __str__(self) -> str:
         return f"{self.what} not used: {self.reason}"
 
 
 def kind_of(run: Run) -> Kind:
-    """Return what a run is solved by.
+    """Return the kind of measurements that a run is solved by.
 
-    Stances count where at least two robots observe in one of them, and win over ranges.
+    Stances if at least two robots observe in one of them, otherwise ranges.
 
     Raises
     ------
@@ -64,14 +64,14 @@ def kind_of(run: Run) -> Kind:
         return "ranges"
     if run.stances:
         raise InputError(
-            f"{run.path}: stance {run.stances[0].index} has one observer only, as has every other; "
+            f"{run.path}: stance {run.stances[0].index} has one observer only, as has every other: "
             "at least two robots must stand and watch the same mover"
         )
     held = [_noun(count, noun) for kind, noun in NOUNS.items() if (count := _count(run, kind, run.team.names))]
     only = f"only {_joined(held)}" if held else "no measurement"
     raise InputError(
-        f"{run.path}: the run holds no stances and no ranges ({only}), so that there is nothing to solve: "
-        "record stances, or ranges to other robots and landmarks"
+        f"{run.path}: there is nothing to solve: the run holds no stances and no ranges ({only}); record stances, or "
+        "ranges to other robots and landmarks"
     )
 
 
@@ -85,7 +85,7 @@ def unused_in(run: Run, options: SolveOptions | None = None) -> tuple[Unused, ..
 
 
 def require_applicable(run: Run, options: SolveOptions) -> Kind:
-    """Return what a run is solved by; `InputError` where an option does not apply to it."""
+    """Return the kind of measurements that a run is solved by; `InputError` where an option does not apply to it."""
     kind = kind_of(run)
     what, inapplicable = "holds stances", {"between_robots=False (--without-robots)": not options.between_robots}
     if kind == "ranges":
@@ -97,7 +97,7 @@ def require_applicable(run: Run, options: SolveOptions) -> Kind:
         }
     for option, given in inapplicable.items():
         if given:
-            raise InputError(f"{run.path} {what}, to which {option} does not apply: leave that out")
+            raise InputError(f"{option} does not apply to {run.path}, which {what}: leave it out")
     return kind
 
 
@@ -115,7 +115,7 @@ def _beside_stances(run: Run, options: SolveOptions) -> Iterable[Unused]:
     elif run.team.floor is None:
         found.append(_unused(run, "odometry", names, "the team states no floor, and wheels measure on a floor only"))
     elif not options.odometry:
-        found.append(_unused(run, "odometry", names, "the options leave odometry out", asked=True))
+        found.append(_unused(run, "odometry", names, "the options leave odometry out", requested=True))
     return [one for one in found if one is not None]
 
 
@@ -135,9 +135,9 @@ def _beside_ranges(run: Run) -> Iterable[Unused]:
     return [one for one in found if one is not None]
 
 
-def _unused(run: Run, kind: str, robots: Iterable[str], reason: str, *, asked: bool = False) -> Unused | None:
+def _unused(run: Run, kind: str, robots: Iterable[str], reason: str, *, requested: bool = False) -> Unused | None:
     count = _count(run, kind, robots)
-    return Unused(kind, count, _noun(count, NOUNS[kind]), reason, asked) if count else None
+    return Unused(kind, count, _noun(count, NOUNS[kind]), reason, requested) if count else None
 
 
 def _count(run: Run, kind: str, robots: Iterable[str]) -> int:

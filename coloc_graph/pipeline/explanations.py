@@ -1,6 +1,5 @@
 """Reasons and warnings of a solution, in words."""
 
-import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 
@@ -14,8 +13,8 @@ from coloc_graph.frontend.pairing.plane_check import implausible
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
 
-REJECTION_P_VALUE = 1e-4  # probability of a chi2 by noise alone below which measurements are warned to disagree
-REASONS_NAMED = 3  # kinds of reasons that are named where no measurement is usable
+WARNING_P_VALUE = 1e-4  # probability of a chi2 by noise alone below which a warning says that measurements disagree
+MAX_REASONS = 3  # kinds of reasons that are named where no measurement is usable
 
 
 def reasons(measurements: Sequence[PairMeasurement]) -> str:
@@ -24,20 +23,20 @@ def reasons(measurements: Sequence[PairMeasurement]) -> str:
     for measured in measurements:
         h = measured.homography
         kinds.setdefault(_kind(h.unusable or "", h.robot_i, h.robot_j), []).append(
-            f"at stance {h.stance}, {h.robot_i} and {h.robot_j}: {h.unusable}"
+            f"stance {h.stance}, {h.robot_i} and {h.robot_j}: {h.unusable}"
         )
     by_count = sorted(kinds.values(), key=lambda kind: -len(kind))
     total = len(measurements)
     named = [
         kind[0] + (f" (the same in {len(kind)} of {total} measurements)" if total > 1 else "")
-        for kind in by_count[:REASONS_NAMED]
+        for kind in by_count[:MAX_REASONS]
     ]
-    more = sum(map(len, by_count[REASONS_NAMED:]))
+    more = sum(map(len, by_count[MAX_REASONS:]))
     return "; ".join([*named, f"and {more} more for other reasons"] if more else named)
 
 
 def _kind(reason: str, *robots: str) -> str:
-    """A reason without the numbers and names that differ from stance to stance."""
+    """Return a reason without the numbers and names that differ from stance to stance."""
     for robot in robots:
         reason = re.sub(rf"\b{re.escape(robot)}\b", "?", reason)
     reason = re.sub(r"`[^`]*`(, `[^`]*`)*", "?", reason)
@@ -99,7 +98,7 @@ def implausible_planes(run: Run, options: SolveOptions, measurements: Sequence[P
 
 
 def why_disconnected(disconnected: tuple[DisconnectedComponent, ...], measurements: Iterable[PairMeasurement]) -> str:
-    """The first unusable measurement, or else what would tie the first disconnected part."""
+    """Describe the first unusable measurement, or else the first disconnected part with its remedy."""
     unusable = [m.homography for m in measurements if m.homography.unusable]
     if unusable:
         return f"stance {unusable[0].stance}, {unusable[0].robot_i} and {unusable[0].robot_j}: {unusable[0].unusable}"
@@ -118,32 +117,30 @@ def warnings_of_graph(
         if m.homography.unusable and not little_in_common(m.homography, stances[m.homography.stance])
     ]
     warnings += [
-        f"stance {m.homography.stance}: {m.homography.robot_i} and {m.homography.robot_j} are used, and doubtful: "
+        f"stance {m.homography.stance}: {m.homography.robot_i} and {m.homography.robot_j} are used, but suspicious: "
         f"{m.homography.doubt}"
         for m in measurements
         if m.homography.doubt
     ]
-    warnings += [f"{part} (left out of the result)" for part in disconnected[:REASONS_NAMED]]
-    if len(disconnected) > REASONS_NAMED:
-        warnings.append(f"{len(disconnected) - REASONS_NAMED} more groups of poses are not tied to the reference")
+    warnings += [f"{part} (left out of the result)" for part in disconnected[:MAX_REASONS]]
+    if len(disconnected) > MAX_REASONS:
+        warnings.append(f"{len(disconnected) - MAX_REASONS} more groups of poses are not tied to the reference")
     warnings += [f"the {one.measurement} is not used: it is {one.reason}" for one in estimate.rejected]
     warnings += [str(bump) for bump in estimate.bumped]
     warnings += _far(estimate)
-    chance = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
-    if chance < REJECTION_P_VALUE:
+    p_value = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
+    if p_value < WARNING_P_VALUE:
         warnings.append(
             f"the measurements disagree (chi2/dof {estimate.chi2 / estimate.dof:.1f} with {estimate.dof} degrees of "
-            f"freedom, expected 1; noise alone does that {_once_in(chance)}): a robot moved that is called an anchor, "
-            "or mounts, heights, the floor or the noise are not as stated"
+            f"freedom, expected 1; probability by noise alone {_p_value(p_value)}): an anchor moved, or mounts, "
+            "heights, the floor or the noise are not as stated"
         )
     return warnings
 
 
-def _once_in(chance: float) -> str:
-    """A small probability in words."""
-    if chance < 1e-9:
-        return "less than once in 1 000 000 000 runs"
-    return f"about once in {10 ** round(-math.log10(chance)):,} runs".replace(",", " ")
+def _p_value(p_value: float) -> str:
+    """Format a small probability."""
+    return "below 1e-9" if p_value < 1e-9 else f"{p_value:.0e}"
 
 
 def warnings_of_ranges(estimate: Estimate) -> list[str]:
@@ -158,15 +155,15 @@ def _outliers(problem: RangingProblem) -> str:
     for row in np.flatnonzero(problem.outliers).tolist():
         pair = int(m.robot[row]), int(m.target[row])
         pairs[pair] = pairs.get(pair, 0) + 1
-    (robot, target), most = max(pairs.items(), key=lambda one: one[1])
+    (robot, target), count = max(pairs.items(), key=lambda one: one[1])
     return (
         f"{sum(pairs.values())} of {len(m)} measurements were rejected as outliers (robust weight near 0), "
-        f"{most} of them of {problem.names[target]} by {problem.names[robot]}"
+        f"{count} of them of {problem.names[target]} by {problem.names[robot]}"
     )
 
 
 def _far(estimate: Estimate) -> list[str]:
     return [
-        f"{row} is {row.sigmas:.1f} sigmas from what the team states: measure it again, or state it so"
+        f"{row} is {row.sigmas:.1f} sigmas from the team's value: measure it again, or update the team file"
         for row in estimate.calibration.far
     ]

@@ -1,4 +1,4 @@
-"""One stance after the other: measured when it is over, and entered; on a logged run as on a team in the field."""
+"""Incremental solving stance by stance, of a logged run or of a team in the field."""
 
 import math
 import time
@@ -38,12 +38,14 @@ from coloc_graph.team import Team
 def measure_stance(
     run: Recorded, stance: Stance, options: SolveOptions, tracks: StanceTracks | None = None
 ) -> Iterator[PairMeasurement]:
-    """What each pair of observers measured in a stance, one after the other, but for the offset of their clocks, which
-    all stances know together: `share_clock_offsets`."""
+    """Yield the measurement of each pair of observers of a stance.
+
+    Without the offset of their clocks, which all stances determine together: `share_clock_offsets`.
+    """
     options = options.resolved()
     frontend = options.frontend
     assert frontend is not None
-    # a joint estimate takes the scale from the spans by itself, and the heights for a start
+    # a joint estimate uses the spans itself, and the heights for initial values
     scale: Scale = "heights" if options.method == "joint" else frontend.scale
     tracks = tracks or StanceTracks(run, stance, frontend.tracker)
     pairs = measured_pairs(tracks, stance.end)
@@ -53,7 +55,7 @@ def measure_stance(
 
 @dataclass(frozen=True)
 class _Known:
-    """Knowledge of the last stance that the next one needs; immutable, so that what was known before can come back."""
+    """State after a stance that the next one needs; immutable, so that an earlier state can be restored."""
 
     stance: Stance | None = None
     posed: frozenset[str] = frozenset()  # robots that have a pose at the stance
@@ -86,19 +88,19 @@ class OdometryAndSightings:
         return list(self._known.doubts)
 
     def withdraw(self) -> None:
-        """Forget the last stance; once, until another has come."""
+        """Remove the last stance; only once until another was added."""
         self._known = self._earlier
         self._samples = {robot: [] for robot in self.team.names}  # they are read again
 
     def of_stance(self, run: Recorded, stance: Stance, measured: Sequence[PairMeasurement]) -> list[Measurement]:
-        """Sightings and odometry of a stance, whose pairs are all `measured`."""
+        """Return sightings and odometry of a stance whose pairs are all `measured`."""
         known = self._known
         stayed = known.stayed(stance)
         wheels = {robot: self._wheels(run, robot, stance) for robot in self.team.names}
         sightings = sight_movers(run, stance, measured, wheels)
         unsighted = unsighted_movers(run, stance, measured, wheels, sightings)
         sightings += sight_standing(run, stance, measured, known.stance)
-        # who has stayed sees no more of a landmark than when it came
+        # a robot that stayed learns nothing new of a landmark that it has sighted
         sighted = {one for one in known.sighted if one[0] in stayed - self._slips.keys()}
         landmarks, doubts = _landmarks(run, stance, measured, sighted)
         sightings += landmarks
@@ -137,7 +139,7 @@ class OdometryAndSightings:
 def _landmarks(
     run: Recorded, stance: Stance, measured: Sequence[PairMeasurement], known: set[tuple[str, str]]
 ) -> tuple[list[Sighting], list[Doubt]]:
-    """Sightings of landmarks by the observers, but for those (observer, landmark) that are `known`."""
+    """Return sightings of landmarks by the observers, without the (observer, landmark) that are `known`."""
     seen = (
         (robot, what)
         for one in measured
@@ -148,8 +150,19 @@ def _landmarks(
 
 @dataclass(frozen=True, eq=False)
 class EnteredStance:
-    """A stance that is in, where its robots stand by what was known then, and what was measured in it and on the way
-    to it; `pairs` are all that were looked at, the unusable too."""
+    """A stance in the estimate.
+
+    Parameters
+    ----------
+    stance : Stance
+        The stance.
+    estimate : StanceEstimate
+        Poses of its robots as estimated when it was added.
+    measurements : tuple of Measurement
+        Its measurements, and the odometry into it.
+    pairs : tuple of PairMeasurement
+        Measurements of all pairs, unusable ones included.
+    """
 
     stance: Stance
     estimate: StanceEstimate
@@ -158,7 +171,15 @@ class EnteredStance:
 
 
 class StanceSolver:
-    """Measures each stance when it is over, and enters it into an estimator."""
+    """Incremental solver: measures each stance when it is over, and adds it to an estimator.
+
+    Parameters
+    ----------
+    team : Team
+        The team.
+    options : SolveOptions, optional
+        As of `solve`.
+    """
 
     def __init__(self, team: Team, options: SolveOptions | None = None) -> None:
         self.options = (options or SolveOptions()).resolved()
@@ -167,11 +188,11 @@ class StanceSolver:
         self.estimator = Estimator(
             team.reference, team.names, team.floor, slips_of(team), robot_models, landmarks_of(team)
         )
-        #: All pairs of all stances; those that are unusable too.
+        #: All pairs of all stances, unusable ones included.
         self.measured: tuple[PairMeasurement, ...] = ()
-        #: What is to be said of clocks.
+        #: Warnings on clocks.
         self.warnings: list[str] = []
-        #: How long the front end and the estimator took, stance by stance [s].
+        #: Time of the front end and of the estimator for each stance [s].
         self.seconds: list[tuple[float, float]] = []
         #: Noise of marker centres as it is known from the stances that are in, and before the last.
         self.noise = self._earlier_noise = self._next_noise = NoiseBelief.of(team)
@@ -181,8 +202,10 @@ class StanceSolver:
     def measure(
         self, run: Recorded, stance: Stance, pairs: Iterable[PairMeasurement] | None = None
     ) -> tuple[PairMeasurement, ...]:
-        """What the pairs of a stance measure, by what is known so far of their clocks; `pairs` come from
-        `measure_stance`, here or elsewhere."""
+        """Return the measurements of a stance, with the clock offsets estimated until now.
+
+        `pairs` come from `measure_stance`, here or in another process.
+        """
         started = time.perf_counter()
         if pairs is None:
             pairs = measure_stance(Restated(run, self.noise.used(self.team)), stance, self.options)
@@ -195,18 +218,21 @@ class StanceSolver:
     def enter(
         self, run: Recorded, stance: Stance, measured: tuple[PairMeasurement, ...] | None = None
     ) -> EnteredStance:
-        """Enter a stance with what was measured in it, by `measure`.
+        """Add a stance with its measurements by `measure`.
 
-        A stance without an anchor raises `MeasurementError`, but for the first.
+        Raises
+        ------
+        MeasurementError
+            A stance after the first has no anchor and no odometry into it.
         """
         shared = self.measure(run, stance) if measured is None else measured
         started = time.perf_counter()
         noisy = Restated(run, self._next_noise.used(self.team))
         motions = [] if self.team.floor is None else self._motions.of_stance(noisy, stance, shared)
         made = (*(m.relative_pose for m in shared if m.relative_pose is not None), *motions)
-        entering = time.perf_counter()
+        adding = time.perf_counter()
         before = next(reversed(self.estimator.stances), None)
-        # before the first nobody can have stayed, whatever it says
+        # the first stance has no anchors, whatever it names
         here = stance if before else replace(stance, anchors=())
         try:
             said = self.estimator.add(here, made, after=before.index if before else None)
@@ -214,7 +240,7 @@ class StanceSolver:
             if self.team.floor is not None:
                 self._motions.withdraw()
             raise
-        self.seconds.append((self._measuring + entering - started, time.perf_counter() - entering))
+        self.seconds.append((self._measuring + adding - started, time.perf_counter() - adding))
         self.measured += tuple(replace(one, with_team=None) for one in shared)
         self._earlier_noise, self.noise = self.noise, self._next_noise
         return EnteredStance(here, said, made, shared)
@@ -225,7 +251,7 @@ class StanceSolver:
         return self._motions.doubts
 
     def withdraw(self) -> None:
-        """Take the last stance out again, as if it had never come; `EstimationError` where it is the first."""
+        """Remove the last stance, as if it had never been added; `EstimationError` where it is the first."""
         index = self.estimator.withdraw().index
         self.noise = self._earlier_noise
         if self.team.floor is not None:
@@ -235,27 +261,27 @@ class StanceSolver:
 
 
 class RangingSolver:
-    """Takes in the measurements of a ranging run in the order of time."""
+    """Incremental solver of a ranging run, in the order of time."""
 
     def __init__(self, team: Team, keyframes: Drive) -> None:
         self._incremental = IncrementalKeyframes(team, keyframes)
         begin = min(float(times[0]) for times in keyframes.times if len(times))
         end = max(float(times[-1]) for times in keyframes.times if len(times))
-        #: Times at which to `enter` [UTC s], all measurements together.
+        #: Times of the updates that take in all measurements [UTC s].
         self.times = tuple(begin + n * EVERY for n in range(1, math.ceil((end - begin) / EVERY) + 2))
-        #: By robot, each pose as it was estimated at its time; there once `estimate` was called.
+        #: Poses as they were estimated at their times, by robot; filled by `estimate`.
         self.online: Mapping[str, Trajectory] = {}
         #: Duration of each step [s].
         self.seconds: list[float] = []
 
     def enter(self, until: float) -> Latest:
-        """Take in everything measured before a time [UTC s]; return the newest poses."""
+        """Add all measurements before a time [UTC s]; return the newest poses."""
         started = time.perf_counter()
         latest = self._incremental.advance(until)
         self.seconds.append(time.perf_counter() - started)
         return latest
 
     def estimate(self) -> Estimate:
-        """Return the estimate of everything that was taken in; once, at the end."""
+        """Return the estimate of all measurements; once, at the end."""
         estimate, self.online = self._incremental.finish()
         return estimate

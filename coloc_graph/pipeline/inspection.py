@@ -1,6 +1,6 @@
-"""What is in a run, and what is wrong with it: every reason for which a solve would use less than all of it.
+"""Inspection of a run: every reason for which a solve would use less than all of it.
 
-Detections that name their markers are measured as a solve does; images are not looked into.
+Detections that name their markers are measured as a solve does; images are not decoded.
 """
 
 import itertools
@@ -22,7 +22,7 @@ from coloc_graph.team import Landmark
 
 @dataclass(frozen=True)
 class Finding:
-    """Something wrong with a run: `where` (a stance, a robot), and `what` with its remedy in words."""
+    """A problem of a run: `where` it is (a stance, a robot), and `what` it is with its remedy, in words."""
 
     where: str
     what: str
@@ -30,7 +30,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class LandmarkSeen:
-    """A landmark of the team, and by whom it was seen, and in which stances, in detections that name it."""
+    """A landmark of the team, with the stances and observers whose detections name it."""
 
     landmark: Landmark
     stances: tuple[int, ...]
@@ -38,18 +38,18 @@ class LandmarkSeen:
 
     @property
     def what(self) -> str:
-        """What is seen of it, in words."""
+        """Description of its markers."""
         if self.landmark.tag is not None:
             return f"tag {self.landmark.tag.family} {self.landmark.tag.id}"
         return "no camera sees it" if self.landmark.markers is None else "two lights"
 
 
 def landmarks_seen(run: Run) -> list[LandmarkSeen]:
-    """Where the landmarks of a team are seen; images are not looked into."""
+    """Return the landmarks of a team with the stances and observers that see them; images are not decoded."""
     stances: dict[str, dict[int, None]] = {landmark.name: {} for landmark in run.team.landmarks}
     observers: dict[str, dict[str, None]] = {landmark.name: {} for landmark in run.team.landmarks}
-    watches = [(stance, robot) for stance in run.stances for robot in stance.observers] if stances else []
-    for stance, robot in watches:
+    observed = [(stance, robot) for stance in run.stances for robot in stance.observers] if stances else []
+    for stance, robot in observed:
         for name in {name for one in run.detections(robot, stance.start, stance.end) for name in _bodies(one)}:
             if name in stances:
                 stances[name][stance.index] = observers[name][robot] = None
@@ -61,12 +61,12 @@ def _bodies(one: Detections) -> Iterable[str]:
 
 
 def inspect(run: Run) -> list[Finding]:
-    """Everything that is wrong with a run, and what a solve would not use of it, without looking into its images."""
+    """Find everything that is wrong with a run, and the data that a solve would not use, without decoding images."""
     findings = [Finding("file", warning) for warning in run.warnings]
     try:
         findings += [Finding("run", str(one)) for one in unused_in(run)]
         if kind_of(run) == "ranges":
-            return [*findings, *_drive_findings(run)]
+            return [*findings, *_ranging_findings(run)]
     except InputError as why:
         findings.append(Finding("run", str(why).removeprefix(f"{run.path}: ")))
     if run.stances and run.team.reference not in run.stances[0].observers:
@@ -78,17 +78,17 @@ def inspect(run: Run) -> list[Finding]:
     return findings
 
 
-def _drive_findings(run: Run) -> list[Finding]:
-    """What is wrong with a run of robots that drive all the time."""
+def _ranging_findings(run: Run) -> list[Finding]:
+    """Find the problems of a ranging run."""
     findings = []
     for robot in run.team.names:
         if run.topics.get(f"/{robot}/ranges") and not run.topics.get(f"/{robot}/odometry"):
-            findings.append(Finding(robot, "it measured ranges and has no odometry: record it too"))
+            findings.append(Finding(robot, "it measured ranges and has no odometry: record its odometry, too"))
         elif run.topics.get(f"/{robot}/ranges") and run.team[robot].ranging is None:
-            findings.append(Finding(robot, "the team does not say how well it measures: give it [robots.ranging]"))
+            findings.append(Finding(robot, "the team states no range sensor: give the robot a [robots.ranging]"))
     if not any(landmark.position is not None for landmark in run.team.landmarks):
         findings.append(
-            Finding("team", "no landmark's position is stated: the world is where the reference robot begins")
+            Finding("team", "no landmark's position is stated: the world is the reference robot's first pose")
         )
     return findings
 
@@ -102,7 +102,7 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
         if not stance.anchors:
             findings.append(Finding(where, "no anchor: nothing ties it to the stance before; let one robot stay put"))
         findings += [
-            Finding(where, f"{robot} is called an anchor, yet it moved since stance {before.index}")
+            Finding(where, f"{robot} is named as an anchor, but moved since stance {before.index}")
             for robot in stance.anchors
             if any(motion.moving for motion in run.motions(robot, before.end, stance.start))
         ]
@@ -131,7 +131,7 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
     tracks = StanceTracks(run, stance)
     try:
         landmarks = [(robot, tracks.landmarks(robot)) for robot in named]
-    except InputError as why:  # of a marker that nobody in the team has
+    except InputError as why:  # of an unknown marker
         return [*findings, Finding(where, str(why).removeprefix(f"{run.path}: {where}: "))]
     for doubt in in_words(sight_landmarks(run, stance, landmarks)[1]):
         findings.append(Finding(where, doubt.removeprefix(f"{where}: ")))
@@ -151,9 +151,9 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
 
 
 def _of_detections(run: Run, stance: Stance, i: str, j: str, tracks: StanceTracks) -> list[str]:
-    """What is wrong with what two observers detected by name."""
+    """Find the problems of the named detections of two observers."""
     sigma = run.team.clock_sigma
-    if sigma > 0:  # the search for the clocks' offset is for a solve
+    if sigma > 0:  # only a solve estimates the clocks' offset
         tracks_i, tracks_j = (tracks.of(robot) for robot in (i, j))
         camera_i, camera_j = (run.team[robot].camera for robot in (i, j))
         try:

@@ -1,4 +1,4 @@
-"""Everything that a result depends on besides the run: `SolveOptions`."""
+"""Options of a solve: `SolveOptions`."""
 
 from dataclasses import dataclass, replace
 from typing import get_args
@@ -10,12 +10,12 @@ from coloc_graph.team import Robot, Team
 
 METHODS: tuple[Method, ...] = get_args(Method)
 
-UNKNOWN_HEIGHT = 0.1  # tolerance of camera heights where the scale comes from the markers' span alone [m]
+UNKNOWN_HEIGHT_SIGMA = 0.1  # m: sigma of camera heights where the scale comes from the markers' span alone
 
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """Everything that a result depends on besides the run.
+    """Options of a solve: all that a result depends on besides the run.
 
     Parameters
     ----------
@@ -25,13 +25,13 @@ class SolveOptions:
         sightings of the movers. `joint` (the default) takes the homographies themselves, and calibrates mounts,
         markers and clocks along with the poses.
     frontend : FrontendOptions, optional
-        Of a run with stances: how images are measured. The default belongs to the method.
+        Of a run with stances: measurement of images. The default depends on the method.
     odometry : bool
-        Use wheel odometry. A run with ranges alone cannot do without.
+        Use wheel odometry. A run with ranges alone needs it.
     incremental : bool
-        Measure and enter in the order of time, as a team in the field would.
+        Estimate in the order of time, as a team in the field would.
     between_robots : bool
-        Of a run with ranges: use the ranges between robots, not those to landmarks alone.
+        Of a run with ranges: use ranges between robots too, not only those to landmarks.
     """
 
     method: Method | None = None
@@ -42,9 +42,9 @@ class SolveOptions:
 
     def __post_init__(self) -> None:
         if self.method is not None and self.method not in METHODS:
-            raise InputError(f"there is no method `{self.method}`; choose one of {', '.join(METHODS)}")
+            raise InputError(f"there is no method `{self.method}`: choose one of {', '.join(METHODS)}")
         if self.incremental and self.method == "chain":
-            raise InputError("a chain is composed, and never incremental: leave out `incremental`, or use joint")
+            raise InputError("method `chain` cannot be incremental: leave out `incremental`, or use `joint`")
 
     def resolved(self) -> "SolveOptions":
         """Return the options of a run with stances, with the default method and front end where none is chosen."""
@@ -64,4 +64,4 @@ class SolveOptions:
         if self.method != "joint":
             return {}
         robot_models = {robot.name: robot for robot in team.robots}
-        return dict(with_height_sigma(robot_models, UNKNOWN_HEIGHT)) if self.by_span else robot_models
+        return with_height_sigma(robot_models, UNKNOWN_HEIGHT_SIGMA) if self.by_span else robot_models

@@ -1,4 +1,4 @@
-"""A pose graph of any program, solved: the optimum from the poses that the file states."""
+"""Solving of a pose graph file of any program, from its initial poses."""
 
 import time
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class PoseGraphSolution:
     Attributes
     ----------
     path, graph
-        File, and what was read from it.
+        The file and its graph.
     values
         Poses at the optimum, by the file's ids.
     chi2_before, chi2
@@ -52,14 +52,14 @@ def solve_pose_graph(path: str | Path, *, lenient: bool = False) -> PoseGraphSol
     path
         File with vertices and edges in 2D or in 3D.
     lenient
-        Whether to project information matrices that are not positive definite; see `read_g2o`.
+        Project information matrices that are not positive definite; see `read_g2o`.
 
     Raises
     ------
     InputError
-        If it is no pose graph.
+        The file is no pose graph.
     EstimationError
-        If vertices are disconnected from all that are fixed, or the optimiser's answer does not pass its check.
+        Vertices are disconnected from all fixed ones, or the optimiser did not converge.
     """
     path, began = Path(path), time.perf_counter()
     graph = read_g2o(path, lenient=lenient)
@@ -84,15 +84,15 @@ def solve_pose_graph(path: str | Path, *, lenient: bool = False) -> PoseGraphSol
 
 def _require_connected(path: Path, graph: G2oGraph) -> None:
     keys = list(graph.values.keys())
-    place = {key: n for n, key in enumerate(keys)}
-    ends = [list(map(place.__getitem__, graph.factors.at(n).keys())) for n in range(graph.factors.size())]
+    index = {key: n for n, key in enumerate(keys)}
+    ends = [list(map(index.__getitem__, graph.factors.at(n).keys())) for n in range(graph.factors.size())]
     pairs = np.array([pair for pair in ends if len(pair) == 2], np.int64).reshape(-1, 2)
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(keys), len(keys)))
     _, component = connected_components(links, directed=False)
-    held = {component[place[key]] for key in graph.fixed}
-    loose = [key for key, one in zip(keys, component.tolist(), strict=True) if one not in held]
-    if loose:
+    fixed = {component[index[key]] for key in graph.fixed}
+    disconnected = [key for key, one in zip(keys, component.tolist(), strict=True) if one not in fixed]
+    if disconnected:
         raise EstimationError(
-            f"{path}: {len(loose)} of {len(keys)} vertices, as {loose[0]}, are disconnected from vertex "
-            f"{graph.fixed[0]}, which is fixed; give edges that connect them, or fix a vertex in each part (FIX ID)"
+            f"{path}: {len(disconnected)} of {len(keys)} vertices, as {disconnected[0]}, are disconnected from vertex "
+            f"{graph.fixed[0]}, which is fixed: give edges that connect them, or fix a vertex in each part (FIX ID)"
         )

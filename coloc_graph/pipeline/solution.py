@@ -20,7 +20,7 @@ from coloc_graph.team import Team
 
 @dataclass(frozen=True)
 class Count:
-    """Number of measurements of a kind that are in an estimate, and that are not."""
+    """Number of measurements of a kind that an estimate uses, and of those that it does not."""
 
     used: int
     rejected: int
@@ -28,20 +28,20 @@ class Count:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution:
-    """A solved run: the estimate, what it was made of, and how long it took.
+    """A solved run: the estimate, its measurements, and the time that it took.
 
     Parameters
     ----------
     run : Run
         The run.
     options : SolveOptions
-        What it was solved with.
+        Options of the solve.
     estimate : Estimate
-        The poses, and all that was found along.
+        Poses, outliers and calibration.
     measurements : tuple of PairMeasurement
         Of a run with stances: every pair of observers of every stance, unusable ones too.
     warnings : tuple of str
-        Sentences on what was left out, and on what looks wrong.
+        Sentences on data that was left out, and on what looks wrong.
     seconds_frontend, seconds_backend : float
         Time it took [s].
     seconds_updates : tuple of float
@@ -69,18 +69,15 @@ class Solution:
     without_pose: Mapping[str, str] = field(default_factory=dict)
     noise: NoiseBelief | None = None
 
-    def why_not(self, measured: PairMeasurement) -> str | None:
-        """Return why a pair's measurement is not in the estimate; None where it is."""
-        if measured.homography.unusable is not None:
-            return measured.homography.unusable
-        pose = measured.relative_pose
-        return None if pose is None else self.reason(pose)
-
-    def reason(self, link: Link) -> str | None:
-        """Return why a measurement of the graph is not in the estimate; None where it is."""
-        if id(link) in self._rejected:
-            return self._rejected[id(link)]
-        return "not tied to the reference" if not self._disconnected.isdisjoint(link.ends) else None
+    def reason(self, measured: PairMeasurement | Link) -> str | None:
+        """Return the reason for which a measurement is not in the estimate; None where it is."""
+        if isinstance(measured, PairMeasurement):
+            if measured.homography.unusable is not None or measured.relative_pose is None:
+                return measured.homography.unusable
+            measured = measured.relative_pose
+        if id(measured) in self._rejected:
+            return self._rejected[id(measured)]
+        return "not tied to the reference" if not self._disconnected.isdisjoint(measured.ends) else None
 
     @property
     def calibrated_team(self) -> Team | None:
@@ -113,7 +110,7 @@ class Solution:
         if self.estimate.is_ranging:
             used = self.estimate.ranging.used
             return {"range": Count(int(np.count_nonzero(used)), int(np.count_nonzero(~used)))}
-        reasons: dict[str, list[str | None]] = {"homography": [self.why_not(one) for one in self.measurements]}
+        reasons: dict[str, list[str | None]] = {"homography": [self.reason(one) for one in self.measurements]}
         for kind, _, reason in self.links:
             reasons.setdefault(kind, []).append(reason)
         return {kind: Count(found.count(None), len(found) - found.count(None)) for kind, found in reasons.items()}

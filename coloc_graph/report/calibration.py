@@ -111,7 +111,7 @@ def residuals_figure(calibration: CameraCalibration) -> Figure:
     return figure
 
 
-def require_place(out: Path, *, force: bool) -> None:
+def require_output_folder(out: Path, *, force: bool) -> None:
     """Raise `InputError` where a calibration cannot go to the folder `out`, or one is there, unless with `force`."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} exists and is not a folder; give another place")

@@ -223,14 +223,14 @@ def _flat(prefix: str, options: dict[str, Any]) -> Iterator[tuple[str, str]]:
 def _measurements_section(solution: Solution) -> str:
     measurements = solution.measurements
     head = ["Stance", "Pair", "Points", "Inliers", "Residual", "Overlap [px]", "Normal error [°]", "Usable, or why not"]
-    rows = table(head, (_measurement_row(one, solution.why_not(one)) for one in measurements), [1, 7])
+    rows = table(head, (_measurement_row(one, solution.reason(one)) for one in measurements), [1, 7])
     return (
         f"<h2>Measurements</h2>\n<details>\n<summary>{many(len(measurements), 'measured pair')}</summary>\n"
         f"{rows}\n</details>"
     )
 
 
-def _measurement_row(measured: PairMeasurement, why_not: str | None) -> list[str]:
+def _measurement_row(measured: PairMeasurement, reason: str | None) -> list[str]:
     h, pose = measured.homography, measured.relative_pose
     return [
         str(h.stance),
@@ -240,7 +240,7 @@ def _measurement_row(measured: PairMeasurement, why_not: str | None) -> list[str
         number(h.residual, 2),
         number(h.overlap_px, 0),
         number(None if pose is None or pose.normal_error is None else math.degrees(pose.normal_error), 2),
-        "yes" if why_not is None else f'<span class="bad">{escape(why_not)}</span>',
+        "yes" if reason is None else f'<span class="bad">{escape(reason)}</span>',
     ]
 
 

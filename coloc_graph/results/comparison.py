@@ -1,4 +1,4 @@
-"""What is compared with what: estimates and truth from results, runs, and TUM files of other programs."""
+"""Comparison of an estimate with truth, from results, runs, and TUM files of other programs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError, RunError
 from coloc_graph.evaluation import (
-    LONGEST_TRUTH_GAP,
+    MAX_TRUTH_GAP,
     RPE_DISTANCES,
     Accuracy,
     Alignment,
@@ -26,10 +26,20 @@ from coloc_graph.run import is_mcap, read_truth
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Estimated and true trajectories by robot, and how they are brought together.
+    """Estimated and true trajectories by robot, and the alignment between them.
 
-    `reference` is the robot that defines the estimate's world, None where none does. `on_floor`: the robots stand on
-    the plane z = 0 of both worlds.
+    Parameters
+    ----------
+    estimated, truth : mapping of str to Trajectory
+        Poses T_world_body by robot.
+    alignment : Alignment
+        Alignment of the truth with the estimate.
+    reference : str or None
+        Robot that defines the estimate's world; None where none does.
+    on_floor : bool
+        The robots stand on the plane z = 0 of both worlds.
+    max_gap : float
+        Longest gap over which truth is interpolated [s].
     """
 
     estimated: Mapping[str, Trajectory]
@@ -37,26 +47,26 @@ class Comparison:
     alignment: Alignment
     reference: str | None
     on_floor: bool
-    longest_gap: float = LONGEST_TRUTH_GAP
+    max_gap: float = MAX_TRUTH_GAP
 
     def only(self, robots: Sequence[str]) -> "Comparison":
-        """The comparison of these robots alone; `InputError` for one that the estimate does not hold."""
+        """Return the comparison of these robots alone; `InputError` for one that the estimate does not hold."""
         unknown = [robot for robot in robots if robot not in self.estimated]
         if unknown:
-            raise InputError(f"the estimate does not hold robot {unknown[0]}; it holds {', '.join(self.estimated)}")
+            raise InputError(f"the estimate holds no robot {unknown[0]}: choose from {', '.join(self.estimated)}")
         return replace(self, estimated={robot: self.estimated[robot] for robot in robots})
 
     def compare(
         self, rpe: Sequence[float] = RPE_DISTANCES, pairs_from: PairsFrom = "estimate"
     ) -> tuple[Accuracy, dict[str, NDArray[np.float64]]]:
-        """The accuracy, and the true poses (n, 4, 4) in the estimate's world, NaN where there is no truth."""
+        """Return the accuracy, and the true poses (n, 4, 4) in the estimate's world, NaN where there is no truth."""
         true = align(
             self.estimated,
             self.truth,
             self.reference,
             on_floor=self.on_floor,
             alignment=self.alignment,
-            longest_gap=self.longest_gap,
+            max_gap=self.max_gap,
         )
         accuracy = evaluate(
             self.estimated,
@@ -76,10 +86,23 @@ def of_result(
     truth: Sequence[str] = (),
     alignment: Alignment | None = None,
 ) -> Comparison:
-    """A result against the truth in its run (where `run_path` says, if it was moved), or against another truth.
+    """Compare a result with the truth in its run, or with another truth.
 
-    Aligned as is usual (`usual_alignment`) unless said otherwise. Raises `InputError` where the run is another or has
-    no truth.
+    Parameters
+    ----------
+    path : str or Path
+        Folder of the result.
+    run_path : str, Path or None
+        The run, where it was moved.
+    truth : sequence of str
+        Truth as of `read_truths`; (): that of the run.
+    alignment : Alignment or None
+        None: `usual_alignment`.
+
+    Raises
+    ------
+    InputError
+        The run is not that of the result, or has no truth.
     """
     result = read_result(path)
     estimated = _with_poses(result.trajectories, f"{path}")
@@ -106,10 +129,25 @@ def of_files(
     reference: str | None = None,
     on_floor: bool = False,
 ) -> Comparison:
-    """TUM files, or folders of them, against others or against the truth in a run; each as for `read_truths`.
+    """Compare TUM files, or folders of them, with others or with the truth in a run; each as for `read_truths`.
 
-    One file against one file is one robot, whatever their names. Aligned by the team unless said otherwise. Raises
-    `InputError` where a robot is to be the reference and none is named, or one that is not there.
+    One file against one file is one robot, whatever their names.
+
+    Parameters
+    ----------
+    estimate, truth : sequence of str
+        Files and folders.
+    alignment : Alignment or None
+        None: by the team.
+    reference : str or None
+        Robot that defines the estimate's world.
+    on_floor : bool
+        The robots stand on the plane z = 0 of both worlds.
+
+    Raises
+    ------
+    InputError
+        The alignment needs a reference and none is named.
     """
     estimated, true = _read(estimate), read_truths(truth)
     if len(estimated) == len(true) == 1 and all("=" not in one for one in (*estimate, *truth)):
@@ -118,12 +156,12 @@ def of_files(
     if reference is None and len(estimated) == 1:
         reference = next(iter(estimated))
     if alignment == "reference" and reference is None:
-        raise InputError(f"which robot is the reference is not said; name one of {', '.join(estimated)}")
+        raise InputError(f"the reference robot is not named: name one of {', '.join(estimated)}")
     return Comparison(estimated, true, alignment or "team", reference, on_floor)
 
 
 def read_truths(given: Sequence[str]) -> dict[str, Trajectory]:
-    """True trajectories by robot: of a run (.mcap), or as TUM: a folder of <robot>.tum, a file, or ROBOT=FILE each."""
+    """Read true trajectories of a run (.mcap), or of TUM files: a folder of <robot>.tum, a file, or ROBOT=FILE each."""
     if len(given) == 1 and Path(given[0]).is_file() and is_mcap(Path(given[0])):
         truth = read_truth(given[0])
         if not truth:
@@ -133,7 +171,7 @@ def read_truths(given: Sequence[str]) -> dict[str, Trajectory]:
 
 
 def _read(given: Sequence[str]) -> dict[str, Trajectory]:
-    """Trajectories by robot, in the order in which they are named."""
+    """Read trajectories by robot, in the order in which they are named."""
     found: dict[str, Trajectory] = {}
     for one in given:
         name, equals, file = one.partition("=")
@@ -141,7 +179,7 @@ def _read(given: Sequence[str]) -> dict[str, Trajectory]:
         if path.is_dir():
             files = sorted(path.glob("*.tum"))
             if not files:
-                raise InputError(f"{path} holds no .tum files; name them, as ROBOT=FILE each")
+                raise InputError(f"{path} holds no .tum files: name them, as ROBOT=FILE each")
             several = {file.stem: read_tum(file) for file in files}
         elif path == Path(one):
             several = {path.stem: read_tum(path)}
@@ -149,21 +187,19 @@ def _read(given: Sequence[str]) -> dict[str, Trajectory]:
             several = {name: read_tum(path)}
         twice = several.keys() & found.keys()
         if twice:
-            raise InputError(f"robot {min(twice)} is given twice, the second time by {one}; name each robot once")
+            raise InputError(f"robot {min(twice)} is given twice, the second time by {one}: name each robot once")
         found |= {robot: replace(trajectory, robot=robot) for robot, trajectory in several.items()}
     return _with_poses(found, ", ".join(given))
 
 
 def _with_poses(trajectories: Mapping[str, Trajectory], where: str) -> dict[str, Trajectory]:
-    """The trajectories, all of which must hold a pose."""
+    """Return the trajectories, all of which must hold a pose."""
     empty = [robot for robot, one in trajectories.items() if not len(one)]
     if empty or not trajectories:
-        raise InputError(
-            f"{where}: there are no poses{f' of robot {empty[0]}' if empty else ''}; nothing can be compared"
-        )
+        raise InputError(f"{where}: there are no poses{f' of robot {empty[0]}' if empty else ''} to compare")
     return dict(trajectories)
 
 
 def is_result(path: str | Path) -> bool:
-    """Whether a path is to be opened as a result, and not as a folder of TUM files; what is neither says so."""
+    """Return whether to open a path as a result, not as a folder of TUM files; true of a path that is neither."""
     return holds_result(path) or not any(Path(path).glob("*.tum"))

@@ -1,4 +1,4 @@
-"""Where work is done that comes in many parts: processes of this machine, or a cluster of Dask."""
+"""Executors of parallel work: processes of this machine, or a Dask cluster."""
 
 import signal
 from collections.abc import Iterator
@@ -11,16 +11,24 @@ import cv2
 
 from coloc_graph.errors import InputError
 
-#: To find a cluster may take so long [s].
-PATIENCE = 10.0
+CONNECT_TIMEOUT = 10.0  # s, to connect to a cluster
 
 
 @contextmanager
 def workers(processes: int = 1, cluster: str | None = None) -> Iterator[Executor]:
-    """An executor: `processes` new (spawned) processes, or those of the Dask scheduler at an address.
+    """Yield an executor; work that has not begun when the block is left is cancelled.
 
-    A script that asks for processes needs the usual `if __name__ == "__main__":`. What has not begun when the
-    block is left is cancelled. Raises `InputError` where there is no such cluster, or Dask is not installed.
+    Parameters
+    ----------
+    processes : int
+        Number of spawned processes; a script that calls this needs the usual `if __name__ == "__main__":`.
+    cluster : str or None
+        Address of a Dask scheduler, used instead.
+
+    Raises
+    ------
+    InputError
+        There is no such cluster, or Dask is not installed.
     """
     if cluster is not None:
         with _dask(cluster) as executor:
@@ -44,10 +52,10 @@ def _dask(address: str) -> Iterator[Executor]:
             "a cluster needs Dask, which is not installed here: pip install 'coloc-graph[cluster]'"
         ) from error
     try:
-        client: Any = Client(address, timeout=PATIENCE, set_as_default=False)  # type: ignore[no-untyped-call]
+        client: Any = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
-            f"there is no Dask scheduler at {address} ({error}); start one with `dask scheduler`, and give its address"
+            f"there is no Dask scheduler at {address} ({error}): start one with `dask scheduler`, and give its address"
         ) from error
     try:
         yield client.get_executor(pure=False)
@@ -56,5 +64,5 @@ def _dask(address: str) -> Iterator[Executor]:
 
 
 def _begin() -> None:
-    cv2.setNumThreads(1)  # the processes are what is parallel
+    cv2.setNumThreads(1)  # the processes are parallel already
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends a worker without a traceback of its own

@@ -1,4 +1,4 @@
-"""The folder of a result: written whole or not at all, and read back.
+"""The folder of a result: atomic writing, and reading.
 
 A folder holds summary.json, trajectories/<robot>.tum (and .cov.csv), measurements.csv, config.toml and report.html;
 of a run with stances also graph.g2o and graph.dot; of an incremental estimate of a ranging run also
@@ -46,46 +46,45 @@ def holds_result(out: str | Path) -> bool:
     return (Path(out) / SUMMARY).is_file()
 
 
-def require_place(out: str | Path) -> None:
-    """Raise `InputError` where a result cannot go to `out`: it is something else, or its folder cannot be one."""
+def require_output_folder(out: str | Path) -> None:
+    """Raise `InputError` where a result cannot be written to `out`."""
     out = Path(out)
     if out.exists() and not holds_result(out) and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} exists and is not a result; give another folder, or remove it")
+        raise InputError(f"{out} exists and is not a result: give another folder, or remove it")
     above = next(folder for folder in out.absolute().parents if folder.exists())
     if not above.is_dir():
-        raise InputError(f"{out} cannot be made, since {above} is not a folder; give another folder")
+        raise InputError(f"{out} cannot be made, since {above} is not a folder: give another folder")
     if not os.access(above, os.W_OK):
-        raise InputError(f"{out} cannot be written, since {above} is not yours to write to; give another folder")
+        raise InputError(f"{out} cannot be written, since {above} is not writable: give another folder")
 
 
 @contextmanager
-def whole_result(out: str | Path) -> Iterator[Path]:
-    """Yield a folder to write a result to, with trajectories/ in it, which is at `out` once it is whole.
+def atomic_result(out: str | Path) -> Iterator[Path]:
+    """Yield a folder to write a result to, with trajectories/ in it, and move it to `out` at the end.
 
-    An earlier result there is replaced then, and stays as it was after an exception.
+    An earlier result there is replaced, or kept as it was after an exception.
     """
-    require_place(out)
-    place = Path(out).resolve()  # "." has no name, and a link's target is what is replaced
-    with locked_output(place):
-        # a folder of our own beside it, whose name nobody else has
-        work = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=place.parent))
+    require_output_folder(out)
+    target = Path(out).resolve()  # "." has no name, and of a link the target is replaced
+    with locked_output(target):
+        work = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
         part, old = work / "new", work / "old"
         (part / "trajectories").mkdir(parents=True)
         try:
             yield part
-            if place.exists():
-                place.rename(old)
-            part.rename(place)
+            if target.exists():
+                target.rename(old)
+            part.rename(target)
         except BaseException:
-            if old.exists() and not place.exists():
-                old.rename(place)
+            if old.exists() and not target.exists():
+                old.rename(target)
             raise
         finally:
             shutil.rmtree(work, ignore_errors=True)
 
 
 def write_summary(summary: dict[str, Any], run: Path, out: str | Path, part: Path) -> None:
-    """Write summary.json into `part` of the result `out`, with its format and the run that it was made of."""
+    """Write summary.json into `part` of the result `out`, with its format and the path and id of its run."""
     named = {"format": FORMAT, "version": __version__, **summary}
     named |= {"run": os.path.relpath(run.absolute(), Path(out).absolute()), "run_id": run_id(run)}
     (part / SUMMARY).write_text(json.dumps(named, indent=2) + "\n", encoding="utf-8")
@@ -101,22 +100,22 @@ def read_summary(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     if not (path / SUMMARY).exists():
-        raise InputError(f"{path} is not a result: it has no {SUMMARY}; give the folder that `coloc solve --out` wrote")
+        raise InputError(f"{path} is not a result, for want of {SUMMARY}: give a folder that `coloc solve --out` wrote")
     summary = read_json(path / SUMMARY, REMEDY)
     if not isinstance(summary, dict):
         raise InputError(f"{path / SUMMARY} is damaged (it holds no fields); {REMEDY}")
     if summary.get("kind") == "pose graph":
-        raise InputError(f"{path} is a solved pose graph, without robots and times; take its graph.g2o")
+        raise InputError(f"{path} is a solved pose graph, without robots and times: use its graph.g2o")
     number = summary.get("format")
     if number != FORMAT:
         had = "an earlier version of coloc-graph wrote it" if number is None else f"its format is {number}"
-        raise InputError(f"{path} is a result that this version does not read ({had}): solve the run again")
+        raise InputError(f"{path} is a result that this version does not read ({had}): {REMEDY}")
     return summary
 
 
 @dataclass(frozen=True)
 class Config:
-    """What a result was made with: the version, the options, and the team as stated."""
+    """Configuration of a result: version, options, and the team as stated."""
 
     version: str
     options: SolveOptions
@@ -134,7 +133,7 @@ def write_config(options: SolveOptions, team: Team, part: Path) -> None:
 
 
 def read_config(path: str | Path) -> Config:
-    """Return what the result in a folder was made with; `InputError` where config.toml is missing or damaged."""
+    """Return the configuration of a result; `InputError` where config.toml is missing or damaged."""
     file = Path(path) / CONFIG
     config = read_toml(file, REMEDY)
     team = convert(file, config.get("team"), Team, REMEDY)
@@ -160,11 +159,11 @@ class Result:
     trajectories : mapping of str to Trajectory
         Estimated poses by robot.
     run_path : Path
-        Where the run that it was made of should be.
+        Recorded path of its run.
     run_id : str or None
         That run's id.
     config : Config
-        What it was made with.
+        Version, options and team.
     """
 
     path: Path
@@ -201,10 +200,10 @@ class Result:
     def require_run(self, path: str | Path) -> None:
         """Raise `InputError` where the file at `path` is not the run that this result was made of."""
         if not Path(path).exists():
-            raise InputError(f"{self.path}: the run that it was made of is no longer at {path}; give --run RUN")
+            raise InputError(f"{self.path}: its run is no longer at {path}: give --run RUN")
         if self.run_id is not None and run_id(path) != self.run_id:
             raise InputError(
-                f"{path} is not the run that {self.path} was made of; give that one with --run, or solve this one"
+                f"{path} is not the run of the result {self.path}: give that one with --run, or solve this one"
             )
 
 

@@ -1,4 +1,4 @@
-"""Many runs, each solved by itself: in any process, resumed where it stopped, and a bad one ends none of the others."""
+"""Solving of many runs in parallel, each by itself, with resuming; a bad run ends none of the others."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, as_completed
@@ -10,19 +10,27 @@ from typing import Any
 from coloc_graph._version import __version__
 from coloc_graph.errors import ColocError, InputError
 from coloc_graph.pipeline.batch import SolveOptions, solve
-from coloc_graph.results.folder import SUMMARY, holds_result, read_config, read_summary, require_place
+from coloc_graph.results.folder import SUMMARY, holds_result, read_config, read_summary, require_output_folder
 from coloc_graph.results.writer import write_result
 from coloc_graph.run import open_run, run_id
 
-#: A run whose process dies is tried so often: whose fault it was is not known when several are under way.
-TRIES = 2
+MAX_TRIES = 2  # of a run whose process died: with several under way it is not known whose fault it was
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a run: its result is in `out`, unless `failed` says why there is none.
+    """Outcome of one run.
 
-    `resumed` where it was there already. `summary` is that of the result ({}: none).
+    Parameters
+    ----------
+    run, out : Path
+        The run, and the folder of its result.
+    summary : dict
+        summary.json of the result; {} where there is none.
+    failed : str
+        Reason for which there is no result; "" where there is one.
+    resumed : bool
+        The result existed before.
     """
 
     run: Path
@@ -33,77 +41,90 @@ class Outcome:
 
 
 def runs_in(folder: str | Path) -> list[Path]:
-    """The runs (.mcap) in a folder and the folders in it, by name; `InputError` where there are none."""
+    """Return the runs (.mcap) in a folder and the folders in it, by name; `InputError` where there are none."""
     folder = Path(folder)
     found = sorted(path for path in folder.rglob("*.mcap") if path.is_file())
     if not found:
-        raise InputError(f"{folder}: holds no run (.mcap); give a run, or a folder of runs")
+        raise InputError(f"{folder} holds no run (.mcap): give a run, or a folder of runs")
     return found
 
 
-def places_of(runs: Sequence[Path], folder: str | Path, out: str | Path) -> list[Path]:
-    """Where the result of each run in a folder goes: as it is called there, without its ending.
+def result_folders(runs: Sequence[Path], folder: str | Path, out: str | Path) -> list[Path]:
+    """Return the folder of each run's result in `out`: the run's path in `folder` without its ending.
 
     `InputError` where one result would lie in another, which is replaced as a whole when its run is solved again.
     """
-    places = [Path(out) / path.relative_to(folder).with_suffix("") for path in runs]
-    run_at = dict(zip(places, runs, strict=True))
-    for run, place in zip(runs, places, strict=True):
-        for above in place.parents:
+    folders = [Path(out) / path.relative_to(folder).with_suffix("") for path in runs]
+    run_at = dict(zip(folders, runs, strict=True))
+    for run, result in zip(runs, folders, strict=True):
+        for above in result.parents:
             if above in run_at:
                 raise InputError(
-                    f"{run}: its result would lie in that of {run_at[above]}; give the run or its folder another name"
+                    f"{run}: its result would lie in that of {run_at[above]}: give the run or its folder another name"
                 )
-    return places
+    return folders
 
 
 def solve_runs(
     runs: Sequence[Path],
-    places: Sequence[Path],
+    folders: Sequence[Path],
     options: SolveOptions | None = None,
     *,
     executors: Callable[[], AbstractContextManager[Executor]],
-    told: Callable[[Outcome], None] | None = None,
+    on_outcome: Callable[[Outcome], None] | None = None,
 ) -> list[Outcome]:
-    """Solve each run, and write its result to its place; what became of them comes back in their order.
+    """Solve each run, and write its result to its folder.
 
-    A result that is there already, of the same run, options and version, is left as it is. `executors` makes one
-    more executor where one broke. `told` hears of each run as soon as it is over.
+    Parameters
+    ----------
+    runs, folders : sequence of Path
+        The runs, and the folder of each result. An existing result of the same run, options and version is kept.
+    options : SolveOptions, optional
+        As of `solve`.
+    executors : callable
+        Makes an executor, and one more where it broke.
+    on_outcome : callable, optional
+        Called with each outcome as soon as it is known.
+
+    Returns
+    -------
+    list of Outcome
+        In the order of the runs.
     """
     options = options or SolveOptions()
     outcomes: dict[int, Outcome] = {}
 
     def take(number: int, outcome: Outcome) -> None:
         outcomes[number] = outcome
-        if told is not None:
-            told(outcome)
+        if on_outcome is not None:
+            on_outcome(outcome)
 
-    for number, (run, out) in enumerate(zip(runs, places, strict=True)):
+    for number, (run, out) in enumerate(zip(runs, folders, strict=True)):
         if (summary := _earlier(run, out, options)) is not None:
             take(number, Outcome(run, out, summary, resumed=True))
-    for tries in reversed(range(TRIES)):
+    for tries in reversed(range(MAX_TRIES)):
         left = [number for number in range(len(runs)) if number not in outcomes]
         if not left:
             break
         with executors() as executor:
             futures: dict[Future[Outcome], int] = {
-                executor.submit(solve_one, runs[number], places[number], options): number for number in left
+                executor.submit(solve_one, runs[number], folders[number], options): number for number in left
             }
             for future in as_completed(futures):
                 number = futures[future]
                 try:
                     take(number, future.result())
-                except Exception as error:  # `solve_one` raises none: its process is gone, and what waited for it
+                except Exception as error:  # `solve_one` raises none: its process died, or another one's did
                     if not tries:
-                        said = f"{runs[number]}: the process that solved it ended ({type(error).__name__}: {error})"
-                        take(number, Outcome(runs[number], places[number], {}, failed=said))
+                        failed = f"{runs[number]}: the process that solved it ended ({type(error).__name__}: {error})"
+                        take(number, Outcome(runs[number], folders[number], {}, failed=failed))
     return [outcomes[number] for number in range(len(runs))]
 
 
 def solve_one(run: Path, out: Path, options: SolveOptions) -> Outcome:
-    """Solve a run and write its result; what is wrong with it is said in the outcome, whatever it is."""
+    """Solve a run and write its result; any failure is described in the outcome."""
     try:
-        require_place(out)
+        require_output_folder(out)
         write_result(solve(open_run(run), options), out)
         return Outcome(run, out, read_summary(out))
     except ColocError as error:
@@ -116,7 +137,7 @@ def solve_one(run: Path, out: Path, options: SolveOptions) -> Outcome:
 
 
 def _earlier(run: Path, out: Path, options: SolveOptions) -> dict[str, Any] | None:
-    """The summary of a result that is of this run as it is now, by these options and this version; else None."""
+    """Return the summary of a result of this very run by these options and this version; None where there is none."""
     if not holds_result(out):
         return None
     try:

@@ -1,4 +1,4 @@
-"""measurements.csv: one row a measurement, of every kind."""
+"""The table measurements.csv: one row per measurement, of every kind."""
 
 import csv
 import io
@@ -13,9 +13,9 @@ from coloc_graph.errors import InputError
 from coloc_graph.measurements import Odometry
 from coloc_graph.pipeline.solution import Solution
 
-#: `index_i` and `index_j` are stances, or, of a ranging run, keyframes (empty of a landmark). `residual` is the RMS
+#: `index_i` and `index_j` are stances, or, of a ranging run, keyframes (empty for a landmark). `residual` is the RMS
 #: residual in the estimate in units of the measurement's noise; `points_residual` that of a homography's points.
-#: Angles are in degrees but for `bearing` [rad]; lengths in metres; times in seconds.
+#: Angles are in degrees, except `bearing` [rad]; lengths in metres; times in seconds.
 MEASUREMENT_COLUMNS = (
     *("kind", "used", "reason", "time", "robot_i", "index_i", "robot_j", "index_j", "residual"),
     *("points", "inliers", "points_residual", "time_offset", "time_offset_sigma", "overlap_px"),
@@ -40,18 +40,18 @@ def read_measurements(path: Path, kinds: Iterable[str]) -> list[Mapping[str, str
         with path.open(encoding="utf-8", newline="") as file:
             rows = csv.DictReader(file)
             if tuple(rows.fieldnames or ()) != MEASUREMENT_COLUMNS:
-                raise ValueError("its columns are others")
+                raise ValueError("its columns are not those of this version")
             found: list[Mapping[str, str]] = []
             for row in rows:
                 if row["used"] not in ("yes", "no") or None in row.values():
-                    raise ValueError(f"line {rows.line_num} is not whole")
+                    raise ValueError(f"line {rows.line_num} is incomplete")
                 if row["kind"] in kinds:
                     found.append(row)
             return found
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); solve the run again") from error
+        raise InputError(f"{path} cannot be read ({error.strerror}): solve the run again") from error
     except (ValueError, csv.Error) as error:
-        raise InputError(f"{path} is damaged ({error}); solve the run again") from error
+        raise InputError(f"{path} is damaged ({error}): solve the run again") from error
 
 
 def _row(kind: str, reason: str | None, **cells: Any) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def _homographies(solution: Solution) -> Iterator[dict[str, Any]]:
             }
         yield _row(
             "homography",
-            solution.why_not(measured),
+            solution.reason(measured),
             time=f"{times[h.stance]:.6f}",
             robot_i=h.robot_i,
             index_i=h.stance,

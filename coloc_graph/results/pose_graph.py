@@ -10,18 +10,17 @@ from coloc_graph._version import __version__
 from coloc_graph.geometry.lie import quaternion
 from coloc_graph.input_file import read_json, read_text
 from coloc_graph.pipeline.pose_graph import PoseGraphSolution
-from coloc_graph.results.folder import SUMMARY, whole_result
+from coloc_graph.results.folder import SUMMARY, atomic_result
 
-#: Value of `kind` in summary.json, which results of runs do not have.
-KIND = "pose graph"
+KIND = "pose graph"  # `kind` in summary.json, which results of runs do not have
 
 
 def write_pose_graph_result(solution: PoseGraphSolution, out: str | Path) -> None:
     """Write a solved pose graph to the folder `out`; an earlier result there is replaced.
 
-    All lines of graph.g2o but those of vertices are those of the file that was solved.
+    Lines of graph.g2o other than vertices are copied from the file that was solved.
     """
-    with whole_result(out) as part:
+    with atomic_result(out) as part:
         (part / "trajectories").rmdir()
         (part / "graph.g2o").write_text(_solved_text(solution), encoding="utf-8")
         (part / SUMMARY).write_text(json.dumps(summarise_pose_graph(solution), indent=2) + "\n", encoding="utf-8")
@@ -35,7 +34,7 @@ def read_pose_graph_summary(out: str | Path) -> dict[str, Any]:
 
 
 def summarise_pose_graph(solution: PoseGraphSolution) -> dict[str, Any]:
-    """Fields of summary.json."""
+    """Return the content of summary.json."""
     graph = solution.graph
     return {
         "version": __version__,

@@ -1,4 +1,4 @@
-"""Write a result, compared with the truth where the run has it: `write_result`.
+"""Writing of a result, with its accuracy where the run holds truth: `write_result`.
 
 The same run, options and version give the same bytes, except for `seconds` in summary.json.
 """
@@ -25,7 +25,7 @@ from coloc_graph.results.folder import (
     CALIBRATED_TEAM,
     LANDMARKS,
     MEASUREMENTS,
-    whole_result,
+    atomic_result,
     write_config,
     write_summary,
 )
@@ -94,7 +94,7 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
     Parameters
     ----------
     solution : Solution
-        What `solve` returned.
+        Solution by `solve`.
     out : str or Path
         The folder; an earlier result there is replaced.
 
@@ -108,14 +108,14 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
     InputError
         `out` is something else than a result.
     """
-    from coloc_graph.report import render_report  # matplotlib is heavy, and of no use to who only reads results
+    from coloc_graph.report import render_report  # matplotlib is heavy, and reading results does not need it
 
     estimate = solution.estimate
     assessed = assess(solution)
     accuracy, true = assessed if assessed is not None else (None, None)
     if assessed is None:
         solution = with_truth_warning(solution)
-    with whole_result(out) as part:
+    with atomic_result(out) as part:
         for robot, trajectory in estimate.trajectories.items():
             write_tum(trajectory, part / "trajectories" / f"{robot}.tum")
         if solution.online:

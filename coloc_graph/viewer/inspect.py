@@ -135,7 +135,7 @@ def _draw_tracks(half: Image, tracks: Sequence[Track]) -> None:
         colour = tuple(int(value) for value in palette.ROBOTS[(number + 4) % len(palette.ROBOTS)])
         points = np.round(8 * (PICTURE_SCALE * (track.uv + 0.5) - 0.5)).astype(np.int32)
         # a pause in a track is no line across the image
-        for part in np.split(points, np.flatnonzero(np.diff(track.times) > longest_gap(track.times)) + 1):
+        for part in np.split(points, np.flatnonzero(np.diff(track.times) > max_gap(track.times)) + 1):
             cv2.polylines(half, [part], False, colour, 1, cv2.LINE_AA, 3)
 
 
@@ -159,7 +159,7 @@ def _draw_points(run: Run, halves: list[Image], robots: tuple[str, str], measure
             cv2.drawMarker(halves[1], at, (86, 180, 233), cv2.MARKER_TILTED_CROSS, 9, 1, cv2.LINE_AA)
 
 
-def longest_gap(times: Array) -> float:
+def max_gap(times: Array) -> float:
     """Longest interval between two samples of a track that are joined [s]."""
     return max(IMAGE_TOLERANCE, GAP_FACTOR * float(np.median(np.diff(times)))) if len(times) > 1 else IMAGE_TOLERANCE
 
@@ -236,7 +236,7 @@ def _joined(parts: Sequence[tuple[Array, Array, palette.Colours]]) -> Lines:
     points, colours = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3), np.uint8)]
     for times, places, colour in parts:
         good = (
-            (np.diff(times) <= longest_gap(times))
+            (np.diff(times) <= max_gap(times))
             & np.isfinite(places[:-1]).all(axis=1)
             & np.isfinite(places[1:]).all(axis=1)
         )
@@ -256,8 +256,8 @@ def _edge_lines(scene: Scene, edge: int, found: Inspection | None) -> Iterator[s
     edges = scene.edges
     i, j = (scene.robots[int(n)] for n in (edges.i[edge], edges.j[edge]))
     yield f"### {i} - {j}, stance {scene.stances[int(edges.rows[edge])].index}"
-    if edges.why_not[edge]:
-        yield f"**Rejected:** {edges.why_not[edge]}"
+    if edges.reason[edge]:
+        yield f"**Rejected:** {edges.reason[edge]}"
     if np.isfinite(edges.sigmas[edge]):
         yield f"residual **{edges.sigmas[edge]:.2f} sigma** ({edges.of_what})"
     if found is None:

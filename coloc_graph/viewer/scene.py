@@ -102,14 +102,14 @@ class Edges:
     """Measurements of pairs of observers: `rows` (m,) of the stances, robots `i` and `j` (m,) by number.
 
     `sigmas` (m,) is the residual of each, RMS in units of its noise, NaN if unknown; `of_what` names the quantity.
-    `why_not` is the reason to reject a measurement, "" for one that is used.
+    `reason` is the reason to reject a measurement, "" for one that is used.
     """
 
     rows: Index
     i: Index
     j: Index
     sigmas: Array
-    why_not: tuple[str, ...]
+    reason: tuple[str, ...]
     of_what: str = ""
 
     def __len__(self) -> int:
@@ -118,7 +118,7 @@ class Edges:
     @cached_property
     def used(self) -> Mask:
         """(m,), True for a measurement in the estimate."""
-        return np.array([not why for why in self.why_not], bool)
+        return np.array([not why for why in self.reason], bool)
 
 
 @dataclass(frozen=True, eq=False)

@@ -242,7 +242,7 @@ def as_edges(
         i=np.array([number[one[1]] for one in kept]),
         j=np.array([number[one[2]] for one in kept]),
         sigmas=np.array([one[3] for one in kept], float),
-        why_not=tuple(one[4] for one in kept),
+        reason=tuple(one[4] for one in kept),
         of_what=of_what,
     )
 

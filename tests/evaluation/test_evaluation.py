@@ -243,7 +243,7 @@ def test_the_truth_of_a_robot_that_drives_is_followed_between_its_samples():
     np.testing.assert_allclose(found[[1, 2, 3, 5]], expected[[1, 2, 3, 5]], atol=1e-12)
     assert np.isnan(found[[0, 4]]).all()
     # unless it is said that it drove evenly
-    found = true_poses(truth, dataclasses.replace(asked, stances=None), longest_gap=8.0)
+    found = true_poses(truth, dataclasses.replace(asked, stances=None), max_gap=8.0)
     share = 3.8 / 7.8
     np.testing.assert_allclose(found[4, :3, 3], [0.06 + 0.44 * share, 0.02 + 0.48 * share, 0], atol=1e-12)
 

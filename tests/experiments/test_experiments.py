@@ -17,7 +17,7 @@ import pytest
 from coloc_graph import experiments
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
-from coloc_graph.experiments import CELLS, Fig4, Fig5, fig4, measure_cells, require_place, save, table1, table2
+from coloc_graph.experiments import CELLS, Fig4, Fig5, fig4, measure_cells, require_output_folder, save, table1, table2
 from coloc_graph.experiments.figures_single_step import fig4_figure, fig5_figure
 from coloc_graph.experiments.paper import TABLE1_FROM_A, TABLE1_STEPS, TABLE2
 from coloc_graph.experiments.pool import spread
@@ -259,7 +259,7 @@ def test_the_commands_options_reach_the_experiment(single, tmp_path, capsys, mon
 )
 def test_a_bad_value_is_one_sentence(arguments, what, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("coloc_graph.results.executors.PATIENCE", 0.5)
+    monkeypatch.setattr("coloc_graph.results.executors.CONNECT_TIMEOUT", 0.5)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("mine")
     try:
@@ -274,7 +274,7 @@ def test_a_bad_value_is_one_sentence(arguments, what, tmp_path, capsys, monkeypa
 
 def test_a_place_with_experiments_takes_another(tmp_path):
     (tmp_path / "fig4.json").write_text("{}")
-    require_place(tmp_path, "fig5")
+    require_output_folder(tmp_path, "fig5")
 
 
 def test_importing_the_command_draws_nothing():

@@ -138,7 +138,7 @@ def test_truth_at_a_hundred_hertz_is_interpolated_to_what_was_estimated_in_betwe
     slow = np.arange(0, 6.1, 0.5)
     write_tum(Trajectory("A", 1.7e9 + slow, circle(slow)), tmp_path / "true.tum")
     assert "the truth of robot est is at none of its times" in call(*files)[2]
-    code, out, err = call(*files, "--align", "none", "--longest-gap", 0.6)
+    code, out, err = call(*files, "--align", "none", "--max-gap", 0.6)
     assert code == 0 and 0.01 < json.loads(out)["translation_m"]["max"] < 0.04  # a chord of 0.5 rad
 
 

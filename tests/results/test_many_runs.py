@@ -15,7 +15,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.pipeline.batch import SolveOptions
 from coloc_graph.results import many_runs
 from coloc_graph.results.executors import workers
-from coloc_graph.results.many_runs import places_of, runs_in, solve_runs
+from coloc_graph.results.many_runs import result_folders, runs_in, solve_runs
 from coloc_graph.run import open_run
 
 
@@ -52,7 +52,9 @@ solve_one = many_runs.solve_one
 def solved(folder, out, executors, options=None):
     runs = runs_in(folder)
     heard = []
-    outcomes = solve_runs(runs, places_of(runs, folder, out), options, executors=executors, told=heard.append)
+    outcomes = solve_runs(
+        runs, result_folders(runs, folder, out), options, executors=executors, on_outcome=heard.append
+    )
     assert [one.run for one in outcomes] == runs
     assert sorted(heard, key=lambda one: one.run) == sorted(outcomes, key=lambda one: one.run)
     return {one.run.stem: one for one in outcomes}
@@ -116,7 +118,7 @@ def test_the_command_prints_a_table_and_says_which_failed(folder, tmp_path, caps
     ],
 )
 def test_what_a_folder_cannot_have_is_one_sentence(folder, tmp_path, capsys, monkeypatch, more, words):
-    monkeypatch.setattr("coloc_graph.results.executors.PATIENCE", 0.5)
+    monkeypatch.setattr("coloc_graph.results.executors.CONNECT_TIMEOUT", 0.5)
     assert main(["solve", str(folder), "--out", str(tmp_path / "out"), *more]) == 2
     assert words in capsys.readouterr().err
 

@@ -100,7 +100,7 @@ def test_a_wrong_measurement_is_a_refused_edge_with_its_reason():
     team = team_of(4, 6, seed=2, wrong=0.15)
     estimate = smooth(graph_of_team(team))
     drawn = scene_of_estimate(estimate)
-    wrong = {one for one in drawn.edges.why_not if one}
+    wrong = {one for one in drawn.edges.reason if one}
     assert len(estimate.rejected) == (~drawn.edges.used).sum() > 0 and all("contradicted" in why for why in wrong)
     frame = shown(drawn)
     assert len(frame.rejected.points) > (~drawn.edges.used).sum()  # dashes
@@ -363,7 +363,7 @@ def test_stances_are_shown_while_the_run_is_solved_and_what_cannot_be_used_too(s
 
         solve(run, SolveOptions(incremental=True), on_update=entered)
         assert rows == [(1, 1, 1), (2, 2, 1), (3, 3, 2)]
-        assert "line" in viewer.scene.edges.why_not[1] and len(viewer.frame.rejected.points)
+        assert "line" in viewer.scene.edges.reason[1] and len(viewer.frame.rejected.points)
 
 
 def test_publishing_costs_the_estimator_less_than_a_millisecond(short_solution):

@@ -115,7 +115,7 @@ def test_slider_click_and_keys(scene, page_of):
         # a click on an edge that was refused, which is dashed, opens the panel that says why
         why = "contradicted by all others"
         edge = clear_edge(viewer, client)[0]
-        doubtful = replace(scene.edges, why_not=tuple(why if n == edge else "" for n in range(len(scene.edges))))
+        doubtful = replace(scene.edges, reason=tuple(why if n == edge else "" for n in range(len(scene.edges))))
         assert segments_of(page, "/rejected") == 0
         viewer.pick(None)
         viewer.publish(replace(scene, edges=doubtful))
