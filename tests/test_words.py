@@ -13,17 +13,9 @@ NOT_YET = {
     "backend",
     "calibration",
     "cli",
-    "evaluation",
     "exchange",
     "frontend",
-    "geometry",
-    "measurements",
-    "pipeline",
-    "report",
-    "results",
     "robot_io",
-    "run",
-    "team",
     "viewer",
 }
 CLAUSES = {"What", "Where", "Whether", "Which", "Who", "Whose", "How", "So", "Such"}

@@ -22,7 +22,7 @@ from coloc_graph.measurements import (
     Sighting,
 )
 from coloc_graph.run import Stance
-from coloc_graph.run.atomic_file import write_whole
+from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.team import Floor, Landmark, Robot, Slip
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -193,7 +193,7 @@ def write(saved: Checkpoint, path: Path) -> None:
         waiting=[_WaitingStance(one.stance, _of_all(one.measurements), one.after) for one in saved.waiting],
     )
     try:
-        write_whole(path, msgspec.json.encode(file), synchronise=True)
+        write_atomically(path, msgspec.json.encode(file), synchronise=True)
     except OSError as error:
         raise InputError(f"{path}: the checkpoint cannot be written ({error.strerror}); give another path") from error
 

@@ -8,7 +8,7 @@ import msgspec
 
 from coloc_graph.errors import TeamError
 from coloc_graph.input_file import MAX_DESCRIPTION_SIZE, read_text
-from coloc_graph.run.atomic_file import write_whole
+from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.team import Camera, Mount, Team, parse_team
 
 #: What a calibration says of a camera, and of a mount; the rest is the robot's own.
@@ -47,7 +47,7 @@ def _write(path: Path, robot: str, part: str, values: Mapping[str, Any], out: Pa
     except (TOMLKitError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise TeamError(f"{path}: cannot be changed ({error}); write the values of `{part}` by hand") from error
     _require_same(path, text, team, robot, part, values)
-    write_whole(out, text)
+    write_atomically(out, text)
 
 
 def _require_same(path: Path, text: str, team: Team, robot: str, part: str, values: Mapping[str, Any]) -> None:

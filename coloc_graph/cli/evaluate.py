@@ -59,9 +59,9 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.evaluation import RPE_DISTANCES, accuracy_json
 
     if args.plot:
-        from coloc_graph.report.comparison import comparison_drawings, require_plot_place, write_plots
+        from coloc_graph.report.comparison import comparison_drawings, require_plot_path, write_plots
 
-        require_plot_place(args.plot, force=args.force)  # before the work, not after it
+        require_plot_path(args.plot, force=args.force)  # before the work, not after it
     comparison = _comparison(args)
     if args.robots:
         comparison = comparison.only([robot for robot in args.robots.split(",") if robot])

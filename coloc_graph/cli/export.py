@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
 
     from coloc_graph.errors import InputError
     from coloc_graph.results.folder import read_result
-    from coloc_graph.run.atomic_file import write_whole
+    from coloc_graph.run.atomic_file import write_atomically
 
     result, out = read_result(args.result), Path(args.out)
     if os.path.lexists(out):
@@ -48,6 +48,6 @@ def run(args: argparse.Namespace) -> int:
     if args.format == "tum":
         shutil.copytree(source, out)
     else:
-        write_whole(out, source.read_bytes())
+        write_atomically(out, source.read_bytes())
     print(f"wrote {out}")
     return 0

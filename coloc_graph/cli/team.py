@@ -73,7 +73,7 @@ def run_new(args: argparse.Namespace) -> int:
     import msgspec
 
     from coloc_graph.errors import InputError
-    from coloc_graph.run.atomic_file import require_writable, write_whole
+    from coloc_graph.run.atomic_file import require_writable, write_atomically
     from coloc_graph.team import Team
 
     width, times, height = args.size.partition("x")
@@ -108,7 +108,7 @@ def run_new(args: argparse.Namespace) -> int:
     problems, _ = findings(team)
     if problems:
         raise InputError(f"that is no team to solve: {problems[0]}")
-    write_whole(Path(args.out), text)
+    write_atomically(Path(args.out), text)
     print(f"{args.out}: robots {', '.join(team.names)}; correct its numbers, then `coloc team check {args.out}`")
     return 0
 

@@ -1,6 +1,6 @@
-"""An estimate against truth: alignment by time for a whole team, ATE, RPE, lengths as in Table II, and NEES.
+"""Evaluation of an estimate with truth: alignment of a whole team, ATE, RPE, lengths as in Table II, and NEES.
 
-`align` takes the truth into the estimate's world, at its times; `evaluate` compares. See docs/evaluation.md.
+`align` transforms the truth into the estimate's world, at its times; `evaluate` compares. See docs/evaluation.md.
 """
 
 from coloc_graph.evaluation.accuracy import Accuracy, DistanceAccuracy, RobotAccuracy, accuracy_json, evaluate
@@ -14,7 +14,7 @@ from coloc_graph.evaluation.pose_errors import (
     absolute_errors,
     relative_errors,
 )
-from coloc_graph.evaluation.truth import MAX_TRUTH_GAP, left_out, true_poses, with_truth
+from coloc_graph.evaluation.truth import MAX_TRUTH_GAP, true_poses, with_truth, without_truth
 
 __all__ = [
     "ALIGNMENTS",
@@ -35,7 +35,6 @@ __all__ = [
     "align",
     "effective_poses",
     "evaluate",
-    "left_out",
     "nees",
     "nees_of",
     "relative_errors",
@@ -43,4 +42,5 @@ __all__ = [
     "usual_alignment",
     "whitened",
     "with_truth",
+    "without_truth",
 ]

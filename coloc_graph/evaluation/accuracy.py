@@ -1,4 +1,4 @@
-"""An estimate against truth in figures: lengths as in the paper's Table II, ATE, RPE, heading, and NEES."""
+"""Accuracy of an estimate: lengths as in the paper's Table II, ATE, RPE, heading error, and NEES."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -20,22 +20,33 @@ from coloc_graph.evaluation.pose_errors import (
     relative_errors,
     spread,
 )
-from coloc_graph.evaluation.truth import first_with_truth, left_out, with_truth
+from coloc_graph.evaluation.truth import first_with_truth, with_truth, without_truth
 from coloc_graph.geometry.lie import yaw
 from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-#: A robot that got no further than this stayed where it was [m].
-STAYED = 0.05
+STANDING_DISTANCE = 0.05  # m between first and last pose, up to which a robot counts as standing
 
 
 @dataclass(frozen=True)
 class RobotAccuracy:
-    """One robot's row of Table II, and its errors. Lengths are straight from its first to its last estimated pose [m].
+    """Accuracy of one robot.
 
-    `translation` [m] and `rotation_deg` are over all poses (ATE), `relative` over stretches of the way (RPE). `nees`
-    is None where no covariances say what the errors should be.
+    Parameters
+    ----------
+    robot : str
+        Its name.
+    true_length, estimated_length : float
+        Straight distance from its first to its last estimated pose [m].
+    end_position_error, heading_error_deg : float
+        Errors of the last pose [m], [deg].
+    translation, rotation_deg : Spread
+        Errors over all poses (ATE) [m], [deg].
+    relative : tuple of RelativeError
+        Errors over distances travelled (RPE).
+    nees : Nees or None
+        Consistency; None without covariances.
     """
 
     robot: str
@@ -60,13 +71,13 @@ class RobotAccuracy:
 
     @property
     def length_error_percent(self) -> float | None:
-        """Size of the length error in % of the true length; None for a robot that did not get anywhere."""
-        return 100 * abs(self.length_error) / self.true_length if self.true_length > STAYED else None
+        """Size of the length error in % of the true length; None for a standing robot."""
+        return 100 * abs(self.length_error) / self.true_length if self.true_length > STANDING_DISTANCE else None
 
 
 @dataclass(frozen=True)
 class DistanceAccuracy:
-    """The distance between two robots that stayed where they were [m]."""
+    """True and estimated distance between two standing robots [m]."""
 
     robot_i: str
     robot_j: str
@@ -81,12 +92,29 @@ class DistanceAccuracy:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """A team's accuracy: errors over all poses of all robots, the largest end errors of any robot, and the average
-    NEES per degree of freedom (1 where the covariances tell the truth) over `nees_poses` poses.
+    """Accuracy of a team.
 
-    `distances` are those of the pairs of robots that stayed where they were, of which lengths say nothing. `warnings`
-    say which poses had no truth. `alignment` says what was made to agree; where it was fitted to the errors there is
-    no NEES, since the covariances are those in the world of the reference.
+    Parameters
+    ----------
+    robots : tuple of RobotAccuracy
+        Accuracy of each robot.
+    alignment : Alignment
+        Alignment of the truth. Where it was fitted to all poses there is no NEES, since the covariances are those in
+        the world of the reference.
+    translation, rotation_deg : Spread
+        Errors over all poses of all robots (ATE) [m], [deg].
+    relative : tuple of RelativeError
+        Errors over distances travelled (RPE).
+    end_position_error, heading_error_deg : float
+        Largest errors of any robot's last pose [m], [deg].
+    anees : float or None
+        Average NEES per degree of freedom, 1 of a consistent estimate.
+    nees_poses : int
+        Poses that it is of.
+    distances : tuple of DistanceAccuracy
+        Distances between standing robots, whose lengths are meaningless.
+    warnings : tuple of str
+        Sentences on poses without truth.
     """
 
     robots: tuple[RobotAccuracy, ...]
@@ -117,21 +145,39 @@ def evaluate(
     pairs_from: PairsFrom = "estimate",
     reference: str | None = None,
 ) -> Accuracy:
-    """Compare an estimate with the true poses (n, 4, 4) of `align`, by the alignment that it was asked for.
+    """Compare an estimate with truth.
 
-    Poses without truth are left out, and so are robots without any; `Accuracy.warnings` counts them. At least one pose
-    has truth. `on_floor`: the NEES is that of heading, x and y, since the floor decides the rest. `rpe` are the
-    distances of the RPE [m], of the robots' paths in the estimate or in the truth (`pairs_from`). `reference` is the
-    robot that was aligned: where its first pose with truth is not the one that defines the world, there is no NEES.
+    Parameters
+    ----------
+    estimated : mapping of str to Trajectory
+        Estimated poses by robot.
+    true : mapping of str to (n, 4, 4) float
+        True poses by `align`, NaN where there is no truth: these poses are ignored and counted in the warnings. At
+        least one pose has truth.
+    on_floor : bool
+        The NEES is that of heading, x and y.
+    alignment : Alignment
+        Alignment by which `true` was made.
+    rpe : sequence of float
+        Distances of the RPE [m].
+    pairs_from : {"estimate", "truth"}
+        Path by which these distances are measured.
+    reference : str or None
+        Robot that was aligned: where its first pose with truth is not the one that defines the world, there is no
+        NEES.
+
+    Returns
+    -------
+    Accuracy
+        Errors of the team and of each robot.
     """
-    warnings = left_out(estimated, true)
+    warnings = without_truth(estimated, true)
     late = _aligned_late(estimated, true, reference) if alignment == "reference" and reference is not None else None
     warnings += (late,) if late else ()
     kept = {robot: with_truth(true[robot]) for robot in estimated}
     estimated = {robot: one.where(kept[robot]) for robot, one in estimated.items() if kept[robot].any()}
     true = {robot: true[robot][kept[robot]] for robot in estimated}
-    # covariances are in the body's tangent, which no alignment turns; but they are of errors from the world's beginning
-    # on, and what a fit took from all poses together they do not know
+    # covariances are those of errors relative to the first pose; a fit of all poses to truth is not in them
     stated = alignment in ("reference", "none") and not late
     components = PLANAR if on_floor else FREE
 
@@ -174,15 +220,15 @@ def evaluate(
 
 
 def _aligned_late(estimated: Mapping[str, Trajectory], true: Mapping[str, Array], reference: str) -> str | None:
-    """Sentence on an alignment by another pose of the reference than its first; None where it is the first, or held."""
+    """Warn of an alignment by another pose of the reference than its first; None where it is the first, or equal."""
     first = first_with_truth(estimated, true, reference)
     if first is None or (estimated[reference].T_world_body[: first + 1] == estimated[reference].T_world_body[0]).all():
         return None
     at = estimated[reference]
     where = f"stance {at.stances[first]}" if at.stances is not None else f"{at.times[first]:.3f} s"
     return (
-        f"the truth of the reference robot {reference} begins after the estimate: aligned by its pose at {where}; "
-        "there is no NEES, since the covariances are of errors since the estimate begins"
+        f"the truth of the reference robot {reference} begins after the estimate: aligned by its pose at {where}, and "
+        "without NEES, since the covariances are relative to its first pose"
     )
 
 
@@ -196,13 +242,13 @@ def _distances(
             true=float(np.linalg.norm(true[j][-1, :3, 3] - true[i][-1, :3, 3])),
             estimated=float(np.linalg.norm(estimated[j].positions[-1] - estimated[i].positions[-1])),
         )
-        for i, j in itertools.combinations([row.robot for row in rows if row.true_length <= STAYED], 2)
-        if estimated[i].times[-1] == estimated[j].times[-1]  # not where one drove by
+        for i, j in itertools.combinations([row.robot for row in rows if row.true_length <= STANDING_DISTANCE], 2)
+        if estimated[i].times[-1] == estimated[j].times[-1]  # not of robots at different times
     )
 
 
 def accuracy_json(accuracy: Accuracy) -> dict[str, Any]:
-    """An accuracy as in summary.json; numbers that do not exist are null."""
+    """Return an accuracy as in summary.json; numbers that do not exist are null."""
     return {
         "alignment": accuracy.alignment,
         "length_error_percent": {row.robot: row.length_error_percent for row in accuracy.robots},

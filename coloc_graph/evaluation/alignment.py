@@ -1,4 +1,4 @@
-"""Truth taken into the estimate's world: by the reference's first pose, by a fit, or as it is."""
+"""Alignment of truth with the estimate's world: by the reference's first pose, by a fit, or not at all."""
 
 from collections.abc import Mapping
 from typing import Literal, get_args
@@ -7,28 +7,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.evaluation.truth import MAX_TRUTH_GAP, first_with_truth, require_some, true_poses, with_truth
+from coloc_graph.evaluation.truth import MAX_TRUTH_GAP, first_with_truth, require_truth, true_poses, with_truth
 from coloc_graph.geometry.lie import closest_rotation, floor_pose, se3, se3_inverse, yaw
 from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-#: What of the estimate and the truth is made to agree before they are compared.
-#: `reference`: the reference robot's first pose; `team`: all poses of all robots, by one rigid motion;
-#: `robot`: each robot's own poses, by its own; `none`: nothing, since both are in the same world.
+#: Alignment of the truth with the estimate.
+#: `reference`: by the reference robot's first pose; `team`: all poses of all robots by one rigid motion;
+#: `robot`: each robot's poses by a rigid motion of its own; `none`: both are in the same world.
 Alignment = Literal["reference", "team", "robot", "none"]
 ALIGNMENTS: tuple[Alignment, ...] = get_args(Alignment)
 
-#: Positions that reach no further across their line, or about their point, than this part of their length have no
-#: rotation of their own (variances, so that this is 0.03 mm a metre).
-_THIN = 1e-9
+_DEGENERATE_RATIO = 1e-9  # ratio of the positions' principal variances below which they lie on a line: 0.03 mm per m
 
 
 def usual_alignment(
     estimated: Mapping[str, Trajectory], truth: Mapping[str, Trajectory], reference: str | None
 ) -> Alignment:
-    """By the reference, in whose world poses at stances are; by the team where poses belong to no stances, or the
-    reference has no truth at its poses."""
+    """Return the default alignment: by the reference, in whose world poses at stances are.
+
+    By the team where poses belong to no stances, or the reference has no truth at its poses.
+    """
     if reference is None or any(one.stances is None for one in estimated.values()):
         return "team"
     if reference in estimated and not with_truth(true_poses(truth, estimated[reference])).any():
@@ -45,14 +45,33 @@ def align(
     alignment: Alignment = "reference",
     max_gap: float = MAX_TRUTH_GAP,
 ) -> dict[str, Array]:
-    """The true poses T_world_body (n, 4, 4) at each robot's estimated poses, in the estimate's world; NaN without.
+    """Return the true poses at the times of an estimate, in the estimate's world.
 
-    They are found by time (`true_poses`). On a floor the truth is turned and moved on it only. `reference` is the
-    robot that defines the world, where that is what is aligned: by its first pose that has a true one. Raises
-    `InputError` where no pose has a true one, and where what is to be aligned says too little.
+    Parameters
+    ----------
+    estimated, truth : mapping of str to Trajectory
+        Estimated and true poses by robot.
+    reference : str or None
+        Robot that defines the world, for alignment by its first pose that has truth.
+    on_floor : bool
+        Move and turn the truth on the floor only.
+    alignment : Alignment
+        Kind of alignment.
+    max_gap : float
+        Longest gap over which truth is interpolated [s].
+
+    Returns
+    -------
+    dict of str to (n, 4, 4) float
+        T_world_body by robot, NaN where there is no truth.
+
+    Raises
+    ------
+    InputError
+        No pose has truth, or the alignment is undetermined.
     """
     at = {robot: true_poses(truth, one, max_gap) for robot, one in estimated.items()}
-    require_some(truth, estimated, at)
+    require_truth(truth, estimated, at)
     if alignment == "none":
         return at
     if alignment == "reference":
@@ -72,9 +91,9 @@ def align(
 def _of_reference(
     estimated: Mapping[str, Trajectory], at: Mapping[str, Array], reference: str | None, *, on_floor: bool
 ) -> Array:
-    """T_world_truth (4, 4) that puts the reference's first pose with truth where it truly was."""
+    """Return T_world_truth (4, 4) by the reference's first pose with truth."""
     if reference is None or reference not in at:
-        raise InputError(f"the estimate does not hold the reference robot {reference}; nothing can be compared")
+        raise InputError(f"the estimate does not hold the reference robot {reference}: choose another alignment")
     first = first_with_truth(estimated, at, reference)
     if first is None:
         raise InputError(
@@ -88,7 +107,7 @@ def _of_reference(
 
 
 def _fitted(estimated: Mapping[str, Trajectory], at: Mapping[str, Array], *, on_floor: bool) -> Array:
-    """T_world_truth (4, 4) that brings all true positions nearest to the estimated ones.
+    """Fit T_world_truth (4, 4) that brings all true positions nearest to the estimated ones.
 
     Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, without scale.
     """
@@ -98,24 +117,24 @@ def _fitted(estimated: Mapping[str, Trajectory], at: Mapping[str, Array], *, on_
     size = 2 if on_floor else 3
     a, b = (to - to.mean(0))[:, :size], (of - of.mean(0))[:, :size]
     spreads = np.array([np.linalg.eigvalsh(x.T @ x / len(x))[::-1] for x in (a, b)])
-    if (spreads[:, 0] < 1e-12).any() or (not on_floor and (spreads[:, 1] < _THIN * spreads[:, 0]).any()):
+    if (spreads[:, 0] < 1e-12).any() or (not on_floor and (spreads[:, 1] < _DEGENERATE_RATIO * spreads[:, 0]).any()):
         whose = ", ".join(estimated)
         shape, remedy = "in one place", "reference"
         if spreads.shape[1] == 3 and not (spreads[:, 0] < 1e-12).any():
             shape, remedy = "on one line", "reference, or planar if they are on a floor"
         raise InputError(
-            f"all poses of {whose} are {shape}, so that no rotation can be fitted; align by another way ({remedy})"
+            f"no rotation can be fitted, since all poses of {whose} are {shape}: choose another alignment ({remedy})"
         )
     R = np.eye(3)
     R[:size, :size] = _rotation(a.T @ b)
     t = to.mean(0) - R @ of.mean(0)
     if on_floor:
-        t[2] = 0.0  # heights are those above the floor, in the estimate and in truth
+        t[2] = 0.0  # heights are relative to the floor in both
     return se3(R, t)
 
 
 def _rotation(M: Array) -> Array:
-    """The rotation nearest to a matrix of two or three dimensions."""
+    """Return the rotation nearest to a matrix (2, 2) or (3, 3)."""
     if len(M) == 3:
         return closest_rotation(M)
     angle = np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1])

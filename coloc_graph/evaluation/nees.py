@@ -1,4 +1,4 @@
-"""NEES: whether errors are as large as the covariances say, and how surely one trajectory can tell."""
+"""NEES: consistency of errors with covariances, with its confidence interval for one trajectory."""
 
 from dataclasses import dataclass
 
@@ -12,19 +12,26 @@ from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-#: Tangent components of a pose on the floor, and of one that is free.
-PLANAR = [2, 3, 4]
-FREE = [0, 1, 2, 3, 4, 5]
-#: A pose that is known better than this defines the world; its error says nothing [m, rad].
-DEFINED = 1e-5
+PLANAR = [2, 3, 4]  # tangent components of a pose on the floor
+FREE = [0, 1, 2, 3, 4, 5]  # tangent components of a free pose
+MIN_POSE_SIGMA = 1e-5  # m, rad: a pose with smaller sigmas defines the world, and has no error
 
 
 @dataclass(frozen=True)
 class Nees:
-    """Mean normalised estimation error squared per degree of freedom over `poses`, 1 where covariances are honest.
+    """Mean normalised estimation error squared (NEES) per degree of freedom of one trajectory.
 
-    `low` and `high` hold 95 % of a chi-square variable of as many degrees of freedom as `effective` poses have that
-    know nothing of each other. That number is estimated, too: of honest runs 84 to 96 % were in (docs/evaluation.md).
+    Parameters
+    ----------
+    mean : float
+        NEES per degree of freedom; 1 is expected of a consistent estimate.
+    poses : int
+        Number of poses.
+    effective : float
+        Equivalent number of independent poses, estimated.
+    low, high : float
+        95 % interval of a chi-square variable with the degrees of freedom of `effective` poses. Of consistent runs 84
+        to 96 % were in it (docs/evaluation.md).
     """
 
     mean: float
@@ -35,12 +42,12 @@ class Nees:
 
     @property
     def consistent(self) -> bool:
-        """Whether the mean is in its interval."""
+        """True if the mean is in its interval."""
         return self.low <= self.mean <= self.high
 
 
 def nees(estimated: Trajectory, T_true: Array, components: list[int]) -> Nees | None:
-    """The NEES of a trajectory against true poses (n, 4, 4), with its interval; None where no pose has a covariance."""
+    """Return the NEES of a trajectory with true poses (n, 4, 4); None where no pose has a covariance."""
     z = whitened(estimated, T_true, components)
     if not len(z):
         return None
@@ -51,15 +58,15 @@ def nees(estimated: Trajectory, T_true: Array, components: list[int]) -> Nees | 
 
 
 def nees_of(estimated: Trajectory, T_true: Array, components: list[int]) -> Array:
-    """Normalised estimation error squared per degree of freedom, of each pose of `whitened`."""
+    """Return the normalised estimation error squared per degree of freedom of each pose of `whitened`."""
     return np.asarray((whitened(estimated, T_true, components) ** 2).mean(axis=1))
 
 
 def whitened(estimated: Trajectory, T_true: Array, components: list[int]) -> Array:
-    """Errors in units of their covariances, (m, d): unit normal, if these are right, along the world's axes.
+    """Return errors (m, d) whitened by their covariances, along the world's axes: unit normal if consistent.
 
-    Of each pose that has a true one, NaN being none, and a covariance to speak of: the pose that defines the world has
-    none and is left out; a pose held over several stances counts once.
+    Of each pose with truth (not NaN) and a covariance: the pose that defines the world has none; a pose held over
+    several stances counts once.
     """
     if estimated.covariances is None:
         return np.empty((0, len(components)))
@@ -70,10 +77,10 @@ def whitened(estimated: Trajectory, T_true: Array, components: list[int]) -> Arr
     finite = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
     values = np.linalg.eigvalsh(np.where(finite[:, None, None], covariances, 0.0))
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).clip(min=0)).max(axis=1, initial=0.0)
-    kept = new & with_truth(T_true) & finite & (sigmas >= DEFINED) & (values[:, 0] > 1e-15 * values[:, -1])
+    kept = new & with_truth(T_true) & finite & (sigmas >= MIN_POSE_SIGMA) & (values[:, 0] > 1e-15 * values[:, -1])
     T_world_body = T_world_body[kept]
     xi = se3_log(se3_inverse(T_world_body) @ T_true[kept])
-    # along the world's axes: in those of a body that turns, neighbours would seem to know nothing of each other
+    # along the world's axes: along those of a turning body, neighbours would seem uncorrelated
     R = T_world_body[:, :3, :3] if components != PLANAR else floor_pose(0, 0, yaw(T_world_body))[:, :3, :3]
     both = np.zeros((len(R), 6, 6))
     both[:, :3, :3] = both[:, 3:, 3:] = R
@@ -84,12 +91,12 @@ def whitened(estimated: Trajectory, T_true: Array, components: list[int]) -> Arr
 
 
 def effective_poses(z: Array) -> float:
-    """How many independent poses say as much of the mean NEES as whitened errors (n, d) in a row do.
+    """Return the number of independent poses that determine the mean NEES as well as whitened errors (n, d) do.
 
-    n / (1 + 2 sum (1 - h/n) rho_h^2), rho_h the correlation of errors h poses apart, up to where it is lost: the
-    squares of two normal variables are correlated by the square of their correlation. The errors' mean is taken for
-    zero, as it is if the estimate is consistent; a bias so makes the interval wider. Source of the sum: Sokal, "Monte
-    Carlo Methods in Statistical Mechanics", 1997, eq. (2.16).
+    n / (1 + 2 sum (1 - h/n) rho_h^2), rho_h the correlation of errors h poses apart, up to its first zero: the squares
+    of two normal variables are correlated by the square of their correlation. The errors' mean is taken as zero, as of
+    a consistent estimate; a bias therefore makes the interval wider. Source of the sum: Sokal, "Monte Carlo Methods in
+    Statistical Mechanics", 1997, eq. (2.16).
     """
     n = len(z)
     spectrum = np.fft.rfft(z, 2 * n, axis=0)

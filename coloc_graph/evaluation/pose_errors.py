@@ -1,4 +1,4 @@
-"""How far poses are from where they should be: ATE over all poses, RPE over stretches of the way."""
+"""Errors of poses: ATE over all poses, RPE over distances travelled."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,17 +11,15 @@ from coloc_graph.geometry.lie import se3, so3_log
 
 Array = NDArray[np.float64]
 
-#: The distances of the RPE, unless others are asked for [m].
-RPE_DISTANCES = (1.0, 2.0, 5.0, 10.0)
-#: The ends of a pair are apart by its distance, give or take this part of it.
-RPE_TOLERANCE = 0.1
-#: Whose path says how far apart the ends of a pair are.
+RPE_DISTANCES = (1.0, 2.0, 5.0, 10.0)  # m, default distances of the RPE
+RPE_TOLERANCE = 0.1  # deviation of a pair's path length from the distance, relative
+#: Path along which the distance between the poses of a pair is measured.
 PairsFrom = Literal["estimate", "truth"]
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Root mean square, mean, median and greatest of errors."""
+    """Root mean square, mean, median and maximum of errors."""
 
     rmse: float
     mean: float
@@ -30,7 +28,7 @@ class Spread:
 
 
 def spread(errors: Array) -> Spread:
-    """The spread of errors (n,), of which there is at least one."""
+    """Return the spread of errors (n,), at least one."""
     return Spread(
         rmse=float(np.sqrt(np.mean(errors**2))),
         mean=float(errors.mean()),
@@ -41,9 +39,16 @@ def spread(errors: Array) -> Spread:
 
 @dataclass(frozen=True)
 class RelativeError:
-    """Relative pose error over a distance travelled [m]: RMS of translation [m] and rotation [deg] over all `pairs`.
+    """Relative pose error (RPE) over a distance travelled.
 
-    None where no two poses are that far apart.
+    Parameters
+    ----------
+    distance : float
+        The distance [m].
+    pairs : int
+        Number of pairs of poses.
+    translation, rotation_deg : float or None
+        RMS errors [m], [deg]; None without pairs.
     """
 
     distance: float
@@ -58,7 +63,7 @@ class RelativeError:
 
 
 def absolute_errors(T_estimated: Array, T_true: Array) -> tuple[Array, Array]:
-    """Distance [m] and angle [rad] between poses (n, 4, 4) and where they should be, each (n,)."""
+    """Return distance [m] and angle [rad] between estimated and true poses (n, 4, 4), each (n,)."""
     distance = np.linalg.norm(T_estimated[:, :3, 3] - T_true[:, :3, 3], axis=1)
     return np.asarray(distance), _angles(T_true[:, :3, :3].mT @ T_estimated[:, :3, :3])
 
@@ -66,10 +71,10 @@ def absolute_errors(T_estimated: Array, T_true: Array) -> tuple[Array, Array]:
 def relative_errors(
     T_estimated: Array, T_true: Array, distance: float, pairs_from: PairsFrom = "estimate"
 ) -> tuple[Array, Array]:
-    """What two poses (of (n, 4, 4)) that are `distance` [m] apart say wrongly of each other: metres and radians, (m,).
+    """Return the errors of the relative poses of pairs that are `distance` [m] apart: metres and radians, each (m,).
 
-    The pairs are those of evo's `--all_pairs`: for each pose the later one whose path from here is nearest to the
-    distance, if it is so by a tenth. Source: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems",
+    The pairs are those of evo's `--all_pairs`: for each pose the later one with the path length nearest to the
+    distance, within `RPE_TOLERANCE`. Source: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems",
     2012, eq. (1).
     """
     i, j = pairs_of((T_estimated if pairs_from == "estimate" else T_true)[:, :3, 3], distance)
@@ -78,11 +83,11 @@ def relative_errors(
 
 
 def pairs_of(positions: Array, distance: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """For each pose the later one that is `distance` [m] on along the path of positions (n, 3): indices, each (m,)."""
+    """Return indices (m,) of poses, and of those `distance` [m] later along the path of positions (n, 3)."""
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
     n = len(path)
     i = np.arange(n - 1)
-    # the nearest is next to where the distance would be reached; where the robot stands, it is the first pose there
+    # the nearest is next to the point where the distance is reached; of a standing robot, the first pose there
     reached = np.searchsorted(path, path[i] + distance)
     arrived = np.searchsorted(path, path)
     near = arrived[(reached[:, None] + np.arange(-2, 2)).clip(0, n - 1)]
@@ -93,7 +98,7 @@ def pairs_of(positions: Array, distance: float) -> tuple[NDArray[np.int64], NDAr
 
 
 def relative_error(distance: float, parts: Sequence[tuple[Array, Array]]) -> RelativeError:
-    """The errors of `relative_errors`, of one robot or of several, as one figure."""
+    """Return the RMS of `relative_errors` of one or several robots."""
     translation, rotation = (np.concatenate(list(part)) for part in zip(*parts, strict=True))
     if not len(translation):
         return RelativeError(distance, 0, None, None)
@@ -102,7 +107,7 @@ def relative_error(distance: float, parts: Sequence[tuple[Array, Array]]) -> Rel
 
 
 def _between(T_world_i: Array, T_world_j: Array) -> Array:
-    """T_i_j; positions are subtracted before they are turned, so that a far origin costs no digits."""
+    """Return T_i_j; positions are subtracted before they are rotated, so that a far origin costs no digits."""
     R_i_world = T_world_i[:, :3, :3].mT
     return se3(R_i_world @ T_world_j[:, :3, :3], (R_i_world @ (T_world_j[:, :3, 3:] - T_world_i[:, :3, 3:]))[..., 0])
 

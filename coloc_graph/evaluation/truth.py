@@ -1,4 +1,4 @@
-"""True poses at the times of an estimate, and what is left out where there is no truth."""
+"""Interpolation of true poses at the times of an estimate, and warnings of missing truth."""
 
 from collections.abc import Mapping
 
@@ -11,17 +11,15 @@ from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-#: True poses further apart in time than this are not joined [s].
-MAX_TRUTH_GAP = 0.25
-#: Instants no further apart than this are the same [s]: times of floats and of nanoseconds differ in the last digits.
-SAME_TIME = 1e-6
+MAX_TRUTH_GAP = 0.25  # s between true poses over which truth is interpolated
+SAME_TIME = 1e-6  # s: difference of equal times by rounding
 
 
 def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, max_gap: float = MAX_TRUTH_GAP) -> Array:
-    """The true poses (n, 4, 4) at an estimate's times, interpolated between two that are near; NaN without truth.
+    """Return the true poses (n, 4, 4) at an estimate's times, interpolated; NaN where there is no truth.
 
-    Near is at most `max_gap` [s] apart. In a longer gap a robot of an estimate with stances stood where it was
-    before, since robots stand while they observe and truth may be sparse then; of one without, nothing is known.
+    Over gaps of up to `max_gap` [s]. In a longer gap a robot of an estimate with stances stood where it was before,
+    since robots stand while they observe and truth may be sparse then; of one without stances nothing is known.
     """
     true = truth.get(estimated.robot)
     times = estimated.times
@@ -46,20 +44,20 @@ def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, max_gap: 
 
 
 def with_truth(true: Array) -> NDArray[np.bool_]:
-    """At which of its poses (n, 4, 4) an estimate has a true one, (n,)."""
+    """Return where poses (n, 4, 4) have truth (are finite), (n,)."""
     return np.asarray(np.isfinite(true).all(axis=(1, 2)))
 
 
 def first_with_truth(estimated: Mapping[str, Trajectory], true: Mapping[str, Array], robot: str) -> int | None:
-    """Index of a robot's first pose that has a true one; None where none has, or the robot is not there."""
+    """Return the index of a robot's first pose with truth; None where there is none."""
     known = np.flatnonzero(with_truth(true[robot])) if robot in estimated else np.zeros(0, np.int64)
     return int(known[0]) if len(known) else None
 
 
-def require_some(
+def require_truth(
     truth: Mapping[str, Trajectory], estimated: Mapping[str, Trajectory], true: Mapping[str, Array]
 ) -> None:
-    """Raise `InputError` where no pose of any robot has a true one."""
+    """Raise `InputError` where no pose of any robot has truth."""
     if any(with_truth(one).any() for one in true.values()):
         return
     both = [robot for robot in estimated if len(truth.get(robot, ()))]
@@ -70,14 +68,14 @@ def require_some(
         )
     robot = both[0]
     raise InputError(
-        f"the truth of robot {robot} is at none of its times: the estimate reaches from "
+        f"robot {robot} has no truth at the times of its poses: the estimate reaches from "
         f"{_span(estimated[robot].times)}, the truth from {_span(truth[robot].times)}, with gaps; check the clocks, or "
         "record truth more often"
     )
 
 
-def left_out(estimated: Mapping[str, Trajectory], true: Mapping[str, Array]) -> tuple[str, ...]:
-    """A sentence a robot on the poses that have no true one, and are left out."""
+def without_truth(estimated: Mapping[str, Trajectory], true: Mapping[str, Array]) -> tuple[str, ...]:
+    """Warn of poses without truth, one sentence per robot."""
     sentences = []
     for robot in estimated:
         known = np.flatnonzero(with_truth(true[robot]))
@@ -85,11 +83,11 @@ def left_out(estimated: Mapping[str, Trajectory], true: Mapping[str, Array]) -> 
         if not lost:
             continue
         if not len(known):
-            sentences.append(f"robot {robot} is not evaluated: there is no truth at the times of its {n} poses")
+            sentences.append(f"robot {robot} is not evaluated: it has no truth at the times of its {n} poses")
             continue
         before, after = int(known[0]), n - 1 - int(known[-1])
         sentences.append(
-            f"robot {robot}: {lost} of {n} poses are left out, since there is no truth at their times "
+            f"robot {robot}: {lost} of {n} poses are not evaluated: they have no truth at their times "
             f"({before} before it begins, {after} after it ends, {lost - before - after} in its gaps)"
         )
     return tuple(sentences)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.input_file import decode_text, quoted, read_bytes
-from coloc_graph.run.atomic_file import write_whole
+from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.team import Camera
 from coloc_graph.team.camera import MAX_SIDE
 
@@ -45,7 +45,7 @@ def write_camera_info(camera: Camera, name: str, path: Path) -> None:
 
     Nothing is rectified: R is the identity and P is [K 0].
     """
-    write_whole(path, camera_info_text(camera, name))
+    write_atomically(path, camera_info_text(camera, name))
 
 
 def camera_info_text(camera: Camera, name: str) -> str:

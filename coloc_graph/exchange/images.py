@@ -13,7 +13,7 @@ from coloc_graph.exchange.csv_table import Table, read_table
 from coloc_graph.exchange.image_sources import ImageSource, open_sources
 from coloc_graph.exchange.stances import MotionThresholds, Movements, derive_stances
 from coloc_graph.exchange.still_cameras import movements_by_images
-from coloc_graph.run import EncodedImage, Image, Motion, Stance, whole_run
+from coloc_graph.run import EncodedImage, Image, Motion, Stance, atomic_run
 from coloc_graph.run.encode import ImageFormat
 from coloc_graph.run.image_header import read_image_header
 from coloc_graph.team import Team, read_team
@@ -90,7 +90,7 @@ def import_images(
         moves = [movements_by_images(one.robot, one.times, one.pixels()) for one in found]
         made = _find_stances(team, found, moves)
     total = sum(map(len, found))
-    with whole_run(Path(out), team, image_format=image_format) as writer:
+    with atomic_run(Path(out), team, image_format=image_format) as writer:
         rest: list[Stance | Motion] = sorted(
             [*made, *(motion for one in moves for motion in one.motions())], key=_begin, reverse=True
         )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from coloc_graph.errors import InputError
 from coloc_graph.exchange.dat_table import DatTable, read_dat
 from coloc_graph.geometry.lie import floor_pose
-from coloc_graph.run import OdometrySample, Ranges, RunWriter, whole_run
+from coloc_graph.run import OdometrySample, Ranges, RunWriter, atomic_run
 from coloc_graph.team import Floor, Landmark, Ranging, Robot, Team, Wheels
 
 Array = NDArray[np.float64]
@@ -108,7 +108,7 @@ def import_mrclam(
     count = sum(len(one.targets) for each in ranges.values() for one in each)
     if not count:
         raise InputError(f"{folder}: no measurement is of a robot or a landmark in Barcodes.dat; give a whole dataset")
-    with whole_run(out, team) as writer:
+    with atomic_run(out, team) as writer:
         if not map_known:
             writer.write_true_team(true_team)
         _write(writer, names, ranges, odometry, truth, lambda done: progress(done, count) if progress else None)

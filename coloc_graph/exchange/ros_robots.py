@@ -17,7 +17,7 @@ from coloc_graph.exchange.ros_read import Recording
 from coloc_graph.exchange.stances import Movements, movements
 from coloc_graph.geometry.lie import yaw
 from coloc_graph.run import OdometrySample
-from coloc_graph.run.odometry_breaks import find_breaks, joined
+from coloc_graph.run.odometry_breaks import find_breaks, join_breaks
 from coloc_graph.run.schemas import to_seconds
 from coloc_graph.team import Team
 
@@ -90,7 +90,7 @@ def odometry_of(bag: Bag, robot: RobotTopics, recording: Recording) -> tuple[lis
     increments = np.concatenate(parts)
     for one in breaks:
         increments[one.index] = np.diag(np.square(one.sigmas))
-    samples = zip(times.tolist(), joined(poses, breaks), increments, strict=True)
+    samples = zip(times.tolist(), join_breaks(poses, breaks), increments, strict=True)
     return [OdometrySample(robot.name, *one) for one in samples], said
 
 

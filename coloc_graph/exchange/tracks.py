@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import TracksError
 from coloc_graph.exchange.csv_table import Table, first, read_table
-from coloc_graph.run import Detections, Motion, Planes, RunWriter, Stance, whole_run
+from coloc_graph.run import Detections, Motion, Planes, RunWriter, Stance, atomic_run
 from coloc_graph.run.schemas import to_ns, to_seconds
 from coloc_graph.team import Team, read_team
 
@@ -90,7 +90,7 @@ def import_tracks(
     stances = _stances(tracks, team, observers, moved)
     _require_planes(tracks_path, stances, planes)
 
-    with whole_run(out, team) as writer:
+    with atomic_run(out, team) as writer:
         _write(writer, tracks, stances, planes, moved, progress)
     return ImportSummary(
         stances=len(stances),

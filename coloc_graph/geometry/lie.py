@@ -54,14 +54,14 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def across(N: ArrayLike) -> Array:
-    """Two unit vectors (2, 3) across a unit vector (3,), and across each other."""
+    """Two unit vectors (2, 3) orthogonal to a unit vector (3,) and to each other."""
     return np.asarray(np.linalg.svd(np.asarray(N, float)[None])[2][1:])
 
 
 def closest_rotation(M: ArrayLike) -> Array:
     """The rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the Frobenius norm."""
     R = np.asarray(M, float)
-    # what is nearly a rotation is one after a few Newton-Schulz steps, at a fraction of the cost of an SVD
+    # near a rotation a few Newton-Schulz steps suffice, at a fraction of the cost of an SVD
     for _ in range(6):
         off = R.mT @ R - np.eye(3)
         size = np.abs(off).max(initial=0.0)
@@ -80,7 +80,7 @@ def closest_rotation(M: ArrayLike) -> Array:
 def quaternion(R: ArrayLike) -> tuple[float, float, float, float]:
     """The unit quaternion (w, x, y, z), w >= 0, of one rotation (3, 3).
 
-    Shepperd, "Quaternion from Rotation Matrix", 1978: from the largest part, which is exact at every angle.
+    From the largest part, which is exact at every angle: Shepperd, "Quaternion from Rotation Matrix", 1978.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(R, float).tolist()
     parts = (a + e + i, a - e - i, e - a - i, i - a - e)
@@ -197,8 +197,10 @@ SL3_BASIS: Array = _sl3_basis()
 
 
 def _vee_matrix() -> Array:
-    """From the nine entries, row by row, to the coordinates: the pseudo-inverse of the basis, with the identity's share
-    of the diagonal left out."""
+    """Matrix from the nine entries, row by row, to the coordinates: the pseudo-inverse of the basis.
+
+    Without the identity's share of the diagonal.
+    """
     entries = np.column_stack([SL3_BASIS.reshape(8, 9).T, np.eye(3).ravel()])
     return np.ascontiguousarray(np.linalg.inv(entries)[:8].T)
 
@@ -306,8 +308,7 @@ def sl3_adjoint(H: ArrayLike, H_inverse: ArrayLike) -> Array:
 
 
 def sl3_log_derivative(h: ArrayLike) -> Array:
-    """How the coordinates (..., 8) of exp(h) exp(x) change with x at 0, (..., 8, 8): the inverse right Jacobian of
-    SL(3)."""
+    """Inverse right Jacobian of SL(3), (..., 8, 8): derivative of the coordinates of exp(h) exp(x) by x at 0."""
     ad = (np.asarray(h, float)[..., None, None, :] @ _SL3_AD)[..., 0, :]
     square = ad @ ad
     one = np.eye(8)

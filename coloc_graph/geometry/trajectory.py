@@ -10,10 +10,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses of one robot: `T_world_body` (n, 4, 4) [m] at `times` (n,) [UTC s].
+    """Poses of one robot.
 
-    `stances` (n,) numbers the stances the poses belong to; `covariances` (n, 6, 6) are in GTSAM's tangent
-    (rotation first, body frame), None where there are none (truth).
+    Parameters
+    ----------
+    robot : str
+        Its name.
+    times : (n,) float
+        Times [UTC s].
+    T_world_body : (n, 4, 4) float
+        Poses [m].
+    stances : (n,) int or None
+        Index of each pose's stance; None of poses without stances.
+    covariances : (n, 6, 6) float or None
+        In GTSAM's tangent: rotation [rad] first, then translation [m], body frame; None of truth.
     """
 
     robot: str
@@ -26,7 +36,7 @@ class Trajectory:
         return len(self.times)
 
     def where(self, kept: NDArray[np.bool_]) -> "Trajectory":
-        """The poses where `kept` (n,) is true."""
+        """Return the poses where `kept` (n,) is true."""
         stances = None if self.stances is None else self.stances[kept]
         covariances = None if self.covariances is None else self.covariances[kept]
         return Trajectory(self.robot, self.times[kept], self.T_world_body[kept], stances, covariances)

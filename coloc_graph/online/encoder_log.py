@@ -11,7 +11,7 @@ import msgspec
 
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.robot_io.create.odometry import WHEELS, arc, ticks_between
-from coloc_graph.run.atomic_file import write_whole
+from coloc_graph.run.atomic_file import write_atomically
 
 FURTHEST = 5.0  # a longer distance means that the robot was carried, or its counters were reset [m]
 SHARE = 0.1  # sigma of a motion of which only the end is known, as a share of its length
@@ -44,7 +44,7 @@ class EncoderLog:
     def write(self, counted: Counted) -> None:
         """Write counts atomically; a disk that refuses does not stop a robot."""
         with contextlib.suppress(OSError):
-            write_whole(self._path, msgspec.json.encode(counted))
+            write_atomically(self._path, msgspec.json.encode(counted))
 
 
 def way_since(counted: Counted, ticks: tuple[int, int]) -> tuple[Planar, tuple[float, float, float]] | None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar
-from coloc_graph.team.shared_view import View, places_in_view
+from coloc_graph.team.shared_view import View, positions_in_view
 
 Array = NDArray[np.float64]
 
@@ -125,7 +125,7 @@ class Formation:
         front = max(self.ways(places).values())
         x, y, heading = self.course.at(front)
         for near in (NEAR, NEAR - 0.1):
-            region = places_in_view(views, p_markers, (x, y), (near, FAR), MARGIN, heading)
+            region = positions_in_view(views, p_markers, (x, y), (near, FAR), MARGIN, heading)
             if len(region) >= 6:
                 break
         else:

@@ -12,7 +12,7 @@ ALIGNED = 0.02  # a heading is reached within this angle [rad]
 SET_OFF = 0.06  # the robot drives straight once it heads at the waypoint to within this [rad]
 BRAKE = 2.0  # speed per distance to the waypoint [1/s]
 STEER = 2.5  # turn rate per heading error [1/s]
-LEAST_SPEED = 0.02  # slowest speed [m/s]
+MIN_SPEED = 0.02  # slowest speed [m/s]
 LEAST_TURN = 0.08  # slowest turn rate [rad/s]
 
 
@@ -71,7 +71,7 @@ class Follower:
             if not self._going and abs(off) > SET_OFF:
                 return Twist(0.0, self._turning(off))
             self._going = True
-            v = min(self._speed, max(BRAKE * away, LEAST_SPEED)) * max(math.cos(2 * off), 0.0)
+            v = min(self._speed, max(BRAKE * away, MIN_SPEED)) * max(math.cos(2 * off), 0.0)
             return Twist(ahead * v, max(-self._turn, min(self._turn, STEER * off)) if away > 3 * NEAR else 0.0)
         if self._yaw is not None and abs(off := wrap(self._yaw - yaw)) > ALIGNED:
             return Twist(0.0, self._turning(off))

@@ -1,6 +1,6 @@
-"""What one looks at: figures of a result (matplotlib) and the self-contained `report.html`.
+"""Figures of a result (matplotlib) and the self-contained `report.html`.
 
-The only package that imports matplotlib; import it where a picture is wanted, not before.
+The only package that imports matplotlib; import it only where a figure is made.
 """
 
 from coloc_graph.report.hero import hero_figure

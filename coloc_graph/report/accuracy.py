@@ -1,4 +1,4 @@
-"""How good an estimate is, in the tables of a report."""
+"""Tables of a report on the accuracy of an estimate."""
 
 import dataclasses
 from html import escape
@@ -8,7 +8,7 @@ from coloc_graph.report.page import DASH, many, number, table
 
 
 def accuracy_section(accuracy: Accuracy) -> str:
-    """The tables of an accuracy."""
+    """Return the tables of an accuracy as HTML."""
     head = ["Robot", "True [cm]", "Est. [cm]", "Error [cm]", "Error [%]", "ATE [cm]", "End [cm]", "Heading [°]"]
     rows = [
         [
@@ -31,15 +31,15 @@ def accuracy_section(accuracy: Accuracy) -> str:
     )
     if accuracy.anees is not None:
         note += (
-            f" The squared error is {number(accuracy.anees, 2)} times what the covariances predict "
-            f"(NEES per degree of freedom over {many(accuracy.nees_poses, 'pose')}, expected 1)."
+            f" NEES per degree of freedom: {number(accuracy.anees, 2)} over {many(accuracy.nees_poses, 'pose')}, "
+            "expected 1."
         )
     first = f'<h2>Accuracy</h2>\n{table(head, rows, [0], foot)}\n<p class="soft">{note}</p>'
     return f"{first}\n{_errors_table(accuracy)}\n{_relative_table(accuracy)}"
 
 
 def _errors_table(accuracy: Accuracy) -> str:
-    """Errors over all poses, and each robot's NEES with its 95 % interval."""
+    """Return the table of errors over all poses, and each robot's NEES with its 95 % interval."""
     head = ["All poses", *("RMSE [cm]", "Mean", "Median", "Max"), *("RMSE [°]", "Mean", "Median", "Max"), "NEES",
             "95 % interval"]  # fmt: skip
     rows = []
@@ -53,21 +53,21 @@ def _errors_table(accuracy: Accuracy) -> str:
             nees = [value if row.nees.consistent else f'<span class="bad">{value}</span>', interval]
         rows.append([escape(row.robot), *spreads, *nees])
     note = (
-        "Position and rotation over all poses. The NEES of exact covariances is in the interval in 95 % of runs; "
-        "the interval is wide, since neighbouring poses share errors and few of them are independent."
+        "Position and rotation over all poses. The NEES of a consistent estimate is in the interval in 95 % of runs; "
+        "the interval is wide, since the errors of neighbouring poses are correlated."
     )
     return f'{table(head, rows, [0])}\n<p class="soft">{note}</p>'
 
 
 def _relative_table(accuracy: Accuracy) -> str:
-    """Errors over stretches of the way, of the distances that some robot went."""
+    """Return the table of relative errors, of the distances that some robot travelled."""
     which = [k for k, one in enumerate(accuracy.relative) if one.pairs]
     if not which:
         return ""
     head = ["Relative (RPE)", *(f"{accuracy.relative[k].distance:g} m" for k in which)]
     whose = [*((row.robot, row.relative) for row in accuracy.robots), ("Team", accuracy.relative)]
     rows = [[escape(name), *(_relative_cell(relative[k]) for k in which)] for name, relative in whose]
-    note = "RMS error of translation, in % of the distance travelled, and of rotation between two poses so far apart."
+    note = "RMS error of translation, in % of the distance travelled, and of rotation between two poses that far apart."
     return f'{table(head, rows[:-1], [0], rows[-1])}\n<p class="soft">{note}</p>'
 
 

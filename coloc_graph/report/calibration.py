@@ -1,4 +1,4 @@
-"""Pictures of a camera's calibration: where corners were seen, how well a ray is known, what residuals are left."""
+"""Figures of a camera's calibration: coverage by corners, uncertainty of rays, residuals."""
 
 import io
 import json
@@ -15,22 +15,20 @@ from coloc_graph.calibration.lens import pixel_grid, ray_sigmas
 from coloc_graph.calibration.summary import SUMMARY, summarise_camera
 from coloc_graph.calibration.verdict import REGIONS, cell_counts, uncovered, verdict
 from coloc_graph.errors import InputError
-from coloc_graph.report.drawing import BAD, COLOURS, GREY, INK, PALE, styled
-from coloc_graph.run.atomic_file import write_whole
+from coloc_graph.report.drawing import BAD, COLOURS, GREY, INK, PALE, round_125, styled
+from coloc_graph.run.atomic_file import write_atomically
 
 Array = NDArray[np.float64]
 
 COVERAGE = "coverage.png"
 RESIDUALS = "residuals.png"
-#: Cells along the longer side of the image, where corners are counted.
-CELLS = 24
-#: Of more images than this, bars have no names.
-MOST_NAMED = 40
+CELLS = 24  # cells along the longer side of the image in which corners are counted
+MAX_NAMED = 40  # images up to which bars have names
 
 
 @styled
 def coverage_figure(calibration: CameraCalibration) -> Figure:
-    """Where in the image corners were seen, and how well the pixel of a ray is known."""
+    """Draw the coverage of the image by corners, and the uncertainty of a ray's pixel."""
     used = calibration.used
     uv = np.concatenate([view.uv for view in used.views])
     figure = Figure(figsize=(11, 0.9 + 5.2 * used.height / used.width), layout="constrained")
@@ -41,7 +39,7 @@ def coverage_figure(calibration: CameraCalibration) -> Figure:
     counts = cell_counts(uv, used.width, used.height, columns, rows).astype(float)
     extent = (-0.5, used.width - 0.5, used.height - 0.5, -0.5)
     heat = seen.imshow(np.where(counts > 0, counts, np.nan), extent=extent, cmap="Blues", vmin=0, aspect="equal")
-    figure.colorbar(heat, ax=seen, shrink=0.62, label="corners in a cell")
+    figure.colorbar(heat, ax=seen, shrink=0.62, label="corners per cell")
     for view in used.views:
         seen.add_patch(Polygon(_hull(view.uv), closed=True, fill=False, edgecolor=INK, linewidth=0.5, alpha=0.35))
     for name in uncovered(uv, used.width, used.height):
@@ -51,34 +49,34 @@ def coverage_figure(calibration: CameraCalibration) -> Figure:
         seen.add_patch(Rectangle(corner, *size, fill=False, hatch="///", edgecolor=BAD, linewidth=0, alpha=0.6))
         seen.text(corner[0] + size[0] / 2, corner[1] + size[1] / 2, "not\ncovered", color=BAD, ha="center", va="center")
     images = f"{len(used.views)} images, {len(uv)} corners"
-    _of_image(seen, calibration, f"Where corners were seen ({images})")
+    _of_image(seen, calibration, f"Coverage by corners ({images})")
 
     grid = pixel_grid(used.width, used.height, 2 * columns, 2 * rows)
     sigmas = ray_sigmas(calibration.bundle.intrinsics, calibration.covariance, uv, grid.reshape(-1, 2))
     sigmas = sigmas.reshape(grid.shape[:2])
     top = float(np.nanpercentile(sigmas[np.isfinite(sigmas)], 99)) if np.isfinite(sigmas).any() else 1.0
     map_ = known.imshow(sigmas, extent=extent, cmap="viridis_r", vmin=0, vmax=max(top, 1e-6), aspect="equal")
-    figure.colorbar(map_, ax=known, shrink=0.62, label="one sigma, px an axis", extend="max")
-    _of_image(known, calibration, "How well a ray's pixel is known, but for a turn of the camera")
+    figure.colorbar(map_, ax=known, shrink=0.62, label="standard deviation per axis, px", extend="max")
+    _of_image(known, calibration, "Uncertainty of a ray's pixel, without that of the camera's rotation")
     return figure
 
 
 @styled
 def residuals_figure(calibration: CameraCalibration) -> Figure:
-    """What is left of each corner, enlarged, and the RMS of each image with those that were refused."""
+    """Draw the residual of each corner, enlarged, and the RMS of each image, with those that were rejected."""
     used = calibration.used
     uv, r = np.concatenate([view.uv for view in used.views]), np.concatenate(calibration.bundle.residuals)
     figure = Figure(figsize=(11, 0.9 + 5.2 * used.height / used.width), layout="constrained")
     figure.suptitle(
-        f"{calibration.bundle.rms:.3f} px RMS: {calibration.camera.noise_px:.3f} px an axis is each corner's own, "
-        f"{calibration.shared_px:.3f} px shared with its neighbours",
+        f"{calibration.bundle.rms:.3f} px RMS: per axis {calibration.camera.noise_px:.3f} px independent, "
+        f"{calibration.shared_px:.3f} px shared by neighbouring corners",
         x=0.01,
         ha="left",
         size=10.5,
         weight="bold",
     )
     field, bars = figure.subplots(1, 2)
-    enlarged = _round(used.width / 40 / max(float(np.percentile(np.linalg.norm(r, axis=1), 95)), 1e-9))
+    enlarged = round_125(used.width / 40 / max(float(np.percentile(np.linalg.norm(r, axis=1), 95)), 1e-9))
     field.quiver(
         *uv.T,
         *r.T,
@@ -90,7 +88,7 @@ def residuals_figure(calibration: CameraCalibration) -> Figure:
         width=0.0016,
         alpha=0.8,
     )
-    _of_image(field, calibration, f"Residuals, enlarged {enlarged:g} times; a colour an image")
+    _of_image(field, calibration, f"Residuals, enlarged {enlarged:g} times; one colour per image")
     images = calibration.images
     at = np.arange(len(images))
     off = np.array([image.rms for image in images])
@@ -98,32 +96,32 @@ def residuals_figure(calibration: CameraCalibration) -> Figure:
     bars.bar(at, off, color=colours)
     usual = max(image.rms for image in images if not image.refused)
     bars.set_ylim(0, 1.25 * min(off.max(), 4 * usual))
-    for place, image in zip(at, images, strict=True):
+    for x, image in zip(at, images, strict=True):
         if image.refused:
-            bars.text(place, 0.02 * usual, f"refused: {image.rms:.2f}", rotation=90, ha="center", va="bottom", size=8)
+            bars.text(x, 0.02 * usual, f"rejected: {image.rms:.2f}", rotation=90, ha="center", va="bottom", size=8)
     bars.axhline(calibration.bundle.rms, color=GREY, linewidth=1, linestyle="--")
     bars.set_ylabel("RMS of an image, px")
     names = [Path(image.name).name for image in images]
-    if len(names) <= MOST_NAMED:
+    if len(names) <= MAX_NAMED:
         bars.set_xticks(at, names, rotation=90, size=7)
     bars.grid(visible=False, axis="x")
-    bars.set_title("Each image; dashed: all that were used", loc="left", size=10)
+    bars.set_title("RMS by image; dashed: of all used images", loc="left", size=10)
     return figure
 
 
 def require_output_folder(out: Path, *, force: bool) -> None:
-    """Raise `InputError` where a calibration cannot go to the folder `out`, or one is there, unless with `force`."""
+    """Raise `InputError` where a calibration cannot be written to the folder `out`, or one exists without `force`."""
     if out.exists() and not out.is_dir():
-        raise InputError(f"{out} exists and is not a folder; give another place")
+        raise InputError(f"{out} exists and is not a folder; give another folder")
     if (out / SUMMARY).exists():
         if not force:
             raise InputError(f"{out} holds an earlier calibration; replace it with --force, or give another folder")
     elif out.is_dir() and any(out.iterdir()):
-        raise InputError(f"{out} holds something else than a calibration; give another folder, or empty it")
+        raise InputError(f"{out} holds files that are not a calibration; give another folder, or empty it")
 
 
 def write_camera_calibration(calibration: CameraCalibration, out: Path) -> tuple[Path, ...]:
-    """Write calibration.json, coverage.png and residuals.png to the folder `out`; returns their paths."""
+    """Write calibration.json, coverage.png and residuals.png to the folder `out`, and return their paths."""
     files: dict[Path, str | bytes] = {
         out / SUMMARY: json.dumps(summarise_camera(calibration), indent=2) + "\n",
         out / COVERAGE: _png(coverage_figure(calibration)),
@@ -131,7 +129,7 @@ def write_camera_calibration(calibration: CameraCalibration, out: Path) -> tuple
     }
     out.mkdir(parents=True, exist_ok=True)
     for path, data in files.items():
-        write_whole(path, data)
+        write_atomically(path, data)
     return tuple(files)
 
 
@@ -158,12 +156,6 @@ def _hull(uv: Array) -> Array:
     from scipy.spatial import ConvexHull
 
     return np.asarray(uv[ConvexHull(uv).vertices])
-
-
-def _round(value: float) -> float:
-    """The nearest of 1, 2, 5, 10, 20, ... below a number."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))
 
 
 def _wrapped(text: str) -> str:

@@ -1,6 +1,6 @@
-"""Figures of an estimate against truth: trajectories, errors over time, RPE by distance; in one file or three.
+"""Figures of an estimate and truth: trajectories, errors over time, RPE by distance; in one file or three.
 
-They take trajectories of any origin: what the figures of a result (`plots`) show of its graph is not in them.
+For trajectories of any origin; `plots` has the figures of a result with its graph.
 """
 
 import tempfile
@@ -21,11 +21,9 @@ from coloc_graph.geometry.se2 import wrap
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.report.drawing import COLOURS, GREY, INK, MARKERS, Array, Truth, styled, world_covariances
 
-_WIDTH = 9.0  # [in]
-#: The figures; there is no last one where nobody went far enough.
-NAMES = ("trajectories", "errors", "rpe")
-#: Pictures that can be written.
-SUFFIXES = (".png", ".svg", ".pdf")
+_WIDTH = 9.0  # in
+NAMES = ("trajectories", "errors", "rpe")  # figures; without the last one where no robot travelled far enough
+SUFFIXES = (".png", ".svg", ".pdf")  # formats of pictures
 _ALIGNED: dict[Alignment, str] = {
     "reference": "aligned by the reference robot's first pose",
     "team": "one rigid alignment of the team",
@@ -39,10 +37,18 @@ Drawing = Callable[[FigureBase], None]
 def comparison_drawings(
     estimated: Mapping[str, Trajectory], true: Truth, accuracy: Accuracy, *, on_floor: bool
 ) -> dict[str, tuple[float, Drawing]]:
-    """The figures by name: how high each is [in], and what draws it.
+    """Return the figures by name: their heights [in] and the functions that draw them.
 
-    `true` is, by robot, the true poses (n, 4, 4) of `evaluation.align`, NaN where there are none. Bands of 2 sigma are
-    where the NEES is stated: with the reference aligned, or nothing.
+    Parameters
+    ----------
+    estimated : mapping of str to Trajectory
+        Estimated poses by robot.
+    true : mapping of str to (n, 4, 4) float
+        True poses by `evaluation.align`, NaN where there is no truth.
+    accuracy : Accuracy
+        Of these; bands of 2 sigma are drawn where it has a NEES.
+    on_floor : bool
+        Draw no errors of z.
     """
     has_rpe = any(one.pairs for one in accuracy.relative)
     return {
@@ -58,36 +64,36 @@ def comparison_drawings(
 
 @styled
 def drawn(height: float, draw: Drawing) -> Figure:
-    """Return a figure of its own of a drawing, `height` [in] high."""
+    """Return a separate figure of a drawing, `height` [in] high."""
     figure = Figure(figsize=(_WIDTH, height), layout="constrained")
     draw(figure)
     return figure
 
 
-def require_plot_place(out: str | Path, *, force: bool) -> None:
+def require_plot_path(out: str | Path, *, force: bool) -> None:
     """Raise `InputError` where plots cannot be written to `out`, a picture (.png, .svg, .pdf) or a folder."""
     out = Path(out)
     if out.suffix and out.suffix.lower() not in SUFFIXES and not out.is_dir():
-        raise InputError(f"{out} is no kind of picture; name one of {', '.join(SUFFIXES)}, or a folder")
+        raise InputError(f"{out} is not a kind of picture; name one of {', '.join(SUFFIXES)}, or a folder")
     if out.suffix.lower() not in SUFFIXES and out.exists() and not out.is_dir():
-        raise InputError(f"{out} exists and is not a folder; give another place, or remove it")
+        raise InputError(f"{out} exists and is not a folder; give another path, or remove it")
     if out.suffix.lower() in SUFFIXES and out.is_dir():
-        raise InputError(f"{out} is a folder; give the name of a picture, or a folder that is not called like one")
+        raise InputError(f"{out} is a folder with the name of a picture; give another path")
     if not out.absolute().parent.is_dir():
-        raise InputError(f"{out} cannot be written, since there is no such folder; make it, or give another place")
-    there = [path for path in _paths(out, NAMES) if path.exists()]
-    if there and not force:
-        raise InputError(f"{there[0]} exists; replace it with --force, or give another name")
+        raise InputError(f"{out} cannot be written: its folder does not exist; make it, or give another path")
+    existing = [path for path in _paths(out, NAMES) if path.exists()]
+    if existing and not force:
+        raise InputError(f"{existing[0]} exists; replace it with --force, or give another name")
 
 
 @styled
 def write_plots(out: str | Path, drawings: Mapping[str, tuple[float, Drawing]], *, force: bool) -> list[Path]:
-    """Write the drawings into one picture, or one each into a folder, whole or not at all; returns the paths.
+    """Write the drawings into one picture, or one each into a folder, atomically, and return the paths.
 
-    Raises `InputError` as `require_plot_place`.
+    Raises `InputError` as `require_plot_path` does.
     """
     out = Path(out)
-    require_plot_place(out, force=force)
+    require_plot_path(out, force=force)
     if out.suffix.lower() in SUFFIXES:
         heights = [height for height, _ in drawings.values()]
         whole = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
@@ -108,7 +114,7 @@ def write_plots(out: str | Path, drawings: Mapping[str, tuple[float, Drawing]], 
         for path in paths:
             (Path(work) / path.name).replace(path)
     for path in set(_paths(out, NAMES)) - set(paths):
-        path.unlink(missing_ok=True)  # of an earlier comparison
+        path.unlink(missing_ok=True)  # left by an earlier comparison
     return paths
 
 
@@ -131,7 +137,7 @@ def _height_of_trajectories(estimated: Mapping[str, Trajectory], true: Truth) ->
 
 
 def _trajectories(figure: FigureBase, estimated: Mapping[str, Trajectory], true: Truth, accuracy: Accuracy) -> None:
-    """The team from above, in the estimate's world."""
+    """Draw the team from above, in the estimate's world."""
     axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
     handles = []
     for place, (robot, one) in enumerate(estimated.items()):
@@ -151,7 +157,7 @@ def _trajectories(figure: FigureBase, estimated: Mapping[str, Trajectory], true:
 def _errors(
     figure: FigureBase, estimated: Mapping[str, Trajectory], true: Truth, accuracy: Accuracy, *, on_floor: bool
 ) -> None:
-    """Errors along the world's axes [cm] and of the heading [deg] over time, a row a robot."""
+    """Draw errors along the world's axes [cm] and of the heading [deg] over time, one row per robot."""
     columns = ["x", "y", *([] if on_floor else ["z"]), "heading"]
     grid = figure.subplots(len(estimated), len(columns), sharex=True, squeeze=False)
     begin = min(float(one.times[0]) for one in estimated.values())
@@ -190,7 +196,7 @@ def _band(axes: Axes, times: Array, reach: Array, colour: str) -> None:
 
 
 def _rpe(figure: FigureBase, accuracy: Accuracy) -> None:
-    """Relative errors by distance: translation in % of it, and rotation."""
+    """Draw relative errors by distance: translation in % of it, and rotation."""
     left, right = figure.subplots(1, 2)
     rows = [(row.robot, row.relative, COLOURS[place % len(COLOURS)], MARKERS[place % len(MARKERS)], 1.2)
             for place, row in enumerate(accuracy.robots)]  # fmt: skip

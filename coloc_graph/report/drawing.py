@@ -1,7 +1,6 @@
-"""What all figures share: style, colours, ellipses, headings, and which poses are worth drawing.
+"""Common parts of all figures: style, colours, ellipses, headings, selection of poses.
 
-`truth` is, by robot, the true poses T_world_body (n, 4, 4) [m] in the estimate's world at the estimate's
-stances. Tangent covariances are rotation first, in the body frame; they are turned into the world here.
+`truth` is, by robot, the true poses T_world_body (n, 4, 4) [m] in the estimate's world at the estimate's stances.
 """
 
 from collections.abc import Mapping
@@ -20,18 +19,16 @@ from coloc_graph.geometry.trajectory import Trajectory
 Array = NDArray[np.float64]
 Truth = Mapping[str, NDArray[np.float64]]
 
-#: Okabe and Ito's colours that stand out on white; told apart with any colour vision.
+#: Okabe and Ito's colours that are visible on white; distinguishable with any colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-#: A marker a robot, so that colour is never the only difference.
+#: One marker per robot, so that colour is never the only difference.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 INK = "#24292f"
 GREY = "#6e7781"
 PALE = "#d8dee4"
 BAD = "#D55E00"
-#: Radius of the ellipse that holds 95 % of a planar Gaussian, in standard deviations.
-K_95 = float(np.sqrt(5.991464547107979))
-#: At most so many ellipses, ticks or rings a robot; more would be a smear.
-MOST_SHOWN = 80
+K_95 = float(np.sqrt(5.991464547107979))  # standard deviations to the ellipse that holds 95 % of a planar Gaussian
+MAX_SHOWN = 80  # ellipses, ticks or rings per robot
 
 _RC = {
     "svg.hashsalt": "coloc",
@@ -52,34 +49,34 @@ _RC = {
     "legend.frameon": False,
     "lines.solid_capstyle": "round",
 }
-#: Decorates what makes or writes a figure: the user's own matplotlib settings change nothing.
+#: Decorator of functions that make or write a figure: the user's own matplotlib settings have no effect.
 styled = matplotlib.style.context(_RC, after_reset=True)
 
 
 def colour_of(estimate: Estimate, robot: str) -> str:
-    """The robot's colour: by its place in the team."""
-    return COLOURS[_place(estimate, robot) % len(COLOURS)]
+    """Return the robot's colour, by its index in the team."""
+    return COLOURS[_index(estimate, robot) % len(COLOURS)]
 
 
 def marker_of(estimate: Estimate, robot: str) -> str:
-    """The robot's marker: by its place in the team."""
-    return MARKERS[_place(estimate, robot) % len(MARKERS)]
+    """Return the robot's marker, by its index in the team."""
+    return MARKERS[_index(estimate, robot) % len(MARKERS)]
 
 
-def _place(estimate: Estimate, robot: str) -> int:
+def _index(estimate: Estimate, robot: str) -> int:
     robots = estimate.source.robots
     return robots.index(robot) if robot in robots else len(robots)
 
 
 def trajectories_of(estimate: Estimate) -> list[Trajectory]:
-    """The trajectories that hold a pose, in the team's order."""
+    """Return the trajectories that hold a pose, in the team's order."""
     return sorted(
-        (one for one in estimate.trajectories.values() if len(one)), key=lambda one: _place(estimate, one.robot)
+        (one for one in estimate.trajectories.values() if len(one)), key=lambda one: _index(estimate, one.robot)
     )
 
 
 def truth_of(trajectory: Trajectory, truth: Truth | None) -> Array | None:
-    """The robot's true poses (n, 4, 4), None where there are none; `InputError` where their number differs."""
+    """Return the robot's true poses (n, 4, 4), None where there are none; `InputError` where their number differs."""
     true = None if truth is None else truth.get(trajectory.robot)
     if true is not None and true.shape != trajectory.T_world_body.shape:
         raise InputError(
@@ -90,7 +87,7 @@ def truth_of(trajectory: Trajectory, truth: Truth | None) -> Array | None:
 
 
 def ellipse_points(mean: ArrayLike, cov: ArrayLike, k: float = K_95, count: int = 49) -> Array:
-    """Closed outlines (..., count, 2) of the `k`-sigma ellipses of covariances (..., 2, 2) about (..., 2)."""
+    """Return closed outlines (..., count, 2) of the `k`-sigma ellipses of covariances (..., 2, 2) about (..., 2)."""
     values, vectors = np.linalg.eigh(np.asarray(cov, float))
     # a row of `axes` is a semi-axis; rounding can make a tiny eigenvalue negative
     axes = k * np.sqrt(values.clip(min=0))[..., None] * np.swapaxes(vectors, -1, -2)
@@ -100,7 +97,7 @@ def ellipse_points(mean: ArrayLike, cov: ArrayLike, k: float = K_95, count: int 
 
 
 def world_covariances(trajectory: Trajectory) -> tuple[Array, Array]:
-    """Covariances of position (n, 3, 3) [m^2] and of rotation (n, 3, 3) [rad^2] along the world's axes.
+    """Return covariances of position (n, 3, 3) [m^2] and of rotation (n, 3, 3) [rad^2] along the world's axes.
 
     NaN where the trajectory has no covariance, or one that is not finite.
     """
@@ -126,30 +123,36 @@ def heading_sigmas(trajectory: Trajectory) -> Array:
     return np.asarray(np.sqrt(world_covariances(trajectory)[1][:, 2, 2].clip(min=0)))
 
 
-def thinned(index: NDArray[np.int64], most: int = MOST_SHOWN) -> NDArray[np.int64]:
-    """At most so many of the indices, evenly, first and last among them."""
-    if len(index) <= most:
+def thinned(index: NDArray[np.int64], count: int = MAX_SHOWN) -> NDArray[np.int64]:
+    """Return at most `count` of the indices, evenly spaced, the first and the last included."""
+    if len(index) <= count:
         return index
-    return np.asarray(index[np.linspace(0, len(index) - 1, most).round().astype(int)])
+    return np.asarray(index[np.linspace(0, len(index) - 1, count).round().astype(int)])
 
 
-def standing_places(trajectory: Trajectory) -> NDArray[np.int64]:
-    """Indices of the poses that differ from the one before: a pose held over several stances counts once."""
+def round_125(value: float) -> float:
+    """Round a number down to 1, 2, 5, 10, 20, ..."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))
+
+
+def new_poses(trajectory: Trajectory) -> NDArray[np.int64]:
+    """Return indices of the poses that differ from the one before: a pose held over several stances counts once."""
     same = (trajectory.T_world_body[1:] == trajectory.T_world_body[:-1]).all(axis=(1, 2))
     return np.flatnonzero(np.concatenate([[True], ~same]))
 
 
-def held_places(estimate: Estimate, trajectory: Trajectory) -> NDArray[np.int64]:
-    """Indices of the poses that a stay-put constraint holds, each place once."""
+def held_poses(estimate: Estimate, trajectory: Trajectory) -> NDArray[np.int64]:
+    """Return indices of the poses that a stay-put constraint holds, each pose once."""
     if trajectory.stances is None:
         return np.empty(0, np.int64)
     held = [one.before for one in estimate.graph.stay_puts if one.robot == trajectory.robot]
     index = np.flatnonzero(np.isin(trajectory.stances, held))
-    return index[np.isin(index, standing_places(trajectory))]
+    return index[np.isin(index, new_poses(trajectory))]
 
 
 def draw_landmarks(axes: Axes, estimate: Estimate, scale: float = 1.0) -> None:
-    """A star a landmark with its name, and the 95 % ellipse of its place, its axes drawn `scale` times as long."""
+    """Draw each landmark as a star with its name and 95 % ellipse, `scale` times enlarged."""
     for name, placed in estimate.landmarks.items():
         x, y, _ = placed.planar
         outline = ellipse_points([x, y], placed.covariance_xy_yaw[:2, :2], K_95 * scale)
@@ -161,7 +164,7 @@ def draw_landmarks(axes: Axes, estimate: Estimate, scale: float = 1.0) -> None:
 
 
 def bounds(estimate: Estimate, truth: Truth | None) -> tuple[Array, Array]:
-    """The least and greatest x, y [m] of all finite poses; the unit square about 0 where there are none."""
+    """Return the minimum and maximum x, y [m] of all finite poses; the unit square about 0 where there are none."""
     points = [one.positions[:, :2] for one in trajectories_of(estimate)]
     points += [np.array([placed.planar[:2]]) for placed in estimate.landmarks.values()]
     points += [T[:, :2, 3] for one in trajectories_of(estimate) if (T := truth_of(one, truth)) is not None]
@@ -173,8 +176,8 @@ def bounds(estimate: Estimate, truth: Truth | None) -> tuple[Array, Array]:
 
 
 def draw_ellipses(axes: Axes, trajectory: Trajectory, colour: str, scale: float = 1.0) -> None:
-    """95 % ellipses of x, y, their axes drawn `scale` times as long."""
-    index = thinned(standing_places(trajectory))
+    """Draw the 95 % ellipses of x, y, `scale` times enlarged."""
+    index = thinned(new_poses(trajectory))
     planar = world_covariances(trajectory)[0][index, :2, :2]
     finite = np.isfinite(planar).all(axis=(1, 2))
     outlines = ellipse_points(trajectory.positions[index[finite], :2], planar[finite], K_95 * scale)
@@ -184,7 +187,7 @@ def draw_ellipses(axes: Axes, trajectory: Trajectory, colour: str, scale: float 
 
 
 def draw_headings(axes: Axes, T_world_body: Array, colour: str, length: float, width: float = 1.4) -> None:
-    """A tick of `length` [m] along the heading of each pose (n, 4, 4)."""
+    """Draw a tick of `length` [m] along the heading of each pose (n, 4, 4)."""
     start = T_world_body[:, :2, 3]
     heading = yaw(T_world_body)
     end = start + length * np.stack([np.cos(heading), np.sin(heading)], axis=1)

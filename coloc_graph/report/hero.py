@@ -1,4 +1,4 @@
-"""The README's picture: a team leap-frogs down a hallway, and where the estimate says it is."""
+"""The README's figure: a team leap-frogs down a hallway."""
 
 import itertools
 from dataclasses import replace
@@ -25,17 +25,16 @@ from coloc_graph.report.drawing import (
     draw_ellipses,
     draw_headings,
     marker_of,
+    new_poses,
     position_sigmas,
-    standing_places,
     styled,
     thinned,
     trajectories_of,
     truth_of,
 )
 
-#: Radius of a robot as drawn [m]: the paper's iRobot Create.
-BODY_RADIUS = 0.16
-#: Room about the poses [m]: ahead of them, their cameras look.
+BODY_RADIUS = 0.16  # m, of a robot as drawn: the paper's iRobot Create
+# m, margins about the poses, with the cameras' views ahead
 _BEFORE = np.array([0.35, 0.3])
 _AHEAD = np.array([0.75, 0.3])
 _FLOOR = "#f4f6f8"
@@ -44,10 +43,21 @@ _TRUTH: dict[str, Any] = {"color": INK, "linewidth": 1.0, "linestyle": (0, (4, 3
 
 @styled
 def hero_figure(estimate: Estimate, truth: Truth | None = None, fov_deg: float = 56.0) -> Figure:
-    """A wide (2:1) picture of a run: the whole way from above, its first leaps, its end to the centimetre.
+    """Draw a wide (2:1) figure of a run: all of it from above, its first leaps, its last pose.
 
-    `fov_deg` is the cameras' horizontal field of view, drawn along the robots' headings. Raises `InputError`
-    where `truth` has another number of poses than the estimate.
+    Parameters
+    ----------
+    estimate : Estimate
+        Of a run with stances.
+    truth : mapping of str to (n, 4, 4) float, optional
+        True poses by robot.
+    fov_deg : float
+        Horizontal field of view of the cameras, drawn along the robots' headings.
+
+    Raises
+    ------
+    InputError
+        `truth` has another number of poses than the estimate.
     """
     estimate, truth = _along_x(estimate, truth)
     figure = Figure(figsize=(12, 6), facecolor="white")
@@ -62,7 +72,7 @@ def hero_figure(estimate: Estimate, truth: Truth | None = None, fov_deg: float =
     _scale_bar(whole, 1.0, "1 m", at=0.55)
     _draw_first_leaps(first, estimate, truth, fov_deg)
     if trajectories:
-        last = max(trajectories, key=_how_far)
+        last = max(trajectories, key=_distance_and_sigma)
         _draw_end(end, estimate, last, truth_of(last, truth))
         _connect(figure, whole, first, box=True)
         _connect(figure, whole, end, box=False)
@@ -71,7 +81,7 @@ def hero_figure(estimate: Estimate, truth: Truth | None = None, fov_deg: float =
 
 
 def _along_x(estimate: Estimate, truth: Truth | None) -> tuple[Estimate, Truth | None]:
-    """The same, turned about the world's z so that the team travels to the right."""
+    """Rotate estimate and truth about the world's z so that the team travels to the right."""
     ways = [one.positions[-1] - one.positions[0] for one in trajectories_of(estimate)]
     x, y, _ = np.sum([np.zeros(3), *ways], axis=0)
     T_picture_world = floor_pose(0.0, 0.0, -np.arctan2(y, x))
@@ -83,8 +93,8 @@ def _along_x(estimate: Estimate, truth: Truth | None) -> tuple[Estimate, Truth |
     return replace(estimate, trajectories=turned), true
 
 
-def _how_far(one: Trajectory) -> tuple[float, float]:
-    """How far a robot got, to the centimetre, and then how uncertain its end is."""
+def _distance_and_sigma(one: Trajectory) -> tuple[float, float]:
+    """Return the distance that a robot travelled, to the centimetre, and the uncertainty of its last pose [m]."""
     sigma = float(np.nan_to_num(position_sigmas(one)[-1]))
     return round(float(np.linalg.norm(one.positions[-1] - one.positions[0])), 2), sigma
 
@@ -108,7 +118,7 @@ def _frame(axes: Axes, low: Array, high: Array) -> None:
 
 def _draw_whole(axes: Axes, estimate: Estimate, trajectory: Trajectory, true: Array | None, fov_deg: float) -> None:
     colour, xy = colour_of(estimate, trajectory.robot), trajectory.positions[:, :2]
-    places = standing_places(trajectory)
+    places = new_poses(trajectory)
     for index in thinned(places, 6):
         _draw_camera(axes, trajectory.T_world_body[index], colour, fov_deg, 0.55, 0.13)
     shown = thinned(places).tolist()
@@ -131,19 +141,19 @@ def _draw_camera(axes: Axes, T: Array, colour: str, fov_deg: float, reach: float
     axes.add_patch(Wedge(tuple(T[:2, 3]), reach, *cone, color=colour, alpha=alpha, linewidth=0, zorder=1))
 
 
-def _first_places(trajectory: Trajectory, count: int = 5) -> Array:
-    return np.asarray(trajectory.T_world_body[standing_places(trajectory)[:count]])
+def _first_poses(trajectory: Trajectory, count: int = 5) -> Array:
+    return np.asarray(trajectory.T_world_body[new_poses(trajectory)[:count]])
 
 
 def _draw_first_leaps(axes: Axes, estimate: Estimate, truth: Truth | None, fov_deg: float) -> None:
-    """The first five places of each robot, as bodies, with their cameras, and arrows from each to the next."""
+    """Draw the first five poses of each robot as bodies, with their cameras, and arrows from each to the next."""
     trajectories = trajectories_of(estimate)
-    seen = np.concatenate([np.zeros((0, 2)), *[_first_places(one)[:, :2, 3] for one in trajectories]])
+    seen = np.concatenate([np.zeros((0, 2)), *[_first_poses(one)[:, :2, 3] for one in trajectories]])
     if len(seen):
         _frame(axes, seen.min(axis=0) - _BEFORE, seen.max(axis=0) + _AHEAD)
     side_of = [one.positions[0, 1] for one in trajectories]
     for trajectory in trajectories:
-        colour, places = colour_of(estimate, trajectory.robot), _first_places(trajectory)
+        colour, places = colour_of(estimate, trajectory.robot), _first_poses(trajectory)
         side = 1 if trajectory.positions[0, 1] >= np.mean(side_of) else -1
         for number, T in enumerate(places):
             last = number == len(places) - 1
@@ -165,23 +175,18 @@ def _draw_body(axes: Axes, T: Array, colour: str, face: str) -> None:
 
 
 def _draw_end(axes: Axes, estimate: Estimate, trajectory: Trajectory, true: Array | None) -> None:
-    """The last pose to the centimetre: estimate with its 95 % ellipse, and truth."""
+    """Draw the last pose: estimate with its 95 % ellipse, and truth."""
     colour, xy = colour_of(estimate, trajectory.robot), trajectory.positions[-1, :2]
     off = 0.0 if true is None else float(np.linalg.norm(true[-1, :2, 3] - xy))
     sigma = float(np.nan_to_num(position_sigmas(trajectory)[-1]))
     reach = 1.5 * max(K_95 * sigma, off, 0.002)
     _frame(axes, xy - reach, xy + reach)
-    draw_ellipses(axes, _only_last(trajectory), colour)
+    draw_ellipses(axes, trajectory.where(np.arange(len(trajectory)) == len(trajectory) - 1), colour)
     axes.plot(*xy, marker=marker_of(estimate, trajectory.robot), markersize=8, color=colour, markeredgecolor="white")
     if true is not None:
         axes.plot(*true[-1, :2, 3], marker="+", markersize=13, color=INK, markeredgewidth=1.6, zorder=6)
     step = 10.0 ** np.floor(np.log10(reach))
     _scale_bar(axes, step, f"{100 * step:g} cm" if step >= 0.01 else f"{1000 * step:g} mm")
-
-
-def _only_last(one: Trajectory) -> Trajectory:
-    covariances = None if one.covariances is None else one.covariances[-1:]
-    return Trajectory(one.robot, one.times[-1:], one.T_world_body[-1:], None, covariances)
 
 
 def _scale_bar(axes: Axes, length: float, label: str, at: float = 0.97) -> None:
@@ -192,12 +197,12 @@ def _scale_bar(axes: Axes, length: float, label: str, at: float = 0.97) -> None:
 
 
 def _connect(figure: Figure, whole: Axes, part: Axes, box: bool) -> None:
-    """Mark in the whole what a part shows, and lead the eye there."""
+    """Mark the region of a part in the whole, and connect both."""
     (left, right), (low, high) = part.get_xlim(), part.get_ylim()
     if box:
-        (least_x, most_x), (least_y, most_y) = whole.get_xlim(), whole.get_ylim()
-        left, right = max(left, least_x), min(right, most_x)
-        low, high = max(low, least_y), min(high, most_y)
+        (min_x, max_x), (min_y, max_y) = whole.get_xlim(), whole.get_ylim()
+        left, right = max(left, min_x), min(right, max_x)
+        low, high = max(low, min_y), min(high, max_y)
         whole.add_patch(Rectangle((left, low), right - left, high - low, fill=False, edgecolor=GREY, linewidth=0.8))
         pairs = [((left, low), (0.0, 1.0)), ((right, low), (1.0, 1.0))]
     else:
@@ -223,7 +228,7 @@ def _write_text(figure: Figure, estimate: Estimate, truth: Truth | None) -> None
     figure.text(0.03, 0.02, "While one stays put, the other leaps ahead; their cameras watch a third.", **small)
     if trajectories:
         cross = ", + truth" if truth else ""
-        figure.text(0.97, 0.02, f"Where it ends: 95 % ellipse{cross}", ha="right", **small)
+        figure.text(0.97, 0.02, f"Last pose: 95 % ellipse{cross}", ha="right", **small)
     y = 0.385
     for one, length in zip(trajectories[:3], lengths, strict=False):
         colour, true = colour_of(estimate, one.robot), truth_of(one, truth)

@@ -1,4 +1,4 @@
-"""report.html: accuracy, warnings, calibration, figures and measurements of a solution in one file, without scripts."""
+"""The report report.html: accuracy, warnings, calibration, figures and measurements in one file, without scripts."""
 
 import dataclasses
 import math
@@ -27,14 +27,18 @@ def render_report(solution: Solution, accuracy: Accuracy | None, truth: Truth | 
     Parameters
     ----------
     solution : Solution
-        What was solved.
+        The solution.
     accuracy, truth : optional
         The accuracy, and by robot the true poses T_world_body (n, 4, 4) of `evaluation.align`; None without truth.
 
+    Raises
+    ------
+    InputError
+        `truth` has another number of poses than the estimate.
+
     Notes
     -----
-    No time of day and no timing is in it: the same input gives the same text. Raises `InputError` where `truth` has
-    another number of poses than the estimate.
+    It holds no time of day and no timing: the same input gives the same text.
     """
     name, is_ranging = solution.run.path.name, solution.estimate.is_ranging
     world = "the reference robot's body at its first stance"
@@ -84,7 +88,7 @@ def _verdict(solution: Solution, accuracy: Accuracy | None) -> str:
 def _robot_verdict(row: RobotAccuracy) -> str:
     name = escape(row.robot)
     if row.length_error_percent is None:
-        return f"{name}: stayed where it was, {number(100 * row.end_position_error, 2)} cm off"
+        return f"{name}: standing, position error {number(100 * row.end_position_error, 2)} cm"
     return (
         f"{name}: {number(100 * row.true_length, 1)} cm true, {number(100 * row.estimated_length, 1)} cm estimated, "
         f"<b>{number(row.length_error_percent, 2)} %</b>"
@@ -92,16 +96,16 @@ def _robot_verdict(row: RobotAccuracy) -> str:
 
 
 def _calibration_section(solution: Solution) -> str:
-    """Numbers stated with a tolerance, as stated and as estimated."""
+    """Return the table of numbers stated with a tolerance, as stated and as estimated."""
     rows = solution.estimate.calibration.rows
     if not rows:
         return ""
 
     def value(number: float, sigma: float, unit: str) -> str:
-        number, sigma, unit, digits = (1000 * number, 1000 * sigma, "mm", 2) if unit == "m" else (number, sigma, "°", 3)
-        return f"{number:.{digits}f} ± {sigma:.{digits}f} {unit}"
+        factor, shown, digits = {"m": (1000, "mm", 2), "deg": (1, "°", 3)}.get(unit, (1, unit, 4))
+        return f"{factor * number:.{digits}f} ± {factor * sigma:.{digits}f} {shown}".rstrip()
 
-    head = ["Robot", "What", "Stated", "Found", "Off by (σ of what was stated)"]
+    head = ["Robot", "Parameter", "Stated", "Estimated", "Difference [σ stated]"]
     cells = [
         [
             escape(row.robot),
@@ -139,7 +143,7 @@ def _noise_section(solution: Solution) -> str:
 
 
 def _landmarks_section(solution: Solution) -> str:
-    """Where the landmarks are, and the map."""
+    """Return the table of the poses of the landmarks and of the map."""
     rows = landmark_rows(solution.estimate)
     if not rows:
         return ""
@@ -166,11 +170,11 @@ def _figures_section(solution: Solution, accuracy: Accuracy | None, truth: Truth
 
 
 def _figures(solution: Solution, truth: Truth | None) -> Iterator[tuple[str, Figure, str]]:
-    """Name, figure and caption, of a run with stances."""
+    """Yield name, figure and caption of a run with stances."""
     estimate = solution.estimate
-    errors = "Error of position and heading along the way; the band is what the covariances predict (2σ)."
+    errors = "Error of position and heading by distance travelled; the band is the predicted 2σ."
     if not truth:
-        errors = "What the covariances predict along the way (2σ): there is no truth to compare with."
+        errors = "Predicted 2σ of position and heading by distance travelled; there is no truth to compare with."
     yield "above", trajectories_figure(estimate, truth), "The team from above, in the world of the reference robot."
     yield "errors", error_figure(estimate, truth), errors
     caption = "Residuals of each stance's points in units of the stated pixel noise, expected 1."
@@ -180,9 +184,9 @@ def _figures(solution: Solution, truth: Truth | None) -> Iterator[tuple[str, Fig
 def _ranging_figures(
     solution: Solution, accuracy: Accuracy | None, truth: Truth | None
 ) -> Iterator[tuple[str, Figure, str]]:
-    """Name, figure and caption, of a ranging run."""
+    """Yield name, figure and caption of a ranging run."""
     captions = {
-        "errors": "Error of position and heading in time; bands are what the covariances predict (2σ).",
+        "errors": "Error of position and heading over time; bands are the predicted 2σ.",
         "rpe": "Relative errors by the distance travelled.",
     }
     yield "above", map_figure(solution.estimate, truth), "Robots and landmarks from above."
@@ -208,11 +212,11 @@ def _used_section(solution: Solution) -> str:
         *_flat("", dataclasses.asdict(solution.options)),
     ]
     rows = [[escape(key), escape(value)] for key, value in facts]
-    return f"<h2>What was used</h2>\n{table(['What', 'Value'], rows, [0, 1])}"
+    return f"<h2>Measurements and options</h2>\n{table(['Item', 'Value'], rows, [0, 1])}"
 
 
 def _flat(prefix: str, options: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Options by dotted name."""
+    """Yield options by dotted name."""
     for key, value in options.items():
         if isinstance(value, dict):
             yield from _flat(f"{prefix}{key}.", value)
@@ -222,7 +226,7 @@ def _flat(prefix: str, options: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _measurements_section(solution: Solution) -> str:
     measurements = solution.measurements
-    head = ["Stance", "Pair", "Points", "Inliers", "Residual", "Overlap [px]", "Normal error [°]", "Usable, or why not"]
+    head = ["Stance", "Pair", "Points", "Inliers", "Residual", "Overlap [px]", "Normal error [°]", "Used"]
     rows = table(head, (_measurement_row(one, solution.reason(one)) for one in measurements), [1, 7])
     return (
         f"<h2>Measurements</h2>\n<details>\n<summary>{many(len(measurements), 'measured pair')}</summary>\n"
@@ -245,7 +249,7 @@ def _measurement_row(measured: PairMeasurement, reason: str | None) -> list[str]
 
 
 def _ranges_section(solution: Solution) -> str:
-    """Ranges and bearings by robot, with the factors on their stated noise."""
+    """Return the table of ranges and bearings by robot, with the factors on their stated noise."""
     problem = solution.estimate.ranging
     robot, rows = problem.keyframes.measured.robot, []
     for number_, name in enumerate(problem.keyframes.robots):
@@ -256,5 +260,5 @@ def _ranges_section(solution: Solution) -> str:
              str((own & ~problem.used & ~problem.outliers).sum()), *noise]
         )  # fmt: skip
     head = ["Robot", "Used", "Outliers", "Without poses", "Range noise ×", "Bearing noise ×"]
-    note = "Noise × is the factor by which residuals are larger than the stated standard deviations."
+    note = "Noise × is the ratio of residuals to the stated standard deviations."
     return f'<h2>Ranges and bearings</h2>\n{table(head, rows, [0])}\n<p class="soft">{note}</p>'

@@ -1,4 +1,4 @@
-"""What the reports have in common: an HTML document with nothing to fetch or execute, its tables and figures."""
+"""Parts of an HTML report with nothing to fetch or execute: document, tables, figures."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -42,7 +42,7 @@ footer { margin-top: 3rem; border-top: 1px solid var(--line); padding-top: .75re
 
 
 def document(title: str, sections: Iterable[str]) -> str:
-    """A whole document of its sections; empty ones are left out."""
+    """Return a document of its sections, without empty ones."""
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -54,7 +54,7 @@ def document(title: str, sections: Iterable[str]) -> str:
 
 
 def figure_card(name: str, figure: Figure, caption: str) -> str:
-    """A figure with its caption; names are different within a document."""
+    """Return a figure with its caption; its name is unique in the document."""
     return (
         f'<figure>\n<div class="card" role="img" aria-label="{escape(caption)}">{figure_svg(figure, name)}</div>\n'
         f"<figcaption>{escape(caption)}</figcaption>\n</figure>"
@@ -62,18 +62,17 @@ def figure_card(name: str, figure: Figure, caption: str) -> str:
 
 
 def many(count: int, what: str) -> str:
-    """So many of what, in words."""
+    """Return a count with its noun, in the plural where needed."""
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def number(value: float | None, digits: int) -> str:
-    """A number, or a dash where there is none."""
+    """Format a number; a dash where there is none."""
     return f"{value:.{digits}f}" if value is not None and math.isfinite(value) else DASH
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], text: Sequence[int], foot: Sequence[str] = ()) -> str:
-    """A table; the columns `text` are to the left."""
-    """A table of cells that are HTML already; the columns of `text` are set to the left."""
+    """Return a table of cells that are HTML; columns in `text` are left-aligned."""
 
     def cells(tag: str, row: Sequence[str]) -> str:
         return "".join(
@@ -88,7 +87,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], text: Sequence[int
 
 
 def warnings_section(warnings: Sequence[str]) -> str:
-    """The warnings, if there are any."""
+    """Return the list of warnings; "" where there are none."""
     if not warnings:
         return ""
     items = "\n".join(f"<li>{escape(warning)}</li>" for warning in warnings)

@@ -1,7 +1,7 @@
-"""Figures of a result: trajectories from above, errors against what was predicted, residuals by stance.
+"""Figures of a result: trajectories from above, errors with predicted bands, residuals by stance.
 
-Each function returns a `matplotlib.figure.Figure` of its own: no pyplot, no global state. `figure_svg` writes
-one as text, the same figure always as the same bytes.
+Each function returns a `matplotlib.figure.Figure`: no pyplot, no global state. `figure_svg` writes one as text, the
+same figure always as the same bytes.
 """
 
 import io
@@ -36,17 +36,18 @@ from coloc_graph.report.drawing import (
     draw_headings,
     draw_landmarks,
     heading_sigmas,
-    held_places,
+    held_poses,
     marker_of,
+    new_poses,
     position_sigmas,
-    standing_places,
+    round_125,
     styled,
     thinned,
     trajectories_of,
     truth_of,
 )
 
-_WIDTH = 9.0  # [in]
+_WIDTH = 9.0  # in
 
 
 @styled
@@ -68,10 +69,10 @@ def map_figure(estimate: Estimate, truth: Truth | None = None) -> Figure:
 
 @styled
 def trajectories_figure(estimate: Estimate, truth: Truth | None = None) -> Figure:
-    """The team from above, world frame [m]: estimate over truth, headings, 95 % ellipses, held poses ringed.
+    """Draw the team from above, world frame [m]: estimate and truth, headings, 95 % ellipses, rings on held poses.
 
-    Ellipses too small to be seen are drawn larger, by the round number that the legend states. Raises
-    `InputError` where `truth` has another number of poses than the estimate.
+    Ellipses that are too small to be seen are enlarged by the round factor in the legend. Raises `InputError` where
+    `truth` has another number of poses than the estimate.
     """
     low, high = bounds(estimate, truth)
     size = np.maximum(high - low, 0.5)
@@ -83,7 +84,7 @@ def trajectories_figure(estimate: Estimate, truth: Truth | None = None) -> Figur
         colour = colour_of(estimate, trajectory.robot)
         draw_ellipses(axes, trajectory, colour, scale)
         _draw_path(axes, estimate, trajectory)
-        shown = thinned(standing_places(trajectory))
+        shown = thinned(new_poses(trajectory))
         draw_headings(axes, trajectory.T_world_body[shown], colour, 0.022 * float(size.max()))
         true = truth_of(trajectory, truth)
         if true is not None:
@@ -104,7 +105,7 @@ def _draw_path(axes: Axes, estimate: Estimate, trajectory: Trajectory) -> None:
         *xy.T, color=colour, linewidth=1.6, marker=marker_of(estimate, trajectory.robot), markersize=size,
         markevery=every, zorder=3, label=trajectory.robot,
     )  # fmt: skip
-    held = thinned(held_places(estimate, trajectory))
+    held = thinned(held_poses(estimate, trajectory))
     axes.plot(
         *xy[held].T, linestyle="", marker="o", markersize=9.5, markerfacecolor="none", markeredgecolor=colour,
         markeredgewidth=0.9, zorder=4, gid="held",
@@ -112,7 +113,7 @@ def _draw_path(axes: Axes, estimate: Estimate, trajectory: Trajectory) -> None:
 
 
 def _is_above(estimate: Estimate, trajectory: Trajectory) -> bool:
-    """Whether a robot starts above the team's middle: where there is room for its label."""
+    """Return whether a robot starts above the team's middle, where its label then goes."""
     starts = [one.positions[0, 1] for one in trajectories_of(estimate)]
     return bool(trajectory.positions[0, 1] >= np.mean(starts))
 
@@ -125,14 +126,12 @@ def _label_start(axes: Axes, trajectory: Trajectory, colour: str, above: bool) -
 
 
 def _ellipse_scale(estimate: Estimate, extent: float) -> float:
-    """1, or the round number that makes the largest ellipse's half axis about a fortieth of the picture."""
+    """Return 1, or the round factor that makes the largest ellipse's half axis about a fortieth of the figure."""
     sigmas = np.concatenate([[0.0], *[position_sigmas(one) for one in trajectories_of(estimate)]])
     largest = K_95 * float(np.nanmax(sigmas))
     if largest <= 0 or largest > 0.01 * extent:
         return 1.0
-    wanted = extent / 40 / largest
-    decade = 10.0 ** np.floor(np.log10(wanted))
-    return float(decade * max(step for step in (1, 2, 5) if step <= wanted / decade * (1 + 1e-9)))
+    return round_125(extent / 40 / largest)
 
 
 def _legend(estimate: Estimate, truth: Truth | None, scale: float) -> list[Line2D | Patch]:
@@ -142,7 +141,7 @@ def _legend(estimate: Estimate, truth: Truth | None, scale: float) -> list[Line2
         handles.append(Line2D([], [], color=colour, marker=marker, markersize=4, label=one.robot))
     if truth:
         handles.append(Line2D([], [], color=INK, linewidth=1, linestyle=(0, (4, 3)), label="truth"))
-    if any(len(held_places(estimate, one)) for one in trajectories_of(estimate)):
+    if any(len(held_poses(estimate, one)) for one in trajectories_of(estimate)):
         ring = Line2D([], [], linestyle="", marker="o", markersize=9, markeredgecolor=GREY, label="stayed put")
         ring.set_markerfacecolor("none")
         handles.append(ring)
@@ -156,10 +155,10 @@ def _legend(estimate: Estimate, truth: Truth | None, scale: float) -> list[Line2
 
 @styled
 def error_figure(estimate: Estimate, truth: Truth | None = None) -> Figure:
-    """Errors of position (x, y) [cm] and heading [deg] against each robot's own estimated path length [m].
+    """Draw errors of position (x, y) [cm] and heading [deg] by each robot's own estimated path length [m].
 
-    A band reaches to the predicted 2 sigma: in the worst direction for the position. Without truth the band is
-    all there is. Raises `InputError` where `truth` has another number of poses than the estimate.
+    Bands are the predicted 2 sigma, of the position in its worst direction; without truth they are drawn alone. Raises
+    `InputError` where `truth` has another number of poses than the estimate.
     """
     figure = Figure(figsize=(_WIDTH, 4.6), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
@@ -173,7 +172,7 @@ def error_figure(estimate: Estimate, truth: Truth | None = None) -> Figure:
         _draw_error(above, estimate, trajectory.robot, travelled, off, np.zeros_like(position), position)
         _draw_error(below, estimate, trajectory.robot, travelled, turned, -heading, heading)
     if above.get_xlim()[1] < 0.1:
-        above.set_xlim(-0.5, 0.5)  # nobody went anywhere
+        above.set_xlim(-0.5, 0.5)  # no robot moved
     above.set_ylim(bottom=0)
     below.axhline(0, color=GREY, linewidth=0.8)
     what = "error" if any_truth else "predicted 2σ"
@@ -214,9 +213,9 @@ def _draw_error(
 
 @styled
 def residual_figure(measurements: Iterable[HomographyMeasurement]) -> Figure:
-    """By stance: the RMS residual in units of the noise (1 is expected), and inliers of points.
+    """Draw, by stance, the RMS residual in units of the noise (1 is expected), and the numbers of points and inliers.
 
-    A grey bar holds 95 % of what noise alone gives; a cross on the axis is a measurement that is unusable.
+    A grey bar is the 95 % interval by noise alone; a cross on the axis is an unusable measurement.
     """
     measured = list(measurements)
     good = [one for one in measured if one.unusable is None]
@@ -227,8 +226,8 @@ def residual_figure(measurements: Iterable[HomographyMeasurement]) -> Figure:
     above, below = figure.subplots(2, 1, sharex=True)
 
     dof = np.array([max(one.dof, 1) for one in good], float)
-    least, most = (np.sqrt(chdtri(dof, p) / dof) for p in (0.975, 0.025))
-    _bars(above, stance, least, most, len(measured))
+    low, high = (np.sqrt(chdtri(dof, p) / dof) for p in (0.975, 0.025))
+    _bars(above, stance, low, high, len(measured))
     above.axhline(1, color=GREY, linewidth=0.9, linestyle="--")
     above.scatter(stance, [one.residual for one in good], s=size, color=COLOURS[0], zorder=3)
     above.set_ylabel("RMS residual [noise]")
@@ -260,7 +259,7 @@ def _residual_legend(any_bad: bool) -> list[Line2D | Patch]:
     handles: list[Line2D | Patch] = [
         Line2D([], [], linestyle="", marker="o", markersize=5, color=COLOURS[0], label="residual; inliers"),
         Line2D([], [], linestyle="", marker="_", markersize=8, color=GREY, label="all points"),
-        Patch(facecolor=PALE, label="95 % of what noise alone gives; outliers"),
+        Patch(facecolor=PALE, label="95 % interval by noise alone; outliers"),
     ]
     if any_bad:
         handles.append(Line2D([], [], linestyle="", marker="x", markersize=6, color=BAD, label="not used"))
@@ -269,7 +268,7 @@ def _residual_legend(any_bad: bool) -> list[Line2D | Patch]:
 
 @styled
 def figure_svg(figure: Figure, name: str = "figure") -> str:
-    """The figure as an <svg> element, to be put into HTML: ids begin with `name`, nothing refers outside."""
+    """Return the figure as an <svg> element for HTML: ids begin with `name`, nothing refers outside."""
     out = io.StringIO()
     figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     svg = out.getvalue()

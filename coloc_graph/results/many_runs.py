@@ -45,7 +45,7 @@ def runs_in(folder: str | Path) -> list[Path]:
     folder = Path(folder)
     found = sorted(path for path in folder.rglob("*.mcap") if path.is_file())
     if not found:
-        raise InputError(f"{folder} holds no run (.mcap): give a run, or a folder of runs")
+        raise InputError(f"{folder}: holds no run (.mcap); give a run, or a folder of runs")
     return found
 
 

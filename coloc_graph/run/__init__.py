@@ -1,6 +1,6 @@
-"""Runs, the recordings of a team: `RunWriter` writes one, `open_run` reads it lazily, as the records of `messages`.
+"""Recordings of a team: `RunWriter` writes a run, `open_run` reads it lazily, as the records of `messages`.
 
-A run is one MCAP file that Foxglove opens; docs/run-format.md says what is in it. `read_truth` and
+A run is one MCAP file that Foxglove opens; docs/run-format.md is its specification. `read_truth` and
 `read_true_team` are for evaluation alone.
 """
 
@@ -18,7 +18,7 @@ from coloc_graph.run.messages import (
 )
 from coloc_graph.run.reader import Run, open_run, read_true_team, read_truth, run_id, truth_counts
 from coloc_graph.run.recorded import Recorded
-from coloc_graph.run.writer import RunWriter, whole_run
+from coloc_graph.run.writer import RunWriter, atomic_run
 
 __all__ = [
     "Detections",
@@ -33,11 +33,11 @@ __all__ = [
     "Run",
     "RunWriter",
     "Stance",
+    "atomic_run",
     "is_mcap",
     "open_run",
     "read_true_team",
     "read_truth",
     "run_id",
     "truth_counts",
-    "whole_run",
 ]

@@ -1,4 +1,4 @@
-"""Atomic writes: a file is there whole or not at all."""
+"""Atomic writes of files."""
 
 import os
 import secrets
@@ -7,8 +7,7 @@ from pathlib import Path
 
 from coloc_graph.errors import InputError
 
-#: Bytes of the random part of a temporary name.
-_RANDOM_BYTES = 8
+_RANDOM_BYTES = 8  # bytes of the random part of a temporary name
 
 
 def require_writable(path: str | Path, *, force: bool = False, what: str = "a file") -> None:
@@ -23,15 +22,15 @@ def require_writable(path: str | Path, *, force: bool = False, what: str = "a fi
 
 
 def open_part(path: Path) -> tuple[int, Path]:
-    """Create the temporary file of an output, beside it, under a name that nobody can foresee.
+    """Create the temporary file of an output, beside it, under an unpredictable name.
 
-    The file is new (`O_EXCL`) and no link is followed (`O_NOFOLLOW`); its rights are those that the system gives to new
-    files. It is called `NAME.<random>.part`, so that what a killed process wrote can be found.
+    The file is new (`O_EXCL`) and no link is followed (`O_NOFOLLOW`); its permissions are those of new files. Its name
+    is `NAME.<random>.part`, so that files of killed processes can be found.
 
     Parameters
     ----------
     path
-        Output that the file is for.
+        The output.
 
     Returns
     -------
@@ -43,7 +42,7 @@ def open_part(path: Path) -> tuple[int, Path]:
 
 
 def parts_left(path: Path) -> list[Path]:
-    """Temporary files of an output (see `open_part`) that killed processes left beside it, by name."""
+    """Return the temporary files of an output (see `open_part`) that killed processes left beside it, by name."""
     return sorted(one for one in path.parent.glob("*.part") if _is_part(one.name, path.name) and one.is_file())
 
 
@@ -52,8 +51,8 @@ def _is_part(name: str, of: str) -> bool:
     return len(random) == 2 * _RANDOM_BYTES and f"{of}.{random}.part" == name and set(random) <= set("0123456789abcdef")
 
 
-def write_whole(path: Path, data: str | bytes, *, synchronise: bool = False) -> None:
-    """Write a file atomically; a file that is replaced keeps its rights, and a link stays a link.
+def write_atomically(path: Path, data: str | bytes, *, synchronise: bool = False) -> None:
+    """Write a file atomically; a replaced file keeps its permissions, and a link stays a link.
 
     Parameters
     ----------
@@ -62,7 +61,7 @@ def write_whole(path: Path, data: str | bytes, *, synchronise: bool = False) -> 
     data
         Content; text is written as UTF-8.
     synchronise
-        Whether the content is on the disk, not only in the system's hands, before the file gets its name.
+        Synchronise the content to the disk before the file gets its name.
     """
     path = path.resolve()
     file, part = open_part(path)

@@ -1,4 +1,4 @@
-"""One chunk of an MCAP file: its records, checked before anything in them is believed."""
+"""Chunks of an MCAP file: reading of their records, with checks against damage and hostile input."""
 
 import struct
 import zlib
@@ -17,10 +17,8 @@ from mcap.records import Channel, Schema
 
 from coloc_graph.errors import RunError
 
-#: Larger than any image; a larger length is damage, and nothing is allocated for it.
-MAX_RECORD = 256 * 1024 * 1024
-#: Most records in one chunk. Writers make chunks of kilobytes to a few megabytes; the smallest message takes 31 bytes.
-MAX_RECORDS = 250_000
+MAX_RECORD = 256 * 1024 * 1024  # bytes of a record: larger than any image; a larger length is damage
+MAX_RECORDS = 250_000  # records in a chunk; writers make chunks of up to megabytes, the smallest message takes 31 bytes
 HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")  # start, end, uncompressed size, its CRC, length of the compression's name
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -35,18 +33,33 @@ class ChannelInfo(NamedTuple):
 
 
 class Message(NamedTuple):
-    """One message as it is in the file, `ns` UTC nanoseconds; `place` is where it is among the others of its chunk."""
+    """One message as in the file: `ns` is its time [UTC ns], `position` its index among the records of its chunk."""
 
     channel: int
     ns: int
     data: memoryview
-    place: int
+    position: int
 
 
 @dataclass(slots=True)
 class ChunkInfo:
-    """Place of a chunk in the file and its `size` without compression [bytes], the times in it [ns], and the number of
-    messages by channel."""
+    """Position and contents of a chunk.
+
+    Parameters
+    ----------
+    offset, length : int
+        Position in the file [bytes].
+    start, end : int
+        First and last time [UTC ns].
+    size : int
+        Size without compression [bytes].
+    counts : dict of int to int
+        Number of messages by channel.
+    index_offsets : dict of int to int
+        Offsets of its message indexes by channel [bytes].
+    index_length : int
+        Length of all of them [bytes].
+    """
 
     offset: int
     length: int
@@ -60,19 +73,19 @@ class ChunkInfo:
 
 @dataclass(frozen=True)
 class Definitions:
-    """The channels and the names of the schemas (by id) that chunks define."""
+    """Channels, and names of schemas, that chunks define; by id."""
 
     channels: dict[int, ChannelInfo] = field(default_factory=dict)
     schemas: dict[int, str] = field(default_factory=dict)
 
 
 def damaged(path: Path, offset: int, what: str) -> RunError:
-    """The sentence for a file that is neither whole nor merely cut off."""
+    """Return the error for a file that is neither whole nor merely cut off."""
     return RunError(f"{path}: damaged at byte {offset} ({what}); copy it again from where it was recorded")
 
 
 def records(path: Path, data: bytes, offset: int) -> Iterator[tuple[int, memoryview]]:
-    """(opcode, body) of the records in `data`, which is at (or, compressed, in the chunk at) `offset`."""
+    """Yield (opcode, body) of the records in `data`, which is at (or, compressed, in the chunk at) `offset`."""
     view = memoryview(data)
     at, end, left = 0, len(view), MAX_RECORDS
     while at < end:
@@ -83,18 +96,18 @@ def records(path: Path, data: bytes, offset: int) -> Iterator[tuple[int, memoryv
         at += HEAD.size
         until = at + length
         if not opcode or until > end:
-            raise damaged(path, offset, "what is in it is not a row of records")
+            raise damaged(path, offset, "no sequence of records")
         yield opcode, view[at:until]
         at = until
 
 
 def stream(body: memoryview) -> ReadDataStream:
-    """A record's body as mcap's record classes read it."""
+    """Return a record's body as a stream for mcap's record classes."""
     return ReadDataStream(BytesIO(body))
 
 
 def decompressed(path: Path, file: BinaryIO, chunk: ChunkInfo) -> bytes:
-    """The records in a chunk; RunError where they are not what was written (CRC)."""
+    """Return the decompressed records of a chunk; RunError where they do not match their checksum."""
     file.seek(chunk.offset + HEAD.size)
     body = file.read(chunk.length - HEAD.size)
     at = _CHUNK.size
@@ -107,7 +120,7 @@ def decompressed(path: Path, file: BinaryIO, chunk: ChunkInfo) -> bytes:
     if (start, end, size) != (chunk.start, chunk.end, chunk.size) or len(data) != int.from_bytes(
         body[at - 8 : at], "little"
     ):
-        raise damaged(path, chunk.offset, "a chunk whose head contradicts itself")
+        raise damaged(path, chunk.offset, "a chunk with an inconsistent header")
     if size > MAX_RECORD:
         raise damaged(path, chunk.offset, f"a chunk of {size} bytes")
     try:
@@ -115,12 +128,12 @@ def decompressed(path: Path, file: BinaryIO, chunk: ChunkInfo) -> bytes:
     except (zstandard.ZstdError, RuntimeError, ValueError, MemoryError) as error:
         raise damaged(path, chunk.offset, "a chunk that cannot be decompressed") from error
     if len(out) != size or crc not in (0, zlib.crc32(out)):
-        raise damaged(path, chunk.offset, "a chunk that does not have its checksum")
+        raise damaged(path, chunk.offset, "a chunk that does not match its checksum")
     return out
 
 
 def _decompress(name: bytes, data: bytes, size: int) -> bytes:
-    # what is inside states its size too, and that is what would be allocated
+    # the compressed frame states its size, too, and that would be allocated
     if name == b"zstd":
         stated = zstandard.get_frame_parameters(data).content_size
         if stated not in (size, zstandard.CONTENTSIZE_UNKNOWN):
@@ -137,21 +150,21 @@ def _decompress(name: bytes, data: bytes, size: int) -> bytes:
 
 
 def messages(path: Path, file: BinaryIO, chunk: ChunkInfo) -> Iterator[Message]:
-    """The messages in a chunk, in the order of writing; all are checked."""
+    """Yield the messages of a chunk, checked, in the order of writing."""
     start, end = chunk.start, chunk.end
-    for place, (opcode, body) in enumerate(records(path, decompressed(path, file, chunk), chunk.offset)):
+    for position, (opcode, body) in enumerate(records(path, decompressed(path, file, chunk), chunk.offset)):
         if opcode != Opcode.MESSAGE:
             continue
         if len(body) < _MESSAGE.size:
-            raise damaged(path, chunk.offset, "a message without a head")
+            raise damaged(path, chunk.offset, "a message without a header")
         channel, _, ns, _ = _MESSAGE.unpack_from(body)
         if not start <= ns <= end:
             raise damaged(path, chunk.offset, "a message outside of its chunk's time")
-        yield Message(channel, ns, body[_MESSAGE.size :], place)
+        yield Message(channel, ns, body[_MESSAGE.size :], position)
 
 
 def learn(path: Path, file: BinaryIO, chunk: ChunkInfo, known: Definitions) -> None:
-    """Add the channels and schemas that a chunk defines to those that are known."""
+    """Add the channels and schemas that a chunk defines to `known`."""
     for opcode, body in records(path, decompressed(path, file, chunk), chunk.offset):
         try:
             if opcode == Opcode.SCHEMA:

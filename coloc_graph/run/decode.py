@@ -1,4 +1,4 @@
-"""Bytes to records. A `MalformedError` says what is wrong, the reader adds where."""
+"""Decoding of messages. A `MalformedError` describes the fault, the reader adds topic and time."""
 
 import math
 from typing import Any, TypeVar
@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 class MalformedError(ValueError):
-    """A message is not what its topic says; the message says why."""
+    """Message that does not have its topic's format; its text is the reason."""
 
 
 def _json(data: memoryview, kind: type[T]) -> T:
@@ -30,12 +30,12 @@ def _json(data: memoryview, kind: type[T]) -> T:
 
 
 def decode_team(data: memoryview) -> Team:
-    """A team from its JSON."""
+    """Decode a team from its JSON."""
     return _json(data, Team)
 
 
 def decode_detections(robot: str, ns: int, data: memoryview) -> Detections:
-    """The detections in one image."""
+    """Decode the detections in one image."""
     wire = _json(data, schemas.DetectionsWire)
     n = len(wire.u)
     for name in ("v", "covariance", "marker", "flags", "peak", "area"):
@@ -56,7 +56,7 @@ def decode_detections(robot: str, ns: int, data: memoryview) -> Detections:
 
 
 def decode_odometry(robot: str, ns: int, data: memoryview) -> OdometrySample:
-    """One sample of a robot's odometry."""
+    """Decode one sample of a robot's odometry."""
     wire = _json(data, schemas.OdometryWire)
     return OdometrySample(
         robot, schemas.to_seconds(ns), np.array([wire.x, wire.y, wire.yaw]), np.array(wire.covariance)
@@ -64,12 +64,12 @@ def decode_odometry(robot: str, ns: int, data: memoryview) -> OdometrySample:
 
 
 def decode_motion(robot: str, ns: int, data: memoryview) -> Motion:
-    """The beginning or the end of a movement."""
+    """Decode the begin or the end of a movement."""
     return Motion(robot, schemas.to_seconds(ns), _json(data, schemas.MotionWire).moving)
 
 
 def decode_ranges(robot: str, ns: int, data: memoryview) -> Ranges:
-    """Measurements of a range and bearing sensor at one instant."""
+    """Decode the measurements of a range and bearing sensor at one time."""
     wire = _json(data, schemas.RangesWire)
     if not len(wire.target) == len(wire.range) == len(wire.bearing):
         lengths = f"`range` has {len(wire.range)} and `bearing` {len(wire.bearing)}"
@@ -83,7 +83,7 @@ def decode_ranges(robot: str, ns: int, data: memoryview) -> Ranges:
 
 
 def decode_stance(ns: int, data: memoryview) -> Stance:
-    """A stance; its start is the message's time."""
+    """Decode a stance; its start is the message's time."""
     wire = _json(data, schemas.StanceWire)
     end = schemas.to_seconds(wire.end_ns) if abs(wire.end_ns) < 2**64 else -1.0
     stance = Stance(wire.index, schemas.to_seconds(ns), end, wire.observers, wire.movers, wire.anchors)
@@ -95,7 +95,7 @@ def decode_stance(ns: int, data: memoryview) -> Stance:
 
 
 def decode_planes(ns: int, data: memoryview) -> Planes:
-    """The marker planes of one stance."""
+    """Decode the marker planes of one stance."""
     wire = _json(data, schemas.PlanesWire)
     planes = Planes(wire.stance, schemas.to_seconds(ns), wire.planes, wire.sigmas)
     try:

@@ -1,4 +1,4 @@
-"""Records to bytes, refusing what cannot be read back as it was meant."""
+"""Encoding of records, with checks that they can be read back."""
 
 import math
 from collections.abc import Sequence
@@ -28,21 +28,21 @@ Array = NDArray[np.float64]
 ImageFormat = Literal["jpeg", "png", "raw"]
 Record = Detections | Image | EncodedImage | OdometrySample | Motion | Ranges | Stance | Planes
 
-JPEG_QUALITY = 95
+JPEG_QUALITY = 95  # of OpenCV's scale from 0 to 100
 
 
 def flag_names(flag: int) -> list[schemas.FlagName]:
-    """The lower-case names of the flags that are set."""
+    """Return the lower-case names of the flags that are set."""
     return [flag_.name.lower() for flag_ in Flag if flag_ and flag & flag_]  # type: ignore[union-attr, misc]
 
 
 def encode_team(team: Team) -> bytes:
-    """The JSON of a team."""
+    """Encode a team as JSON."""
     return msgspec.json.encode(msgspec.to_builtins(team))
 
 
 def check_robots(team: Team, names: tuple[str, ...], where: str) -> None:
-    """RunError where one of the names is not a robot of the team."""
+    """Raise `RunError` where one of the names is not a robot of the team."""
     for name in names:
         if name not in team.names:
             raise RunError(
@@ -52,7 +52,7 @@ def check_robots(team: Team, names: tuple[str, ...], where: str) -> None:
 
 
 def encode_record(record: Record, image_format: ImageFormat) -> tuple[str, str, float, bytes]:
-    """(topic, schema, time [s], bytes) of a record."""
+    """Encode a record: topic, schema, time [s] and bytes."""
     match record:
         case Image():
             schema = schemas.RAW_IMAGE if image_format == "raw" else schemas.COMPRESSED_IMAGE
@@ -76,7 +76,7 @@ def encode_record(record: Record, image_format: ImageFormat) -> tuple[str, str, 
 
 
 def encode_pose(time: float, T_world_body: Array) -> bytes:
-    """A foxglove.PoseInFrame in frame `world`."""
+    """Encode a pose as foxglove.PoseInFrame in frame `world`."""
     T = np.asarray(T_world_body, float)
     if T.shape != (4, 4) or not _is_rigid(T.tolist()):
         raise RunError(f"the true pose at {time} s is not a finite rigid transform (4, 4); give T_world_body")
@@ -91,12 +91,12 @@ def encode_pose(time: float, T_world_body: Array) -> bytes:
 
 
 def _is_rigid(T: list[list[float]]) -> bool:
-    """True if a transform is finite and its first three columns are those of a rotation."""
+    """Return whether a transform is finite and its first three columns are those of a rotation."""
     if not all(math.isfinite(value) for row in T for value in row):
         return False
     a, b, c = zip(*(row[:3] for row in T[:3]), strict=True)
     cross = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-    # two unit vectors at right angles, and the third what they make
+    # two orthogonal unit vectors, and the third their cross product
     off = (_dot(a, a) - 1, _dot(b, b) - 1, _dot(a, b))
     return all(abs(one) <= 1e-6 for one in (*off, *(u - v for u, v in zip(cross, c, strict=True))))
 
@@ -165,19 +165,19 @@ def _ranges(record: Ranges) -> schemas.RangesWire:
 
 
 def check_ranges(ranges: Sequence[float], where: str) -> None:
-    """RunError where a range is none."""
+    """Raise `RunError` where a range is not positive."""
     for one in ranges:
         if not one > 0:
             raise RunError(f"{where} is {one}; give metres above 0, and leave out what was not measured")
 
 
 def check_targets(team: Team, ranges: Ranges, where: str) -> None:
-    """RunError where what was measured is no other robot and no landmark of the team."""
+    """Raise `RunError` where a target is neither another robot nor a landmark of the team."""
     known = {*team.names, *(landmark.name for landmark in team.landmarks)} - {ranges.robot}
     for target in ranges.targets:
         if target not in known:
             raise RunError(
-                f"{where} name `{target}`, which is no other robot and no landmark of the team; leave it out"
+                f"{where} name `{target}`, which is neither another robot nor a landmark of the team; leave it out"
             )
 
 
@@ -193,7 +193,7 @@ def _stance(record: Stance) -> schemas.StanceWire:
 
 
 def check_stance(stance: Stance, where: str) -> None:
-    """RunError where a stance contradicts itself."""
+    """Raise `RunError` where a stance contradicts itself."""
     if stance.index < 0:
         raise RunError(f"{where}: the index is {stance.index}; number the stances from 0")
     if not stance.end >= stance.start:
@@ -216,7 +216,7 @@ def _four(plane: Any) -> tuple[float, float, float, float]:
 
 
 def check_planes(planes: Planes, where: str) -> None:
-    """RunError where a plane is none: not four finite numbers, a normal that is not unit, a distance <= 0."""
+    """Raise `RunError` where a plane is not four finite numbers with a unit normal and a distance above 0."""
     for robot, plane in planes.planes.items():
         values = np.asarray(plane, float)
         if values.shape != (4,) or not np.isfinite(values).all():

@@ -1,12 +1,10 @@
-"""Size of an encoded image as its header states it, so that it is known before anything is decoded."""
+"""Size of an encoded image by its header, before anything is decoded."""
 
 import struct
 from typing import NamedTuple
 
-#: Most pixels that are decoded; a grey image of this size takes 64 MiB.
-MAX_PIXELS = 2**26
-#: Most pixels times scans: a progressive JPEG is decoded once a scan.
-MAX_SCANNED_PIXELS = 2**28
+MAX_PIXELS = 2**26  # pixels of a decoded image; a grey one of this size takes 64 MiB
+MAX_SCANNED_PIXELS = 2**28  # pixels times scans: a progressive JPEG is decoded once per scan
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8\xff"
 #: Channels by PNG's colour type: grey, RGB, palette (decoded to BGR), grey and alpha, RGB and alpha.
@@ -16,7 +14,7 @@ _FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 
 
 class ImageHeader(NamedTuple):
-    """Size [px], channels and bits a channel of an encoded image."""
+    """Size [px], channels and bits per channel of an encoded image."""
 
     width: int
     height: int
@@ -28,7 +26,7 @@ class ImageHeader(NamedTuple):
 
 
 def read_image_header(data: bytes) -> ImageHeader | None:
-    """Header of a PNG or JPEG; None if the bytes are neither, or end before it."""
+    """Read the header of a PNG or JPEG; None if the bytes are neither, or end before it."""
     if data.startswith(PNG_MAGIC):
         return _png(data)
     if data.startswith(JPEG_MAGIC):
@@ -37,7 +35,7 @@ def read_image_header(data: bytes) -> ImageHeader | None:
 
 
 def too_large(header: ImageHeader, data: bytes) -> str | None:
-    """Reason why an image with this header takes too much memory or time to decode; None if it does not."""
+    """Return the reason why an image takes too much memory or time to decode; None if it does not."""
     pixels = header.width * header.height
     if pixels > MAX_PIXELS:
         return f"has {header.width} x {header.height} pixels, and {MAX_PIXELS} are decoded at most"

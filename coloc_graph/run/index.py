@@ -1,7 +1,7 @@
 """Index of the MCAP file of a run: its chunks, their messages, and what is damaged.
 
-mcap's own readers need a whole file, believe every length that they read, and name no place. This one walks
-over the record headers (https://mcap.dev/spec), the same way for a whole file and for one that was cut off.
+mcap's own readers need a whole file, trust every length that they read, and do not locate damage. This one walks over
+the record headers (https://mcap.dev/spec), the same way for a whole file and for one that was cut off.
 """
 
 import struct
@@ -31,17 +31,29 @@ from coloc_graph.run.chunks import (
 )
 
 MAGIC = b"\x89MCAP0\r\n"
-#: Bytes that come out of one byte of a file; images without noise, and zstd, come to a few hundred.
-MAX_COMPRESSION = 2000
+MAX_COMPRESSION = 2000  # ratio of decompressed to compressed size; noiseless images reach a few hundred with zstd
 FOOTER_HEAD = HEAD.pack(Opcode.FOOTER, 20)
 FOOTER_SIZE = len(FOOTER_HEAD) + 20
 
 
 @dataclass(frozen=True)
 class Index:
-    """Chunks in the order of the file; `lost` bytes at its end could not be read, None where it is whole.
+    """Index of an MCAP file.
 
-    `newest` are the messages by channel of the chunks that were read last, by their offset.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    profile : str
+        Profile in its header.
+    chunks : tuple of ChunkInfo
+        In the order of the file.
+    channels : dict of int to ChannelInfo
+        Channels that have messages.
+    lost : int or None
+        Bytes at the end that could not be read; None of a whole file.
+    newest : dict
+        Cache of decompressed chunks: messages by channel, by the chunk's offset.
     """
 
     path: Path
@@ -53,13 +65,19 @@ class Index:
 
 
 def is_mcap(path: Path) -> bool:
-    """True if a file begins as an MCAP file does."""
+    """Return whether a file begins with the magic bytes of MCAP."""
     with path.open("rb") as file:
         return file.read(len(MAGIC)) == MAGIC
 
 
 def build_index(path: Path) -> Index:
-    """The index of an MCAP file, whole or cut off; RunError where it is damaged or is none."""
+    """Build the index of an MCAP file, whole or cut off.
+
+    Raises
+    ------
+    RunError
+        The file is damaged, or not an MCAP file.
+    """
     if path.exists() and not path.is_file():
         raise RunError(f"{path}: is not a file; give the path of a run (.mcap)")
     try:
@@ -109,7 +127,7 @@ class _Walk:
             raise RunError(f"{self.path}: is not an MCAP file; give the path of a run (.mcap)")
 
     def _footer(self) -> Footer | None:
-        """The footer of a file that was finished; None where it was cut off."""
+        """Return the footer of a whole file; None where it was cut off."""
         start = self.size - len(MAGIC) - FOOTER_SIZE
         if start < len(MAGIC):
             return None
@@ -122,7 +140,7 @@ class _Walk:
         return footer
 
     def _walk(self, whole: bool) -> int:
-        """Note all records to the end of the data or the last whole one; returns where that ends [byte]."""
+        """Note all records up to the end of the data or the last whole one; return the offset there [bytes]."""
         end = self.size - len(MAGIC) if whole else self.size
         offset = len(MAGIC)
         while offset < end and self.data_end is None:
@@ -139,11 +157,11 @@ class _Walk:
             self._note(opcode, offset, length)
             offset += HEAD.size + length
         if whole and self.data_end is None:
-            raise damaged(self.path, offset, "the data have no end")
+            raise damaged(self.path, offset, "the end of the data is missing")
         return offset
 
     def _only_zeros(self, offset: int) -> bool:
-        # what a file system leaves, after a power cut, of blocks that were never written
+        # after a power cut a file system leaves zeros in blocks that were never written
         self.file.seek(offset)
         return all(not block.strip(b"\0") for block in iter(lambda: self.file.read(1 << 20), b""))
 
@@ -155,7 +173,7 @@ class _Walk:
             self.profile = body[4 : 4 + int.from_bytes(body[:4], "little")].decode("utf-8", "replace")
         elif opcode == Opcode.CHUNK:
             if length < 40:
-                raise damaged(self.path, offset, "a chunk without a head")
+                raise damaged(self.path, offset, "a chunk without a header")
             start, end, size = struct.unpack("<QQQ", self._read(offset + HEAD.size, 24))
             self.chunks.append(ChunkInfo(offset, HEAD.size + length, start, end, size))
         elif opcode == Opcode.MESSAGE_INDEX:
@@ -168,20 +186,20 @@ class _Walk:
     def _note_index(self, offset: int, length: int) -> None:
         channel, size = struct.unpack("<HI", self._read(offset + HEAD.size, 6)) if length >= 6 else (0, -1)
         if size != length - 6 or size % 16 or not self.chunks:
-            raise damaged(self.path, offset, "a message index that contradicts itself")
+            raise damaged(self.path, offset, "an inconsistent message index")
         chunk = self.chunks[-1]
         chunk.index_length += HEAD.size + length
-        if size:  # some writers also list the channels of which a chunk has nothing
+        if size:  # some writers also list channels without messages in the chunk
             chunk.counts[channel] = chunk.counts.get(channel, 0) + size // 16
             chunk.index_offsets[channel] = offset
 
     def _require_plausible_size(self) -> None:
-        """Refuse a file that is all compression: reading it takes time and memory by what comes out of it."""
+        """Raise `RunError` for a decompression bomb."""
         size = sum(chunk.size for chunk in self.chunks)
         if size > MAX_RECORD + MAX_COMPRESSION * self.size:
             raise RunError(
-                f"{self.path}: is {self.size} bytes that hold {size}, as no recording does; record it again, or "
-                "compress it less"
+                f"{self.path}: its {self.size} bytes decompress to {size}, which no recording does; record it again, "
+                "or compress it less"
             )
 
     def _count_messages(self, chunk: ChunkInfo) -> int:
@@ -191,13 +209,13 @@ class _Walk:
         return sum(chunk.counts.values())
 
     def _compare_with_summary(self, footer: Footer) -> None:
-        """Compare the chunks and counts with those in the summary: headers and indexes have no checksums."""
+        """Compare chunks and counts with those in the summary: headers and indexes have no checksums."""
         start = footer.summary_start
         footer_start = self.size - len(MAGIC) - FOOTER_SIZE
         summary = self._read(start, footer_start - start)
         crc = zlib.crc32(self._read(footer_start, FOOTER_SIZE - 4), zlib.crc32(summary))
         if start != self.data_end or footer.summary_crc not in (0, crc):
-            raise damaged(self.path, start, "the summary does not have its checksum")
+            raise damaged(self.path, start, "a summary that does not match its checksum")
         chunks: list[ChunkIndex] = []
         counts: dict[int, int] | None = None
         try:
@@ -211,11 +229,11 @@ class _Walk:
         if chunks:
             self._compare_chunks(chunks)
         if counts is not None and {channel: n for channel, n in counts.items() if n} != self._totals():
-            raise damaged(self.path, start, "there are not as many messages as the summary says")
+            raise damaged(self.path, start, "the number of messages is not that of the summary")
 
     def _compare_chunks(self, wanted: list[ChunkIndex]) -> None:
         if len(wanted) != len(self.chunks):
-            raise damaged(self.path, wanted[0].chunk_start_offset, "there are not as many chunks as the summary says")
+            raise damaged(self.path, wanted[0].chunk_start_offset, "the number of chunks is not that of the summary")
         for said, chunk in zip(sorted(wanted, key=lambda said: said.chunk_start_offset), self.chunks, strict=True):
             same = (
                 said.chunk_start_offset == chunk.offset
@@ -226,7 +244,7 @@ class _Walk:
                 and chunk.index_offsets.items() <= said.message_index_offsets.items()
             )
             if not same:
-                raise damaged(self.path, chunk.offset, "a chunk is not what the summary says")
+                raise damaged(self.path, chunk.offset, "a chunk differs from its entry in the summary")
 
     def _totals(self) -> dict[int, int]:
         totals: dict[int, int] = {}
@@ -236,7 +254,7 @@ class _Walk:
         return totals
 
     def _channels(self) -> dict[int, ChannelInfo]:
-        """All channels that have messages, learned from the chunks in which they first appear."""
+        """Return all channels that have messages, from the chunks in which they first appear."""
         known = Definitions()
         skipped: list[ChunkInfo] = []
         for chunk in self.chunks:

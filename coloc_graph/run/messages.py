@@ -1,7 +1,7 @@
-"""Records of a run: one frozen dataclass a message.
+"""Records of a run: one frozen dataclass per message.
 
-Times are UTC seconds (float64) by the clock of the robot that wrote the message. Pixels: (0, 0) is the centre
-of the top-left pixel.
+Times are UTC seconds (float64) by the clock of the robot that wrote the message. Pixels: (0, 0) is the centre of the
+top-left pixel.
 """
 
 from dataclasses import dataclass, field
@@ -15,21 +15,37 @@ Array = NDArray[np.float64]
 
 
 class Flag(IntFlag):
-    """Reasons to doubt a detection."""
+    """Reasons for which a detection may be bad."""
 
     NONE = 0
     SATURATED = 1  # the blob's core is at the sensor's limit
     CLIPPED = 2  # the blob touches the border of the image
-    MERGED = 4  # the blob is too large or too long to be one marker
-    BLURRED = 8  # the blob is drawn out by motion
+    MERGED = 4  # the blob is too large or too long for one marker
+    BLURRED = 8  # the blob is elongated by motion
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """The marker centres in one image: `uv` (n, 2) [px], `covariance` (n, 2, 2) [px^2], n may be 0.
+    """Marker centres in one image; n may be 0.
 
-    `markers` names each one where its identity is known ("C/0": robot C's first marker), or is "".
-    `flags` (n,) are `Flag`s, `peak` (n,) grey levels above the background, `area` (n,) [px].
+    Parameters
+    ----------
+    robot : str
+        Robot whose camera took the image.
+    time : float
+        Time of the image [UTC s].
+    uv : (n, 2) float
+        Centres [px].
+    covariance : (n, 2, 2) float
+        Their covariances [px^2].
+    markers : tuple of str
+        Name of each marker ("C/0": robot C's first one); "" where it is not known.
+    flags : (n,) uint8
+        Sums of `Flag`s.
+    peak : (n,) float
+        Brightness above the background [grey levels].
+    area : (n,) float
+        Area of each blob [px].
     """
 
     robot: str
@@ -44,7 +60,17 @@ class Detections:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """One image of a robot's camera: `pixels` (height, width) grey or (height, width, 3) BGR, uint8."""
+    """One image of a robot's camera.
+
+    Parameters
+    ----------
+    robot : str
+        The robot.
+    time : float
+        Time [UTC s].
+    pixels : (height, width) or (height, width, 3) uint8
+        Grey, or BGR.
+    """
 
     robot: str
     time: float
@@ -53,9 +79,18 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class EncodedImage:
-    """An image as another camera's file, `data` a whole `format` (jpeg or png), to be written as it is.
+    """An image as a camera's file, written as it is, and read back as an `Image`.
 
-    It is read back as an `Image`.
+    Parameters
+    ----------
+    robot : str
+        The robot.
+    time : float
+        Time [UTC s].
+    format : {"jpeg", "png"}
+        Format of the file.
+    data : bytes
+        Content of the file.
     """
 
     robot: str
@@ -66,9 +101,18 @@ class EncodedImage:
 
 @dataclass(frozen=True, eq=False)
 class OdometrySample:
-    """Sample of wheel odometry: `pose` (x [m], y [m], yaw [rad]) in the robot's own odometry frame.
+    """Sample of wheel odometry.
 
-    `covariance` (3, 3) is that of the increment since the previous sample, in the previous sample's body.
+    Parameters
+    ----------
+    robot : str
+        The robot.
+    time : float
+        Time [UTC s].
+    pose : (3,) float
+        x [m], y [m], yaw [rad] in the robot's own odometry frame.
+    covariance : (3, 3) float
+        Covariance of the increment since the previous sample, in the previous sample's body.
     """
 
     robot: str
@@ -79,9 +123,20 @@ class OdometrySample:
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """Ranges (n,) [m] and bearings (n,) [rad, left of ahead is positive] of `targets`, measured by one robot.
+    """Ranges and bearings measured by one robot at one time.
 
-    Targets are robots and landmarks of the team.
+    Parameters
+    ----------
+    robot : str
+        The observer.
+    time : float
+        Time [UTC s].
+    targets : tuple of str
+        Robots and landmarks of the team.
+    range : (n,) float
+        Ranges [m].
+    bearing : (n,) float
+        Bearings [rad], positive to the left.
     """
 
     robot: str
@@ -93,7 +148,7 @@ class Ranges:
 
 @dataclass(frozen=True)
 class Motion:
-    """A robot begins or ends a movement."""
+    """Begin (`moving`) or end of a movement of a robot, at a time [UTC s]."""
 
     robot: str
     time: float
@@ -102,9 +157,20 @@ class Motion:
 
 @dataclass(frozen=True)
 class Stance:
-    """A stretch of time in which `observers` stand still and watch `movers`.
+    """Interval in which observers stand still and watch movers.
 
-    `anchors` have stayed put since the previous stance (none at the first).
+    Parameters
+    ----------
+    index : int
+        Number of the stance, from 0.
+    start, end : float
+        Interval [UTC s].
+    observers : tuple of str
+        Robots that stand and watch.
+    movers : tuple of str
+        Robots that move.
+    anchors : tuple of str
+        Robots that have stayed put since the previous stance; () at the first.
     """
 
     index: int
@@ -117,10 +183,18 @@ class Stance:
 
 @dataclass(frozen=True)
 class Planes:
-    """The marker plane of one stance as stated, where it is not the mounts': per robot unit normal and distance.
+    """Stated marker planes of one stance, used instead of those by the mounts.
 
-    `planes` maps an observer to (nx, ny, nz, d): N . X = d in that robot's camera frame, d > 0 [m]. `sigmas` maps it to
-    the standard deviations of the normal [rad] and of d [m], where the plane is not exact.
+    Parameters
+    ----------
+    stance : int
+        Index of the stance.
+    time : float
+        Time of the message [UTC s].
+    planes : dict of str to (nx, ny, nz, d)
+        By observer: N . X = d in its camera frame, d > 0 [m].
+    sigmas : dict of str to (float, float)
+        Standard deviations of the normal [rad] and of d [m], where the plane is not exact.
     """
 
     stance: int

@@ -1,4 +1,4 @@
-"""Breaks in odometry: jumps that no wheel can make, as of a driver that restarts, found and joined."""
+"""Detection and joining of breaks in odometry: jumps that no wheel can make, as of a driver that restarts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,22 +10,34 @@ from coloc_graph.geometry.se2 import wrap
 
 Array = NDArray[np.float64]
 
-SPEED_FACTOR = 3.0  # a jump is faster than the robot's usual top speed by this factor
-USUAL = 0.95  # quantile of the speeds while moving that is called usual
-LEAST_SPEED = 1.0  # and faster than this [m/s]
-LEAST_TURN_RATE = 6.0  # or turns faster than this [rad/s]
-LEAST_STEP = 0.03  # shorter jumps do no harm [m]
-LEAST_TURN = 0.15  # nor do smaller turns [rad]
-UNSURE_M = 0.01  # standard deviation of a way across a break, besides what the robot may have driven [m]
-UNSURE_RAD = 0.02  # the same of its turn [rad]
+USUAL_QUANTILE = 0.95  # quantile of the speeds while moving that is the usual top speed
+SPEED_FACTOR = 3.0  # speed of a jump relative to the usual top speed
+MIN_SPEED = 1.0  # m/s, of a jump
+MIN_TURN_RATE = 6.0  # rad/s, of a jump
+MIN_STEP = 0.03  # m: shorter jumps do no harm
+MIN_TURN = 0.15  # rad: smaller turns do no harm
+BREAK_SIGMA = 0.01  # m: sigma of the distance across a break, besides the motion in it
+BREAK_YAW_SIGMA = 0.02  # rad: the same of its turn
 
 
 @dataclass(frozen=True)
 class OdometryBreak:
-    """A jump at sample `index` (`time` [UTC s]): `distance` [m] and `turn` [rad] within `interval` [s].
+    """A jump in odometry.
 
-    `to_origin` says that the samples begin anew at exactly (0, 0, 0). `sigmas` are how far the robot may have gone
-    in the interval: x, y [m], yaw [rad].
+    Parameters
+    ----------
+    index : int
+        First sample after it.
+    time : float
+        Time of that sample [UTC s].
+    distance, turn : float
+        Size of the jump [m], [rad].
+    interval : float
+        Time since the sample before [s].
+    to_origin : bool
+        The samples restart at exactly (0, 0, 0).
+    sigmas : (float, float, float)
+        Standard deviations of the motion in the interval: x, y [m], yaw [rad].
     """
 
     index: int
@@ -37,8 +49,8 @@ class OdometryBreak:
     sigmas: tuple[float, float, float]
 
     def __str__(self) -> str:
-        anew = ": it began anew, at the origin" if self.to_origin else ""
-        what = f"by {self.distance:.2f} m" + (f" and {np.rad2deg(self.turn):.0f} deg" if self.turn > LEAST_TURN else "")
+        anew = ": it restarted at the origin" if self.to_origin else ""
+        what = f"by {self.distance:.2f} m" + (f" and {np.rad2deg(self.turn):.0f} deg" if self.turn > MIN_TURN else "")
         return f"jumped {what} within {self.interval:.2f} s at {self.time:.3f} s{anew}"
 
 
@@ -62,16 +74,16 @@ def find_breaks(times: ArrayLike, poses: ArrayLike) -> list[OdometryBreak]:
         return []
     steps = np.diff(p, axis=0)
     way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(wrap(steps[:, 2]))
-    # two samples that come at once have not driven for no time
+    # samples with (almost) the same time would give infinite speeds
     lasted = np.maximum(np.diff(t), np.median(np.diff(t)))
     speed, rate = way / lasted, turn / lasted
     usual_speed, usual_rate = _usual(speed), _usual(rate)
-    jumped = (speed > max(SPEED_FACTOR * usual_speed, LEAST_SPEED)) & (way > LEAST_STEP)
-    jumped |= (rate > max(SPEED_FACTOR * usual_rate, LEAST_TURN_RATE)) & (turn > LEAST_TURN)
+    jumped = (speed > max(SPEED_FACTOR * usual_speed, MIN_SPEED)) & (way > MIN_STEP)
+    jumped |= (rate > max(SPEED_FACTOR * usual_rate, MIN_TURN_RATE)) & (turn > MIN_TURN)
     found = []
     for k in np.flatnonzero(jumped).tolist():
         interval = float(t[k + 1] - t[k])
-        drove = UNSURE_M + usual_speed * interval
+        drove = BREAK_SIGMA + usual_speed * interval
         found.append(
             OdometryBreak(
                 index=k + 1,
@@ -80,22 +92,22 @@ def find_breaks(times: ArrayLike, poses: ArrayLike) -> list[OdometryBreak]:
                 turn=float(turn[k]),
                 interval=interval,
                 to_origin=not p[k + 1].any(),
-                sigmas=(drove, drove, UNSURE_RAD + usual_rate * interval),
+                sigmas=(drove, drove, BREAK_YAW_SIGMA + usual_rate * interval),
             )
         )
     return found
 
 
 def _usual(speeds: Array) -> float:
-    """Speed that the robot usually drives at most; 0 where it hardly ever moves."""
+    """Usual top speed of a robot; 0 where it hardly ever moves."""
     moving = np.sort(speeds[speeds > 0])
-    # a few jumps are not what is usual
+    # without the few fastest, which may be jumps
     kept = moving[: max(len(moving) - 3, 0)]
-    return float(np.quantile(kept, USUAL)) if len(kept) else 0.0
+    return float(np.quantile(kept, USUAL_QUANTILE)) if len(kept) else 0.0
 
 
-def joined(poses: ArrayLike, breaks: Sequence[OdometryBreak]) -> Array:
-    """Poses (n, 3) in one frame: after each break they go on from where the robot was before it."""
+def join_breaks(poses: ArrayLike, breaks: Sequence[OdometryBreak]) -> Array:
+    """Return poses (n, 3) in one frame: after each break they continue from the pose before it."""
     p = np.array(poses, float).reshape(-1, 3)
     for one in breaks:
         before, first = p[one.index - 1].copy(), p[one.index].copy()

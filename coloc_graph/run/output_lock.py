@@ -1,4 +1,4 @@
-"""One writer an output: a lock that is taken before anything is touched, and released by the system after a crash."""
+"""Lock of an output against a second writer, released by the system after a crash."""
 
 import contextlib
 import errno
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from coloc_graph.errors import InputError
 
-#: File systems without locks say so with one of these.
+#: Errors by file systems without locks.
 _WITHOUT_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS}
 
 _held: ContextVar[frozenset[Path]] = ContextVar("outputs locked by this thread", default=frozenset())
@@ -20,19 +20,19 @@ class OutputLock:
     """Exclusive lock on the output `path`, taken when it is made and held until `release`.
 
     The lock is that of `flock` on `.NAME.lock` beside the output, which is removed when the lock is released. A file
-    that a killed process left behind is not locked, and is taken over.
+    that a killed process left behind is not locked, and is reused.
 
     Raises
     ------
     InputError
-        If another writer holds the lock.
+        Another writer holds the lock.
     OSError
-        If the lock's file cannot be made.
+        The lock's file cannot be made.
     """
 
     def __init__(self, path: str | Path) -> None:
-        place = Path(path).absolute()
-        self._path = place.with_name(f".{place.name}.lock")
+        output = Path(path).absolute()
+        self._path = output.with_name(f".{output.name}.lock")
         self._file: int | None = None
         while self._file is None:
             file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK, 0o600)
@@ -48,7 +48,7 @@ class OutputLock:
                     os.close(file)
 
     def release(self) -> None:
-        """Let others write to the output; a second call does nothing."""
+        """Release the lock; a second call does nothing."""
         if self._file is not None:
             with contextlib.suppress(OSError):
                 self._path.unlink()
@@ -78,16 +78,16 @@ def locked_output(path: str | Path) -> Iterator[None]:
     Raises
     ------
     InputError
-        If another writer holds the lock.
+        Another writer holds the lock.
     """
-    place = Path(path).resolve()  # what is behind a link is one output, whatever it is called
-    if place in _held.get():
+    output = Path(path).resolve()  # the target of a link is the same output
+    if output in _held.get():
         yield
         return
-    missing = [folder for folder in place.parents if not folder.exists()]
-    place.parent.mkdir(parents=True, exist_ok=True)
-    lock = OutputLock(place)
-    token = _held.set(_held.get() | {place})
+    missing = [folder for folder in output.parents if not folder.exists()]
+    output.parent.mkdir(parents=True, exist_ok=True)
+    lock = OutputLock(output)
+    token = _held.set(_held.get() | {output})
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""`open_run` and the `Run` it gives; `read_truth` and `read_true_team`, which are for evaluation alone."""
+"""Reading of runs: `open_run`; `read_truth` and `read_true_team`, which are for evaluation alone."""
 
 import hashlib
 from collections.abc import Iterator, Mapping
@@ -16,20 +16,35 @@ from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, 
 from coloc_graph.run.topics import Item, decoded, read_near, read_topic, time_span
 from coloc_graph.team import Team
 
-SAME_TIME = 1_000  # difference of instants that are the same, by rounding [ns]
-MAX_IDENTIFYING = 1 << 20  # bytes of which a run's id is made, at most
+SAME_TIME = 1_000  # ns: difference of equal times by rounding
+MAX_IDENTIFYING = 1 << 20  # bytes that a run's id is computed from, at most
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run:
     """Recording of a team, read on demand; it holds no open file and gives no access to truth.
 
-    `topics` counts the messages of each topic, `start` and `end` are the first and the last message's time
-    [UTC s] (None where there is none but the team). `warnings` are sentences on what could not be read.
+    Parameters
+    ----------
+    path : Path
+        The file.
+    team : Team
+        The team as stated.
+    warnings : tuple of str
+        Sentences on what could not be read.
+    stances : tuple of Stance
+        In the order of their indices.
+    planes : dict of int to Planes
+        Stated planes by stance.
+    topics : dict of str to int
+        Number of messages by topic.
+    start, end : float or None
+        Time of the first and the last message [UTC s]; None where there is none but the team.
 
-    The methods that iterate give the messages of one robot in the order of time, from `start` to `end`, both
-    included [UTC s]; at any time only one chunk is in memory. They raise RunError where the file is damaged,
-    naming the place.
+    Notes
+    -----
+    The methods that iterate yield the messages of one robot in the order of time, from `start` to `end`, both included
+    [UTC s]; only a few chunks are in memory at any time. They raise `RunError` where the file is damaged.
     """
 
     path: Path
@@ -48,27 +63,27 @@ class Run:
         return f"Run({str(self.path)!r}, robots {robots}, {stances} stance{'s' * (stances != 1)} in {seconds:.1f} s)"
 
     def images(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Image]:
-        """The images of a robot's camera."""
+        """Yield the images of a robot's camera."""
         items = self._items(robot, "image", start, end)
         return decoded(self._index, items, lambda item: decode.decode_image(robot, item.ns, item.schema, item.data))
 
     def detections(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Detections]:
-        """Detections in the images of a robot's camera, one record an image."""
+        """Yield the detections in the images of a robot's camera, one record per image."""
         items = self._items(robot, "detections", start, end)
         return decoded(self._index, items, lambda item: decode.decode_detections(robot, item.ns, item.data))
 
     def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
-        """A robot's odometry."""
+        """Yield a robot's odometry."""
         items = self._items(robot, "odometry", start, end)
         return decoded(self._index, items, lambda item: decode.decode_odometry(robot, item.ns, item.data))
 
     def motions(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Motion]:
-        """The beginnings and ends of a robot's movements."""
+        """Yield the begins and ends of a robot's movements."""
         items = self._items(robot, "motion", start, end)
         return decoded(self._index, items, lambda item: decode.decode_motion(robot, item.ns, item.data))
 
     def ranges(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Ranges]:
-        """Measurements of a robot's range and bearing sensor, one record an instant."""
+        """Yield the measurements of a robot's range and bearing sensor, one record per time."""
         items = self._items(robot, "ranges", start, end)
         for one in decoded(self._index, items, lambda item: decode.decode_ranges(robot, item.ns, item.data)):
             check_targets(self.team, one, f"{self.path}: the ranges of {robot} at {one.time} s")
@@ -80,15 +95,15 @@ class Run:
         return any(self._count(robot, "ranges") for robot in self.team.names)
 
     def has_images(self, robot: str) -> bool:
-        """True if there is an image of this robot's camera."""
+        """Return whether there is an image of this robot's camera."""
         return self._count(robot, "image") > 0
 
     def has_detections(self, robot: str) -> bool:
-        """True if there are detections of this robot's camera."""
+        """Return whether there are detections of this robot's camera."""
         return self._count(robot, "detections") > 0
 
     def _count(self, robot: str, kind: str) -> int:
-        check_robots(self.team, (robot,), f"{self.path}: the question")
+        check_robots(self.team, (robot,), f"{self.path}: the query")
         return self.topics.get(schemas.topic_of(robot, kind), 0)
 
     def _items(self, robot: str, kind: str, start: float | None, end: float | None) -> tuple[str, Iterator[Item]]:
@@ -100,10 +115,22 @@ class Run:
 
 
 def open_run(path: str | Path) -> Run:
-    """The run in an MCAP file: team, stances and index are read now, everything else when asked for.
+    """Open a run: its team, stances and index are read now, everything else on demand.
 
-    A file that was cut off opens up to its last whole chunk, with a warning. RunError, naming the place,
-    for a file that is damaged, is no run, or holds what contradicts itself.
+    Parameters
+    ----------
+    path : str or Path
+        An MCAP file. A file that was cut off opens up to its last whole chunk, with a warning.
+
+    Returns
+    -------
+    Run
+        The recording.
+
+    Raises
+    ------
+    RunError
+        The file is damaged, is no run, or contradicts itself.
     """
     index = build_index(Path(path))
     _check_format(index)
@@ -123,14 +150,14 @@ def open_run(path: str | Path) -> Run:
         team=team,
         warnings=(
             *_cut_off(index),
-            *(f"{index.path}: {topic} is no topic of a run and is left out" for topic in unknown),
+            *(f"{index.path}: {topic} is no topic of a run and is ignored" for topic in unknown),
         ),
         stances=_stances(index, team),
         planes=_planes(index, team),
         topics=topics,
         start=min((schemas.to_seconds(first) for first, _ in spans), default=None),
         end=max((schemas.to_seconds(last) for _, last in spans), default=None),
-        # without truth, so that nothing that is given a run can come upon it
+        # without truth, so that no user of a run can read it
         _index=replace(index, channels={c: i for c, i in index.channels.items() if not schemas.is_truth(i.topic)}),
     )
 
@@ -180,12 +207,12 @@ def truth_counts(path: str | Path) -> dict[str, int]:
 
 
 def read_true_team(path: str | Path) -> Team | None:
-    """True mounts and markers of the team, None if they are not recorded. For evaluation alone."""
+    """Read the true mounts and markers of the team, None if they are not recorded. For evaluation alone."""
     return _read_team(build_index(Path(path)), schemas.TRUE_TEAM_TOPIC)
 
 
 def run_id(path: str | Path) -> str:
-    """Identifier of a run, the same for its file moved, copied or cut off, whatever the name.
+    """Return the identifier of a run, the same for its file moved, copied, renamed or cut off.
 
     The SHA-256 of the file up to the end of its second chunk, of 1 MiB at most: the team, and the first data.
     """
@@ -197,7 +224,7 @@ def run_id(path: str | Path) -> str:
 
 
 def _clamped_ns(seconds: float) -> int:
-    """Nanoseconds of a bound, which may lie outside of what a file can hold."""
+    """Return a bound in nanoseconds, within the range of a file's times."""
     if np.isnan(seconds):
         raise RunError("a time range cannot begin or end at NaN; give UTC seconds")
     return schemas.to_ns(min(max(seconds, 0.0), 9e9))
@@ -217,7 +244,7 @@ def _read_team(index: Index, topic: str) -> Team | None:
 
 
 def _check_topics(index: Index, team: Team) -> list[str]:
-    """The topics that a run does not have; RunError for what a run has in another shape."""
+    """Return the topics that no run has; RunError for a run's topic with another schema."""
     unknown = []
     for info in index.channels.values():
         split = schemas.robot_and_kind(info.topic)

@@ -10,7 +10,7 @@ from coloc_graph.team import Team
 
 
 class Recorded(Protocol):
-    """Interface for the measurement of a stance: `run.Run`, or the memory of a mission."""
+    """Source of a stance's recordings: `run.Run`, or the memory of a mission."""
 
     @property
     def path(self) -> Path:
@@ -22,19 +22,19 @@ class Recorded(Protocol):
 
     @property
     def planes(self) -> dict[int, Planes]:
-        """Planes that are stated, by stance."""
+        """Stated planes by stance."""
 
     def has_detections(self, robot: str) -> bool:
-        """True if there are detections of this robot's camera."""
+        """Return whether there are detections of this robot's camera."""
 
     def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
-        """The detections of a robot's camera in a time [UTC s]."""
+        """Yield the detections of a robot's camera in an interval [UTC s]."""
 
     def images(self, robot: str, start: float, end: float) -> Iterator[Image]:
-        """The images of a robot's camera in a time [UTC s]."""
+        """Yield the images of a robot's camera in an interval [UTC s]."""
 
     def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
-        """A robot's odometry in a time [UTC s]."""
+        """Yield a robot's odometry in an interval [UTC s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,21 +51,21 @@ class Restated:
 
     @property
     def planes(self) -> dict[int, Planes]:
-        """Planes that are stated, by stance."""
+        """Stated planes by stance."""
         return self.recorded.planes
 
     def has_detections(self, robot: str) -> bool:
-        """True if there are detections of this robot's camera."""
+        """Return whether there are detections of this robot's camera."""
         return self.recorded.has_detections(robot)
 
     def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
-        """The detections of a robot's camera in a time [UTC s]."""
+        """Yield the detections of a robot's camera in an interval [UTC s]."""
         return self.recorded.detections(robot, start, end)
 
     def images(self, robot: str, start: float, end: float) -> Iterator[Image]:
-        """The images of a robot's camera in a time [UTC s]."""
+        """Yield the images of a robot's camera in an interval [UTC s]."""
         return self.recorded.images(robot, start, end)
 
     def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
-        """A robot's odometry in a time [UTC s]."""
+        """Yield a robot's odometry in an interval [UTC s]."""
         return self.recorded.odometry(robot, start, end)

@@ -1,4 +1,4 @@
-"""The format of a run: its topics, what a message of each looks like on disk, and time.
+"""Format of a run: topics, their messages on disk, and times.
 
 docs/run-format.md is the specification; this file and it change together.
 """
@@ -12,10 +12,9 @@ import msgspec
 from coloc_graph.errors import RunError
 from coloc_graph.team import Team
 
-#: The MCAP profile of what this version writes; another number after the prefix is another format.
-PROFILE_PREFIX = "coloc-graph-run-"
-FORMAT = 1
-LIBRARY = "coloc-graph"
+PROFILE_PREFIX = "coloc-graph-run-"  # of the MCAP profile, followed by the format
+FORMAT = 1  # that this version writes and reads
+LIBRARY = "coloc-graph"  # MCAP's name of the program that wrote a file
 
 TEAM_TOPIC = "/team"
 TRUE_TEAM_TOPIC = "/truth/team"
@@ -55,7 +54,7 @@ class OdometryWire(Wire, frozen=True):
 
 
 class RangesWire(Wire, frozen=True):
-    """Columns over what was measured at one instant: who, how far [m], in which direction [rad]."""
+    """Columns over the measurements of one time: target, range [m], bearing [rad]."""
 
     target: list[str]
     range: list[float]
@@ -86,7 +85,7 @@ class PlanesWire(Wire, frozen=True):
     sigmas: dict[str, tuple[float, float]] = {}
 
 
-#: What the last part of `/<robot>/...` may be, with the schemas a message of it can have.
+#: Last parts of a robot's topics, `/<robot>/...`, with the schemas that their messages can have.
 ROBOT_SCHEMAS: Mapping[str, tuple[str, ...]] = {
     "image": (RAW_IMAGE, COMPRESSED_IMAGE),
     "detections": ("coloc_graph.Detections",),
@@ -113,12 +112,12 @@ JSON_TYPES: Mapping[str, type[msgspec.Struct]] = {
 
 
 def topic_of(robot: str, kind: str) -> str:
-    """The topic of one robot's messages of one kind."""
+    """Return the topic of one robot's messages of one kind."""
     return f"/{robot}/{kind}"
 
 
 def robot_and_kind(topic: str) -> tuple[str, str] | None:
-    """(robot, kind) of a robot's topic; None for the team's topics and those that a run does not have."""
+    """Split a robot's topic into (robot, kind); None for the team's topics and those that no run has."""
     parts = topic.split("/")
     if topic not in TEAM_SCHEMAS and len(parts) == 3 and not parts[0] and parts[2] in ROBOT_SCHEMAS:
         return parts[1], parts[2]
@@ -126,18 +125,18 @@ def robot_and_kind(topic: str) -> tuple[str, str] | None:
 
 
 def schemas_of(topic: str) -> tuple[str, ...]:
-    """The schemas a topic's messages can have; empty for a topic that a run does not have."""
+    """Return the schemas that a topic's messages can have; () for a topic that no run has."""
     split = robot_and_kind(topic)
     return ROBOT_SCHEMAS[split[1]] if split else TEAM_SCHEMAS.get(topic, ())
 
 
 def is_truth(topic: str) -> bool:
-    """True if a topic holds truth, which is for evaluation alone."""
+    """Return whether a topic holds truth, which is for evaluation alone."""
     return topic == TRUE_TEAM_TOPIC or topic.endswith("/truth")
 
 
 def schema_of(name: str) -> tuple[str, str, bytes]:
-    """(schema encoding, message encoding, schema) as an MCAP file states them, the same bytes every time."""
+    """Return schema encoding, message encoding and schema for an MCAP file, the same bytes every time."""
     if name in JSON_TYPES:
         schema = msgspec.json.schema(JSON_TYPES[name])
         return "jsonschema", "json", msgspec.json.encode(schema, order="deterministic")
@@ -145,8 +144,8 @@ def schema_of(name: str) -> tuple[str, str, bytes]:
 
 
 def protobuf_type(name: str) -> Any:
-    """The class of one of Foxglove's messages."""
-    # protobuf takes 30 ms to import, which a run without images or truth need not wait for
+    """Return the class of one of Foxglove's messages."""
+    # protobuf takes 30 ms to import, and a run without images or truth does not need it
     if name == RAW_IMAGE:
         from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
@@ -161,7 +160,7 @@ def protobuf_type(name: str) -> Any:
 
 
 def _file_descriptors(message: Any) -> bytes:
-    """A FileDescriptorSet, dependencies first, as MCAP wants for protobuf."""
+    """Return a FileDescriptorSet, dependencies first, as MCAP requires for protobuf."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
     files = FileDescriptorSet()
@@ -177,7 +176,7 @@ def _file_descriptors(message: Any) -> bytes:
 
 
 def to_ns(seconds: float) -> int:
-    """Integer nanoseconds, as on disk, of UTC seconds; RunError where an MCAP cannot hold the time."""
+    """Convert UTC seconds to integer nanoseconds; RunError where an MCAP cannot hold the time."""
     if not math.isfinite(seconds) or not 0 <= seconds < 2**63 / 1e9:
         raise RunError(f"the time {seconds} cannot be recorded; give UTC seconds, finite and not negative")
     # seconds * 1e9 would lose 100 ns at today's dates; both terms here are exact
@@ -186,5 +185,5 @@ def to_ns(seconds: float) -> int:
 
 
 def to_seconds(ns: int) -> float:
-    """UTC seconds of integer nanoseconds: the inverse of `to_ns` for today's dates, else right to 0.5 ns."""
+    """Convert integer nanoseconds to UTC seconds: the inverse of `to_ns` for today's dates, else exact to 0.5 ns."""
     return ns / 1_000_000_000  # int by int, which Python rounds correctly

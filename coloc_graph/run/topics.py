@@ -1,4 +1,4 @@
-"""The messages of one topic, by time and one chunk at a time, from the file to records."""
+"""Reading of one topic's messages by time, one chunk at a time."""
 
 import itertools
 from bisect import bisect_right
@@ -13,9 +13,9 @@ from coloc_graph.run.index import Index
 
 T = TypeVar("T")
 
-KEPT_CHUNKS = 24  # chunks of a run that are kept once they are read
-KEPT_MESSAGES = 250_000  # messages in them, at most, but for the newest chunk
-KEPT_BYTES = 64 * 1024 * 1024  # size of them without compression, at most, but for the newest chunk
+KEPT_CHUNKS = 24  # decompressed chunks in the cache of a run
+KEPT_MESSAGES = 250_000  # messages in the cache, besides the newest chunk
+KEPT_BYTES = 64 * 1024 * 1024  # bytes in the cache, besides the newest chunk
 
 
 class Item(NamedTuple):
@@ -33,7 +33,7 @@ def _chunks(index: Index, topic: str) -> tuple[dict[int, str], list[ChunkInfo]]:
 
 
 def read_topic(index: Index, topic: str, first: int = 0, last: int | None = None) -> Iterator[Item]:
-    """A topic's messages from `first` to `last` [ns], in the order in which they were written."""
+    """Yield a topic's messages from `first` to `last` [ns], in the order in which they were written."""
     wanted, chunks = _chunks(index, topic)
     chunks = [chunk for chunk in chunks if chunk.end >= first and (last is None or chunk.start <= last)]
     for item in _in_order(index, topic, wanted, chunks):
@@ -42,7 +42,7 @@ def read_topic(index: Index, topic: str, first: int = 0, last: int | None = None
 
 
 def _in_order(index: Index, topic: str, wanted: dict[int, str], chunks: Iterable[ChunkInfo]) -> Iterator[Item]:
-    """The messages of a topic in some chunks; `RunError` where time runs backwards."""
+    """Yield the messages of a topic in some chunks; `RunError` where time runs backwards."""
     before = 0
     for message in _messages(index, topic, wanted, chunks):
         if message.ns < before:
@@ -75,7 +75,7 @@ def read_near(index: Index, topic: str, instants: Sequence[int]) -> list[Item]:
 
 
 def _messages(index: Index, topic: str, channels: Collection[int], chunks: Iterable[ChunkInfo]) -> Iterator[Message]:
-    """The messages of some channels in some chunks, in the order of writing; the file is open only while this runs."""
+    """Yield messages of some channels in some chunks, as written; the file is open only while this runs."""
     try:
         with index.path.open("rb") as file:
             for chunk in chunks:
@@ -86,14 +86,14 @@ def _messages(index: Index, topic: str, channels: Collection[int], chunks: Itera
                 if len(found) != sum(chunk.counts.get(channel, 0) for channel in channels):
                     raise damaged(index.path, chunk.offset, f"not as many messages of {topic} as its index says")
                 if len(channels) > 1:
-                    found.sort(key=lambda one: one.place)
+                    found.sort(key=lambda one: one.position)
                 yield from found
     except OSError as error:
         raise RunError(f"{index.path}: cannot be read ({error.strerror}); check the disk") from error
 
 
 def _keep(index: Index, chunk: ChunkInfo, read: Iterable[Message]) -> dict[int, list[Message]]:
-    """The messages of a chunk by channel, kept as one of the newest: of a stance each robot's topics are asked for."""
+    """Put the messages of a chunk, by channel, into the cache: of a stance each robot's topics are read."""
     by_channel: dict[int, list[Message]] = {}
     for one in read:
         by_channel.setdefault(one.channel, []).append(one)
@@ -104,7 +104,7 @@ def _keep(index: Index, chunk: ChunkInfo, read: Iterable[Message]) -> dict[int, 
 
 
 def _too_much(newest: dict[int, dict[int, list[Message]]]) -> bool:
-    """True if the chunks that are kept are too many, or too large."""
+    """Return whether the cached chunks are too many, or too large."""
     kept = [every for by_channel in tuple(newest.values()) if (every := tuple(by_channel.values()))]
     messages_kept = sum(len(each) for every in kept for each in every)
     bytes_kept = sum(memoryview(every[0][0].data.obj).nbytes for every in kept)  # all are views of one chunk
@@ -112,7 +112,7 @@ def _too_much(newest: dict[int, dict[int, list[Message]]]) -> bool:
 
 
 def decoded(index: Index, items: tuple[str, Iterator[Item]], decoder: Callable[[Item], T]) -> Iterator[T]:
-    """The records of (topic, messages); RunError, with topic and time, for a message that is wrong."""
+    """Yield the records of (topic, messages); RunError, with topic and time, for a malformed message."""
     topic, rows = items
     for item in rows:
         try:
@@ -125,7 +125,7 @@ def decoded(index: Index, items: tuple[str, Iterator[Item]], decoder: Callable[[
 
 
 def time_span(index: Index, topic: str) -> tuple[int, int]:
-    """First and last time of a topic [ns]; a chunk's own times are those of all topics, truth included."""
+    """Return the first and last time of a topic [ns]; a chunk's own times are those of all topics, truth included."""
     wanted, chunks = _chunks(index, topic)
     times = [message.ns for message in _messages(index, topic, wanted, chunks[:1] + chunks[1:][-1:])]
     return min(times), max(times)

@@ -1,4 +1,4 @@
-"""`RunWriter` records a run as it happens, `whole_run` writes one that is there whole or not at all."""
+"""Writing of runs: `RunWriter` records a run as it happens, `atomic_run` writes one atomically."""
 
 import os
 import stat
@@ -29,11 +29,11 @@ from coloc_graph.run.messages import Planes, Ranges, Stance
 from coloc_graph.run.output_lock import OutputLock, locked_output
 from coloc_graph.team import Team
 
-CHUNK_SIZE = 128 * 1024
+CHUNK_SIZE = 128 * 1024  # bytes without compression
 
 
 class RunWriter:
-    """Writer of a run while it happens; a context manager, which replaces a file that was there.
+    """Writer of a run while it happens; a context manager, which replaces an existing file.
 
     `write` may be called from several threads.
 
@@ -53,9 +53,9 @@ class RunWriter:
     Raises
     ------
     RunError
-        If a record cannot be read back as it was meant, or if the disk refuses.
+        A record is invalid, or the disk refuses.
     InputError
-        If another writer writes the file.
+        Another writer writes the file.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class RunWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # what was recorded until something went wrong is worth keeping: the file is finished either way
+        # records before an error are worth keeping: the file is finished either way
         if error is None:
             self.close()
         else:
@@ -141,7 +141,7 @@ class RunWriter:
         self._add(schemas.topic_of(robot, "truth"), schemas.POSE_IN_FRAME, time, data)
 
     def write_true_team(self, team: Team) -> None:
-        """Say, once, what the team was really like (true mounts, spans); only evaluations see it."""
+        """Add, once, the true team (true mounts, spans); only evaluations see it."""
         with self._lock:
             self._check_open()
             if self._true_team is not None:
@@ -166,8 +166,8 @@ class RunWriter:
                 raise self._refused(self._failure) from self._failure
 
     def _open(self) -> BinaryIO:
-        """Lock the output, then open it: what is there is emptied only once nobody else writes it."""
-        if not self.path.exists() or self.path.is_file():  # a device is nobody's alone
+        """Lock the output, then open it: an existing file is truncated only after that."""
+        if not self.path.exists() or self.path.is_file():  # a device is not locked
             self._output = OutputLock(self.path)
         if self.path.is_symlink():
             raise RunError(f"{self.path}: is a link; give the path of the file itself")
@@ -205,7 +205,7 @@ class RunWriter:
         self._file.flush()
 
     def _start(self, ns: int) -> None:
-        # the team has no time of its own: that of the first message keeps Foxglove's time line short
+        # the team gets the time of the first message, which keeps Foxglove's time line short
         if self._started:
             return
         self._started = True
@@ -242,12 +242,12 @@ class RunWriter:
 
     def _flush_regularly(self, period: float) -> None:
         while not self._stop.wait(period):
-            with self._lock, suppress(RunError):  # a refusal is kept, and raised where the user writes next
+            with self._lock, suppress(RunError):  # kept in `_failure`, and raised by the next `write`
                 if self._failure is None:
                     self._on_disk(self._flush)
 
     def _close_file(self) -> None:
-        with suppress(OSError):  # it flushes once more, and a disk that is full has said so before
+        with suppress(OSError):  # it flushes once more; a full disk was reported before
             self._file.close()
         self._release()
 
@@ -276,19 +276,19 @@ class _PartWriter(RunWriter):
 
 
 @contextmanager
-def whole_run(
+def atomic_run(
     path: str | Path, team: Team, *, image_format: ImageFormat = "jpeg", flush_every: float | None = None
 ) -> Iterator[RunWriter]:
-    """Yield a `RunWriter` whose file gets its name `path` once it is whole; nothing is left of it after an exception.
+    """Yield a `RunWriter` whose file appears at `path` when it is whole, and not at all after an exception.
 
     Until then it is beside it, as `NAME.<random>.part`. The same input gives the same bytes.
 
     Raises
     ------
     RunError
-        If `path` is a folder, or its folder does not exist.
+        `path` is a folder, or its folder does not exist.
     InputError
-        If another command writes `path`.
+        Another command writes `path`.
     """
     path = Path(path)
     if path.is_dir():

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from coloc_graph.errors import ColocError, InputError
 from coloc_graph.robot_io.create.emulator import CreateEmulator
 from coloc_graph.robot_io.create.physics import Physics
-from coloc_graph.run import whole_run
+from coloc_graph.run import atomic_run
 from coloc_graph.simulation.live_images import ImageServer, LiveCamera
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.rendering import Sensor
@@ -175,7 +175,7 @@ class LiveWorld:
 
     def write_truth(self, path: str | Path, epoch_ns: int) -> None:
         """Write team, true team and truth as a run. UTC is CLOCK_MONOTONIC + `epoch_ns`."""
-        with whole_run(path, self.team) as writer:
+        with atomic_run(path, self.team) as writer:
             writer.write_true_team(self.true_team)
             for robot in self.team.names:
                 times, T_world_body = self.truth(robot)

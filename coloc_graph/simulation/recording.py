@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from coloc_graph.errors import InputError
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.plan import Plan
-from coloc_graph.run import whole_run
+from coloc_graph.run import atomic_run
 from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Stance
 from coloc_graph.simulation.blinking import with_codes
 from coloc_graph.simulation.mess import messy_frames
@@ -108,7 +108,7 @@ def simulate(
         world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps,
                             known=known)  # fmt: skip
 
-    with whole_run(out, world.team, image_format=image_format) as writer:
+    with atomic_run(out, world.team, image_format=image_format) as writer:
         record(world, writer, depth, progress, messy=messy)
     return world
 

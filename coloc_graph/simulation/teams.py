@@ -11,7 +11,7 @@ from coloc_graph.simulation.paths import Array, Leg, PathBuilder, drive
 from coloc_graph.simulation.rig import Imperfections, reference_team, stated_team, true_team
 from coloc_graph.simulation.scenarios import TeamScenario
 from coloc_graph.simulation.world import EPOCH, REST, Capture, World, stamp, standing_pose, stream
-from coloc_graph.team import IMAGES_A_BIT, Team
+from coloc_graph.team import MIN_IMAGES_PER_BIT, Team
 from coloc_graph.team.shared_view import View
 
 # movers wander ahead of the foremost row, from and to, and to either side of their lanes [m], for a time [s]
@@ -37,7 +37,7 @@ def build_team_world(
     """
     imperfections = imperfections or Imperfections()
     bits = [one.blink.bit for one in team.robots if one.blink] if team else []
-    least = max((math.ceil(4 * IMAGES_A_BIT * WANDERING / bit) for bit in bits), default=0)
+    least = max((math.ceil(4 * MIN_IMAGES_PER_BIT * WANDERING / bit) for bit in bits), default=0)
     if points < least:
         raise InputError(f"`points` is {points}, too few to see robots blink; give at least {least}")
     stated = stated_team(team or reference_team(names=scenario.names), imperfections)

@@ -9,7 +9,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import wrap
 from coloc_graph.simulation.paths import SPEED, Array, Leg, drive, stop_and_go, travel
 from coloc_graph.simulation.scenarios import Box
-from coloc_graph.team.shared_view import View, places_in_view
+from coloc_graph.team.shared_view import View, positions_in_view
 
 #: Half the straight stretch on which a pose is passed [m]: a late capture sees the marker move evenly.
 RUN_IN = 0.03
@@ -193,7 +193,7 @@ def _corners(
     views: tuple[View, View], markers: Array, middle: tuple[float, float], far: float, left: bool, where: str
 ) -> Array:
     """Places (4, 2) of the body where both cameras see all markers at any yaw: near, far corners, middle."""
-    region = places_in_view(views, markers, middle, (NEAR, far), IMAGE_MARGIN)
+    region = positions_in_view(views, markers, middle, (NEAR, far), IMAGE_MARGIN)
     if len(region) < 3:
         raise no_common_view(where)
     side = 1.0 if left else -1.0

@@ -16,8 +16,16 @@ Array = NDArray[np.float64]
 class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Extrinsics of the camera, `T_body_camera`, with tolerances.
 
-    `height` is that of the optical centre above the floor, `x` and `y` its place on the body [m]. `tilt_deg`
-    looks down where it is positive; the order is yaw, tilt, roll about the body's z, y, x.
+    Parameters
+    ----------
+    height : float
+        Height of the optical centre above the floor [m].
+    tilt_deg, roll_deg, yaw_deg : float
+        Angles in the order yaw, tilt, roll about the body's z, y, x; a positive tilt looks down.
+    x, y : float
+        Position of the optical centre on the body [m].
+    height_sigma, tilt_sigma_deg, roll_sigma_deg : float
+        Tolerances; 0 is exact.
     """
 
     height: float
@@ -45,7 +53,7 @@ class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         return se3(self.R_body_camera, (self.x, self.y, self.height))
 
     def off_by(self, errors: Array) -> Array:
-        """`T_body_camera` (m, 4, 4) with errors (m, 3) of height [m], tilt and roll [rad]."""
+        """Return `T_body_camera` (m, 4, 4) with errors (m, 3) of height [m], tilt and roll [rad]."""
         yaw, tilt, roll = np.deg2rad([self.yaw_deg, self.tilt_deg, self.roll_deg])
         T = se3(camera_rotation(yaw, tilt + errors[:, 1], roll + errors[:, 2]), (self.x, self.y, self.height))
         T[:, 2, 3] += errors[:, 0]
@@ -53,10 +61,20 @@ class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Markers(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The markers on a body, all at one height: `positions` are (x, y) on the body [m].
+    """Markers on a body, all at one height.
 
-    White LEDs are found by brightness; a marker with `hue_deg` (0 to 360, HSV) by its colour. `span_sigma` is
-    how well the distance between the markers is known.
+    Parameters
+    ----------
+    height : float
+        Height above the floor [m].
+    positions : tuple of (float, float)
+        x, y on the body [m].
+    hue_deg : float or None
+        Colour (HSV, 0 to 360) by which they are detected; None: white, detected by brightness.
+    span_sigma : float
+        Tolerance of the distance between the markers [m].
+    height_sigma : float
+        Tolerance of the height [m].
     """
 
     height: float
@@ -88,31 +106,37 @@ class Markers(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         return math.dist(self.positions[0], self.positions[1])
 
 
-#: A looser stay-put constraint than this does what it says in GTSAM; a tighter one fails here or there [m].
-LEAST_SLIP = 1e-3
+MIN_SLIP = 1e-3  # m: tighter stay-put constraints fail in some graphs of GTSAM
 
 
 class Slip(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Slip of an anchor from one stance to the next, one standard deviation: `sigma` [m] and `sigma_deg`."""
+    """Slip of an anchor from one stance to the next: standard deviations `sigma` [m] and `sigma_deg`."""
 
     sigma: float
     sigma_deg: float
 
     def __post_init__(self) -> None:
         require_finite(self)
-        if self.sigma < LEAST_SLIP or self.sigma_deg <= 0:
+        if self.sigma < MIN_SLIP or self.sigma_deg <= 0:
             raise ValueError(
                 f"a slip of {self.sigma} m and {self.sigma_deg} deg is too tight to be solved; give at least "
-                f"{LEAST_SLIP} m and an angle above 0, or leave `slip` out: then the robot stays put exactly"
+                f"{MIN_SLIP} m and an angle above 0, or leave `slip` out: then the robot stays put exactly"
             )
 
 
 class Devices(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Devices that a robot's own program opens, and the pose at which the robot begins.
+    """Devices that a robot's own program opens, and the robot's initial pose.
 
-    `camera` is a source of images ("v4l2:/dev/video0"), `wheels` the serial port of its Create, of `model` 1 or 2
-    (found out where it is not said). `start` is x, y [m] and yaw [deg] at the beginning, on a floor whose x axis is
-    the way ahead; without one, where the formation has it.
+    Parameters
+    ----------
+    camera : str or None
+        Source of images ("v4l2:/dev/video0").
+    wheels : str or None
+        Serial port of its iRobot Create.
+    model : {1, 2} or None
+        Model of the Create; None: detected.
+    start : (float, float, float) or None
+        Initial x, y [m] and yaw [deg] on a floor whose x axis is the team's direction; None: that of the formation.
     """
 
     camera: str | None = None

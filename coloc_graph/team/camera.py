@@ -1,4 +1,4 @@
-"""`Camera`: a pinhole and its lens."""
+"""Camera model: a pinhole with a lens, `Camera`."""
 
 import math
 
@@ -13,22 +13,33 @@ from coloc_graph.team.checks import require_finite, require_not_negative
 Array = NDArray[np.float64]
 
 
-#: Longest side of an image [px], that of a JPEG.
-MAX_SIDE = 65_535
-#: Rays by which a lens model is checked: the largest x / z, that of a ray 86 deg off the axis, and their number.
-MAX_RAY = 15.0
-RAYS = 6001
+MAX_SIDE = 65_535  # px, side of an image, as of a JPEG
+MAX_RAY = 15.0  # x / z of the outermost ray by which a lens model is checked, 86 deg off the axis
+RAYS = 6001  # number of these rays
 
 
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Pinhole camera with OpenCV's distortion; pixels, (0, 0) is the centre of the top-left pixel.
+    """Pinhole camera with OpenCV's distortion; pixel (0, 0) is the centre of the top-left pixel.
 
-    `distortion` is OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6]]), empty for none. `noise_px` is the standard
-    deviation of a detected marker centre per axis where a detection does not bring its own. `shot_gain` is the
-    variance [grey levels^2] that one grey level of light adds to a pixel; it decides how sure a centre is.
-    `bias_px` is the standard deviation per axis of an error that all centres of one marker share during a stance,
-    and that no number of them averages away: what calibration leaves of the lens, a background that pulls.
-    `centre_noise` is what is known of the noise beyond what detections state; None for nothing but its defaults.
+    Parameters
+    ----------
+    width, height : int
+        Size of the image [px].
+    fx, fy, cx, cy : float
+        Focal lengths and principal point [px].
+    distortion : tuple of float
+        OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6]]); () for none.
+    fps : float
+        Images per second.
+    noise_px : float
+        Standard deviation of a marker centre per axis, where a detection has no covariance of its own [px].
+    shot_gain : float
+        Variance that one grey level of light adds to a pixel [grey levels]; determines the covariance of a centre.
+    bias_px : float
+        Standard deviation per axis of an error that all centres of one marker share during a stance [px]: residual
+        lens distortion, a bright background.
+    centre_noise : CentreNoise or None
+        Noise beyond that stated by detections, with tolerances; None for the defaults.
     """
 
     width: int
@@ -81,9 +92,18 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points_camera: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
-        """Pixels (..., 2) of points in the camera frame (..., 3) [m], and which of them the image contains.
+        """Project points in the camera frame (..., 3) [m].
 
-        Points behind the camera come back as NaN. Source: OpenCV, "Camera Calibration and 3D Reconstruction".
+        Returns
+        -------
+        uv : (..., 2) float
+            Pixels; NaN of points behind the camera.
+        inside : (...) bool
+            True of points in the image.
+
+        Notes
+        -----
+        Source: OpenCV, "Camera Calibration and 3D Reconstruction".
         """
         points = np.asarray(points_camera, float)
         ahead = points[..., 2] > 1e-9
@@ -96,10 +116,10 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return uv, inside & ahead
 
     def fold_radius(self) -> float | None:
-        """Distance from the principal point at which the lens model folds back within the image [px].
+        """Return the distance from the principal point at which the lens model folds back within the image [px].
 
-        None if every pixel has one ray. Beyond the fold the model maps rays from further outside onto the same pixels:
-        no lens does, and a calibration without corners there does not notice.
+        None if every pixel has one ray. Beyond the fold the model maps outer rays onto the same pixels, which no lens
+        does, and which a calibration without corners there does not notice.
         """
         if not self.distortion:
             return None
@@ -110,12 +130,12 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         with np.errstate(all="ignore"):
             seen = r * self._lens(r, zero)[0]
             grows = self._unfolded(r, zero) & np.isfinite(seen) & (seen >= 0)
-        # up to the first that no longer grows
+        # up to the first ray whose radius no longer grows
         reached = float(seen[: max(1, len(r) if grows.all() else int(np.argmin(grows)))].max())
         return None if reached >= math.hypot(across, down) else reached * math.sqrt(self.fx * self.fy)
 
     def _unfolded(self, x: Array, y: Array) -> NDArray[np.bool_]:
-        """True where the distorted radius still grows: beyond, a lens model folds far points back into the image."""
+        """Return where the distorted radius still grows: beyond, a lens model folds far points back into the image."""
         k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *([0.0] * (8 - len(self.distortion))))
         r2 = x * x + y * y
         with np.errstate(invalid="ignore"):
@@ -127,7 +147,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             return np.asarray((above + above_grows) * below - above * below_grows > 0)
 
     def _lens(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Radial factor and tangential shift of the lens at undistorted normalised coordinates."""
+        """Return radial factor and tangential shift of the lens at undistorted normalised coordinates."""
         k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *([0.0] * (8 - len(self.distortion))))
         r2 = x * x + y * y
         radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
@@ -144,7 +164,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return x * radial + dx, y * radial + dy
 
     def normalise(self, uv: ArrayLike) -> Array:
-        """Undistorted normalised coordinates (n, 2) of pixels (n, 2): the ray is (x, y, 1).
+        """Return the undistorted normalised coordinates (n, 2) of pixels (n, 2): the ray is (x, y, 1).
 
         NaN where the lens model cannot be inverted (pixels far outside the image).
         """
@@ -152,7 +172,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         if not self.distortion:
             return np.asarray(seen)
         x, y = seen.T
-        # OpenCV's fixed point, but to rounding: its five steps leave 1e-3 px at the corners of a wide lens
+        # OpenCV's fixed-point iteration, to rounding: its five steps leave 1e-3 px at the corners of a wide lens
         with np.errstate(all="ignore"):
             for _ in range(100):
                 radial, dx, dy = self._lens(x, y)
@@ -164,7 +184,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return np.where((moved < 1e-9)[:, None], np.stack([x, y], axis=1), np.nan)
 
     def per_pixel(self, x: ArrayLike) -> Array:
-        """Derivative (n, 2, 2) of normalised coordinates by pixels, at normalised coordinates x (n, 2)."""
+        """Return the derivative (n, 2, 2) of normalised coordinates by pixels, at normalised coordinates x (n, 2)."""
         at = np.asarray(x, float)
         if not self.distortion:
             return np.broadcast_to(np.diag([1 / self.fx, 1 / self.fy]), (len(at), 2, 2))

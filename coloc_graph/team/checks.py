@@ -1,4 +1,4 @@
-"""Checks that the parts of a team have in common: a number that is none, or that must not be negative."""
+"""Checks of numbers that the parts of a team have in common."""
 
 import math
 from collections.abc import Iterable

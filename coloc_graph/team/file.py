@@ -1,4 +1,4 @@
-"""team.toml, read and written."""
+"""Reading and writing of team.toml."""
 
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,12 @@ from coloc_graph.team.team import Team
 
 
 def read_team(path: str | Path) -> Team:
-    """Read the team that a TOML file describes.
+    """Read a team from a TOML file.
 
     Raises
     ------
     TeamError
-        If the file cannot be read, or is not a team; it names the file and the path in it.
+        The file cannot be read, or is not a team; the message names the file and the field.
     """
     path = Path(path)
     remedy = "give the path of a team.toml"
@@ -24,30 +24,30 @@ def read_team(path: str | Path) -> Team:
 
 
 def parse_team(path: Path, text: str) -> Team:
-    """The team that a TOML text from `path` describes; see `read_team`."""
+    """Read a team from a TOML text of the file `path`; see `read_team`."""
     return team_of_fields(path, parse_toml(path, text, error=TeamError))
 
 
 def team_of_fields(path: Path, fields: Any) -> Team:
-    """The team with these fields, as a TOML file at `path` has them.
+    """Make a team of the fields of a TOML file at `path`.
 
     Raises
     ------
     TeamError
-        If a field is missing, unknown or wrong.
+        A field is missing, unknown or wrong.
     """
     return convert(path, fields, Team, "see docs/team.md for the fields", error=TeamError)
 
 
 def write_team(team: Team, path: str | Path) -> None:
-    """Write a team as TOML; what `read_team` reads back equal."""
+    """Write a team as TOML, which `read_team` reads back equal."""
     import tomli_w
 
     Path(path).write_text(tomli_w.dumps(without_none(msgspec.to_builtins(team))), encoding="utf-8")
 
 
 def without_none(value: Any) -> Any:
-    """TOML has no null: a field that is None is left out, and reads back as its default."""
+    """Drop fields that are None: TOML has no null, and a missing field reads back as its default."""
     if isinstance(value, dict):
         return {key: without_none(inner) for key, inner in value.items() if inner is not None}
     if isinstance(value, list | tuple):

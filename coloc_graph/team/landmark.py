@@ -1,4 +1,4 @@
-"""`Landmark`: what does not move, by which robots know where they are again."""
+"""Landmarks, which do not move and let robots recognise a place: `Landmark`."""
 
 import math
 import re
@@ -8,14 +8,22 @@ import msgspec
 from coloc_graph.team.body import Markers
 from coloc_graph.team.checks import require_finite, require_not_negative
 
-#: A yaw that is known worse than that [deg] is none: it turns what is measured further than a line follows.
-MOST_YAW_SIGMA_DEG = 45.0
+MAX_YAW_SIGMA_DEG = 45.0  # deg, tolerance of a stated yaw; beyond, a linearisation at the yaw is meaningless
 
 
 class Tag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """An upright AprilTag: its number, the side of its black square [m], and how high its centre is [m].
+    """An upright AprilTag.
 
-    `family` is one of OpenCV's: 16h5, 25h9, 36h10, 36h11.
+    Parameters
+    ----------
+    id : int
+        Its number.
+    size : float
+        Side of its black square [m].
+    height : float
+        Height of its centre [m].
+    family : {"16h5", "25h9", "36h10", "36h11"}
+        Family, as of OpenCV.
     """
 
     id: int
@@ -34,9 +42,24 @@ class Tag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 class Landmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Landmark: `markers` on a body of its own, a `tag`, or a bare point for range and bearing sensors.
 
-    Its frame is a body's: x is the way it faces (out of a tag), y to its left, z up, on the floor. `position` (x, y)
-    [m] and `yaw_deg` are on a map of all landmarks, known to `position_sigma` [m] and `yaw_sigma_deg`; where they are
-    left out, they are found along with the robots' poses. What cameras see has both or neither.
+    Parameters
+    ----------
+    name : str
+        Its name.
+    markers : Markers or None
+        Two markers that cameras see.
+    tag : Tag or None
+        A tag that cameras see.
+    position : (float, float) or None
+        x, y on the map [m]; None: estimated. A landmark that cameras see has a yaw as well.
+    yaw_deg : float or None
+        Yaw on the map; None: estimated.
+    position_sigma, yaw_sigma_deg : float
+        Tolerances.
+
+    Notes
+    -----
+    Its frame is a body's: x is the direction it faces (out of a tag), y to its left, z up, on the floor.
     """
 
     name: str
@@ -56,28 +79,23 @@ class Landmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         if self.markers is not None and self.tag is not None:
             raise ValueError(f"landmark {self.name} has markers and a tag; make two landmarks of it")
         if self.markers is not None and len(self.markers.positions) < 2:
-            raise ValueError(
-                f"landmark {self.name} has one marker, which does not tell a camera how it is turned; give it two"
-            )
+            raise ValueError(f"landmark {self.name} has one marker, which does not give its yaw; give it two")
         if self.yaw_deg is not None and self.position is None:
             raise ValueError(f"landmark {self.name} has a `yaw_deg` and no `position`; give both, or neither")
         if self.seen_as is not None and self.position is not None and self.yaw_deg is None:
             raise ValueError(
-                f"landmark {self.name} has a `position` and no `yaw_deg`; say how it is turned on the map, with a "
-                f"`yaw_sigma_deg` of up to {MOST_YAW_SIGMA_DEG:g}, or leave the position out"
+                f"landmark {self.name} has a `position` and no `yaw_deg`; give its yaw on the map, with a "
+                f"`yaw_sigma_deg` of up to {MAX_YAW_SIGMA_DEG:g}, or leave the position out"
             )
-        if self.yaw_sigma_deg > MOST_YAW_SIGMA_DEG:
+        if self.yaw_sigma_deg > MAX_YAW_SIGMA_DEG:
             raise ValueError(
-                f"landmark {self.name} has a `yaw_sigma_deg` of {self.yaw_sigma_deg:g}; look how it is turned, to "
-                f"{MOST_YAW_SIGMA_DEG:g} deg at least, or leave its position out"
+                f"landmark {self.name} has a `yaw_sigma_deg` of {self.yaw_sigma_deg:g}; measure its yaw to "
+                f"{MAX_YAW_SIGMA_DEG:g} deg or better, or leave its position out"
             )
 
     @property
     def seen_as(self) -> Markers | None:
-        """Markers that a camera sees: its own, or the middles of its tag's left and right edge (`apriltags`).
-
-        None of a bare point.
-        """
+        """Markers that a camera sees: its own, or the middles of its tag's left and right edge; None of a point."""
         if self.tag is None:
             return self.markers
         half = self.tag.size / 2
@@ -85,13 +103,13 @@ class Landmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def on_map(self) -> bool:
-        """True if the team states its position and yaw on the map."""
+        """True if the team states both its position and its yaw on the map."""
         return self.position is not None and self.yaw_deg is not None
 
 
 def require_name(name: str) -> None:
-    """Raise ValueError for what cannot be a part of a topic or of a marker's name."""
+    """Raise ValueError for a name that cannot be a part of a topic or of a marker's name."""
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", name):
         raise ValueError(
-            f"the name `{name}` is not usable in a topic; use letters, digits, - and _, beginning with a letter"
+            f"the name `{name}` cannot be part of a topic; use letters, digits, - and _, beginning with a letter"
         )

@@ -6,17 +6,29 @@ from coloc_graph.team.checks import require_finite, require_not_negative
 
 
 class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A sensor of range and bearing: what it measures, how noisy, and for how long it errs alike.
+    """Range and bearing sensor: systematic errors, noise and tolerances.
 
-    It reads `offset` [m] + `scale` r at range r, and `bearing_offset_deg` more than the bearing. One standard deviation
-    is `range_sigma` + `range_sigma_per_m2` r^2 [m] of a range (as where the range is made of the size of an image), and
-    the hypotenuse of `bearing_sigma_deg` and of `across_sigma` [m] / r of a bearing. Errors of the same target's next
-    measurement are alike for `range_memory` and `bearing_memory` [s], their time of correlation (0: independent).
-    A camera that makes the range of a size in its image tells how far a target is in front of it, and not how far away:
-    its r is r (1 - `depth` (1 - cos(bearing))) with a `depth` of 1, or near it; what measures range has 0. Ranges to
-    robots read `robot_offset` [m] more than those to landmarks.
-    It sits at `x`, `y` [m] on the body. `*_sigma` of what is not noise are tolerances (`place_sigma` is that of x and
-    of y): what has one is found along with the poses.
+    Parameters
+    ----------
+    range_sigma, range_sigma_per_m2 : float
+        Noise of a range r: `range_sigma` + `range_sigma_per_m2` r^2 [m].
+    bearing_sigma_deg, across_sigma : float
+        Noise of a bearing: the hypotenuse of `bearing_sigma_deg` and `across_sigma` [m] / r.
+    range_memory, bearing_memory : float
+        Correlation times of the errors of one target [s]; 0: independent.
+    offset, scale : float
+        It reads `offset` [m] + `scale` r at range r.
+    bearing_offset_deg : float
+        It reads this more than the bearing.
+    depth : float
+        1 where it measures depth (a camera, by the size in the image), 0 where it measures range: its r is
+        r (1 - `depth` (1 - cos(bearing))).
+    robot_offset : float
+        Ranges to robots read this much more than those to landmarks [m].
+    x, y : float
+        Position on the body [m].
+    offset_sigma, scale_sigma, bearing_offset_sigma_deg, depth_sigma, robot_offset_sigma, place_sigma : float
+        Tolerances, `place_sigma` of x and of y; a number with one is estimated along with the poses.
     """
 
     range_sigma: float
@@ -52,10 +64,16 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Calibration of wheel odometry: the motion is `scale` and `turn_scale` times what it reports, `delay` [s] later.
+    """Calibration of wheel odometry; its noise is in the run, sample by sample.
 
-    A delay is what odometry has that is made of commands. `*_sigma` are tolerances: what has one is found along with
-    the poses. How noisy odometry is the run itself says, sample by sample.
+    Parameters
+    ----------
+    scale, turn_scale : float
+        True motion and turn relative to those reported.
+    delay : float
+        Time by which the motion is later than reported, as of odometry made of commands [s].
+    scale_sigma, turn_scale_sigma, delay_sigma : float
+        Tolerances; a number with one is estimated along with the poses.
     """
 
     scale: float = 1.0

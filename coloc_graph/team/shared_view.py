@@ -1,4 +1,4 @@
-"""Floor that cameras at rest see: `View`, and the positions where a robot's markers are in all of them."""
+"""Shared field of view of cameras at rest: `View`, and positions where a robot's markers are in all of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,33 +11,33 @@ from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
 
-GRID = 0.05  # m, distance between positions that are tried
-WIDE = 1.5  # m, positions to either side
+GRID = 0.05  # m, distance between tried positions
+WIDE = 1.5  # m, range of positions to either side
 BODY_RADIUS = 0.17  # m, of an iRobot Create
 BODY_HEIGHT = 0.30  # m, up to the lid of the laptop that it carries
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera at rest in the world."""
+    """A camera at rest, with its pose T_world_camera (4, 4)."""
 
     camera: Camera
     T_world_camera: Array
 
     def project(self, points_world: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
-        """Pixels (..., 2) of points (..., 3) [m] in the world, and which of them the image contains."""
+        """Return the pixels (..., 2) of points (..., 3) [m] in the world, and a mask of those in the image."""
         T_camera_world = se3_inverse(self.T_world_camera)
         return self.camera.project(np.asarray(points_world, float) @ T_camera_world[:3, :3].T + T_camera_world[:3, 3])
 
     def sees(self, points_world: ArrayLike, margin: float) -> NDArray[np.bool_]:
-        """True for points (..., 3) [m] in the image, `margin` [px] from its border."""
+        """Return whether points (..., 3) [m] are in the image, `margin` [px] from its border."""
         uv, inside = self.project(points_world)
         size = np.array([self.camera.width, self.camera.height])
         with np.errstate(invalid="ignore"):
             return np.asarray(inside & (uv >= margin - 0.5).all(-1) & (uv <= size - 0.5 - margin).all(-1))
 
 
-def places_in_view(
+def positions_in_view(
     views: Sequence[View],
     p_markers: Array,
     middle: tuple[float, float],
@@ -45,9 +45,9 @@ def places_in_view(
     margin: float,
     heading: float = 0.0,
 ) -> Array:
-    """Places (n, 2) [m] of a body where all cameras see all its markers (m, 3) at any yaw.
+    """Return positions (n, 2) [m] of a body where all cameras see all its markers (m, 3) at any yaw.
 
-    They lie on a grid, `ahead` [m] from and to of the `middle` along the `heading` [rad], row by row.
+    They lie on a grid, row by row, from `ahead[0]` to `ahead[1]` [m] beyond the `middle` along the `heading` [rad].
     """
     x, y = np.meshgrid(np.arange(ahead[0], ahead[1] + 1e-9, GRID), np.arange(-WIDE, WIDE + 1e-9, GRID), indexing="ij")
     c, s = np.cos(heading), np.sin(heading)
@@ -67,7 +67,7 @@ def hidden(eyes: ArrayLike, points: ArrayLike, bodies: ArrayLike) -> NDArray[np.
     eyes, points
         Optical centres and points (..., 3) [m] in the world; their leading axes are broadcast.
     bodies
-        Places (..., b, 2) [m] of the robots that stand in between: upright cylinders.
+        Positions (..., b, 2) [m] of the robots in between: upright cylinders.
 
     Returns
     -------

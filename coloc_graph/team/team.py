@@ -1,11 +1,11 @@
-"""`Robot`, `Floor`, and the `Team` that they are."""
+"""Description of a team: `Robot`, `Floor` and `Team`."""
 
 from collections.abc import Iterable
 
 import msgspec
 
 from coloc_graph.errors import TeamError
-from coloc_graph.team.blink import Blink, require_told_apart
+from coloc_graph.team.blink import Blink, require_distinguishable
 from coloc_graph.team.body import Devices, Markers, Mount, Slip
 from coloc_graph.team.camera import Camera
 from coloc_graph.team.checks import require_finite, require_not_negative
@@ -14,10 +14,26 @@ from coloc_graph.team.sensors import Ranging, Wheels
 
 
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A body with a camera, its mount, and markers (none on a robot that is never watched).
+    """A robot: its sensors, their extrinsics, and its markers.
 
-    The markers are on all the time, or `blink`. As an anchor it stays put exactly, or, with a `slip`, within that.
-    `devices` are for its own program. A robot without a camera measures by `ranging` and `wheels`.
+    Parameters
+    ----------
+    name : str
+        Its name.
+    camera_if_any, mount_if_any : Camera and Mount, or None
+        `camera` and `mount` in team.toml; both or neither. `camera` and `mount` raise where there is none.
+    markers : Markers or None
+        Markers that others see; None on a robot that is never watched.
+    blink : Blink or None
+        Blink code of the markers; None: they are always on.
+    slip : Slip or None
+        Tolerance of its pose as an anchor; None: it stays put exactly.
+    devices : Devices or None
+        Devices of its own program.
+    ranging : Ranging or None
+        Range and bearing sensor.
+    wheels : Wheels or None
+        Calibration of its wheel odometry.
     """
 
     name: str
@@ -59,7 +75,7 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Floor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The floor the team stands on: how far from level and flat it is (standard deviations)."""
+    """Floor that the team stands on: its standard deviations from level (tilt) and from flat (height [m])."""
 
     tilt_sigma_deg: float = 0.0
     height_sigma: float = 0.0
@@ -70,10 +86,21 @@ class Floor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The robots, the floor (None where they do not stand on a common one), the reference robot, and landmarks.
+    """A team of robots.
 
-    The world frame is the body of `reference` at stance 0. `clock_sigma` [s] is how well the clocks of any two
-    robots agree, one standard deviation; where it is 0 they agree, and no offset is estimated.
+    Parameters
+    ----------
+    reference : str
+        Robot whose body at stance 0 is the world frame.
+    robots : tuple of Robot
+        The robots, at least two.
+    floor : Floor or None
+        Floor that they stand on; None: no common one.
+    clock_sigma : float
+        Standard deviation of the offset between the clocks of any two robots [s]; 0: they agree, and no offset is
+        estimated.
+    landmarks : tuple of Landmark
+        Landmarks, by which robots recognise places.
     """
 
     reference: str
@@ -91,7 +118,7 @@ class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         if twice:
             what = "robots" if names.count(twice[0]) > 1 else "robots or landmarks"
             raise ValueError(f"two {what} are called `{twice[0]}`; give each a name of its own")
-        require_told_apart(
+        require_distinguishable(
             [(one.name, one.markers.hue_deg, one.blink) for one in self.robots if one.blink and one.markers],
             [(one.name, one.camera_if_any.fps) for one in self.robots if one.camera_if_any],
         )
@@ -121,7 +148,7 @@ class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         raise TeamError(f"robot `{name}` is not in the team ({', '.join(self.names)}); add it under [[robots]]")
 
     def marker_height(self, movers: Iterable[str] = ()) -> float | None:
-        """Height of the marker plane of these robots (of all where none is named) [m]; None if they differ."""
+        """Return the height of the marker plane of `movers` (of all robots where none is named) [m]; None if mixed."""
         wanted = tuple(movers) or self.names
         heights = {robot.markers.height for robot in self.robots if robot.markers and robot.name in wanted}
         return heights.pop() if len(heights) == 1 else None

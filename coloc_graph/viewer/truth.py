@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from coloc_graph.errors import InputError
-from coloc_graph.evaluation import Alignment, align, left_out, with_truth
+from coloc_graph.evaluation import Alignment, align, with_truth, without_truth
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.run import Run, Stance, read_truth
 from coloc_graph.viewer.scene import TRUE, Layer, layer_of
@@ -31,4 +31,4 @@ def true_layers(
         robot: replace(one, T_world_body=true[robot], covariances=None).where(with_truth(true[robot]))
         for robot, one in estimated.items()
     }
-    return (layer_of(TRUE, robots, stances, trajectories),), left_out(estimated, true)
+    return (layer_of(TRUE, robots, stances, trajectories),), without_truth(estimated, true)

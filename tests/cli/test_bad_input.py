@@ -203,7 +203,10 @@ def test_a_robot_that_is_not_in_the_team(solve_refused, refused, tmp_path):
 
 def test_an_empty_run(solve_refused, tmp_path):
     sentence = solve_refused(foreign(tmp_path / "run.mcap", []))
-    assert "run.mcap: the run holds no stances and no ranges" in sentence and "record stances" in sentence
+    assert (
+        "run.mcap: there is nothing to solve: the run holds no stances and no ranges" in sentence
+        and "record stances" in sentence
+    )
 
 
 def test_one_observer_only(solve_refused, tmp_path):
@@ -222,7 +225,7 @@ def test_collinear_tracks(solve_refused, short, copied, collinear, tmp_path):
         return collinear(record) if isinstance(record, Detections) else record
 
     sentence = solve_refused(copied(short, tmp_path / "run.mcap", change=change))
-    assert re.search(r"run.mcap: .*at stance 0, A and B: .*one line .*let it turn", sentence), sentence
+    assert re.search(r"run.mcap: .*stance 0, A and B: .*one line .*let it turn", sentence), sentence
 
 
 @pytest.mark.parametrize("how", ["at other instants", "other markers", "one camera blind"])
@@ -239,7 +242,7 @@ def test_markers_that_are_never_in_both_cameras_at_once(solve_refused, short, co
 
     run = copied(short, tmp_path / "run.mcap", change=change)
     sentence = solve_refused(run)
-    assert re.search(r"run.mcap: no stance gives a relative pose; at stance 0, A and B: ", sentence), sentence
+    assert re.search(r"run.mcap: no stance gives a relative pose; stance 0, A and B: ", sentence), sentence
     words = {
         "at other instants": r"at the same instant \(within 5 ms\).*clocks",
         "other markers": r"no marker name is shared: A saw `C/0A`, `C/1A` and B saw `C/0B`, `C/1B`",
@@ -306,9 +309,9 @@ def test_a_result_that_would_replace_something_else_is_refused_before_the_work(r
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "mine").write_text("mine")
     for name, words in (
-        ("file", "file exists and is not a result; give another folder"),
+        ("file", "file exists and is not a result: give another folder"),
         ("folder", "folder exists and is not a result"),
-        ("file/below", "file is not a folder; give another folder"),
+        ("file/below", "file is not a folder: give another folder"),
     ):
         assert words in refused("solve", short, "--out", tmp_path / name)
     sentence = refused("demo", "--stances", "1", "--out", tmp_path / "file")
@@ -352,7 +355,7 @@ def test_an_earlier_result_that_stays_after_a_failed_solve_is_mentioned(refused,
 
 
 def test_a_result_is_not_compared_with_another_run(refused, result, short):
-    assert re.search(r"short.mcap is not the run that .* was made of", refused("evaluate", result, "--run", short))
+    assert re.search(r"short.mcap is not the run of the result ", refused("evaluate", result, "--run", short))
 
 
 def test_the_present_folder_as_a_run_is_refused(refused, tmp_path, monkeypatch):

@@ -146,7 +146,7 @@ def test_nees_counts_a_held_pose_once_and_the_worlds_own_never():
         (lambda team: {"C": team["A"]}, "the truth holds C, and the estimate A, B: give the truth of a robot"),
         (
             lambda team: {"B": trajectory("B", times=TIMES + 100)},
-            "the truth of robot B is at none of its times: the estimate reaches from 1700000000.000 to "
+            "robot B has no truth at the times of its poses: the estimate reaches from 1700000000.000 to "
             "1700000040.000 s, the truth from 1700000100.000",
         ),
         (lambda team: {"B": team["B"]}, "there is no truth of the reference robot A .* align the team"),
@@ -165,7 +165,7 @@ def test_a_robot_without_truth_is_named_and_the_others_are_evaluated(team, truth
     truth = {"A": team["A"]} | ({} if truth_of_b is None else {"B": truth_of_b})
     accuracy = evaluate(team, align(team, truth, "A", on_floor=True), on_floor=True)
     assert [row.robot for row in accuracy.robots] == ["A"] and accuracy.ate == 0
-    assert accuracy.warnings == ("robot B is not evaluated: there is no truth at the times of its 5 poses",)
+    assert accuracy.warnings == ("robot B is not evaluated: it has no truth at the times of its 5 poses",)
 
 
 def test_truth_that_begins_late_is_aligned_by_the_first_pose_that_has_it():
@@ -179,8 +179,8 @@ def test_truth_that_begins_late_is_aligned_by_the_first_pose_that_has_it():
     true = align(estimate, truth, "A", on_floor=True)
     accuracy = evaluate(estimate, true, on_floor=True, reference="A")
     assert accuracy.ate < 1e-12 and accuracy.robots[0].true_length == pytest.approx(2)
-    assert len(accuracy.warnings) == 3 and accuracy.warnings[0].startswith("robot A: 2 of 5 poses are left out")
-    assert "begins after the estimate: aligned by its pose at stance 7; there is no NEES" in accuracy.warnings[2]
+    assert len(accuracy.warnings) == 3 and accuracy.warnings[0].startswith("robot A: 2 of 5 poses are not evaluated")
+    assert "begins after the estimate: aligned by its pose at stance 7, and without NEES" in accuracy.warnings[2]
     assert accuracy.anees is None and accuracy.nees_poses == 0
     # a robot that had not moved until then still defines the world
     held = floor_pose([0, 0, 0, 1, 2], 0, 0)
@@ -258,7 +258,7 @@ def test_poses_outside_of_the_truth_are_left_out_and_counted(team):
     accuracy = evaluate(estimate, true, on_floor=True)
     assert true["B"].shape == (5, 4, 4) and np.isnan(true["B"][[0, 4]]).all()
     assert accuracy.warnings == (
-        "robot B: 2 of 5 poses are left out, since there is no truth at their times "
+        "robot B: 2 of 5 poses are not evaluated: they have no truth at their times "
         "(1 before it begins, 1 after it ends, 0 in its gaps)",
     )
     # what is wrong where there is no truth counts nowhere

@@ -17,7 +17,7 @@ from coloc_graph.exchange.mrclam import import_mrclam
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.results.writer import assess, assess_online, write_result
-from coloc_graph.run import OdometrySample, Ranges, open_run, whole_run
+from coloc_graph.run import OdometrySample, Ranges, atomic_run, open_run
 from coloc_graph.team import Landmark, Ranging, Robot, Team
 from coloc_graph.viewer import scene_of_result
 
@@ -322,7 +322,7 @@ def write(path, *, odometry=True, target="L", ranging=True, away=False):
     sensor = Ranging(range_sigma=0.05, bearing_sigma_deg=0.5) if ranging else None
     robots = tuple(Robot(name=name, ranging=sensor or Ranging(range_sigma=1, bearing_sigma_deg=1)) for name in "AB")
     team = Team(reference="A", robots=robots, landmarks=(Landmark(name="L", position=(1.0, 0.0)),))
-    with whole_run(path, team) as writer:
+    with atomic_run(path, team) as writer:
         for k in range(20):
             if odometry:
                 writer.write(OdometrySample("A", 100.0 + k, np.array([0.1 * k, 0.0, 0.0]), np.eye(3) * 1e-4))

@@ -15,7 +15,7 @@ from coloc_graph.planning.belief import Belief, leap_model, updated
 from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.mission import leap_frog
 from coloc_graph.planning.prediction import Predictor
-from coloc_graph.run import open_run, whole_run
+from coloc_graph.run import atomic_run, open_run
 from coloc_graph.simulation import Imperfections, build_world, record, reference_team
 from coloc_graph.simulation.planned import planned
 from coloc_graph.simulation.rig import stated_team
@@ -31,7 +31,7 @@ def team_of(imperfections=FIELD):
 def estimated(plan, folder, seed, imperfections=FIELD, **options):
     """The world that follows a plan, and its estimate."""
     world = build_world(planned(plan, stream(seed, "formation")), seed=seed, imperfections=imperfections)
-    with whole_run(folder / f"{seed}.mcap", world.team) as writer:
+    with atomic_run(folder / f"{seed}.mcap", world.team) as writer:
         record(world, writer, "tracks")
     return world, solve(open_run(folder / f"{seed}.mcap"), SolveOptions("joint", **options)).estimate
 

@@ -28,7 +28,7 @@ from coloc_graph.report import (
     residual_figure,
     trajectories_figure,
 )
-from coloc_graph.report.drawing import ellipse_points, held_places, position_sigmas, world_covariances
+from coloc_graph.report.drawing import ellipse_points, held_poses, position_sigmas, world_covariances
 from coloc_graph.run import Run, Stance
 
 Truth = dict[str, NDArray[np.float64]]
@@ -169,8 +169,8 @@ def test_covariance_is_turned_from_the_body_into_the_world() -> None:
 def test_a_place_held_over_two_stances_is_ringed_once() -> None:
     estimate, _ = leapfrog(5)
     # A holds at stances 1 and 3, B at 2 and 4: the places they took at 0 and 2, and at 1 and 3
-    assert held_places(estimate, estimate.trajectories["A"]).tolist() == [0, 2]
-    assert held_places(estimate, estimate.trajectories["B"]).tolist() == [1, 3]
+    assert held_poses(estimate, estimate.trajectories["A"]).tolist() == [0, 2]
+    assert held_poses(estimate, estimate.trajectories["B"]).tolist() == [1, 3]
 
 
 def test_trajectories_figure_shows_estimate_truth_ellipses_headings_and_held_places() -> None:
@@ -334,7 +334,7 @@ def test_report_of_a_run_whose_truth_ends_early_says_so_and_draws_the_rest() -> 
     estimate, truth = leapfrog(6)
     truth["A"][3:] = np.nan
     text = Page(render_report(solution_of(estimate), accuracy_of(estimate, truth), truth)).text
-    assert "robot A: 3 of 6 poses are left out" in text and "nan" not in text.lower()
+    assert "robot A: 3 of 6 poses are not evaluated" in text and "nan" not in text.lower()
 
 
 def test_report_escapes_what_others_wrote() -> None:
@@ -363,4 +363,4 @@ def test_report_of_a_tiny_run_with_and_without_truth(stances: int) -> None:
 def test_report_of_a_robot_that_never_moved_gives_no_percentage() -> None:
     estimate, truth = leapfrog(1)
     page = Page(render_report(solution_of(estimate), accuracy_of(estimate, truth), truth))
-    assert "A: stayed where it was" in page.text
+    assert "A: standing" in page.text

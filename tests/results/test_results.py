@@ -158,7 +158,7 @@ def test_a_folder_that_is_something_else_is_refused_and_stays_as_it_was(short_so
     (foreign / "chapter.txt").write_text("years of work")
     (tmp_path / "file").write_text("a file")
     for place in (foreign, tmp_path / "file"):
-        with pytest.raises(InputError, match=f"{place.name} exists and is not a result; give another folder"):
+        with pytest.raises(InputError, match=f"{place.name} exists and is not a result: give another folder"):
             write_result(short_solution, place)
     with pytest.raises(InputError, match="file is not a folder"):
         write_result(short_solution, tmp_path / "file" / "below")
@@ -195,7 +195,7 @@ def test_truth_that_begins_late_or_misses_robots_stops_no_estimate(short, copied
     assert main(["solve", str(run), "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr()
     assert "robot A: 1 of" in said.err and "1 before it begins" in said.err
-    assert "robot B is not evaluated: there is no truth" in said.err
+    assert "robot B is not evaluated: it has no truth" in said.err
     tables = said.out.split("x at the end")  # of the robots without truth their last poses are printed
     assert len(tables) == 2 and "\nB " in tables[1] and "\nA " in tables[0]
     assert list(json.loads((tmp_path / "out" / "summary.json").read_text())["accuracy"]["robots"]) == ["A"]
@@ -208,21 +208,22 @@ def test_truth_that_cannot_be_compared_with_is_a_warning(short, copied, tmp_path
     said = capsys.readouterr()
     for summary in (json.loads(said.out), json.loads((tmp_path / "out" / "summary.json").read_text())):
         assert "accuracy" not in summary
-        assert (
-            sum("not compared with truth: the truth of robot B is at none" in one for one in summary["warnings"]) == 1
-        )
+        assert sum("not compared with truth: robot B has no truth" in one for one in summary["warnings"]) == 1
 
 
 @pytest.mark.parametrize(
     ("summary", "words"),
     [
-        (None, r"is not a result: it has no summary.json"),
+        (None, r"is not a result, for want of summary.json"),
         ("{", "summary.json: is damaged"),
         ("[]", "summary.json is damaged"),
         ('{"format": 1}', r"summary.json: .* missing required field `robots`; solve the run again"),
         ('{"format": 1, "robots": ["A"], "run": "x.mcap"}', "A.tum: cannot be read"),
         ('{"format": 1, "robots": 3, "run": "x.mcap"}', "summary.json: Expected `array`"),
-        ('{"format": 1, "robots": ["../A"], "run": "x.mcap"}', "summary.json: the name `../A` is not usable"),
+        (
+            '{"format": 1, "robots": ["../A"], "run": "x.mcap"}',
+            "summary.json: the name `../A` cannot be part of a topic",
+        ),
         ("[" * 100_000, "summary.json: is damaged"),
         ('{"robots": ' + "1" * 5000 + "}", "summary.json: is damaged"),
     ],
@@ -245,9 +246,9 @@ def test_a_result_knows_its_run_by_content(short, hallway, short_solution, tmp_p
     cut.write_bytes(short.read_bytes()[: ends[1] + 100])
     read.require_run(copy)
     read.require_run(cut)
-    with pytest.raises(InputError, match=r"hallway.mcap is not the run that .*out was made of"):
+    with pytest.raises(InputError, match=r"hallway.mcap is not the run of the result .*out"):
         read.require_run(hallway)
-    with pytest.raises(InputError, match=r"no longer at .*gone.mcap; give --run RUN"):
+    with pytest.raises(InputError, match=r"no longer at .*gone.mcap: give --run RUN"):
         read.require_run(tmp_path / "gone.mcap")
 
 

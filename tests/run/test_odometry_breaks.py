@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coloc_graph.run.odometry_breaks import find_breaks, joined
+from coloc_graph.run.odometry_breaks import find_breaks, join_breaks
 
 
 def drive(seed, n=600, dt=0.05, top=0.4):
@@ -43,8 +43,8 @@ def test_a_driver_that_restarts_is_found_and_what_follows_goes_on_from_before(se
     p[at:, :2] = (p[at:, :2] - p[at, :2]) @ rotation(p[at, 2])
     p[at:, 2] = wrapped(p[at:, 2] - p[at, 2])
     (one,) = find_breaks(t, p)
-    assert one.index == at and one.to_origin and "began anew" in str(one) and one.sigmas[0] < 0.2
-    again = joined(p, [one])
+    assert one.index == at and one.to_origin and "restarted at the origin" in str(one) and one.sigmas[0] < 0.2
+    again = join_breaks(p, [one])
     assert again[at] == pytest.approx(again[at - 1]) and again[:at] == pytest.approx(whole[:at])
     turned = wrapped(again[at:, 2] - whole[at:, 2])  # by what it turned in the step that is lost
     assert np.ptp(turned) < 1e-9 and abs(turned[0]) < 0.1

@@ -12,8 +12,8 @@ from conformance_run import make
 
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError, RunError
-from coloc_graph.run import Motion, RunWriter, open_run, whole_run
-from coloc_graph.run.atomic_file import open_part, parts_left, write_whole
+from coloc_graph.run import Motion, RunWriter, atomic_run, open_run
+from coloc_graph.run.atomic_file import open_part, parts_left, write_atomically
 from coloc_graph.run.output_lock import OutputLock, locked_output
 
 
@@ -53,8 +53,8 @@ def test_temporary_names_are_new_and_cannot_be_foreseen(tmp_path):
     assert parts_left(tmp_path / "run.mcap") == sorted([first[1], second[1]])
 
 
-@pytest.mark.parametrize("second", [whole_run, RunWriter])
-@pytest.mark.parametrize("first", [whole_run, RunWriter])
+@pytest.mark.parametrize("second", [atomic_run, RunWriter])
+@pytest.mark.parametrize("first", [atomic_run, RunWriter])
 def test_the_second_writer_of_a_run_is_refused_and_harms_nothing(tmp_path, first, second):
     path = tmp_path / "run.mcap"
     with first(path, make.team()) as writer:
@@ -113,8 +113,8 @@ def test_what_a_killed_command_wrote_is_said_and_can_be_read_and_does_not_lock(t
     out = tmp_path / "run.mcap"
     code = (
         "import os, signal, sys; sys.path.insert(0, sys.argv[2])\n"
-        "from conformance_run import make; from coloc_graph.run import Motion, whole_run\n"
-        "with whole_run(sys.argv[1], make.team(), flush_every=None) as writer:\n"
+        "from conformance_run import make; from coloc_graph.run import Motion, atomic_run\n"
+        "with atomic_run(sys.argv[1], make.team(), flush_every=None) as writer:\n"
         "    writer.write(Motion('A', 1.0, True))\n"
         "    writer._flush(); writer._file.flush(); os.kill(os.getpid(), signal.SIGKILL)\n"
     )
@@ -135,7 +135,7 @@ def test_a_file_that_is_replaced_keeps_its_rights_and_a_link_stays_one(tmp_path)
     target.write_text("old")
     target.chmod(0o640)
     link.symlink_to(target)
-    write_whole(link, "new", synchronise=True)
+    write_atomically(link, "new", synchronise=True)
     assert target.read_text() == "new" and link.is_symlink()
     assert stat.S_IMODE(target.stat().st_mode) == 0o640
     assert names(tmp_path) == ["link", "target"]

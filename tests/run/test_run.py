@@ -25,12 +25,12 @@ from coloc_graph.run import (
     Planes,
     RunWriter,
     Stance,
+    atomic_run,
     chunks,
     open_run,
     read_true_team,
     read_truth,
     schemas,
-    whole_run,
 )
 
 T0 = make.T0
@@ -50,7 +50,7 @@ def test_images_keep_shape_and_grey_levels(tmp_path, image_format, channels, err
     pixels = (2 * rows + 3 * columns).astype(np.uint8)
     if channels:
         pixels = np.stack([pixels, pixels // 2, 200 - pixels // 2], axis=-1)
-    with whole_run(tmp_path / "run.mcap", make.team(), image_format=image_format) as writer:
+    with atomic_run(tmp_path / "run.mcap", make.team(), image_format=image_format) as writer:
         writer.write(Image("A", 1.5, pixels))
         writer.write(Image("A", 2.5, pixels[:, ::-1]))  # not contiguous
     run = open_run(tmp_path / "run.mcap")
@@ -72,7 +72,7 @@ def test_an_image_without_markers_is_not_the_same_as_no_image(tmp_path):
     nothing = Detections(
         "A", 3.0, np.empty((0, 2)), np.empty((0, 2, 2)), (), np.empty(0, np.uint8), np.empty(0), np.empty(0)
     )
-    with whole_run(tmp_path / "run.mcap", make.team()) as writer:
+    with atomic_run(tmp_path / "run.mcap", make.team()) as writer:
         writer.write(nothing)
     (found,) = open_run(tmp_path / "run.mcap").detections("A")
     assert same(found, nothing)
@@ -84,7 +84,7 @@ def test_every_flag_survives(tmp_path):
     record = Detections(
         "A", 0.0, np.ones((n, 2)), np.tile(np.eye(2), (n, 1, 1)), ("",) * n, flags, np.ones(n), np.ones(n)
     )
-    with whole_run(tmp_path / "run.mcap", make.team()) as writer:
+    with atomic_run(tmp_path / "run.mcap", make.team()) as writer:
         writer.write(record)
     (found,) = open_run(tmp_path / "run.mcap").detections("A")
     assert found.flags.tolist() == flags.tolist()
@@ -104,7 +104,7 @@ def test_truth_is_kept_from_a_run_and_given_to_evaluation(tmp_path):
         floor_pose(0.0, 0.0, math.pi),
         se3(rotation_z(3) @ rotation_y(1) @ rotation_x(-2), [1.0, 2.0, 3.0]),
     ]
-    with whole_run(path, make.team()) as writer:
+    with atomic_run(path, make.team()) as writer:
         for k, T_world_body in enumerate(poses):
             writer.write_truth("B", 5.0 + k, T_world_body)
         writer.write(Motion("A", 6.0, True))
@@ -123,7 +123,7 @@ def test_truth_is_kept_from_a_run_and_given_to_evaluation(tmp_path):
 
 
 def test_a_time_range_includes_both_ends(tmp_path):
-    with whole_run(tmp_path / "run.mcap", make.team()) as writer:
+    with atomic_run(tmp_path / "run.mcap", make.team()) as writer:
         for k in range(1000):
             writer.write(Motion("A", T0 + k / 100, bool(k % 2)))
     run = open_run(tmp_path / "run.mcap")
@@ -136,7 +136,7 @@ def test_a_time_range_includes_both_ends(tmp_path):
 
 def test_reading_touches_only_the_chunks_asked_for(tmp_path, monkeypatch):
     noise = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
-    with whole_run(tmp_path / "run.mcap", make.team(), image_format="raw") as writer:
+    with atomic_run(tmp_path / "run.mcap", make.team(), image_format="raw") as writer:
         for k in range(200):
             writer.write(Image("A" if k < 100 else "B", T0 + k / 100, noise))
     size = (tmp_path / "run.mcap").stat().st_size
@@ -220,7 +220,7 @@ def test_the_writer_refuses_in_a_sentence_and_the_file_stays_good(tmp_path, word
 
 
 def test_topics_need_not_be_in_step_with_each_other(tmp_path):
-    with whole_run(tmp_path / "run.mcap", make.team()) as writer:
+    with atomic_run(tmp_path / "run.mcap", make.team()) as writer:
         writer.write(Motion("A", 10.0, True))
         writer.write(Stance(0, 5.0, 9.0, ("A", "B")))  # written when it is over
         writer.write(Motion("B", 3.0, True))
@@ -229,7 +229,7 @@ def test_topics_need_not_be_in_step_with_each_other(tmp_path):
 
 
 def test_an_exception_finishes_a_recording_and_removes_a_whole_run(tmp_path):
-    for context, name in ((RunWriter, "recording.mcap"), (whole_run, "whole.mcap")):
+    for context, name in ((RunWriter, "recording.mcap"), (atomic_run, "whole.mcap")):
         with pytest.raises(ZeroDivisionError), context(tmp_path / name, make.team()) as writer:
             writer.write(Motion("A", 1.0, True))
             assert not (tmp_path / "whole.mcap").exists()
@@ -243,7 +243,7 @@ def test_an_exception_finishes_a_recording_and_removes_a_whole_run(tmp_path):
 def test_a_whole_run_that_fails_leaves_what_was_there(tmp_path):
     path = everything(tmp_path / "run.mcap")
     before = path.read_bytes()
-    with pytest.raises(RunError), whole_run(path, make.team()) as writer:
+    with pytest.raises(RunError), atomic_run(path, make.team()) as writer:
         writer.write(Motion("Z", 1.0, True))
     assert path.read_bytes() == before
 
@@ -277,7 +277,7 @@ def test_a_disk_that_fills_up_stops_the_recording_and_keeps_what_it_holds(tmp_pa
 
 
 def test_a_run_of_a_team_alone_opens(tmp_path):
-    with whole_run(tmp_path / "run.mcap", make.team()):
+    with atomic_run(tmp_path / "run.mcap", make.team()):
         pass
     run = open_run(tmp_path / "run.mcap")
     assert (run.team, run.stances, run.start, run.end) == (make.team(), (), None, None)

@@ -66,7 +66,7 @@ def test_many_chunks_of_many_messages_are_refused(tmp_path):
 def test_a_file_that_is_all_compression_is_refused(tmp_path):
     size = 64 * 1024 * 1024
     path = bomb(tmp_path / "zeros.mcap", [chunk_of(struct.pack("<BQ", 200, size) + bytes(size))] * 20)
-    assert "as no recording does" in refused_quickly(path)
+    assert "which no recording does" in refused_quickly(path)
 
 
 def test_an_ordinary_run_without_indexes_and_with_high_compression_is_read(tmp_path):

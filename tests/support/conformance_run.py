@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coloc_graph.run import Motion, OdometrySample, Planes, Stance, whole_run
+from coloc_graph.run import Motion, OdometrySample, Planes, Stance, atomic_run
 
 CONFORMANCE = Path(__file__).parents[1] / "run" / "conformance" / "run"
 _spec = importlib.util.spec_from_file_location("conformance_make", CONFORMANCE / "make.py")
@@ -23,7 +23,7 @@ def same(a, b):
 
 
 def everything(path, **options):
-    with whole_run(path, make.team(), **({"image_format": "png"} | options)) as writer:
+    with atomic_run(path, make.team(), **({"image_format": "png"} | options)) as writer:
         make.write_everything(writer)
     return path
 

@@ -122,7 +122,7 @@ WRONG = {
     "a camera that is too slow": (
         "cy = 119.5",
         "cy = 119.5\nfps = 10.0",
-        ["the camera of robot A takes 10 images a second", "at least 0.2 s"],
+        ["the camera of robot A takes 10 images per second", "at least 0.2 s"],
     ),
     "nothing to blink": (MARKERS, "", ["robot C has a `blink` but no markers"]),
     "a robot twice": ('name = "C"', 'name = "A"', ["two robots are called `A`"]),
@@ -149,7 +149,7 @@ def test_what_is_wrong_with_a_team_is_named(read, old, new, wanted):
 @pytest.mark.parametrize(
     ("first", "other", "hue", "words"),
     [
-        ("11011110", "11110110", None, "robots A and B blink alike, wherever their codes begin"),
+        ("11011110", "11110110", None, "robots A and B blink alike"),
         ("110", "101101", None, "robots A and B blink alike"),
         ("110", "110", 120.0, ""),
         ("110", "1110", None, ""),
@@ -167,7 +167,9 @@ def test_codes_differ_wherever_they_begin(first, other, hue, words):
 def test_all_bits_are_as_long():
     a, b, _ = reference_team().robots
     robots = (replace(a, blink=Blink(code="110")), replace(b, blink=Blink(code="1110", bit=0.2)))
-    with pytest.raises(ValueError, match=r"robot A is 0.1 s long and one of robot B 0.2 s; give all the same `bit`"):
+    with pytest.raises(
+        ValueError, match=r"robot A takes 0.1 s and one of robot B 0.2 s; give all robots the same `bit`"
+    ):
         Team(reference="A", robots=robots)
 
 

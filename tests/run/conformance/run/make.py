@@ -18,7 +18,7 @@ from coloc_graph.run import (
     Planes,
     RunWriter,
     Stance,
-    whole_run,
+    atomic_run,
 )
 from coloc_graph.team import Camera, Markers, Mount, Robot, Team
 
@@ -71,9 +71,9 @@ def write_everything(writer: RunWriter) -> None:
 
 
 def main() -> None:
-    with whole_run(HERE / "minimal.mcap", team()) as writer:
+    with atomic_run(HERE / "minimal.mcap", team()) as writer:
         writer.write(Stance(0, T0, T0 + 1, ("A", "B"), ("C",)))
-    with whole_run(HERE / "everything.mcap", team(), image_format="png") as writer:
+    with atomic_run(HERE / "everything.mcap", team(), image_format="png") as writer:
         write_everything(writer)
     whole = (HERE / "everything.mcap").read_bytes()
     # inside of the indexes behind the last chunk, which is whole itself
