@@ -1,4 +1,4 @@
-"""Where the mover drives in a stance: waypoints by optimal design within the common view; `MoverPlanner`."""
+"""Path of the mover in a stance: waypoints by optimal design within the common view; `MoverPlanner`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
