@@ -14,7 +14,6 @@ NOT_YET = {
     "calibration",
     "cli",
     "exchange",
-    "frontend",
     "robot_io",
     "viewer",
 }

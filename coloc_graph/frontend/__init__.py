@@ -1,9 +1,7 @@
 """Images to homography measurements: detect, track, pair, fit, decompose (knows numpy, cv2, scipy; no graph).
 
-`measure_pair` is the whole road for two observers in one stance; its steps are modules of their own.
-
-
-The names below are imported when they are first asked for, so that a detector loads no optimiser.
+`measure_pair` runs all steps for two observers in one stance; each step is a module of its own. The names below are
+imported on first use, so that a detector loads no optimiser.
 """
 
 from typing import TYPE_CHECKING
@@ -23,7 +21,7 @@ if TYPE_CHECKING:
     from coloc_graph.frontend.homography.plane import distance_from_span, on_plane, plane_from_mount
     from coloc_graph.frontend.homography.refinement import PointPairs, least_squares, refine
     from coloc_graph.frontend.images.detection import Blobs, Detector, Threshold, detect_hue, detect_leds, detector_for
-    from coloc_graph.frontend.landmarks import Doubt, SeenLandmarks, in_words, sight_landmarks
+    from coloc_graph.frontend.landmarks import SeenLandmarks, UnusedSighting, describe_unused, sight_landmarks
     from coloc_graph.frontend.odometry import WheelTrack
     from coloc_graph.frontend.pairing.clock_fusion import share_clock_offsets
     from coloc_graph.frontend.pairing.clock_offset import ClockFit, ClockOffset
@@ -47,7 +45,6 @@ __all__ = [
     "ClockOffset",
     "Correspondences",
     "Detector",
-    "Doubt",
     "FrontendOptions",
     "HomographyFit",
     "MarkerTracker",
@@ -59,17 +56,18 @@ __all__ = [
     "Threshold",
     "Track",
     "TrackerOptions",
+    "UnusedSighting",
     "WheelTrack",
     "choose_by_normal",
     "correspond",
     "decompose_svd",
     "decompose_with_normal",
+    "describe_unused",
     "detect_hue",
     "detect_leds",
     "detector_for",
     "distance_from_span",
     "fit_homography",
-    "in_words",
     "least_squares",
     "little_in_common",
     "measure_pair",
@@ -99,7 +97,7 @@ __getattr__, __dir__ = lazy_names(
         "homography.plane": "distance_from_span on_plane plane_from_mount",
         "homography.refinement": "PointPairs least_squares refine",
         "images.detection": "Blobs Detector Threshold detect_hue detect_leds detector_for",
-        "landmarks": "Doubt SeenLandmarks in_words sight_landmarks",
+        "landmarks": "UnusedSighting SeenLandmarks describe_unused sight_landmarks",
         "odometry": "WheelTrack",
         "pairing.clock_fusion": "share_clock_offsets",
         "pairing.clock_offset": "ClockFit ClockOffset",

@@ -1,4 +1,4 @@
-"""From a run with ranges and bearings to keyframes: `keyframes_of`."""
+"""Make keyframes of a run with ranges and bearings: the instants at which each robot measured or was measured."""
 
 import itertools
 from dataclasses import dataclass, replace
@@ -14,51 +14,60 @@ from coloc_graph.team import Ranging, Wheels
 
 Array = NDArray[np.float64]
 
-#: Measurements no further apart are of one instant [s].
-ONE_INSTANT = 0.01
-#: So much of a run is read at a time [s].
-READ_AT_ONCE = 10.0
-#: Odometry with a gap longer than this says nothing there [s].
-LONGEST_GAP = 5.0
-#: A delay that is not known is looked for so far on either side [its sigmas], in steps of so much [s].
-DELAYS_SIGMAS = 4.0
-DELAY_STEP = 0.05
-LEAST_LATE = 0.12  # smaller differences between robots' delays are usual [s]
-CLEARLY = 5.0  # and a delay differs by this many of its sigmas
+ONE_INSTANT = 0.01  # s within which measurements are of one keyframe
+READ_AT_ONCE = 10.0  # s of a run that are read at a time
+MAX_GAP = 5.0  # s between odometry samples, above which there is no odometry
+DELAY_SIGMAS = 4.0  # standard deviations of the prior within which an unknown delay is tabulated
+DELAY_STEP = 0.05  # s, step of that table
+MIN_LATE = 0.12  # s by which a robot's delay must differ from the usual to be corrected
+LATE_SIGMAS = 5.0  # standard deviations by which it must differ too
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
-    """A robot's odometry: `times` (n,), `poses` (n, 3) with the heading unwound, and what its increments' variances add
-    up to (n, 3)."""
+class _Path:
+    """Odometry of a robot: `times` (n,), `poses` (n, 3) with unwrapped heading, and cumulated `variances` (n, 3)."""
 
     times: Array
     poses: Array
     variances: Array
 
     def at(self, times: Array) -> Array:
-        """Poses (m, 3) at some times."""
+        """Interpolate poses (m, 3) at times (m,)."""
         return np.stack([np.interp(times, self.times, column) for column in self.poses.T], axis=-1)
 
     def until(self, times: Array) -> Array:
-        """Variances (m, 3) that have come together at some times."""
+        """Interpolate cumulated variances (m, 3) at times (m,)."""
         return np.stack([np.interp(times, self.times, column) for column in self.variances.T], axis=-1)
 
 
 def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
-    """The keyframes of a run: of each robot, the instants at which it measured or was measured.
+    """Make the keyframes of a run with ranges and bearings.
 
-    Without `between_robots` what robots measured of each other is left out. Raises `InputError` where a robot that
-    measured has no odometry, or nothing was measured.
+    Parameters
+    ----------
+    run
+        The run.
+    between_robots
+        False to ignore measurements between robots.
+
+    Returns
+    -------
+    Drive
+        Keyframes with odometry between them, the measurements, and warnings.
+
+    Raises
+    ------
+    InputError
+        A robot that measured has no odometry, or nothing was measured.
     """
     names, landmarks = run.team.names, tuple(one.name for one in run.team.landmarks)
     numbers = {name: n for n, name in enumerate((*names, *landmarks))}
     samples, ranges = _read(run)
-    ways = [_way(run, robot, samples[robot]) for robot in names]
+    paths = [_path(run, robot, samples[robot]) for robot in names]
     rows: list[tuple[float, int, int, float, float]] = []
     outside = 0
     warnings = []
-    late = _late(run, ways, ranges)
+    late = _late(run, paths, ranges)
     for robot in names:
         if robot in late:
             by, sigma = late[robot]
@@ -72,22 +81,22 @@ def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
             for target, distance, bearing in zip(one.targets, one.range.tolist(), one.bearing.tolist(), strict=True):
                 if target in names and not between_robots:
                     continue
-                if not all(_is_covered(ways[numbers[who]], one.time) for who in (robot, target) if who in names):
+                if not all(_is_covered(paths[numbers[who]], one.time) for who in (robot, target) if who in names):
                     outside += 1
                     continue
                 rows.append((one.time, numbers[robot], numbers[target], distance, bearing))
     if not rows:
-        raise InputError(f"{run.path}: no range was measured while there is odometry; record both at the same time")
+        raise InputError(f"{run.path}: no range was measured while there is odometry: record both at the same time")
     rows.sort()
     table = np.array(rows)
     time, robot_of, target_of = table[:, 0], table[:, 1].astype(int), table[:, 2].astype(int)
     times, keyframe, target_keyframe = _instants(time, robot_of, target_of, len(names))
     if outside:
-        warnings.append(f"{run.path}: {outside} ranges were measured where there is no odometry, and are left out")
+        warnings.append(f"{run.path}: {outside} ranges were measured while there is no odometry and are not used")
     steps = []
-    for name, way, at in zip(names, ways, times, strict=True):
+    for name, path, at in zip(names, paths, times, strict=True):
         wheels = run.team[name].wheels or Wheels()
-        steps.append(_steps(way, at, wheels) if way is not None else _no_steps())
+        steps.append(_steps(path, at, wheels) if path is not None else _no_steps())
     return Drive(
         robots=names,
         landmarks=landmarks,
@@ -107,45 +116,46 @@ def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
     )
 
 
-def _late(run: Run, ways: list[_Way | None], ranges: dict[str, list[Ranges]]) -> dict[str, tuple[float, float]]:
-    """Robots whose measurements are stamped late against their odometry, by how much, and the sigma of that [s].
+def _late(run: Run, paths: list[_Path | None], ranges: dict[str, list[Ranges]]) -> dict[str, tuple[float, float]]:
+    """Robots whose measurements are stamped late against their odometry, with the delay and its sigma [s].
 
-    A delay that all robots share is the odometry's own, which the estimate finds; who differs has a clock that is off.
+    A delay that all robots share is the odometry's own and is estimated with the poses; a robot that differs has a
+    sensor clock that is off.
     """
     standing = {one.name: n for n, one in enumerate(run.team.landmarks)}
     found: dict[str, SensorDelay] = {}
-    for robot, way in zip(run.team.names, ways, strict=True):
+    for robot, path in zip(run.team.names, paths, strict=True):
         seen = [
             (one.time, standing[target], distance, bearing)
             for one in ranges[robot]
             for target, distance, bearing in zip(one.targets, one.range.tolist(), one.bearing.tolist(), strict=True)
             if target in standing
         ]
-        if way is None or not seen:
+        if path is None or not seen:
             continue
         table = np.array(seen)
-        delay = sensor_delay(table[:, 0], table[:, 1].astype(int), table[:, 2], table[:, 3], way.at)
+        delay = sensor_delay(table[:, 0], table[:, 1].astype(int), table[:, 2], table[:, 3], path.at)
         if delay is not None:
             found[robot] = delay
     late = {}
     for robot, delay in found.items():
         wheels = run.team[robot].wheels or Wheels()
-        usual, tolerated = wheels.delay, max(DELAYS_SIGMAS * wheels.delay_sigma, LEAST_LATE)
+        usual, tolerated = wheels.delay, max(DELAY_SIGMAS * wheels.delay_sigma, MIN_LATE)
         if len(found) > 2:
-            usual, tolerated = float(np.median([one.value for one in found.values()])), LEAST_LATE
+            usual, tolerated = float(np.median([one.value for one in found.values()])), MIN_LATE
         off = delay.value - usual
-        if abs(off) > max(tolerated, CLEARLY * delay.sigma):
+        if abs(off) > max(tolerated, LATE_SIGMAS * delay.sigma):
             late[robot] = off, delay.sigma
     return late
 
 
 def _ranging(run: Run, robot: str) -> Ranging:
-    """How well a robot measures; one that never did may have no such sensor."""
+    """Noise of a robot's range sensor; a robot that never measured needs none."""
     ranging = run.team[robot].ranging
     if ranging is None:
         if run.topics.get(f"/{robot}/ranges"):
             raise InputError(
-                f"{run.path}: robot {robot} measured ranges, and the team does not say how well; "
+                f"{run.path}: robot {robot} measured ranges, but the team states no noise for them: "
                 "give it [robots.ranging] in team.toml"
             )
         return Ranging(range_sigma=1.0, bearing_sigma_deg=1.0)
@@ -153,7 +163,7 @@ def _ranging(run: Run, robot: str) -> Ranging:
 
 
 def _read(run: Run) -> tuple[dict[str, list[OdometrySample]], dict[str, list[Ranges]]]:
-    """The odometry and the ranges of all robots, a while of all of them at a time: a chunk of the file holds all."""
+    """Read odometry and ranges of all robots, interval by interval, since a chunk of the file holds all robots."""
     odometry: dict[str, list[OdometrySample]] = {robot: [] for robot in run.team.names}
     ranges: dict[str, list[Ranges]] = {robot: [] for robot in run.team.names}
     begin, end = run.start or 0.0, run.end or 0.0
@@ -165,30 +175,30 @@ def _read(run: Run) -> tuple[dict[str, list[OdometrySample]], dict[str, list[Ran
     return odometry, ranges
 
 
-def _way(run: Run, robot: str, samples: list[OdometrySample]) -> _Way | None:
+def _path(run: Run, robot: str, samples: list[OdometrySample]) -> _Path | None:
     if not samples:
         if run.topics.get(f"/{robot}/ranges"):
-            raise InputError(f"{run.path}: robot {robot} measured ranges, and has no odometry; record it too")
+            raise InputError(f"{run.path}: robot {robot} measured ranges, but has no odometry: record it too")
         return None
     poses = np.array([one.pose for one in samples])
     poses[:, 2] = np.unwrap(poses[:, 2])
     variances = np.array([np.diagonal(one.covariance) for one in samples])
     variances[0] = 0.0
-    return _Way(np.array([one.time for one in samples]), poses, np.cumsum(variances, axis=0))
+    return _Path(np.array([one.time for one in samples]), poses, np.cumsum(variances, axis=0))
 
 
-def _is_covered(way: _Way | None, time: float) -> bool:
-    """Whether there is odometry before and after a time, not too far from it."""
-    if way is None or not way.times[0] <= time <= way.times[-1]:
+def _is_covered(path: _Path | None, time: float) -> bool:
+    """Return whether there is odometry shortly before and after a time."""
+    if path is None or not path.times[0] <= time <= path.times[-1]:
         return False
-    after = int(np.searchsorted(way.times, time, side="right"))
-    return after >= len(way.times) or bool(way.times[after] - way.times[after - 1] <= LONGEST_GAP)
+    after = int(np.searchsorted(path.times, time, side="right"))
+    return after >= len(path.times) or bool(path.times[after] - path.times[after - 1] <= MAX_GAP)
 
 
 def _instants(
     time: Array, robot: NDArray[np.int64], target: NDArray[np.int64], robots: int
 ) -> tuple[list[Array], NDArray[np.int64], NDArray[np.int64]]:
-    """The instants of each robot, and for each measurement whose it is of who measured and of who was measured."""
+    """Keyframe times of each robot, and for each measurement the keyframes of the robot and of the target."""
     times = []
     keyframe, target_keyframe = np.full(len(time), -1), np.full(len(time), -1)
     for n in range(robots):
@@ -204,7 +214,7 @@ def _instants(
 
 
 def _filled(times: Array) -> Array:
-    """Ascending times, and as many in between as it takes to leave no gap too long."""
+    """Insert times into ascending ones until no gap is longer than `LONGEST_STEP`."""
     parts = [
         np.linspace(before, after, int(np.ceil((after - before) / MAX_KEYFRAME_INTERVAL)), endpoint=False)
         for before, after in itertools.pairwise(times.tolist())
@@ -213,10 +223,10 @@ def _filled(times: Array) -> Array:
 
 
 def _shares(time: Array, robot: NDArray[np.int64], target: NDArray[np.int64], ranging: list[Ranging]) -> Array:
-    """How much of each measurement is new, (n, 2) of range and bearing.
+    """Weights (n, 2) of ranges and bearings whose errors are correlated in time.
 
-    Of errors that are correlated as exp(-t / memory), n measurements know their mean as well as
-    1 + (n - 1) (1 - r) / (1 + r) independent ones, r of neighbours: the first counts whole, and each that follows
+    With a correlation exp(-t / memory), n measurements determine their mean as well as 1 + (n - 1) (1 - r) / (1 + r)
+    independent ones, r being the correlation of neighbours: the first has weight 1, and each later one
     (1 - r) / (1 + r) = tanh(t / (2 memory)).
     """
     share = np.ones((len(time), 2))
@@ -229,12 +239,12 @@ def _shares(time: Array, robot: NDArray[np.int64], target: NDArray[np.int64], ra
     return share
 
 
-def _steps(way: _Way, times: Array, wheels: Wheels) -> Steps:
-    reach = DELAYS_SIGMAS * wheels.delay_sigma
+def _steps(path: _Path, times: Array, wheels: Wheels) -> Steps:
+    reach = DELAY_SIGMAS * wheels.delay_sigma
     count = int(np.ceil(reach / DELAY_STEP))
     delays: Array = wheels.delay + DELAY_STEP * np.arange(-count, count + 1, dtype=np.float64)
-    twists: Array = np.stack([_twists(way.at(times - delay)) for delay in delays])
-    variances = np.diff(way.until(times - wheels.delay), axis=0)
+    twists: Array = np.stack([_twists(path.at(times - delay)) for delay in delays])
+    variances = np.diff(path.until(times - wheels.delay), axis=0)
     return Steps(delays, twists, _covariances(twists[count], variances))
 
 
@@ -254,9 +264,9 @@ def _twists(poses: Array) -> Array:
 
 
 def _covariances(twists: Array, variances: Array) -> Array:
-    """Covariances (n - 1, 3, 3) of steps, of what their increments' variances add up to.
+    """Covariances (n - 1, 3, 3) of steps from the sums of their increments' variances.
 
-    A heading that is off spreads evenly over the step, and moves its end by half as much, with a third of the variance.
+    A heading error grows evenly along a step: it moves the end by half its size, with a third of the variance.
     """
     C = np.zeros((len(twists), 3, 3))
     along, across, turn = np.maximum(variances, 1e-10).T

@@ -1,4 +1,4 @@
-"""Landmarks: found in a resting camera's images, or named in its detections; and sighted as robots that stand are."""
+"""Detect landmarks in the images of a camera at rest, or take them from named detections, and sight them."""
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -19,24 +19,18 @@ from coloc_graph.team import Camera, Floor, Landmark, Mount, Robot, Team
 
 Array = NDArray[np.float64]
 
-#: A camera that stands looks for landmarks so often [s]: more images are of the same error, but for the sensor's noise.
-EVERY = 2.0
-#: What an image does not average away of a tag's edges (measured on rendered tags from 1 to 2.6 m) [px].
-TAG_BIAS_PX = 0.05
-#: A marker that stands is seen no further than this from where it is seen mostly [sigma, px], at this share of the
-#: instants at least.
-STILL_SIGMAS = 5.0
-STILL_PX = 0.5
-MOSTLY = 0.6
-#: Two markers are as far apart as a landmark's, to this share of it.
-SPAN_TOLERANCE = 0.35
-#: A bar of two lights that is seen so much along itself [rad] does not say which light is which.
-LEAST_ASIDE = np.deg2rad(10.0)
+INTERVAL = 2.0  # s between images that a camera at rest searches; more images share the same systematic error
+TAG_BIAS_PX = 0.05  # px, systematic error of a tag's edges, measured on rendered tags from 1 to 2.6 m
+STILL_SIGMAS = 5.0  # standard deviations within which samples of a marker at rest lie about their median
+STILL_PX = 0.5  # px, the same as a distance
+MIN_STILL_SHARE = 0.6  # of a marker's samples that must lie within either
+SPAN_TOLERANCE = 0.35  # relative error of the distance between a landmark's two markers
+MIN_ASPECT = np.deg2rad(10.0)  # rad between the line of sight and the line through two lights, to tell them apart
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """A landmark, or a robot that moved (`is_robot`), that an observer saw in a stance and that is not used; `why`."""
+class UnusedSighting:
+    """Landmark, or robot that moved (`is_robot`), that an observer saw in a stance and that has no sighting."""
 
     landmark: str
     observer: str
@@ -47,17 +41,17 @@ class Doubt:
 
 @dataclass(frozen=True, eq=False)
 class SeenLandmarks:
-    """What an observer saw of landmarks: tracks with their markers' names, and why others are not used, by name."""
+    """Landmarks seen by an observer: tracks with names of markers, and reasons why others are not used, by name."""
 
     tracks: list[Track] = field(default_factory=list)
-    doubts: dict[str, str] = field(default_factory=dict)
+    unused: dict[str, str] = field(default_factory=dict)
 
 
 class LandmarkWatch:
-    """Looks for the landmarks of a team in the images of one camera that stands: tags, and pairs of coloured lights.
+    """Detector of a team's landmarks in the images of one camera at rest: AprilTags, and pairs of coloured lights.
 
-    White lights are not looked for: nothing tells them from lamps. Nor are colours that a mover carries, or two
-    landmarks.
+    White lights are not searched for, since they cannot be told from lamps, nor colours that a mover or another
+    landmark has.
     """
 
     def __init__(self, robot: Robot, team: Team, movers: Collection[str]) -> None:
@@ -66,42 +60,42 @@ class LandmarkWatch:
         carried = {m.hue_deg for name in movers if (m := team[name].markers) is not None}
         lit = [(one, one.markers.hue_deg) for one in team.landmarks if one.markers is not None]
         hues = [hue for _, hue in lit]
-        self._lit: list[tuple[Landmark, Detector]] = []
-        self.doubts: dict[str, str] = {}
+        self._lights_of: list[tuple[Landmark, Detector]] = []
+        self.unused: dict[str, str] = {}
         for one, hue in lit:
             if hue is None:
-                self.doubts[one.name] = (
-                    "in images nothing tells its white lights from lamps; give them a colour (`hue_deg`), or use a tag"
+                self.unused[one.name] = (
+                    "in images its white lights cannot be told from lamps; give them a colour (`hue_deg`), or use a tag"
                 )
             elif hue in carried or hues.count(hue) > 1:
-                self.doubts[one.name] = "others have lights of the same colour; give it one of its own, or use a tag"
+                self.unused[one.name] = "others have lights of the same colour; give it its own colour, or use a tag"
             else:
-                self._lit.append((one, detector_for(one.markers, robot.camera)))
+                self._lights_of.append((one, detector_for(one.markers, robot.camera)))
         self._next = -np.inf
         self._samples: dict[str, list[tuple[float, Array, Array]]] = {}
 
     def look(self, image: Image) -> None:
-        """Look at an image, if the last one that was looked at is some time ago."""
-        if image.time < self._next or not (self._tags or self._lit):
+        """Search an image, unless the last search was a moment ago."""
+        if image.time < self._next or not (self._tags or self._lights_of):
             return
-        self._next = image.time + EVERY
+        self._next = image.time + INTERVAL
         camera = self._robot.camera
         if self._tags:
             for tag in find_tags(image.pixels, camera, {family for family, _ in self._tags}):
                 landmark = self._tags.get((tag.family, tag.id))
                 if landmark is not None:
                     self._samples.setdefault(landmark.name, []).append((image.time, tag.uv, tag.covariance))
-        for landmark, detector in self._lit:
+        for landmark, detector in self._lights_of:
             try:
                 found = self._lights(landmark, detector, image.pixels)
             except DegenerateGeometry as why:
-                self.doubts[landmark.name] = str(why)
+                self.unused[landmark.name] = str(why)
                 continue
             if found is not None:
                 self._samples.setdefault(landmark.name, []).append((image.time, *found))
 
     def _lights(self, landmark: Landmark, detector: Detector, pixels: Pixels) -> tuple[Array, Array] | None:
-        """The landmark's first and second light, if they are seen; raises where others might be they."""
+        """First and second light of a landmark, None if they are not seen; raises if they are ambiguous."""
         blobs = detector(pixels)
         blobs = blobs[(blobs.flags & UNRELIABLE) == 0]
         if len(blobs) < 2:
@@ -110,13 +104,13 @@ class LandmarkWatch:
             raise DegenerateGeometry(f"{len(blobs)} lights of its colour are in view, and it has two")
         T_observer_landmark = _roughly(self._robot, landmark, blobs.uv, self._floor)
         toward = se3_inverse(T_observer_landmark)[:2] @ np.array([*self._robot.mount.T_body_camera[:3, 3], 1.0])
-        if abs(np.arctan2(toward[0], abs(toward[1]))) < LEAST_ASIDE:
-            raise DegenerateGeometry("it is seen along its two lights, which tells not which is which")
+        if abs(np.arctan2(toward[0], abs(toward[1]))) < MIN_ASPECT:
+            raise DegenerateGeometry("it is seen along the line of its two lights, which cannot be told apart then")
         order = [0, 1] if toward[0] > 0 else [1, 0]  # it is seen from the side that it faces
         return blobs.uv[order], blobs.covariance[order]
 
     def seen(self) -> SeenLandmarks:
-        """What was seen so far: one sample a marker, since it stands."""
+        """Average all samples into one for each marker."""
         tracks = []
         for name, samples in self._samples.items():
             times, uv, covariance = (np.array(values) for values in zip(*samples, strict=True))
@@ -127,15 +121,14 @@ class LandmarkWatch:
                 try:
                     one = at_rest(still(track), float(times[0]))
                 except DegenerateGeometry as why:
-                    self.doubts[name] = str(why)
+                    self.unused[name] = str(why)
                     break
                 tracks.append(Track(one.robot, one.marker, one.times, one.uv, one.covariance + shared, one.peak))
-        return SeenLandmarks(tracks, dict(self.doubts))
+        return SeenLandmarks(tracks, dict(self.unused))
 
 
 def _roughly(observer: Robot, landmark: Landmark, uv: Array, floor: Floor) -> Array:
-    """T_observer_landmark (4, 4) where two pixels (2, 2) are its lights in their order; raises where they are not a
-    span apart."""
+    """Compute T_observer_landmark (4, 4) from the pixels (2, 2) of its lights in order; raises if they are no span."""
     places = _places(observer.camera, observer.mount, landmark, uv, floor)
     markers = landmark.seen_as
     assert markers is not None
@@ -149,8 +142,7 @@ def _roughly(observer: Robot, landmark: Landmark, uv: Array, floor: Floor) -> Ar
 
 
 def _places(camera: Camera, mount: Mount, landmark: Landmark, uv: Array, floor: Floor) -> Array:
-    """Where on the plane of a landmark's markers pixels (2, 2) are, in the observer's body (2, 2) [m]; raises where
-    that is no span."""
+    """Project pixels (2, 2) of a landmark's markers to their plane: (2, 2) [m], observer's body; raises if no span."""
     markers = landmark.seen_as
     assert markers is not None and markers.span is not None
     T = mount.T_body_camera
@@ -160,20 +152,20 @@ def _places(camera: Camera, mount: Mount, landmark: Landmark, uv: Array, floor: 
     if not abs(apart / markers.span - 1) < SPAN_TOLERANCE:
         far = "above the horizon" if not np.isfinite(apart) else f"{apart:.2f} m apart"
         raise DegenerateGeometry(
-            f"its two markers are seen {far}, and are {markers.span:.2f} m apart, {markers.height:.2f} m above the "
-            "floor: another light is taken for it, or its size and height are not as stated"
+            f"its two markers are seen {far}, but the team states {markers.span:.2f} m, {markers.height:.2f} m above "
+            "the floor: another light is taken for it, or its size or height is wrong"
         )
     return np.asarray(places)
 
 
 def still(track: Track) -> Track:
-    """Of a marker that stands the samples that show it; raises `DegenerateGeometry` where it does not stand."""
+    """Select the samples of a marker at rest; raises `DegenerateGeometry` if it is not at rest."""
     off = track.uv - np.median(track.uv, axis=0)
     sigmas = np.einsum("nk,nkl,nl->n", off, np.linalg.inv(track.covariance), off)
     good = (sigmas < STILL_SIGMAS**2) | (np.linalg.norm(off, axis=1) < STILL_PX)
-    if good.mean() < MOSTLY:
+    if good.mean() < MIN_STILL_SHARE:
         px = float(np.median(np.linalg.norm(off, axis=1)))
-        raise DegenerateGeometry(f"what is taken for its marker {track.marker} does not stand still ({px:.1f} px)")
+        raise DegenerateGeometry(f"the light taken for its marker {track.marker} is not at rest ({px:.1f} px)")
     fields = (getattr(track, name)[good] for name in ("times", "uv", "covariance", "peak"))
     return Track(track.robot, track.marker, *fields)
 
@@ -183,19 +175,30 @@ def sight_landmarks(
     stance: Stance,
     seen: Iterable[tuple[str, SeenLandmarks]],
     known: Collection[tuple[str, str]] = (),
-) -> tuple[list[Sighting], list[Doubt]]:
-    """Where landmarks stand that observers saw in a stance, and what was seen and is not used; nothing without a floor.
+) -> tuple[list[Sighting], list[UnusedSighting]]:
+    """Sight the landmarks that observers saw in a stance.
 
-    `seen` is by observer. What an observer that has stayed put saw of a landmark before, (observer, landmark), is
-    `known`.
+    Parameters
+    ----------
+    run, stance
+        Run and stance.
+    seen
+        Landmarks seen, by observer.
+    known
+        Pairs (observer, landmark) that an observer at rest has sighted before, which are not repeated.
+
+    Returns
+    -------
+    tuple of list
+        Sightings, and landmarks that were seen and are not used; none without a floor.
     """
     if run.team.floor is None or stance.index in run.planes:
         return [], []
     landmarks = {one.name: one for one in run.team.landmarks}
     made: list[Sighting] = []
-    doubts: list[Doubt] = []
+    unused: list[UnusedSighting] = []
     for observer, what in dict(seen).items():
-        doubts += [Doubt(name, observer, stance.index, why) for name, why in what.doubts.items()]
+        unused += [UnusedSighting(name, observer, stance.index, why) for name, why in what.unused.items()]
         for name in dict.fromkeys(track.marker.rpartition("/")[0] for track in what.tracks):
             if (observer, name) in known:
                 continue
@@ -203,19 +206,19 @@ def sight_landmarks(
             try:
                 sighting = _sighting(run, stance, run.team[observer], landmarks[name], own)
             except DegenerateGeometry as why:
-                doubts.append(Doubt(name, observer, stance.index, str(why)))
+                unused.append(UnusedSighting(name, observer, stance.index, str(why)))
                 continue
             made += [] if sighting is None else [sighting]
-    return made, doubts
+    return made, unused
 
 
 def _sighting(
     run: Recorded, stance: Stance, observer: Robot, landmark: Landmark, tracks: Sequence[Track]
 ) -> Sighting | None:
-    """The sighting of one landmark; None where one of its markers is not in view."""
+    """Sight one landmark; None if one of its markers is not in view."""
     markers, named = landmark.seen_as, {track.marker: track for track in tracks}
     if markers is None:
-        raise DegenerateGeometry("it has neither markers nor a tag in the team; give it what is seen")
+        raise DegenerateGeometry("it has neither markers nor a tag in the team; state them")
     pair = [named.get(f"{landmark.name}/{n}") for n in range(2)]
     if pair[0] is None or pair[1] is None:
         return None
@@ -225,7 +228,7 @@ def _sighting(
     _places(observer.camera, observer.mount, landmark, uv, run.team.floor or Floor())
     sighting = sight(stance, observer, Marked(landmark.name, markers), both, plane)
     if sighting is not None and landmark.tag is not None and not _faces(sighting.T_observer_seen, observer):
-        raise DegenerateGeometry("the camera would be behind its tag: its left and right edge are exchanged")
+        raise DegenerateGeometry("the camera would be behind its tag: left and right edge are exchanged")
     return sighting
 
 
@@ -235,10 +238,10 @@ def _faces(T_observer_landmark: Array, observer: Robot) -> bool:
     return bool(p_landmark[0] > 0)
 
 
-def in_words(doubts: Iterable[Doubt]) -> list[str]:
-    """A sentence a landmark or robot, observer and reason: the first of its kind, and how many there are."""
-    kinds: dict[tuple[str, str, str], list[Doubt]] = {}
-    for one in doubts:
+def describe_unused(unused: Iterable[UnusedSighting]) -> list[str]:
+    """Describe unused landmarks and robots, one sentence for each object, observer and reason, with their number."""
+    kinds: dict[tuple[str, str, str], list[UnusedSighting]] = {}
+    for one in unused:
         kinds.setdefault((one.landmark, one.observer, "".join(c for c in one.why if not c.isdigit())), []).append(one)
     return [
         f"stance {all_[0].stance}{f' (and {len(all_) - 1} more)' if len(all_) > 1 else ''}: "

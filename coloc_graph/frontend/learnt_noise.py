@@ -1,7 +1,7 @@
-"""Noise of each camera's marker centres, learnt from the run: `NoiseBelief`.
+"""Learn the noise of each camera's marker centres from the run (`NoiseBelief`).
 
-What a team states (`Camera.centre_noise`, or its defaults) is the prior. All fits of a run update it at once, or one
-after the other as stances end.
+The team's values (`Camera.centre_noise`, or the defaults) are the prior. All fits of a run update it at once, or stance
+by stance.
 """
 
 import math
@@ -26,7 +26,7 @@ PARTS = (("stated sigma times", "scale", ""), ("white floor", "floor", "px"), ("
 
 @dataclass(frozen=True)
 class NoiseRow:
-    """A component of a camera's noise as it was stated and as it was learnt, each within its factor."""
+    """Component of a camera's noise, stated and learnt, each with its factor of uncertainty."""
 
     robot: str
     what: str
@@ -39,10 +39,18 @@ class NoiseRow:
 
 @dataclass(frozen=True, eq=False)
 class NoiseBelief:
-    """Logarithms of the variance components of some robots' cameras: means (k,) and covariance (k, k).
+    """Belief on the noise of robots' cameras.
 
-    Each robot has `COMPONENTS`, one robot after the other. `points` (r,) are the numbers of centres that they are
-    learnt from; `typical` (r, 2) the centres' mean stated variance [px^2] and the share of saturated ones.
+    Attributes
+    ----------
+    robots
+        Names of the r robots with a camera.
+    mean, covariance
+        Logarithms of the variance components, `COMPONENTS` for each robot, (k,), and their covariance, (k, k).
+    points
+        Numbers of marker centres that they are learnt from, (r,).
+    typical
+        Mean stated variance of the centres [px^2] and share of saturated ones, (r, 2).
     """
 
     robots: tuple[str, ...]
@@ -53,7 +61,7 @@ class NoiseBelief:
 
     @classmethod
     def of(cls, team: Team) -> "NoiseBelief":
-        """Return what a team states, of all robots with a camera."""
+        """Return the prior that a team states for all robots with a camera."""
         robots = tuple(robot.name for robot in team.robots if robot.camera_if_any is not None)
         logs = [(team[name].camera.centre_noise or CentreNoise()).logs for name in robots]
         means, sigmas = ([value for one in logs for value in one[which]] for which in (0, 1))
@@ -61,7 +69,7 @@ class NoiseBelief:
         return cls(robots, np.array(means), np.diag(np.square(sigmas)), np.zeros(len(robots), np.int64), none)
 
     def updated(self, measured: Sequence[PairMeasurement]) -> "NoiseBelief":
-        """Return the belief once some measurements are in."""
+        """Return the belief updated by measurements."""
         made = [found for found in map(self._evidence, measured) if found is not None]
         if not made:
             return self
@@ -74,7 +82,7 @@ class NoiseBelief:
         return NoiseBelief(self.robots, mean, covariance, points, sums / np.maximum(points, 1)[:, None])
 
     def _evidence(self, measured: PairMeasurement) -> tuple[NoiseEvidence, list[tuple[int, int, Array]]] | None:
-        """The evidence of a fit, and of either camera its index, number of points, and what is typical of them."""
+        """Evidence of a fit, and for either camera its index, number of points, and their typical values."""
         fit, found, cameras = measured.fit, measured.correspondences, measured.cameras
         if fit is None or found is None or cameras is None:
             return None
@@ -101,12 +109,12 @@ class NoiseBelief:
         return self.mean[own], self.covariance[own, own]
 
     def noise(self, robot: str) -> CentreNoise:
-        """Return what is known of a camera: medians, each within its factor."""
+        """Return the noise of a camera: medians, each with its factor of uncertainty."""
         mean, covariance = self._of(robot)
         return CentreNoise.of_logs(mean.tolist(), np.sqrt(covariance.diagonal()).tolist())
 
     def sigma(self, robot: str) -> tuple[float, float]:
-        """Return the standard deviation of the typical centre [px], and the factor within which it is known."""
+        """Return the standard deviation of a typical centre [px] and its factor of uncertainty."""
         mean, covariance = self._of(robot)
         stated, saturated = self.typical[self.robots.index(robot)]
         parts = np.exp(mean) * (stated, 1.0, saturated)
@@ -114,7 +122,7 @@ class NoiseBelief:
         return math.sqrt(parts.sum()), math.exp(math.sqrt(relative @ covariance @ relative) / 2)
 
     def rows(self, team: Team) -> list[NoiseRow]:
-        """Return all components that anything was learnt of, beside what the team states of them."""
+        """Return the learnt components beside the stated ones."""
         rows = []
         for robot, points, (variance, saturated) in zip(self.robots, self.points, self.typical, strict=True):
             if not points:
@@ -128,10 +136,10 @@ class NoiseBelief:
         return rows
 
     def used(self, team: Team) -> Team:
-        """Return a team whose cameras have the expected variances, which are wide where little is known.
+        """Return a team whose cameras have the expected variances, which are larger than the medians if uncertain.
 
-        The variance of a centre is known better than its components, where these cannot be told from each other: all
-        are widened alike, by what is uncertain of the typical centre.
+        The variance of a centre is often known better than its components, which cannot be separated: all are widened
+        by the uncertainty of the typical centre.
         """
         noises = {}
         for name in self.robots:
@@ -144,13 +152,13 @@ class NoiseBelief:
         return with_centre_noise(team, noises)
 
     def learnt(self, team: Team) -> Team:
-        """Return a team that states what was learnt, of cameras that anything was learnt of."""
+        """Return a team that states the learnt noise of its cameras."""
         noises = {name: self.noise(name) for name, n in zip(self.robots, self.points, strict=True) if n}
         return with_centre_noise(team, noises)
 
 
 def with_centre_noise(team: Team, noises: dict[str, CentreNoise]) -> Team:
-    """Return a team with other noise of some robots' cameras."""
+    """Return a team with the noise of some robots' cameras replaced."""
     robots = [
         structs.replace(one, camera_if_any=structs.replace(one.camera, centre_noise=noises[one.name]))
         if one.name in noises

@@ -1,4 +1,4 @@
-"""What a robot's wheels say of its way between two instants, with a covariance."""
+"""Integrate a robot's wheel odometry between two instants, with a covariance."""
 
 from collections.abc import Sequence
 
@@ -11,12 +11,20 @@ from coloc_graph.run import OdometrySample
 
 Array = NDArray[np.float64]
 
-#: Wheels are not believed better than this between two stances: heading [rad], x, y [m].
-LEAST_SIGMAS = (1e-3, 5e-4, 5e-4)
+MIN_SIGMAS = (1e-3, 5e-4, 5e-4)  # lower bounds of odometry between two stances: heading [rad], x, y [m]
+MAX_GAP = 1.0  # s between samples, above which the speed is unknown
 
 
 class WheelTrack:
-    """One robot's odometry over a run, to be asked for the way between any two instants."""
+    """Wheel odometry of one robot over a run.
+
+    Parameters
+    ----------
+    robot
+        Name of the robot.
+    samples
+        Odometry samples in order of time.
+    """
 
     def __init__(self, robot: str, samples: Sequence[OdometrySample]) -> None:
         self.robot = robot
@@ -29,22 +37,34 @@ class WheelTrack:
         return len(self.times)
 
     def pose_at(self, times: Array) -> Array:
-        """x [m], y [m], yaw [rad] (n, 3) at instants (n,), in the odometry frame; at rest outside the samples."""
+        """Interpolate x [m], y [m], yaw [rad] (n, 3) at times (n,), odometry frame; constant outside the samples."""
         return np.stack([np.interp(times, self.times, column) for column in self._poses.T], axis=1)
 
     def speed_at(self, time: float) -> float:
-        """How fast it drives [m/s]: between the samples about an instant, 0 where there are none near."""
+        """Speed between the samples about an instant [m/s]; 0 if there are none near."""
         after = int(np.searchsorted(self.times, time))
-        if not 0 < after < len(self.times) or self.times[after] - self.times[after - 1] > 1.0:
+        if not 0 < after < len(self.times) or self.times[after] - self.times[after - 1] > MAX_GAP:
             return 0.0
-        way = np.hypot(*(self._poses[after, :2] - self._poses[after - 1, :2]))
-        return float(way / max(self.times[after] - self.times[after - 1], 1e-6))
+        distance = np.hypot(*(self._poses[after, :2] - self._poses[after - 1, :2]))
+        return float(distance / max(self.times[after] - self.times[after - 1], 1e-6))
 
     def between(self, before: int, after: int, start: float, end: float, clock_sigma: float = 0.0) -> Odometry | None:
-        """The way from stance `before`, whose pose is of the instant `start`, to stance `after` at `end` [UTC s].
+        """Integrate odometry from one stance to another.
 
-        `clock_sigma` [s] is how well these instants are known by the robot's clock; it weighs where it drives then.
-        None where the samples do not begin before `end`.
+        Parameters
+        ----------
+        before, after
+            Indices of the stances.
+        start, end
+            Times of the poses in them [UTC s].
+        clock_sigma
+            Standard deviation of these times by the robot's clock [s], which matters if the robot drives then.
+
+        Returns
+        -------
+        Odometry or None
+            Relative pose with its covariance (3, 3) of heading, x, y in the body at the end; None if the samples begin
+            after `end`.
         """
         if not len(self) or self.times[0] >= end:
             return None
@@ -68,7 +88,7 @@ class WheelTrack:
         J[:, 0, 2] = 1.0
         J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = c, -s, -arm[:, 1]
         J[:, 2, 0], J[:, 2, 1], J[:, 2, 2] = s, c, arm[:, 0]
-        covariance = (J @ C @ J.mT).sum(axis=0) + np.diag(np.square(LEAST_SIGMAS))
+        covariance = (J @ C @ J.mT).sum(axis=0) + np.diag(np.square(MIN_SIGMAS))
         late = clock_sigma * np.array([self.speed_at(start), self.speed_at(end)])
         covariance[1:, 1:] += (late**2).sum() * np.eye(2)
         T_odom = floor_pose(x[[0, -1]], y[[0, -1]], yaw[[0, -1]])

@@ -1,4 +1,4 @@
-"""Delay of a robot's ranges and bearings against its own odometry, from how bearings change while it turns."""
+"""Estimate the delay of a robot's ranges and bearings against its odometry, from bearings while it turns."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,18 +10,18 @@ from coloc_graph.geometry.se2 import wrap
 
 Array = NDArray[np.float64]
 
-LONGEST_DELAY = 3.0  # delays are looked for up to this [s]
-STEP = 0.05  # in steps of this [s]
-LONGEST_PAIR = 1.5  # two bearings of one target no further apart tell a turn [s]
-FEWEST_PAIRS = 30  # pairs that tell a delay
-LEAST_TURN = 0.05  # pairs with a smaller turn tell nothing [rad]
-OUTLIER = 3.0  # residuals beyond this, in robust sigmas, count no more
-CLEAR = 25.0  # a delay lowers the robust cost by this (5 sigma)
+MAX_DELAY = 3.0  # s, range of the search
+STEP = 0.05  # s, step of the search
+MAX_PAIR_INTERVAL = 1.5  # s between two bearings of one target that are compared
+MIN_PAIRS = 30  # pairs of bearings needed for an estimate
+MIN_TURN = 0.05  # rad, of the robot between the bearings of a pair
+OUTLIER = 3.0  # robust standard deviations at which the cost of a residual saturates
+MIN_GAIN = 25.0  # decrease of the robust cost that a delay must bring (5 sigma)
 
 
 @dataclass(frozen=True)
 class SensorDelay:
-    """Measurements are stamped `value` [s] later than odometry, with a standard deviation `sigma` [s]."""
+    """Delay of measurements against odometry, positive if they are stamped late, and its standard deviation [s]."""
 
     value: float
     sigma: float
@@ -30,9 +30,9 @@ class SensorDelay:
 def sensor_delay(
     times: Array, targets: NDArray[np.int64], ranges: Array, bearings: Array, pose_at: Callable[[Array], Array]
 ) -> SensorDelay | None:
-    """Estimate by how much a robot's measurements are stamped late against its odometry.
+    """Estimate the delay of a robot's measurements against its odometry.
 
-    While the robot turns, the bearing of a landmark turns the other way; the delay is where the two agree best.
+    While the robot turns, the bearing of a landmark turns the other way; at the delay the two agree best.
 
     Parameters
     ----------
@@ -44,16 +44,16 @@ def sensor_delay(
     Returns
     -------
     SensorDelay or None
-        None where the robot turned too little to tell, or no delay explains the bearings clearly better than none.
+        None if the robot turned too little, or no delay explains the bearings clearly better than none.
     """
     order = np.lexsort((times, targets))
     first, second = order[:-1], order[1:]
-    close = (targets[first] == targets[second]) & (times[second] - times[first] <= LONGEST_PAIR)
+    close = (targets[first] == targets[second]) & (times[second] - times[first] <= MAX_PAIR_INTERVAL)
     first, second = first[close], second[close]
-    if len(first) < FEWEST_PAIRS:
+    if len(first) < MIN_PAIRS:
         return None
     point = ranges[first, None] * np.stack([np.cos(bearings[first]), np.sin(bearings[first])], axis=1)
-    count = round(LONGEST_DELAY / STEP)
+    count = round(MAX_DELAY / STEP)
     delays = STEP * np.arange(-count, count + 1)
     residuals, turns = [], []
     for delay in delays:
@@ -64,15 +64,15 @@ def sensor_delay(
         expected = np.arctan2(off[:, 1], off[:, 0]) - after[:, 2]
         residuals.append(wrap(bearings[second] - expected))
         turns.append(np.abs(after[:, 2] - before[:, 2]))
-    turning = np.max(turns, axis=0) > LEAST_TURN
-    if turning.sum() < FEWEST_PAIRS:
+    turning = np.max(turns, axis=0) > MIN_TURN
+    if turning.sum() < MIN_PAIRS:
         return None
     e = np.array(residuals)[:, turning]
     best = int(np.argmin(np.median(np.abs(e), axis=1)))
     scale = max(1.4826 * float(np.median(np.abs(e[best]))), 1e-4)
     cost = np.minimum((e / scale) ** 2, OUTLIER**2).sum(axis=1)
     best = int(np.argmin(cost))
-    if best in (0, len(delays) - 1) or cost[count] - cost[best] < CLEAR:
+    if best in (0, len(delays) - 1) or cost[count] - cost[best] < MIN_GAIN:
         return None
     low, here, high = cost[best - 1 : best + 2]
     curvature = max(low + high - 2 * here, 1e-9)

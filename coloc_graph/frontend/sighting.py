@@ -1,4 +1,4 @@
-"""Where a robot stands whose two markers a camera at rest sees: position and heading, with a covariance."""
+"""Sight a robot: its position and heading, with a covariance, from its two markers in the image of a camera at rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,16 +21,14 @@ from coloc_graph.team import Markers, Robot
 
 Array = NDArray[np.float64]
 
-#: Two markers further apart or nearer than this share of their span are not a robot's.
-SPAN_TOLERANCE = 0.35
-#: A track without a name must see the robot drive this far for its wheels to tell front from back [m].
-LEAST_WAY = 0.1
+SPAN_TOLERANCE = 0.35  # relative error of the distance between a robot's two markers
+MIN_DRIVEN = 0.1  # m that a robot must drive for its odometry to tell its unnamed markers apart
 _NO_ERRORS = np.zeros((1, 6))
 
 
 @dataclass(frozen=True)
 class Marked:
-    """A body by what is seen of it: a robot's markers, or a landmark's."""
+    """Markers of a robot or of a landmark."""
 
     name: str
     markers: Markers | None
@@ -45,10 +43,28 @@ def sight(
     wheels: WheelTrack | None = None,
     at: float | None = None,
 ) -> Sighting | None:
-    """Where `seen` stands in `observer`, at the instant at which it is seen best, or nearest to `at` [s].
+    """Sight a body with two markers.
 
-    `plane` is that of the markers, made from the observer's mount. Of tracks without names the robot's `wheels` tell
-    which marker is which, by the way it drove. None where two markers are never seen at once, or cannot be told apart.
+    Parameters
+    ----------
+    stance, observer
+        Stance, and the robot that observes.
+    seen
+        Body that is seen.
+    tracks
+        Tracks in the observer's camera.
+    plane
+        Marker plane, computed from the observer's mount.
+    wheels
+        Wheel odometry of the body, which tells markers without names apart.
+    at
+        Time of the sighting [UTC s]; by default the instant at which the markers are seen best.
+
+    Returns
+    -------
+    Sighting or None
+        T_observer_seen with its covariance (3, 3) of heading, x, y; None if two markers are never seen at once, or
+        cannot be told apart.
     """
     markers = seen.markers
     if markers is None or len(markers.positions) < 2 or not plane.d_from_mount or not plane.normal_from_mount:
@@ -70,7 +86,7 @@ def sight(
     good = np.flatnonzero(likely & np.isfinite(places).all(axis=(1, 2)))
     if not len(good):
         return None
-    # nearest is seen best: of a point on the floor the error grows with the square of the distance
+    # the nearest is seen best: the error of a point on the floor grows with the square of the distance
     cost = np.linalg.norm(places[good], axis=2).max(axis=1) if at is None else np.abs(times[good] - at)
     best = int(good[np.argmin(cost)])
     stated, loads = (
@@ -96,7 +112,7 @@ def sight(
 
 
 def at_rest(track: Track, time: float) -> Track:
-    """A track of a marker that stands, as the one sample that all of its samples make, at a time [UTC s]."""
+    """Average the samples of a marker at rest into one sample at a time [UTC s]."""
     n = len(track)
     return replace(
         track,
@@ -117,7 +133,7 @@ def _marker_tracks(
     *,
     alone: bool,
 ) -> tuple[Track, Track] | None:
-    """The tracks of the robot's first and second marker."""
+    """Tracks of the first and the second marker of a body, None if they are not identified."""
     named = named_pair(tracks, seen.name, alone=alone)
     if named is not None:
         return tracks[named[0]], tracks[named[1]]
@@ -143,9 +159,10 @@ def _marker_tracks(
 def _drives_ahead(
     seen: Robot | Marked, first: Track, second: Track, observer: Robot, plane: Plane, wheels: WheelTrack
 ) -> bool | None:
-    """Whether two tracks, taken for the robot's markers in order, make it head the way its wheels drove it.
+    """Return whether two tracks, taken as a robot's markers in order, give it the heading of its odometry.
 
-    The way that was seen is laid over the way that was driven; that turns the odometry frame into the observer's.
+    The observed path is aligned to the odometry's, which gives the rotation between the two frames. None if the
+    odometry does not decide.
     """
     assert seen.markers is not None
     shared = pair_by_time(first.times, second.times)
@@ -158,7 +175,7 @@ def _drives_ahead(
         return None
     middle, driven = places[finite].mean(axis=1), wheels.pose_at(first.times[shared[finite, 0]])
     a, b = middle - middle.mean(axis=0), driven[:, :2] - driven[:, :2].mean(axis=0)
-    if np.linalg.norm(np.ptp(b, axis=0)) < LEAST_WAY:
+    if np.linalg.norm(np.ptp(b, axis=0)) < MIN_DRIVEN:
         return None
     turn = np.arctan2((b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0]).sum(), (a * b).sum())
     arm, model = places[finite, 1] - places[finite, 0], np.diff(seen.markers.p_body[:2, :2], axis=0)[0]
@@ -168,10 +185,10 @@ def _drives_ahead(
 
 
 def _on_floor(observer: Robot, plane: Plane, uv: Array, errors: Array = _NO_ERRORS) -> Array:
-    """Places (n, m, 2) [m] on the marker plane, in the observer's body, of pixels (n, m, 2).
+    """Project pixels (n, m, 2) to the marker plane: (n, m, 2) [m] in the observer's body frame.
 
-    `errors` (n, 6), or (1, 6) of all, are of the normal about two axes across it [rad], of d [m], and of the mount:
-    height, tilt, roll.
+    `errors` (n, 6) or (1, 6) are errors of the normal about two axes across it [rad], of d [m], and of the mount's
+    height [m], tilt and roll [rad].
     """
     n, m, _ = uv.shape
     T_body_camera = observer.mount.off_by(errors[:, 3:])
@@ -188,9 +205,9 @@ def _on_floor(observer: Robot, plane: Plane, uv: Array, errors: Array = _NO_ERRO
 
 
 def _pose(observer: Robot, markers: Markers, plane: Plane, uv: Array, noise: Array) -> tuple[Array, Array]:
-    """Heading, x, y (3,) of a body whose first two markers are seen at pixels (2, 2), and their covariance (3, 3).
+    """Heading, x, y (3,) of a body with its first two markers at pixels (2, 2), and their covariance (3, 3).
 
-    The heading is that of the line through both, the place that of their middle.
+    The line through both gives the heading, their midpoint the position.
     """
     root = np.zeros((10, 10))
     bias = observer.camera.bias_px**2 * np.eye(2)

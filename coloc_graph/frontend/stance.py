@@ -1,4 +1,4 @@
-"""One stance of a run: from its images or detections to the homography between two observers."""
+"""Measure the homography and the relative pose between two observers in one stance, from images or detections."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -45,25 +45,33 @@ from coloc_graph.team import Camera, Markers, Team
 
 Array = NDArray[np.float64]
 
-#: An offset of two clocks that is known no better than this share of what was known before is not observed.
-LEAST_OBSERVED = 0.5
-#: Two of many observers that share fewer points than this have little in common.
-LITTLE_IN_COMMON = 30
+MAX_SIGMA_RATIO = 0.5  # of a clock offset to its prior, above which the offset counts as not observed
+LITTLE_IN_COMMON = 30  # points below which two of many observers may be left unmeasured without a warning
 NOT_OBSERVABLE = (
-    "the offset of the clocks is not observable: the mover drove at constant speed; let it stop and go "
-    "(the offset is left at what the clocks are said to agree to)"
+    "the clock offset is not observable, since the mover drove at constant speed: let it stop and go "
+    "(the offset stays at its prior, `clock_sigma`)"
 )
 
-
-#: Where the plane's distance comes from.
+#: Source of the marker plane's distance.
 Scale = Literal["heights", "span"]
 
 
 @dataclass(frozen=True)
 class FrontendOptions:
-    """How measurements are made. `scale` is where the plane's distance comes from: the stated heights of
-    camera and markers, or the known span between two markers of one robot. `pose` is eq. (2), or the maximum
-    likelihood."""
+    """Options of the front end.
+
+    Attributes
+    ----------
+    criterion
+        "reprojection" (maximum likelihood) or "transfer" (the paper's).
+    pose
+        Relative pose by "eq2" (the paper's) or "ml" (maximum likelihood).
+    scale
+        Source of the marker plane's distance: the stated "heights" of camera and markers, or the known "span" between
+        two markers of one robot.
+    tracker
+        Parameters of tracking.
+    """
 
     criterion: Criterion = "reprojection"
     pose: Literal["eq2", "ml"] = "ml"
@@ -73,13 +81,26 @@ class FrontendOptions:
 
 @dataclass(frozen=True, eq=False)
 class PairMeasurement:
-    """What one pair of observers measured in one stance, with what it was made of.
+    """Measurement of one pair of observers in one stance.
 
-    Where `homography.unusable` says why, `relative_pose` is None; `correspondences` is None where there are
-    none. `tracks` are those of the movers' markers in both cameras, None where it did not come to that; `standing`
-    those of robots that stand, and `landmarks` what both saw of these. Where clocks are not said to agree,
-    `offset_evidence` is what this stance alone knows of their offset (None: nothing), and `at_offset` measures once
-    more with an offset that is known from elsewhere.
+    Attributes
+    ----------
+    homography
+        Homography; `homography.unusable` is the reason if there is none.
+    relative_pose
+        Relative pose, None if the homography is unusable.
+    correspondences
+        Correspondences, None if there are none.
+    offset_evidence
+        Clock offset by this stance alone, None if it is not observed.
+    at_offset
+        Function that repeats the measurement at a known clock offset, if clocks may differ.
+    tracks
+        Tracks of the movers' markers in both cameras, None if the measurement ended before.
+    standing
+        Tracks of the markers of robots at rest in both cameras.
+    landmarks
+        Landmarks seen by both cameras.
     """
 
     homography: HomographyMeasurement
@@ -97,7 +118,7 @@ class PairMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What a pair of observers saw in one stance."""
+    """Tracks of a pair of observers in one stance."""
 
     run: Recorded
     team: Team
@@ -113,11 +134,11 @@ class _Seen:
 
     @property
     def alone(self) -> bool:
-        """Whether one robot moves, and no other."""
+        """True if only one robot moves."""
         return len(self.stance.movers) == 1
 
     def plausible(self, H_j_i: Array, tracks: Sequence[Track]) -> bool:
-        """Whether a homography has both observers on one floor, and pairs tracks that may be a robot's markers."""
+        """Return whether a homography has both observers on one floor and pairs tracks of one robot's markers."""
         team, plane = self.team, self.plane
         if not (plane.normal_from_mount and plane.d_from_mount):
             return True
@@ -132,13 +153,25 @@ class _Seen:
 
 
 def little_in_common(measured: HomographyMeasurement, stance: Stance) -> bool:
-    """Whether a measurement is none since the two see little in common, which in a team of many is nothing wrong."""
+    """Return whether two of many observers share too few points to be worth a warning."""
     return len(stance.observers) > 2 and measured.points < LITTLE_IN_COMMON
 
 
 def measured_pairs(tracks: StanceTracks, end: float) -> list[Pair]:
-    """The pairs of a stance's observers that are measured, by what they saw up to an instant [UTC s]: of many, those
-    with most in common."""
+    """Select the pairs of a stance's observers to measure; of many observers, those that share most samples.
+
+    Parameters
+    ----------
+    tracks
+        Tracks of the stance.
+    end
+        Time up to which they are considered [UTC s].
+
+    Returns
+    -------
+    list of tuple
+        Names of the observers of each pair.
+    """
     return pairs_of(tracks.stance.observers, tracks.all(end), _window(tracks.run))
 
 
@@ -157,11 +190,31 @@ def measure_pair(
     *,
     alone: bool = True,
 ) -> PairMeasurement:
-    """The homography and relative pose between two observers in one stance; degenerate geometry is an answer.
+    """Measure the homography and relative pose between two observers in one stance.
 
-    `tracks` are those of the stance where they are made already, `pairs` all that are measured in it. Where the team's
-    clocks are not said to agree (`Team.clock_sigma`), their offset is estimated with it; unless it is measured `alone`,
-    what is measured is left to `PairMeasurement.at_offset`.
+    Degenerate geometry is a result (`homography.unusable`), not an exception. If the team's clocks may differ
+    (`Team.clock_sigma`), their offset is estimated too.
+
+    Parameters
+    ----------
+    run, stance
+        Run and stance.
+    robot_i, robot_j
+        Names of the observers.
+    options
+        Options of the front end.
+    tracks
+        Tracks of the stance, if they exist already.
+    pairs
+        All pairs that are measured in the stance, which share information; by default `measured_pairs`.
+    alone
+        False if the clock offset is fused over all stances first: the measurement is then completed by
+        `PairMeasurement.at_offset`.
+
+    Returns
+    -------
+    PairMeasurement
+        The measurement.
     """
     found: Correspondences | None = None
     tracks = tracks or StanceTracks(run, stance, options.tracker)
@@ -211,12 +264,12 @@ def _measure_with_clocks(seen: _Seen, alone: bool) -> PairMeasurement:
         )
     if alone:
         return replace(again(offset), offset_evidence=evidence, at_offset=again)
-    open_yet = _unusable(seen.stance, seen.robot_i, seen.robot_j, rough, "the clocks' offset is not decided yet")
+    open_yet = _unusable(seen.stance, seen.robot_i, seen.robot_j, rough, "the clock offset is not estimated yet")
     return PairMeasurement(open_yet, None, rough, evidence, again)
 
 
 def _measured_from(seen: _Seen, found: Correspondences, team: Team) -> PairMeasurement:
-    """The measurement that points are with the cameras of a team, which may have other noise than those of `seen`."""
+    """Measure from correspondences with the cameras of another team, which may have other noise."""
     now = replace(seen, team=team)
     again = partial(_measured_from, seen, found)
     found = with_noise(found, seen.cameras, now.cameras)
@@ -253,7 +306,7 @@ def _measured(
     offset: ClockOffset | None = None,
     by_offset: Array | None = None,
 ) -> PairMeasurement:
-    """The measurement that a fit is; raises `DegenerateGeometry` where it is none."""
+    """Make the measurement from a fit; raises `DegenerateGeometry` if the fit is rejected."""
     robot_i, robot_j, plane = seen.team[seen.robot_i], seen.team[seen.robot_j], seen.plane
     pairing = "the pairing window" if offset is None else "`clock_sigma` says"
     doubt = None
@@ -276,7 +329,7 @@ def _measured(
             time_offset=offset.value,
             time_offset_sigma=offset.sigma,
             by_time_offset=by_offset,
-            warning=NOT_OBSERVABLE if offset.sigma > LEAST_OBSERVED * said else None,
+            warning=NOT_OBSERVABLE if offset.sigma > MAX_SIGMA_RATIO * said else None,
         )
     if seen.options.scale == "span":
         plane = _plane_by_span(plane, seen.tracks_i, robot_i.camera, stance_markers(seen.run, seen.stance))
@@ -293,7 +346,7 @@ def _measured(
 
 
 def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[MarkerSpan, ...]:
-    """The spans of the movers whose two markers can be told from all others; () where the plane is stated."""
+    """Marker spans of the movers whose two markers are identified; () if the plane is stated."""
     if not (seen.plane.normal_from_mount and seen.plane.d_from_mount):
         return ()
     robot, movers = seen.team[seen.robot_i], seen.stance.movers
@@ -318,7 +371,7 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
 
 def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: Markers | None) -> Plane:
     if markers is None or markers.span is None:
-        raise DegenerateGeometry("the movers carry no two markers, so that there is no span to take the scale from")
+        raise DegenerateGeometry("no mover carries two markers: there is no span to take the scale from")
     x_a, x_b = [], []
     for a, b, shared in span_samples(tracks, camera, plane, markers.span):
         x_a.append(camera.normalise(tracks[a].uv[shared[:, 0]]))
@@ -355,10 +408,10 @@ def _measurement(
 
 
 def _bias_root(uv: Array, x: Array, camera: Camera) -> Array:
-    """Square root (n, 2, 6) of the covariance of a camera's bias at points, in pixels and normalised (n, 2): an error
-    that is smooth over the image; (n, 2, 0) where there is none.
+    """Square root (n, 2, 6) of the covariance of a camera's bias at points, or (n, 2, 0) if it has none.
 
-    It has a part that is the same everywhere and one that grows across the points, each `bias_px` large.
+    The bias is an error that is smooth over the image, with a constant part and parts that grow across the points, each
+    with standard deviation `bias_px`. `uv` are pixels, `x` normalised coordinates, (n, 2).
     """
     if not camera.bias_px:
         return np.empty((len(x), 2, 0))
@@ -387,7 +440,7 @@ def _unusable(
 
 
 def overlap(H_j_i: Array, camera_i: Camera, camera_j: Camera, step: int = 4) -> float:
-    """How many pixels of image i see a part of the plane that image j sees as well (sampled every `step`)."""
+    """Number of pixels of image i that show a part of the plane that image j shows too, sampled every `step` [px]."""
     # beyond the plane's horizon the third coordinate changes sign, and `project` says behind
     _, inside = camera_j.project(_rays(camera_i, step) @ H_j_i.T)
     return float(inside.sum() * step**2)
@@ -395,7 +448,7 @@ def overlap(H_j_i: Array, camera_i: Camera, camera_j: Camera, step: int = 4) -> 
 
 @lru_cache(maxsize=100)
 def _rays(camera: Camera, step: int) -> Array:
-    """The rays (x, y, 1) of every so many pixels (n, 3)."""
+    """Rays (x, y, 1) of a grid of pixels, (n, 3)."""
     u, v = np.meshgrid(np.arange(step / 2, camera.width, step), np.arange(step / 2, camera.height, step))
     x = camera.normalise(np.stack([u.ravel(), v.ravel()], axis=1))
     return np.concatenate([x, np.ones((len(x), 1))], axis=1)

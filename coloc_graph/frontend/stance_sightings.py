@@ -1,4 +1,4 @@
-"""Which robots saw which others in a stance: those that moved, and those that stood."""
+"""Sight the robots that move and those that stand in a stance."""
 
 from collections.abc import Iterable, Mapping
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.plane import plane_from_mount
-from coloc_graph.frontend.landmarks import Doubt
+from coloc_graph.frontend.landmarks import UnusedSighting
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.sighting import at_rest, sight
 from coloc_graph.frontend.stance import PairMeasurement
@@ -19,10 +19,22 @@ from coloc_graph.run import Recorded, Stance
 def sight_movers(
     run: Recorded, stance: Stance, measured: Iterable[PairMeasurement], wheels: Mapping[str, WheelTrack]
 ) -> list[Sighting]:
-    """Where the moving robots were in a stance, by the observer that saw each best; nothing without a floor.
+    """Sight the moving robots of a stance, each by the observer that saw it best.
 
-    `measured` are all pairs of the stance. A robot whose markers cannot be told apart, or are never seen at once, is
-    not in the list; tracks without names are followed where one robot moves alone, or has a colour of its own.
+    Parameters
+    ----------
+    run, stance
+        Run and stance.
+    measured
+        Measurements of all pairs of the stance.
+    wheels
+        Wheel odometry by robot, which tells the two markers of a robot apart if they have no names.
+
+    Returns
+    -------
+    list of Sighting
+        Sightings; none without a floor, and none of a robot whose markers cannot be told apart or are never seen at
+        once (`unsighted_movers` gives the reason).
     """
     if run.team.floor is None or stance.index in run.planes:
         return []
@@ -35,7 +47,7 @@ def sight_movers(
     for observer, seen in tracks.items():
         try:
             plane = stance_plane(run, stance, observer)
-        except DegenerateGeometry:  # a camera below the markers, which the homography's refusal names
+        except DegenerateGeometry:  # a camera below the markers, which the homography reports
             continue
         for mover in stance.movers:
             named = len(stance.movers) == 1 or any(track.marker for track in seen)
@@ -53,50 +65,59 @@ def unsighted_movers(
     measured: Iterable[PairMeasurement],
     wheels: Mapping[str, WheelTrack],
     sightings: Iterable[Sighting],
-) -> list[Doubt]:
-    """Movers that were seen in a stance and have no pose in it, with the reason."""
+) -> list[UnusedSighting]:
+    """Movers that were seen in a stance and have no sighting in it, with the reason."""
     sighted = {one.seen for one in sightings}
     if run.team.floor is None or stance.index in run.planes:
         return []
-    doubts: dict[str, Doubt] = {}
+    unused: dict[str, UnusedSighting] = {}
     for one in measured:
         if one.tracks is None:
             continue
         for mover in stance.movers:
             markers = run.team[mover].markers
-            if markers is None or mover in sighted or mover in doubts:
+            if markers is None or mover in sighted or mover in unused:
                 continue
             track = wheels.get(mover)
             if any(seen.marker for side in one.tracks for seen in side):
                 why = (
-                    f"its markers' names do not tell which is which; call them `{mover}/0` and `{mover}/1` in the "
+                    f"the names of its markers do not identify them; call them `{mover}/0` and `{mover}/1` in the "
                     "order of the team, and see both at once"
                 )
             elif len(markers.positions) < 2:
                 why = "it carries one marker, which does not tell its heading; give it two"
             elif len(stance.movers) > 1 and not any(t.marker or t.mover == mover for t in one.tracks[0]):
-                why = "nothing tells its lights from those of other movers; give each a colour, a blink code, or names"
+                why = "its lights cannot be told from those of other movers; give each a colour, a blink code, or names"
             elif track is None or not len(track):
                 why = (
-                    "nothing tells which of its two like lights is which; record its wheel odometry, or name its "
-                    f"markers `{mover}/0` and `{mover}/1`"
+                    "its two equal lights cannot be told apart; record its wheel odometry, or name its markers "
+                    f"`{mover}/0` and `{mover}/1`"
                 )
             else:
-                why = (
-                    "its two lights are never seen at once, or its wheels do not tell them apart; let it drive further"
-                )
+                why = "its two lights are never seen at once, or its odometry does not tell them apart; drive further"
             observer = one.homography.robot_i
-            doubts[mover] = Doubt(mover, observer, stance.index, why, is_robot=True)
-    return list(doubts.values())
+            unused[mover] = UnusedSighting(mover, observer, stance.index, why, is_robot=True)
+    return list(unused.values())
 
 
 def sight_standing(
     run: Recorded, stance: Stance, measured: Iterable[PairMeasurement], before: Stance | None
 ) -> list[Sighting]:
-    """Where robots that stand saw others that stand, whose markers have names; nothing without a floor.
+    """Sight robots at rest by others at rest, from named markers.
 
-    A stance is told by what came since the one `before`: two that have stood since then see no more of each other than
-    they did.
+    Parameters
+    ----------
+    run, stance
+        Run and stance.
+    measured
+        Measurements of all pairs of the stance.
+    before
+        Previous stance. Two robots that have both stood since then are not sighted again.
+
+    Returns
+    -------
+    list of Sighting
+        Sightings; none without a floor.
     """
     if run.team.floor is None or stance.index in run.planes:
         return []

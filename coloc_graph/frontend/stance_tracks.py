@@ -1,4 +1,4 @@
-"""What the cameras saw in one stance: the plane of the markers, and their tracks."""
+"""Track the markers of one stance in the observers' cameras, and provide the marker plane of each."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,28 +24,46 @@ from coloc_graph.team import Markers
 
 Array = NDArray[np.float64]
 
-MIN_SAMPLES = 25  # mean samples of a causal track below which a lone mover is tracked with hindsight
-LEAST_SEEN = 0.5  # share of the images with both lights below which the mover was out of view
-FAST = 0.35  # share of the distance between two lights that is a large step from one image to the next
+MIN_SAMPLES = 25  # mean length of causal tracks below which a lone mover is tracked in a batch
+MIN_SEEN = 0.5  # share of the images with both lights below which the mover was out of view
+FAST = 0.35  # step of a light from image to image, as a share of the distance between both, that is large
 
 
 def stance_markers(run: Recorded, stance: Stance) -> Markers | None:
-    """The markers that are watched in a stance; None where no mover carries any.
+    """Return markers of the movers of a stance, whose height defines the marker plane; None if no mover has any.
 
-    Raises `DegenerateGeometry` where the movers' markers are at different heights.
+    Parameters
+    ----------
+    run, stance
+        Run and stance.
+
+    Raises
+    ------
+    DegenerateGeometry
+        The movers' markers are at different heights.
     """
     carried = [markers for name in stance.movers if (markers := run.team[name].markers) is not None]
     if len({one.height for one in carried}) > 1:
         raise DegenerateGeometry(
-            "the movers' markers are at different heights, so that they share no plane: let one move at a time"
+            "the movers' markers are at different heights and share no plane: let one robot move at a time"
         )
     return carried[0] if carried else None
 
 
 def stance_plane(run: Recorded, stance: Stance, robot: str) -> Plane:
-    """The marker plane in a robot's camera: as stated for the stance, else from its mount and the movers.
+    """Return the marker plane in a robot's camera frame: as stated for the stance, or from its mount and the movers.
 
-    Raises `DegenerateGeometry` where there is no such plane below the camera.
+    Parameters
+    ----------
+    run, stance
+        Run and stance.
+    robot
+        Name of the observer.
+
+    Raises
+    ------
+    DegenerateGeometry
+        There is no such plane below the camera.
     """
     stated = run.planes.get(stance.index)
     if stated is not None and robot in stated.planes:
@@ -55,29 +73,35 @@ def stance_plane(run: Recorded, stance: Stance, robot: str) -> Plane:
     markers = stance_markers(run, stance)
     if markers is None:
         raise DegenerateGeometry(
-            "no robot with markers moves, and no plane is stated: name the movers, or state the plane"
+            "no robot with markers moves, and no marker plane is stated: name the movers, or state the plane"
         )
     return plane_from_mount(run.team[robot].mount, markers, run.team.floor)
 
 
 class StanceTracks:
-    """The tracks of the movers' markers in the observers' cameras: from detections where the run has them, else from
-    images. Made once a camera; of a stance that goes on they go on too.
+    """Tracks of the movers' markers in the observers' cameras, from detections if the run has them, else from images.
 
-    Detections that name their marker are tracks already; the others, and images, go through a tracker: one for each
-    colour of the movers' markers. A colour that one mover alone has tells which that is; of several of one colour, how
-    they blink.
+    Tracks are made once for each camera, and continued while a live stance continues. Detections with marker names are
+    tracks already. Others, and images, pass through a tracker for each colour of the movers' markers. A mover is
+    identified by a colour of its own, or by its blink code.
+
+    Parameters
+    ----------
+    run, stance
+        Run and stance.
+    options
+        Parameters of tracking.
     """
 
     def __init__(self, run: Recorded, stance: Stance, options: TrackerOptions | None = None) -> None:
         self.run, self.stance = run, stance
         stance_markers(run, stance)  # refuses movers whose markers share no plane
         self._options = options or TrackerOptions()
-        self._alike: dict[float | None, list[str]] = {}  # the movers by the colour of their markers
+        self._by_hue: dict[float | None, list[str]] = {}  # movers by the colour of their markers
         for name in stance.movers:
             markers = run.team[name].markers
             if markers is not None:
-                self._alike.setdefault(markers.hue_deg, []).append(name)
+                self._by_hue.setdefault(markers.hue_deg, []).append(name)
         self._trackers: dict[str, dict[float | None, MarkerTracker]] = {}
         self._taken: dict[str, int] = defaultdict(int)
         self._made: dict[str, tuple[float, list[Track]]] = {}
@@ -88,9 +112,19 @@ class StanceTracks:
         self._paths: dict[str, tuple[float, RigidPath]] = {}
 
     def of(self, robot: str, end: float | None = None) -> list[Track]:
-        """Those of an observer, up to an instant (default: the stance's end), which never goes back.
+        """Tracks of an observer up to a time [UTC s].
 
-        `DegenerateGeometry` where the movers' markers share no plane that the camera is above.
+        Parameters
+        ----------
+        robot
+            Name of the observer.
+        end
+            End time, not before that of an earlier call; by default the stance's end.
+
+        Raises
+        ------
+        DegenerateGeometry
+            The movers' markers share no plane below the camera.
         """
         end = self.stance.end if end is None else end
         made = self._made.get(robot)
@@ -99,10 +133,19 @@ class StanceTracks:
         return made[1]
 
     def pair(self, robot_i: str, robot_j: str, end: float, window: float) -> tuple[list[Track], list[Track]]:
-        """Tracks of two observers up to an instant [UTC s], whose images within a `window` [s] are of one instant.
+        """Tracks of two observers up to a time.
 
-        Where one robot with two markers moves alone and the causal tracker broke often, as where lights move far from
-        image to image, its path is found with hindsight and the order of its lights with both cameras.
+        If one robot with two markers moves alone and the causal tracker broke often, as for lights that move far from
+        image to image, its path is found in a batch, and the order of its lights with both cameras.
+
+        Parameters
+        ----------
+        robot_i, robot_j
+            Names of the observers.
+        end
+            End time [UTC s].
+        window
+            Time difference up to which two images are of one instant [s].
         """
         tracks = self.of(robot_i, end), self.of(robot_j, end)
         if not any(map(self._broken, tracks)):
@@ -112,7 +155,7 @@ class StanceTracks:
         return found if all(found) else tracks
 
     def why_broken(self, robot_i: str, robot_j: str, end: float) -> str | None:
-        """Reason why two observers' tracks of a lone mover broke, with what they saw; None where they did not."""
+        """Explain in words why two observers' tracks of a lone mover broke, or return None."""
         robots = robot_i, robot_j
         if not any(self._broken(self.of(robot, end)) for robot in robots):
             return None
@@ -128,11 +171,11 @@ class StanceTracks:
             )
             for path, share in zip(paths, shares, strict=True)
         ]
-        if min(shares) < LEAST_SEEN:
+        if min(shares) < MIN_SEEN:
             remedy = "keep the mover in both fields of view, and check exposure and threshold of the lights"
         elif any(path.step > FAST * path.apart for path in paths):
             remedy = "record more images a second, or let the mover drive and turn slower"
-        elif any(len(path) < LEAST_SEEN * (path.lights >= 2).sum() for path in paths):
+        elif any(len(path) < MIN_SEEN * (path.lights >= 2).sum() for path in paths):
             remedy = "check heights, tilt, span and units in the team: on the marker plane few lights are a span apart"
         else:
             remedy = "let the mover drive further and turn, or record for longer"
@@ -157,7 +200,7 @@ class StanceTracks:
         return made[1]
 
     def _seen(self, robot: str, end: float) -> Iterator[Detections]:
-        """What an observer's whole images show of the lone mover's markers, up to an instant."""
+        """Detections of the lone mover's markers in an observer's whole images, up to a time [UTC s]."""
         run, (mover,) = self.run, self.stance.movers
         if run.has_detections(robot):
             yield from run.detections(robot, self.stance.start, end)
@@ -169,7 +212,7 @@ class StanceTracks:
             yield Detections(robot, image.time, blobs.uv, blobs.covariance, names, blobs.flags, blobs.peak, blobs.area)
 
     def all(self, end: float) -> dict[str, list[Track]]:
-        """Those of all observers up to an instant [UTC s]; none of one whose camera is not above the markers' plane."""
+        """Tracks of all observers up to a time [UTC s]; none for a camera that is not above the marker plane."""
         found: dict[str, list[Track]] = {}
         for robot in self.stance.observers:
             try:
@@ -179,15 +222,15 @@ class StanceTracks:
         return found
 
     def standing(self, robot: str) -> list[Track]:
-        """Those of the markers of robots that stand, once `of` has been asked for; only names tell which they are."""
+        """Tracks of named markers of robots at rest, after a call of `of`."""
         return self._standing.get(robot, [])
 
     def landmarks(self, robot: str) -> SeenLandmarks:
-        """What an observer saw of landmarks, up to where `of` was last asked for; else in the whole stance."""
+        """Landmarks seen by an observer up to the end of the last call of `of`, by default in the whole stance."""
         if not self._landmarks:
             return SeenLandmarks()
         if robot not in self._made:
-            with suppress(DegenerateGeometry):  # of the movers' plane, which is not that of landmarks
+            with suppress(DegenerateGeometry):  # of the movers' plane, which landmarks do not need
                 self.of(robot)
         if robot in self._watches:
             return self._watches[robot].seen()
@@ -206,14 +249,14 @@ class StanceTracks:
                 standing = [track for track in tracks if track.marker[: track.marker.rfind("/") + 1] in stand]
                 self._standing[robot] = standing
                 return [track for track in tracks if track not in standing]
-            # what was detected elsewhere has lost its colour
+            # detections have no colour
             trackers = self._trackers.setdefault(robot, {None: self._tracker(robot, stance.movers)})
             for one in seen[self._taken[robot] :]:
                 trackers[None].take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
             self._taken[robot] = len(seen)
         else:
-            alike = self._alike or {None: []}
-            trackers = self._trackers.setdefault(robot, {hue: self._tracker(robot, own) for hue, own in alike.items()})
+            by_hue = self._by_hue or {None: []}
+            trackers = self._trackers.setdefault(robot, {hue: self._tracker(robot, own) for hue, own in by_hue.items()})
             watch = self._watches.get(robot)
             if watch is None and self._landmarks:
                 watch = self._watches[robot] = LandmarkWatch(run.team[robot], run.team, stance.movers)
@@ -232,7 +275,7 @@ class StanceTracks:
                     self._taken[robot] = number + 1
         planes, tracks = plausible_planes(stance_plane(run, stance, robot), run.team[robot].mount), []
         for hue, tracker in trackers.items():
-            names = self._alike.get(hue, []) if len(trackers) > 1 else list(stance.movers)
+            names = self._by_hue.get(hue, []) if len(trackers) > 1 else list(stance.movers)
             spans = {m.span for name in names if (m := run.team[name].markers) and m.span}
             own, codes = tracker.tracks(), self._codes(names)
             if len(names) > 1 and codes is not None:
@@ -248,25 +291,25 @@ class StanceTracks:
 
     def _require_known(self, robot: str, tracks: Iterable[Track]) -> None:
         if not self._landmarks:
-            return  # what a marker is called is nobody's business where all of them move
+            return  # without landmarks, names of markers are free
         known = {"", *self.run.team.names, *self._landmarks}
         for track in tracks:
             if _name(track) not in known:
                 raise InputError(
                     f"{self.run.path}: stance {self.stance.index}: the detections of {robot} name `{track.marker}`, "
-                    f"and there is no robot or landmark `{_name(track)}` in the team; correct the name, or add it "
-                    "under [[landmarks]]"
+                    f"but the team has no robot or landmark `{_name(track)}`: correct the name, or add it under "
+                    "[[landmarks]]"
                 )
 
     def _codes(self, names: Iterable[str]) -> BlinkCodes | None:
-        """How robots blink, None where none of them does."""
+        """Blink codes of robots, None if none of them blinks."""
         blinks = {name: blink for name in names if (blink := self.run.team[name].blink) is not None}
         if not blinks:
             return None
         return BlinkCodes({name: blink.code for name, blink in blinks.items()}, next(iter(blinks.values())).bit)
 
     def _tracker(self, robot: str, names: Sequence[str]) -> MarkerTracker:
-        """One for the markers of some movers, which are of one colour."""
+        """Tracker of the markers of movers of one colour."""
         camera = self.run.team[robot].camera
         markers = [one for name in names if (one := self.run.team[name].markers) is not None]
         options = replace(self._options, markers=max(sum(len(one.positions) for one in markers), 1))
@@ -278,12 +321,12 @@ class StanceTracks:
 
 
 def _name(track: Track) -> str:
-    """Whose marker a track is by its name."""
+    """Robot or landmark in the name of a track's marker."""
     return track.marker.rpartition("/")[0]
 
 
 def named_tracks(robot: str, detections: Iterable[Detections]) -> list[Track]:
-    """Tracks of detections that carry their marker's name; clipped and merged ones are left out."""
+    """Make tracks of detections with marker names, except clipped and merged ones."""
     every = [one for one in detections if len(one.uv)]
     if not every:
         return []

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from coloc_graph.backend import Estimate, PoseGraph, chain, diagnose, joint, smooth
 from coloc_graph.backend.planar import Latest, optimise_keyframes
 from coloc_graph.errors import EstimationError
-from coloc_graph.frontend import Doubt, PairMeasurement, in_words, share_clock_offsets
+from coloc_graph.frontend import PairMeasurement, UnusedSighting, describe_unused, share_clock_offsets
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
@@ -158,8 +158,8 @@ def _in_batch(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
     _require_ties(run, graph, measured)
     assert options.method is not None  # resolved
     estimate = BATCH[options.method](graph)
-    warnings = _warnings(run, options, estimate, measured, clock_warnings, sources.doubts)
-    missing = without_poses(run, options, estimate, measured, sources.doubts)
+    warnings = _warnings(run, options, estimate, measured, clock_warnings, sources.unused)
+    missing = without_poses(run, options, estimate, measured, sources.unused)
     return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise)
 
 
@@ -174,8 +174,8 @@ def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: 
     _require_ties(run, solver.estimator.graph, solver.measured)
     estimate = solver.estimator.estimate()
     frontend, updates = zip(*solver.seconds, strict=True)
-    warnings = _warnings(run, options, estimate, solver.measured, solver.warnings, solver.doubts)
-    missing = without_poses(run, options, estimate, solver.measured, solver.doubts)
+    warnings = _warnings(run, options, estimate, solver.measured, solver.warnings, solver.unused)
+    missing = without_poses(run, options, estimate, solver.measured, solver.unused)
     return _Solved(estimate, warnings, sum(frontend), solver.measured, updates, {}, missing, solver.noise)
 
 
@@ -217,12 +217,12 @@ def _warnings(
     estimate: Estimate,
     measured: Sequence[PairMeasurement],
     of_clocks: Sequence[str],
-    doubts: Sequence[Doubt],
+    unused: Sequence[UnusedSighting],
 ) -> list[str]:
     """Warnings of a run with stances."""
     return [
         *of_clocks,
-        *in_words(doubts),
+        *describe_unused(unused),
         *implausible_planes(run, options, measured),
         *warnings_of_graph(estimate, diagnose(estimate.graph), measured),
     ]

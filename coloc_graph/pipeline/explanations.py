@@ -8,7 +8,7 @@ from scipy.special import chdtrc
 
 from coloc_graph.backend import DisconnectedComponent, Estimate
 from coloc_graph.backend.ranging import RangingProblem
-from coloc_graph.frontend import Doubt, PairMeasurement, little_in_common
+from coloc_graph.frontend import PairMeasurement, UnusedSighting, little_in_common
 from coloc_graph.frontend.pairing.plane_check import implausible
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
@@ -48,11 +48,11 @@ def without_poses(
     options: SolveOptions,
     estimate: Estimate,
     measurements: Iterable[PairMeasurement],
-    doubts: Iterable[Doubt],
+    unused: Iterable[UnusedSighting],
 ) -> dict[str, str]:
     """Reason, by robot, for which robots of a team with stances have no pose."""
     team, stances = run.team, run.stances
-    sighted = {one.landmark: one.why for one in doubts if one.is_robot}
+    sighted = {one.landmark: one.why for one in unused if one.is_robot}
     disconnected = {robot for robot, _ in estimate.disconnected}
     measured = {m.homography.stance for m in measurements if not m.homography.unusable}
     found: dict[str, str] = {}

@@ -13,10 +13,10 @@ from coloc_graph.backend.planar import IncrementalKeyframes, Latest
 from coloc_graph.backend.planar.incremental import EVERY
 from coloc_graph.errors import ColocError
 from coloc_graph.frontend import (
-    Doubt,
     PairMeasurement,
     Scale,
     StanceTracks,
+    UnusedSighting,
     WheelTrack,
     measure_pair,
     measured_pairs,
@@ -62,7 +62,7 @@ class _Known:
     last: Mapping[str, tuple[int, float]] = field(default_factory=dict)  # stance and time of each robot's last pose
     standing: frozenset[str] = frozenset()  # robots that have not moved since their last pose
     sighted: frozenset[tuple[str, str]] = frozenset()  # landmarks, by the observer that has not moved since it saw them
-    doubts: tuple[Doubt, ...] = ()
+    unused: tuple[UnusedSighting, ...] = ()
 
     def stayed(self, stance: Stance) -> set[str]:
         """Robots that stay from the last stance to this one."""
@@ -83,9 +83,9 @@ class OdometryAndSightings:
         self._samples: dict[str, list[OdometrySample]] = {robot: [] for robot in team.names}  # since each last pose
 
     @property
-    def doubts(self) -> list[Doubt]:
+    def unused(self) -> list[UnusedSighting]:
         """Landmarks and movers that were seen and are not used."""
-        return list(self._known.doubts)
+        return list(self._known.unused)
 
     def withdraw(self) -> None:
         """Remove the last stance; only once until another was added."""
@@ -102,7 +102,7 @@ class OdometryAndSightings:
         sightings += sight_standing(run, stance, measured, known.stance)
         # a robot that stayed learns nothing new of a landmark that it has sighted
         sighted = {one for one in known.sighted if one[0] in stayed - self._slips.keys()}
-        landmarks, doubts = _landmarks(run, stance, measured, sighted)
+        landmarks, unused = _landmarks(run, stance, measured, sighted)
         sightings += landmarks
         posed = [robot for m in measured if m.relative_pose for robot, _ in m.relative_pose.ends]
         posed += [robot for s in sightings for robot, _ in s.ends if robot in self._samples]  # landmarks have no wheels
@@ -117,7 +117,7 @@ class OdometryAndSightings:
             {**known.last, **now},
             frozenset(standing | here),
             frozenset(sighted | {(one.observer, one.seen) for one in landmarks}),
-            (*known.doubts, *doubts, *unsighted),
+            (*known.unused, *unused, *unsighted),
         )
         made: list[Measurement] = [*sightings]
         for robot in sorted((here - standing) & known.last.keys()) if self._odometry else ():
@@ -138,7 +138,7 @@ class OdometryAndSightings:
 
 def _landmarks(
     run: Recorded, stance: Stance, measured: Sequence[PairMeasurement], known: set[tuple[str, str]]
-) -> tuple[list[Sighting], list[Doubt]]:
+) -> tuple[list[Sighting], list[UnusedSighting]]:
     """Return sightings of landmarks by the observers, without the (observer, landmark) that are `known`."""
     seen = (
         (robot, what)
@@ -246,9 +246,9 @@ class StanceSolver:
         return EnteredStance(here, said, made, shared)
 
     @property
-    def doubts(self) -> list[Doubt]:
+    def unused(self) -> list[UnusedSighting]:
         """Landmarks and movers that were seen and are not used."""
-        return self._motions.doubts
+        return self._motions.unused
 
     def withdraw(self) -> None:
         """Remove the last stance, as if it had never been added; `EstimationError` where it is the first."""

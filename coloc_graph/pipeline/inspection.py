@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from coloc_graph.errors import DegenerateGeometry, InputError
-from coloc_graph.frontend.landmarks import in_words, sight_landmarks
+from coloc_graph.frontend.landmarks import describe_unused, sight_landmarks
 from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW, correspond_roughly, pair_by_time
 from coloc_graph.frontend.pairing.plane_check import implausible
 from coloc_graph.frontend.stance import FrontendOptions, little_in_common, measure_pair
@@ -133,7 +133,7 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
         landmarks = [(robot, tracks.landmarks(robot)) for robot in named]
     except InputError as why:  # of an unknown marker
         return [*findings, Finding(where, str(why).removeprefix(f"{run.path}: {where}: "))]
-    for doubt in in_words(sight_landmarks(run, stance, landmarks)[1]):
+    for doubt in describe_unused(sight_landmarks(run, stance, landmarks)[1]):
         findings.append(Finding(where, doubt.removeprefix(f"{where}: ")))
     for i, j in itertools.combinations(stance.observers, 2):
         if run.team.clock_sigma == 0 and not len(pair_by_time(times[i], times[j])):

@@ -94,7 +94,7 @@ def test_points_without_noise_give_the_pose_exactly(files):
         solution = pipeline.solve(open_run(files.out), pipeline.SolveOptions(method=method))
         np.testing.assert_allclose(solution.estimate.pose("B", 0).matrix(), T_WORLD_B, atol=1e-6)
         # the points are no two markers of C, which is said where robots are sighted
-        said = [] if method == "chain" else ["its markers' names do not tell which is which"]
+        said = [] if method == "chain" else ["the names of its markers do not identify them"]
         assert [warning.split(": ")[-1].split(";")[0] for warning in solution.warnings] == said
 
 

@@ -65,7 +65,7 @@ def test_a_moment_that_agrees_among_much_that_does_not_is_no_pairing():
     for (tracks, _), (strange, _) in zip(right_, (other[0], seen_by_both(movers(1, 12), 12)[1]), strict=True):
         when = [slice(0, 16)] * len(tracks)
         short = [
-            replace(t, times=t.times[w], uv=t.uv[w], covariance=t.covariance[w], peak=t.peak[w])
+            replace(t, times=t.times[w], uv=t.uv[w], covariance=t.covariance[w], peak=t.peak[w], saturated=None)
             for t, w in zip(tracks[:2], when, strict=False)
         ]
         pieces.append((short + [replace(t, body=0) for t in strange], []))

@@ -9,7 +9,7 @@ from coloc_graph.cli import main
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend import StanceTracks, sight_landmarks
 from coloc_graph.frontend.images.apriltags import find_tags, measure_tag
-from coloc_graph.frontend.landmarks import Doubt, LandmarkWatch, SeenLandmarks, in_words, still
+from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks, UnusedSighting, describe_unused, still
 from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.pipeline.batch import SolveOptions, solve
@@ -114,8 +114,8 @@ def test_a_tag_is_sighted_where_it_stands_as_surely_as_it_says():
         x, y = distance * np.cos(bearing), distance * np.sin(bearing)
         T = floor_pose(x, y, bearing + np.pi + turned)
         seen = watched(team, [seen_by(team, T, rng) for _ in range(4)])
-        (made,), doubts = sight_landmarks(Run(team), STANCE, [("A", seen)])
-        assert not doubts and (made.observer, made.seen) == ("A", "L1")
+        (made,), unused = sight_landmarks(Run(team), STANCE, [("A", seen)])
+        assert not unused and (made.observer, made.seen) == ("A", "L1")
         off = se3_inverse(made.T_observer_seen) @ T
         xi = np.array([np.arctan2(off[1, 0], off[0, 0]), *off[:2, 3]])
         assert np.abs(xi[1:]).max() < 0.02 and abs(xi[0]) < np.deg2rad(4)
@@ -133,7 +133,7 @@ def test_edges_that_are_exchanged_are_found():
     swapped = [Track("A", "L1/0", left.times, left.uv, left.covariance, left.peak),
                Track("A", "L1/1", right.times, right.uv, right.covariance, right.peak)]  # fmt: skip
     made, (doubt,) = sight_landmarks(Run(team), STANCE, [("A", SeenLandmarks(swapped))])
-    assert not made and "behind its tag: its left and right edge are exchanged" in doubt.why
+    assert not made and "behind its tag: left and right edge are exchanged" in doubt.why
 
 
 def test_a_tag_on_its_side_one_that_is_hidden_in_part_and_a_faint_one_are_no_tags():
@@ -184,7 +184,7 @@ def test_coloured_lights_are_a_landmark_and_which_is_which_is_by_the_side_it_fac
     T = floor_pose(1.6, 0.2, np.pi + 0.3)
     image, uv = bright(team, T, lights, GREEN)
     seen = watched(team, [image, image])
-    assert [track.marker for track in seen.tracks] == ["L1/0", "L1/1"] and not seen.doubts
+    assert [track.marker for track in seen.tracks] == ["L1/0", "L1/1"] and not seen.unused
     assert np.abs(np.concatenate([track.uv for track in seen.tracks]) - uv).max() < 0.3
     (made,), _ = sight_landmarks(Run(team), STANCE, [("A", seen)])
     assert np.abs((made.T_observer_seen - T)[:2]).max() < 0.05
@@ -198,19 +198,19 @@ def test_lights_that_may_be_others_are_refused_in_words_and_never_guessed():
     one = bright(team, floor_pose(1.6, 0.2, np.pi + 0.3), Markers(height=0.15, positions=((0.0, 0.2),)), GREEN)[0]
     wide, _ = bright(team, T, Markers(height=0.15, positions=((0.0, 0.4), (0.0, -0.4))), GREEN)
     edge_on, _ = bright(team, floor_pose(1.6, 0.0, np.pi / 2), lights, GREEN)
-    assert "3 lights of its colour are in view" in watched(team, [three]).doubts["L1"]
+    assert "3 lights of its colour are in view" in watched(team, [three]).unused["L1"]
     assert not watched(team, [one]).tracks
-    assert "another light is taken for it" in watched(team, [wide]).doubts["L1"]
-    assert "seen along its two lights" in watched(team, [edge_on]).doubts["L1"]
+    assert "another light is taken for it" in watched(team, [wide]).unused["L1"]
+    assert "seen along the line of its two lights" in watched(team, [edge_on]).unused["L1"]
     white = team_with(Landmark(name="L1", markers=replace(lights, hue_deg=None)), lens=())
-    assert "nothing tells its white lights from lamps" in watched(white, [three]).doubts["L1"]
+    assert "its white lights cannot be told from lamps" in watched(white, [three]).unused["L1"]
     both = team_with(*(Landmark(name=name, markers=lights) for name in ("L1", "L2")), lens=())
-    doubts = watched(both, [bright(team, T, lights, GREEN)[0]]).doubts
-    assert set(doubts) == {"L1", "L2"} and all("lights of the same colour" in why for why in doubts.values())
+    unused = watched(both, [bright(team, T, lights, GREEN)[0]]).unused
+    assert set(unused) == {"L1", "L2"} and all("lights of the same colour" in why for why in unused.values())
     for mover, doubted in (("C", True), ("B", False)):  # who stands is not seen in other places
         robots = [replace(r, markers=replace(r.markers, hue_deg=120.0)) if r.name == mover else r for r in team.robots]
         seen = watched(replace(team, robots=tuple(robots)), [bright(team, T, lights, GREEN)[0]])
-        assert ("others have lights of the same colour" in seen.doubts.get("L1", "")) is doubted
+        assert ("others have lights of the same colour" in seen.unused.get("L1", "")) is doubted
         assert bool(seen.tracks) is not doubted
 
 
@@ -228,9 +228,9 @@ def test_a_camera_that_stands_looks_every_other_second_and_more_images_make_it_n
 
 
 def test_what_is_not_used_is_told_once_and_counted():
-    L1, L2 = ([Doubt(name, "A", k, f"it is {px} px off") for k, px in places] for name, places in
+    L1, L2 = ([UnusedSighting(name, "A", k, f"it is {px} px off") for k, px in places] for name, places in
               (("L1", ((3, 4), (5, 7), (8, 9))), ("L2", ((4, 4),))))  # fmt: skip
-    assert in_words([*L1, *L2]) == [
+    assert describe_unused([*L1, *L2]) == [
         "stance 3 (and 2 more): landmark L1 is not used as A sees it: it is 4 px off",
         "stance 4: landmark L2 is not used as A sees it: it is 4 px off",
     ]
@@ -246,8 +246,8 @@ def test_one_false_sample_moves_no_landmark_and_a_plane_that_is_stated_leaves_th
         seen[4] += 30.0
         tracks.append(Track("A", f"L1/{n}", np.arange(9.0), seen, np.tile(0.0025 * np.eye(2), (9, 1, 1)), np.zeros(9)))
     run = Run(team)
-    (made,), doubts = sight_landmarks(run, STANCE, [("A", SeenLandmarks(tracks))])
-    assert not doubts and np.abs((made.T_observer_seen - T)[:2]).max() < 0.01
+    (made,), unused = sight_landmarks(run, STANCE, [("A", SeenLandmarks(tracks))])
+    assert not unused and np.abs((made.T_observer_seen - T)[:2]).max() < 0.01
     assert sight_landmarks(run, STANCE, [("A", SeenLandmarks(tracks))], {("A", "L1")}) == ([], [])
     run.planes = {STANCE.index: None}
     assert sight_landmarks(run, STANCE, [("A", SeenLandmarks(tracks))]) == ([], [])
@@ -262,7 +262,7 @@ def test_a_light_that_moves_is_no_landmark_and_one_false_sample_is_left_out():
     track = Track("A", "L1/0", np.arange(n, dtype=float), uv, C, np.zeros(n))
     assert set(track.times) - set(still(track).times) == {7.0, 11.0}
     moving = Track("A", "L1/0", track.times, uv + np.arange(n)[:, None], C, track.peak)
-    with pytest.raises(DegenerateGeometry, match="L1/0 does not stand still"):
+    with pytest.raises(DegenerateGeometry, match="L1/0 is not at rest"):
         still(moving)
 
 
@@ -352,7 +352,7 @@ def test_detections_of_a_landmark_that_the_team_does_not_have_say_so(lap, tmp_pa
         lap, tmp_path / "run.mcap", team=team, stances=[s for s in run.stances if s.index in there],
         change=lambda record: None if isinstance(record, OdometrySample | Motion) else record,
     )  # fmt: skip
-    words = "name `L2/0`, and there is no robot or landmark `L2` in the team"
+    words = "name `L2/0`, but the team has no robot or landmark `L2`"
     with pytest.raises(InputError, match=words):
         solve(open_run(copy), SolveOptions())
     assert any(words in finding.what for finding in inspect(open_run(copy)))

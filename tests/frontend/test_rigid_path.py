@@ -12,7 +12,7 @@ from coloc_graph.frontend import (
     FrontendOptions,
     StanceTracks,
     correspond,
-    in_words,
+    describe_unused,
     measure_pair,
     plane_from_mount,
     sight_movers,
@@ -181,7 +181,7 @@ def test_a_mover_whose_like_lights_nothing_tells_apart_has_a_reason():
     assert measured.relative_pose is not None
     assert not sight_movers(one, one.stance, [measured], {})
     (doubt,) = unsighted_movers(one, one.stance, [measured], {}, [])
-    assert in_words([doubt]) == [
-        "stance 0: C has no pose as A sees it: nothing tells which of its two like lights is which; record its wheel "
-        "odometry, or name its markers `C/0` and `C/1`"
+    assert describe_unused([doubt]) == [
+        "stance 0: C has no pose as A sees it: its two equal lights cannot be told apart; record its wheel odometry, "
+        "or name its markers `C/0` and `C/1`"
     ]

@@ -77,7 +77,7 @@ class Track:
 
     @property
     def loads(self) -> Array:
-        """How much of the variances beyond the stated one each sample has: of the white floor, of saturation (n, 2)."""
+        """Parts of the white floor's and of saturation's variance in each sample (`team.CentreNoise`), (n, 2)."""
         saturated = np.zeros(len(self)) if self.saturated is None else self.saturated
         return np.stack([np.ones(len(self)), saturated], axis=1)
 
