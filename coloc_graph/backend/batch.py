@@ -16,7 +16,7 @@ from coloc_graph.backend.factors import Method, calibrations_in, require_robot_m
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.landmarks import ALWAYS, OnMap
 from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
-from coloc_graph.backend.solver import lm_parameters, with_stack
+from coloc_graph.backend.solver import robust_parameters, with_stack
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Odometry, RelativePose, Sighting
 from coloc_graph.team import Slip
@@ -238,7 +238,7 @@ def _outliers(fit: Fit) -> dict[int, Link]:
         for index, link in enumerate(fit.links)
         if isinstance(link, RelativePose) or (isinstance(link, Sighting) and link.seen in landmarks)
     ]
-    parameters = gtsam.GncLMParams(lm_parameters(fit.values.size()))
+    parameters = gtsam.GncLMParams(robust_parameters(fit.values.size()))
     parameters.setKnownInliers(sorted(set(range(fit.factors.size())) - {first + index for index in suspects}))
     optimiser = gtsam.GncLMOptimizer(fit.factors, fit.values, parameters)
     optimiser.setInlierCostThresholdsAtProbability(1 - 1e-4)

@@ -37,6 +37,10 @@ RELINEARIZE_TILT_JOINT = 5e-4  # rad, roll and pitch
 RELINEARIZE_HEADING_JOINT = 5e-3  # rad
 RELINEARIZE_CALIBRATION = 3e-4  # change of a calibration variable [m, rad, relative, s]
 
+# each fit of graduated non-convexity begins where the one before it ended
+ROBUST_TOLERANCE = 1e-3  # change of half the squared error, relative and absolute
+ROBUST_ITERATIONS = 10  # iterations of a fit
+
 
 def with_stack(poses: int, work: Callable[[], T]) -> T:
     """Return the result of `work`, done in a thread with a larger stack where the graph has many `poses`."""
@@ -75,6 +79,20 @@ def lm_parameters(poses: int) -> gtsam.LevenbergMarquardtParams:
     # our information reaches 1e12, of which GTSAM's bound of 1e5 is no damping: with wrong measurements it gave up
     parameters.setlambdaUpperBound(1e15)
     parameters.setMaxIterations(MAX_ITERATIONS)
+    return parameters
+
+
+def robust_parameters(poses: int) -> gtsam.LevenbergMarquardtParams:
+    """Return the parameters of a fit between two updates of robust weights, of which only residuals are wanted.
+
+    With `lm_parameters` the search for outliers takes 2 to 14 times as long and rejects the same measurements
+    (9 teams of 3 to 8 robots, 10 to 35 % of their homographies wrong).
+    """
+    parameters = lm_parameters(poses)
+    parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
+    parameters.setRelativeErrorTol(ROBUST_TOLERANCE)
+    parameters.setAbsoluteErrorTol(ROBUST_TOLERANCE)
+    parameters.setMaxIterations(ROBUST_ITERATIONS)
     return parameters
 
 
