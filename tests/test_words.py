@@ -14,8 +14,6 @@ NOT_YET = {
     "calibration",
     "cli",
     "exchange",
-    "robot_io",
-    "viewer",
 }
 CLAUSES = {"What", "Where", "Whether", "Which", "Who", "Whose", "How", "So", "Such"}
 LONGEST_THAT = 12  # words of a first sentence "The ... that ..."

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.viewer import Viewer
     from coloc_graph.viewer.access import is_loopback
     from coloc_graph.viewer.browser import require_browser, write_png
-    from coloc_graph.viewer.notes import left_out
+    from coloc_graph.viewer.notes import missing_parts
 
     writes = bool(args.export or args.png)
     for out in (args.export, args.png):
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     host, port = ("127.0.0.1", 0) if writes else (args.host, args.port)
     with take_port(port, host) as listener:  # before the work, not after it
         scene = _scene(args)
-        warn(left_out(scene))
+        warn(missing_parts(scene))
         if not is_loopback(host):
             warn([f"whoever knows the address of this viewer and reaches {host} can see and steer it, unencrypted"])
         with Viewer(scene, host=host, dark=args.dark, listener=listener) as viewer:

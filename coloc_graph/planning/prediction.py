@@ -1,4 +1,4 @@
-"""What planned stances will bring: the covariance of a team after them; `Predictor`."""
+"""Prediction of the covariance of a team after planned stances; `Predictor`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ LEAST_POINTS = 6  # correspondences without which a stance has no homography
 
 @dataclass(frozen=True, eq=False)
 class Promise:
-    """What a planned stance promises: the expected number of correspondences, and the team's covariance after it."""
+    """Prediction of a planned stance: the expected number of correspondences, and the team's covariance after it."""
 
     points: float
     belief: Belief

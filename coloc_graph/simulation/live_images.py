@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.robot_io.camera.simulated import ANSWER, HEADER, MAX_LINE
+from coloc_graph.robot_io.camera.simulated import ANSWER_TIMEOUT, HEADER, MAX_LINE
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.rendering import Field, Sensor
 from coloc_graph.simulation.scenery import RobotInView, Scenery, backdrop, draw
@@ -122,7 +122,7 @@ class ImageServer:
     def _serve(self, connection: socket.socket) -> None:
         try:
             with connection, contextlib.suppress(OSError):  # the client has gone, or we end
-                connection.settimeout(ANSWER)
+                connection.settimeout(ANSWER_TIMEOUT)
                 robot, error = self._asked(connection)
                 connection.sendall(json.dumps({"error": error} if error else {}).encode() + b"\n")
                 if not error:

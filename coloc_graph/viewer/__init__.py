@@ -1,6 +1,6 @@
-"""The viewer: the team, its graph and its doubt in a browser. `Scene` is what is shown, `Viewer` shows it.
+"""The viewer: a team, its graph and its uncertainty in a browser. `Viewer` shows a `Scene`.
 
-`scene`, `sources`, `motion`, `frame`, `plots`, `inspect` and `live` are numpy alone; the other modules know viser.
+`scene`, `sources`, `motion`, `frame`, `plots`, `inspect` and `live` use numpy alone; the other modules use viser.
 """
 
 from coloc_graph.viewer.app import Viewer

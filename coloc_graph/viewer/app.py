@@ -21,12 +21,12 @@ CLOSE_TIMEOUT = 10.0  # s, for the render thread to end
 
 
 class Viewer:
-    """Shows a scene to browsers until it is closed; a context manager.
+    """Viewer of a scene in browsers until it is closed; a context manager.
 
     Parameters
     ----------
     scene
-        The first scene that is shown.
+        The first scene.
     host, port
         Address to listen on; without a port the first free one from 8080 on.
     dark
@@ -37,12 +37,12 @@ class Viewer:
     Attributes
     ----------
     url
-        Address at which it is opened. It holds a token: whoever has it can see and steer the viewer.
+        Address for a browser. It holds a token: whoever has it can see and control the viewer.
 
     Raises
     ------
     InputError
-        If it cannot listen there.
+        It cannot listen there.
     """
 
     def __init__(
@@ -89,10 +89,9 @@ class Viewer:
         self._closed.set()
 
     def publish(self, item: Scene | LiveStance | LivePoses) -> None:
-        """Show a stance that has just entered, the robots' current poses, or another scene of the same robots.
+        """Show a new stance, the robots' current poses, or another scene of the same robots.
 
-        Costs the caller no work. Of `LivePoses` the newest is shown, to whoever looks at the last stance; a scene ends
-        them.
+        Returns at once. Of `LivePoses` the newest is shown while the last stance is shown; a scene ends them.
         """
         self._inbox.publish(item)
 
@@ -136,19 +135,19 @@ class Viewer:
         return self._renderer.frame_cpu_seconds
 
     def wait_closed(self) -> None:
-        """Wait until it is closed from elsewhere, or interrupted by Ctrl-C, which ends the wait without a word."""
+        """Wait until the viewer is closed by another thread, or interrupted by Ctrl-C, which ends the wait silently."""
         try:
-            while not self._closed.wait(0.5):  # a join that is interrupted takes its thread for ended
+            while not self._closed.wait(0.5):  # an interrupted join would mark its thread as ended
                 pass
         except KeyboardInterrupt:
             return
 
     def wait_idle(self, timeout: float = 30.0) -> bool:
-        """Wait until everything that was asked for is shown, images and all."""
+        """Wait until everything that was requested is shown, images included."""
         return self._inbox.idle.wait(timeout)
 
     def html(self) -> str:
-        """Make one HTML page of what is shown, which plays stance by stance without a server."""
+        """Make an HTML page of the scene that plays stance by stance without a server."""
         self.wait_idle()
         return page_of(self.scene, self._renderer.state(rests=True))
 

@@ -1,4 +1,4 @@
-"""A picture of the viewer, rendered by the browser that the machine has, without a window."""
+"""Rendering of the viewer to a PNG, by a browser of this machine without a window."""
 
 import base64
 import json
@@ -27,7 +27,7 @@ ARGUMENTS = (
 )  # fmt: skip
 # true once the page has drawn its floor; by viser's own names
 DRAWN = "window.__viserMutable?.nodeRefFromName?.['/floor'] != null"
-SETTLED = 2.0  # s without a change until a picture counts: fonts and textures come late, and nothing tells
+SETTLED = 2.0  # s without a change until a picture is taken: fonts and textures load late, without notice
 BESIDE = WIDTH + 8  # px beside the scene for the panel, which is cut off
 _HIDE = (
     "document.head.appendChild(Object.assign(document.createElement('style'), "
@@ -36,12 +36,12 @@ _HIDE = (
 
 
 def find_browser() -> str | None:
-    """The path of a Chromium, None where there is none."""
+    """Return the path of a Chromium, None where there is none."""
     return next((path for name in BROWSERS if (path := shutil.which(name))), None)
 
 
 def require_browser() -> str:
-    """The path of a Chromium; `InputError` where there is none."""
+    """Return the path of a Chromium; `InputError` where there is none."""
     browser = find_browser()
     if browser is None:
         raise InputError(
@@ -52,9 +52,12 @@ def require_browser() -> str:
 
 
 def write_png(viewer: Viewer, path: str | Path, size: tuple[int, int] = (1280, 720), timeout: float = 120.0) -> None:
-    """Render what is shown to a PNG of this width and height, seen from where the data are framed.
+    """Render the viewer to a PNG of this width and height [px], from the initial camera.
 
-    Raises `InputError` where there is no browser, or it does not come up in time [s].
+    Raises
+    ------
+    InputError
+        There is no browser, or it takes longer than `timeout` [s].
     """
     browser = require_browser()
     until = time.monotonic() + timeout
@@ -74,16 +77,16 @@ def write_png(viewer: Viewer, path: str | Path, size: tuple[int, int] = (1280, 7
             clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
             picture = _settled(page, {"format": "png", "clip": clip}, until)
     except (TimeoutError, OSError, ValueError, KeyError) as error:
-        raise InputError(f"{browser} gives no picture ({error}); write a page with --export instead") from error
+        raise InputError(f"{browser} renders no picture ({error}); write a page with --export instead") from error
     try:
         Path(path).write_bytes(picture)
     except OSError as error:
-        raise InputError(f"{path} cannot be written ({error.strerror}); give another place") from error
+        raise InputError(f"{path} cannot be written ({error.strerror}); give another path") from error
 
 
 @contextmanager
 def _page(browser: str, until: float) -> Iterator[Connection]:
-    """An empty page of a browser without a window, to be talked to by Chrome's DevTools protocol."""
+    """Yield an empty page of a browser without a window, controlled by Chrome's DevTools protocol."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         command = [browser, "--headless=new", *ARGUMENTS, f"--user-data-dir={profile}", "--no-first-run",
                    "--remote-debugging-port=0", "about:blank"]  # fmt: skip
@@ -111,7 +114,7 @@ def _page(browser: str, until: float) -> Iterator[Connection]:
 
 
 def _settled(page: Connection, parameters: dict[str, Any], until: float) -> bytes:
-    """A screenshot that is the same as the two before it."""
+    """Return a screenshot that equals the two before it."""
     pictures: list[bytes] = []
     while len(pictures) < 3 or len(set(pictures[-3:])) > 1:
         time.sleep(SETTLED / 2)
@@ -120,7 +123,7 @@ def _settled(page: Connection, parameters: dict[str, Any], until: float) -> byte
 
 
 def _call(page: Connection, method: str, parameters: dict[str, Any], until: float) -> dict[str, Any]:
-    """The answer of the browser to one call."""
+    """Return the browser's answer to one call."""
     page.send(json.dumps({"id": 1, "method": method, "params": parameters}))
     while True:
         answer = json.loads(page.recv(timeout=_require_time(until)))

@@ -1,4 +1,4 @@
-"""The cameras of the browsers: framing the data, following a robot, and the size at which robots can be seen."""
+"""Cameras of the browsers: framing the data, following a robot, and the scale at which robots are visible."""
 
 from collections.abc import Callable
 
@@ -10,8 +10,8 @@ from coloc_graph.viewer.frame import Frame
 from coloc_graph.viewer.motion import extent
 from coloc_graph.viewer.scene import Scene
 
-NEAR = 25.0  # m; robots that are farther away are drawn larger than they are
-LARGEST = 64.0  # largest factor by which they are
+TRUE_SIZE_DISTANCE = 25.0  # m; robots that are farther away are enlarged
+MAX_ENLARGEMENT = 64.0  # factor by which they are
 FOV = float(np.radians(40))  # rad, vertical field of view
 PITCH = float(np.radians(40))  # rad, by which the first camera looks down
 ASPECT = 1.3  # width over height of a picture, at least
@@ -20,7 +20,7 @@ TALL = 0.6  # m, height of a robot with its label
 
 
 class Cameras:
-    """The cameras of all browsers that are connected; moved by the render thread alone."""
+    """Cameras of all connected browsers; moved by the render thread alone."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -36,7 +36,7 @@ class Cameras:
                     wake()
 
     def size(self) -> float:
-        """Factor by which robots are drawn larger than they are, by the nearest camera."""
+        """Return the factor by which robots are enlarged, by the nearest camera."""
         eyes = [(client.camera.position, client.camera.look_at) for client in self._server.get_clients().values()]
         if not eyes:
             first = self._server.initial_camera
@@ -44,14 +44,14 @@ class Cameras:
         return seen_size(min(float(np.linalg.norm(eye - at)) for eye, at in eyes))
 
     def frame_all(self, scene: Scene, aside: float = 0.0) -> None:
-        """Turn all cameras to all of the data."""
+        """Frame all of the data with all cameras."""
         initial_camera(self._server, scene, aside)
         position, look_at = camera_on(scene, aside)
         for client in self._server.get_clients().values():
             client.camera.position, client.camera.look_at = position, look_at
 
     def follow(self, robot: str, scene: Scene, frame: Frame) -> None:
-        """Have all cameras look at a robot, from their direction and distance; a name of no robot does nothing."""
+        """Have all cameras look at a robot, from their direction and distance; an unknown name does nothing."""
         if robot not in scene.robots:
             return
         here = frame.poses[scene.robots.index(robot), :3]
@@ -65,12 +65,16 @@ class Cameras:
 
 
 def seen_size(distance: float) -> float:
-    """Factor by which robots are drawn larger for a camera at a distance [m]: a power of two."""
-    return float(2 ** np.floor(np.log2(np.clip(distance / NEAR, 1.0, LARGEST)))) if np.isfinite(distance) else 1.0
+    """Return the factor by which robots are enlarged for a camera at a distance [m]: a power of two."""
+    return (
+        float(2 ** np.floor(np.log2(np.clip(distance / TRUE_SIZE_DISTANCE, 1.0, MAX_ENLARGEMENT))))
+        if np.isfinite(distance)
+        else 1.0
+    )
 
 
 def initial_camera(server: viser.ViserServer, scene: Scene, aside: float = 0.0) -> None:
-    """Frame the data: from behind and the right of the way the team went, looking down on it."""
+    """Frame the data: from behind and the right of the team's direction, looking down."""
     position, look_at = camera_on(scene, aside)
     server.initial_camera.fov = FOV
     server.initial_camera.far = max(1000.0, 10 * float(np.linalg.norm(position - look_at)))
@@ -78,7 +82,7 @@ def initial_camera(server: viser.ViserServer, scene: Scene, aside: float = 0.0) 
 
 
 def camera_on(scene: Scene, aside: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Position of a camera that sees all of the data, and the point it looks at: (3,) and (3,) [m], world frame."""
+    """Return position (3,) of a camera that sees all of the data, and the point (3,) it looks at [m], world frame."""
     low, high = extent(scene)
     high = high + np.array([0.0, aside])
     middle, along = (low + high) / 2, high - low

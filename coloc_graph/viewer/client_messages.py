@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import msgspec
 import viser
 
-COORDINATE_LIMIT = 1e9  # m; a camera that is farther away is no camera of an honest browser
+COORDINATE_LIMIT = 1e9  # m; no camera of an honest browser is farther away
 IMAGE_LIMIT = 1 << 16  # px
 NAME_LIMIT = 1024  # characters of a text
 
@@ -21,7 +21,7 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class _ClientMessage(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
-    """Base of the messages, told apart by viser's names."""
+    """Base of the messages, distinguished by viser's names."""
 
 
 class CameraMessage(_ClientMessage, tag="ViewerCameraMessage"):

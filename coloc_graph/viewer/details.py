@@ -1,4 +1,4 @@
-"""Slow contents of a frame, made beside the render thread: images, marker trajectories, and the picked edge."""
+"""Slow contents of a frame, made by another thread: images, marker trajectories, and the picked edge."""
 
 import itertools
 from collections.abc import Callable, Iterable
@@ -21,7 +21,7 @@ Picked = tuple[str, int]
 
 
 class Details:
-    """Contents that come later than their frame; `wake` is called when one is there."""
+    """Contents that are ready later than their frame; `wake` is called when one is."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self.images: dict[str, Image | None] = {}
@@ -54,7 +54,7 @@ class Details:
         return is_waiting
 
     def look_up_markers(self, scene: Scene, row: int, *, dark: bool, rests: bool, wanted: bool) -> bool:
-        """Bring the trajectories of the markers up to date, which are drawn at rest only; True while being made."""
+        """Bring the trajectories of the markers, drawn at rest only, up to date; True while they are being made."""
         if scene.run is None or not len(scene):
             return False
         if not rests:
@@ -66,7 +66,7 @@ class Details:
         return lines is None
 
     def report(self, scene: Scene, picked: Picked, row: int) -> tuple[str, Image | None, bool] | None:
-        """Text and picture of what is picked, and whether more is being made; None if it is not in the scene."""
+        """Return text and picture of the picked item, and whether more is being made; None if it is gone."""
         kind, number = picked
         if kind == "robot":
             return inspect.robot_report(scene, number, row), None, False
@@ -91,4 +91,4 @@ class Details:
 
 
 def _image_in_a_tuple(run: Run, robot: str, time: float) -> tuple[Image | None]:
-    return (inspect.camera_image(run, robot, time),)  # None alone is what the worker says before it knows
+    return (inspect.camera_image(run, robot, time),)  # None alone is the worker's answer before it is ready

@@ -1,4 +1,4 @@
-"""A scene as one HTML page that plays without a server or a network: viser's recording, and a legend over it."""
+"""Export of a scene to one HTML page that plays without a server: viser's recording, with a legend."""
 
 import html
 import itertools
@@ -16,9 +16,9 @@ from coloc_graph.viewer.panel import legend
 from coloc_graph.viewer.scene import Scene
 from coloc_graph.viewer.server import open_listener, start_server, stop_server
 
-STANCE_SECONDS = 1.0  # s for a stance, less in a long run
-MAX_SECONDS = 60.0  # s for all of them
-HELD_SECONDS = 3.0  # s for which the last stance is held
+STANCE_SECONDS = 1.0  # s per stance, less in a long run
+MAX_SECONDS = 60.0  # s for all stances
+HELD_SECONDS = 3.0  # s for the last stance
 STEP_SECONDS = 0.1  # s between steps of the animation
 MAX_STANCES = 240  # stances that are played; of more a selection
 MAX_STANCES_IN_FULL = 80  # stances up to which each has its images, and trails in each step
@@ -82,7 +82,7 @@ def _images(scene: Scene, row: int) -> dict[str, Image | None]:
     for robot in scene.robots:
         try:
             found[robot] = inspect.camera_image(scene.run, robot, scene.middle(row))
-        except ColocError:  # the viewer says it; the page is of what can be seen
+        except ColocError:  # the viewer reports it
             found[robot] = None
     return found
 

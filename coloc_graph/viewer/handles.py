@@ -7,8 +7,9 @@ import viser
 from numpy.typing import NDArray
 
 from coloc_graph.geometry.lie import quaternion
-from coloc_graph.viewer import meshes, palette, still
+from coloc_graph.viewer import meshes, palette
 from coloc_graph.viewer.frame import NO_LINES, Batch, Frame, Lines, ViewState
+from coloc_graph.viewer.landmarks import landmark_mesh, landmark_of
 from coloc_graph.viewer.motion import extent
 from coloc_graph.viewer.prepared import about_z
 from coloc_graph.viewer.scene import TRUE, Scene
@@ -125,8 +126,8 @@ class GraphView:
 
     def _add_landmark(self, scene: Scene, name: str) -> None:
         add, path = self.server.scene, f"/landmarks/{name}"
-        landmark = still.landmark_of(scene.team, name)
-        body = add.add_mesh_trimesh(f"{path}/body", still.landmark_mesh(landmark), receive_shadow=False)
+        landmark = landmark_of(scene.team, name)
+        body = add.add_mesh_trimesh(f"{path}/body", landmark_mesh(landmark), receive_shadow=False)
         label = add.add_label(f"{path}/name", name, position=(0, 0, 0.4), anchor="bottom-center")
         self._landmarks[name] = add.add_frame(path, show_axes=False), body, label
 

@@ -12,9 +12,9 @@ from coloc_graph.frontend import PairMeasurement
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Measurement, RelativePose, Sighting
 from coloc_graph.run import Stance
+from coloc_graph.viewer.landmarks import landmarks_in, sighted_in
 from coloc_graph.viewer.scene import Array, Scene, layer_of
 from coloc_graph.viewer.sources import as_edges, stayed
-from coloc_graph.viewer.still import landmarks_in, sighted_in
 
 LIVE = "live"  # name of the layer if the first scene has none
 RESIDUAL_AT_INSERTION = "of the measurement in the estimate when it came in"

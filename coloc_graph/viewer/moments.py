@@ -1,4 +1,4 @@
-"""Moments of a ranging run: equal parts of its time, which the viewer shows where other runs have stances."""
+"""Moments of a ranging run: equal intervals, which the viewer shows in place of stances."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,8 +10,8 @@ from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.run import Stance
 from coloc_graph.viewer.scene import Array
 
-LEAST_MOMENT = 1.0  # duration of a moment, at least [s]
-MAX_MOMENTS = 2000
+MIN_MOMENT = 1.0  # s, duration of a moment
+MAX_MOMENTS = 2000  # moments of a run
 
 
 def moments_of(trajectories: Mapping[str, Trajectory]) -> tuple[Stance, ...]:
@@ -20,7 +20,7 @@ def moments_of(trajectories: Mapping[str, Trajectory]) -> tuple[Stance, ...]:
     if not times:
         raise InputError("there are no poses to show; solve the run again")
     begin, end = min(t[0] for t in times), max(t[-1] for t in times)
-    step = max(LEAST_MOMENT, (end - begin) / MAX_MOMENTS)
+    step = max(MIN_MOMENT, (end - begin) / MAX_MOMENTS)
     starts = (begin + step * np.arange(int((end - begin) / step) + 1)).tolist()
     return tuple(Stance(k, t, t + step, (), tuple(trajectories)) for k, t in enumerate(starts))
 

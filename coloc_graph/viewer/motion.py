@@ -1,4 +1,4 @@
-"""Pose of a robot between two stances: by wheel odometry if there is any, else interpolated."""
+"""Pose of a robot between two stances: by wheel odometry if available, otherwise interpolated."""
 
 from functools import lru_cache
 
@@ -14,10 +14,10 @@ AHEAD = 1.5  # m, distance from an observer to the markers that it watches
 
 
 def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
-    """x, y, z [m] and heading [rad] of a robot, (n, 4), at ascending times (n,); NaN where it has no pose at all.
+    """Return x, y, z [m] and heading [rad] of a robot, (n, 4), at ascending times (n,); NaN without any pose.
 
-    A robot that watches stands from the beginning of a stance to its end. In between it follows its wheels, bent so
-    that they lead from the one pose to the other.
+    An observer stands from the beginning of a stance to its end. In between it follows its odometry, corrected linearly
+    so that it ends at the next pose.
     """
     out = np.full((len(time), 4), np.nan)
     if not len(layer.rows[number]):
@@ -51,8 +51,10 @@ def pose_at(scene: Scene, layer: Layer, number: int, time: Array) -> Array:
 
 
 def extent(scene: Scene, samples: int = 400) -> tuple[Array, Array]:
-    """Least and greatest x, y [m] of all poses, of the ways between them, and of what the last observers have before
-    them; as `Scene.bounds` without any."""
+    """Return minimum and maximum x, y [m] of all poses, of the paths between, and of the last observers' views.
+
+    As `Scene.bounds` where there are no poses.
+    """
     low, high = scene.bounds
     if not scene.layers or not len(scene):
         return low, high
@@ -72,7 +74,7 @@ def extent(scene: Scene, samples: int = 400) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=64)
 def _keys(scene: Scene, layer: Layer, number: int) -> tuple[Array, Array]:
-    """The times (k,) at which a robot is known to be somewhere, ascending, and where (k, 4)."""
+    """Return the ascending times (k,) of a robot's known poses, and these poses (k, 4)."""
     rows = layer.rows[number]
     poses = np.concatenate([layer.xyz[number, rows], layer.yaw[number, rows, None]], axis=1)
     stands = scene.standing[number, rows]
@@ -82,7 +84,7 @@ def _keys(scene: Scene, layer: Layer, number: int) -> tuple[Array, Array]:
 
 
 def _ahead(pose: Array, before: Array, after: Array) -> Array:
-    """x, y, heading (n, 3) of poses (n, 4) moved on as wheels went from `before` to `after` (n, 3)."""
+    """Return poses (n, 4) moved by the odometry from `before` to `after` (n, 3): x, y, heading (n, 3)."""
     turn = pose[:, 3] - before[:, 2]
     c, s = np.cos(turn), np.sin(turn)
     x, y = (after[:, :2] - before[:, :2]).T

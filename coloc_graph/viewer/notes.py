@@ -1,4 +1,4 @@
-"""Notes on what a scene does not show, and notifications in the browsers."""
+"""Notes on missing parts of a scene, and notifications in the browsers."""
 
 import viser
 
@@ -26,7 +26,7 @@ class Notifications:
             self.show(title, text)
 
 
-def left_out(scene: Scene) -> list[str]:
+def missing_parts(scene: Scene) -> list[str]:
     """Sentences on everything that a scene cannot show."""
     return [one for one in (*scene.notes, missing_images(scene)) if one]
 

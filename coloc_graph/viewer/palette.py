@@ -1,4 +1,4 @@
-"""Colours that are told apart with any colour vision, light and dark, and as three.js takes them."""
+"""Colours that are distinguishable with any colour vision, light and dark, and in the colour space of three.js."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ _FLAT = (0.7 * np.arange(256)).astype(np.uint8)
 
 
 def rgb(code: str) -> tuple[int, int, int]:
-    """The colour of `#rrggbb`."""
+    """Return the colour of `#rrggbb`."""
     return int(code[1:3], 16), int(code[3:5], 16), int(code[5:7], 16)
 
 
@@ -33,12 +33,12 @@ ODOMETRY: Colours = np.array(rgb("#8a6d3b"), np.uint8)
 
 
 def robot_colours(count: int, dark: bool = False) -> Colours:
-    """A colour a robot (count, 3); the seventh has the first's again, and its name."""
+    """Return one colour per robot (count, 3); the seventh has the first's again."""
     return seen_on(ROBOTS[np.arange(count) % len(ROBOTS)], dark)
 
 
 def seen_on(colours: Colours, dark: bool) -> Colours:
-    """Colours (..., 3) made for a light paper, lighter where it is dark."""
+    """Return colours (..., 3) made for a light background, lighter for a dark one."""
     return np.rint(colours + 0.3 * (255.0 - colours)).astype(np.uint8) if dark else colours
 
 
@@ -72,10 +72,10 @@ def residual_colours(sigmas: NDArray[np.float64], dark: bool) -> Colours:
 
 
 def flat(colours: Colours) -> Colours:
-    """Colours of what lies on the floor: the lights from above would wash them out."""
+    """Return darker colours for items on the floor, which the lights from above would wash out."""
     return np.asarray(_FLAT[colours])
 
 
 def linear(colours: Colours) -> Colours:
-    """Colours as viser takes those of line vertices and of batches: linear, and not sRGB."""
+    """Return linear colours, as viser expects of line vertices and batches, of sRGB ones."""
     return np.asarray(_LINEAR[colours])

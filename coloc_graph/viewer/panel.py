@@ -84,7 +84,7 @@ class Panel:
         self._listen()
 
     def _listen(self) -> None:
-        # what this process sets itself comes without a client, and is no wish of anybody
+        # an event without a client is caused by this process, not by a user
         for slider, what in (
             (self.stance, "stance"), (self.time, "time"), (self.speed, "changed"), (self.k_sigma, "changed"),
         ):  # fmt: skip

@@ -16,8 +16,8 @@ from coloc_graph.measurements import Node
 from coloc_graph.pipeline.pose_graph import solve_pose_graph
 from coloc_graph.results.pose_graph import KIND, read_pose_graph_summary
 from coloc_graph.run import Stance
+from coloc_graph.viewer.links import links_of
 from coloc_graph.viewer.scene import Layer, Scene, layer_of
-from coloc_graph.viewer.ties import links_of
 
 SUFFIX = ".g2o"
 AS_STATED = "as in the file"

@@ -1,4 +1,4 @@
-"""The render thread: computes each frame from scene, controls and inbox, and alone touches the handles."""
+"""The render thread: computes each frame from scene, controls and inbox; only it uses the handles."""
 
 import time
 import traceback
@@ -13,24 +13,24 @@ from coloc_graph.viewer.frame import NO_LINES, Frame, ViewState, frame_of
 from coloc_graph.viewer.handles import MAX_NAMES, GraphView
 from coloc_graph.viewer.inbox import Inbox, Work
 from coloc_graph.viewer.live import LiveScene
-from coloc_graph.viewer.notes import Notifications, left_out
+from coloc_graph.viewer.notes import Notifications, missing_parts
 from coloc_graph.viewer.panel import Panel, set_value
 from coloc_graph.viewer.playback import REST_DELAY, Playback
 from coloc_graph.viewer.prepared import readable_sigma
 from coloc_graph.viewer.scene import Scene
 
-FRAME_INTERVAL = 0.03  # s between frames at least, so that the server comes to send them
-GROWTH_INTERVAL = 0.25  # s between scenes that are put together of live stances, at least
-PLOT_INTERVAL = 0.15  # s between plots while time moves, at least; they are pushed whole
+FRAME_INTERVAL = 0.03  # s between frames, so that the server has time to send them
+GROWTH_INTERVAL = 0.25  # s between scenes made of live stances
+PLOT_INTERVAL = 0.15  # s between plots while time moves; each is sent as a whole
 
 
 class Renderer:
-    """The frame that is shown, and the loop that keeps it up to date.
+    """Loop that keeps the frame up to date.
 
     Attributes
     ----------
     scene, frame
-        Shown last; the frame is None before the first.
+        The last ones shown; the frame is None before the first.
     frame_seconds, frame_cpu_seconds
         Time that the last frame took, on the clock and on the processor [s].
     picked
@@ -48,7 +48,7 @@ class Renderer:
         self._server, self._panel, self._inbox = server, panel, inbox
         self._playback = Playback(scene)
         self._live = LiveScene(scene)
-        self._note = "; ".join(left_out(scene))
+        self._note = "; ".join(missing_parts(scene))
         self._dark = False
         self._aside = self._grown_at = self._plotted_at = 0.0
         initial_camera(server, scene)
@@ -71,7 +71,7 @@ class Renderer:
                     self._move_robots()
                 else:
                     is_pending = self._step(now - played_at if is_playing else 0.0)
-            except Exception as error:  # a thread that has died would look like a viewer that hangs
+            except Exception as error:  # a dead thread would look like a viewer that hangs
                 traceback.print_exc()
                 self.notifications.show("The viewer failed", f"{type(error).__name__}: {error}")
                 is_pending = False
@@ -150,20 +150,20 @@ class Renderer:
         notes = (
             live.note if live is not None else "",
             frame.note,
-            f"robots are drawn {size:.0f} times as large as they are, to be seen from afar" if size > 1 else "",
-            f"of more than {MAX_NAMES} robots no name is written: click one" if len(frame.roles) > MAX_NAMES else "",
+            f"robots are drawn {size:.0f} times as large as they are, to be visible from afar" if size > 1 else "",
+            f"names of more than {MAX_NAMES} robots are not shown: click one" if len(frame.roles) > MAX_NAMES else "",
             self._note,
         )
         self._panel.show_status(self.scene, frame, self._playback.time, notes)
 
     def _report(self, frame: Frame) -> bool:
-        """Bring the panel of what was clicked up to date; True while it is being made."""
+        """Bring the panel of the clicked item up to date; True while it is being made."""
         picked = self.picked
-        told = self.details.report(self.scene, picked, frame.row) if picked else ("", None, False)
-        if told is None:
+        report = self.details.report(self.scene, picked, frame.row) if picked else ("", None, False)
+        if report is None:
             self.picked = None
             return False
-        text, picture, is_waiting = told
+        text, picture, is_waiting = report
         self._panel.inspect(text, picture)
         return is_waiting
 
@@ -181,14 +181,14 @@ class Renderer:
             self.cameras.frame_all(scene, self._aside)
 
     def _grow(self) -> None:
-        """Take in what was published; whoever looks at the last stance is shown the new one."""
+        """Add published stances and scenes; where the last stance was shown, show the new one."""
         if not self._inbox.has_published or time.perf_counter() - self._grown_at < GROWTH_INTERVAL:
             return
         was_at_end = self.scene.row_at(self._playback.time) == len(self.scene) - 1
         whole: Scene | None = None
         for item in self._inbox.take_published():
             if isinstance(item, Scene):
-                whole, self._inbox.live_poses, self._note = item, None, "; ".join(left_out(item))
+                whole, self._inbox.live_poses, self._note = item, None, "; ".join(missing_parts(item))
             else:
                 self._live.add(item)
                 self.details.keep(item.pairs)

@@ -1,4 +1,4 @@
-"""Scene of the viewer as arrays: robots by stances, one row a robot, NaN for a robot without a pose."""
+"""Scene of the viewer as arrays: robots by stances, one row per robot, NaN for a robot without a pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,11 +22,22 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """The poses of all robots at all stances by one method: `robots` (r) by `stances` (s), NaN where there is none.
+    """Poses of all robots (r) at all stances (s) by one method, NaN where there is none.
 
-    `xyz` (r, s, 3) [m] and `yaw` (r, s) [rad] in the world at `times` (r, s) [s]; `covariance` (r, s, 2, 2) [m^2] of
-    x, y along the world's axes and `yaw_sigma` (r, s) [rad], NaN where there are none. `trajectories` are what it was
-    made of. `aside` is the layer of another result, in a comparison.
+    Parameters
+    ----------
+    name : str
+        Its name in the panel.
+    times : (r, s) float
+        Times of the poses [UTC s].
+    xyz, yaw : (r, s, 3) and (r, s) float
+        Poses in the world [m], [rad].
+    covariance, yaw_sigma : (r, s, 2, 2) and (r, s) float
+        Covariance of x, y along the world's axes [m^2], standard deviation of yaw [rad]; NaN where there is none.
+    trajectories : mapping of str to Trajectory
+        The poses by robot.
+    aside : bool
+        The layer is that of another result, in a comparison.
     """
 
     name: str
@@ -65,9 +76,9 @@ def layer_of(
     *,
     aside: bool = False,
 ) -> Layer:
-    """The layer of trajectories; those without stance numbers are taken to have a pose at each stance they cover.
+    """Make a layer of trajectories; those without stances have a pose at each stance in order.
 
-    Raises `InputError` that names robot and stance where a pose is not finite, or of a stance that is not there.
+    Raises `InputError`, with robot and stance, where a pose is not finite, or of an unknown stance.
     """
     row_of = {stance.index: row for row, stance in enumerate(stances)}
     r, s = len(robots), len(stances)
@@ -82,7 +93,7 @@ def layer_of(
         if unknown or len(named) != len(one):
             raise InputError(
                 f"{name}: robot {robot} has a pose at stance {unknown[0] if unknown else len(one)}, which the run does "
-                "not hold: give the run that it was made of"
+                "not hold: give the run that was solved"
             )
         bad = ~np.isfinite(one.T_world_body).all(axis=(1, 2)) | ~np.isfinite(one.times)
         if bad.any():
@@ -141,8 +152,11 @@ NO_LINKS = Links(_NONE, _NONE, _NONE, _NONE)
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """Landmarks by number: `names`, places `xy` (l, 2) [m] and `yaw` (l,) [rad] in the world, `covariance` (l, 2, 2) of
-    x, y and `yaw_sigma` (l,) [rad]; `sightings` are of robots i, of landmarks j."""
+    """Landmarks by number.
+
+    `names`, positions `xy` (l, 2) [m] and `yaw` (l,) [rad] in the world, `covariance` (l, 2, 2) of x, y and `yaw_sigma`
+    (l,) [rad]; `sightings` are of robots i, of landmarks j.
+    """
 
     names: tuple[str, ...] = ()
     xy: Array = field(default_factory=lambda: np.zeros((0, 2)))
@@ -160,14 +174,38 @@ NO_LANDMARKS = Landmarks()
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """All that is shown of a run and its estimates; immutable.
+    """A run and its estimates as shown; immutable.
 
-    `layers` are the estimates, the first being the one whose poses the robots stand at. `stayed` are the stay-put
-    constraints (q, 2): robot by number, row of the later stance. `sightings` (observer, seen) and `odometry` are the
-    other measurements, `landmarks` the estimated ones. `beside` is the scene of another result, in a comparison: its
-    first layer is `aside`, and its edges are numbered on from `edges`. `team` is as stated, `calibrated` as estimated.
-    `notes` are sentences on what is missing, and why.
-    Without a `run` there are no images, marker tracks and inspections.
+    Parameters
+    ----------
+    robots : tuple of str
+        Names by number.
+    stances : tuple of Stance
+        Stances by row.
+    layers : tuple of Layer
+        Estimates; robots are drawn at the poses of the first.
+    edges : Edges
+        Measurements of pairs of observers.
+    sightings, odometry : Links
+        Sightings (observer, seen), and wheel odometry.
+    stayed : (q, 2) int
+        Stay-put constraints: robot by number, row of the later stance.
+    team, calibrated : Team or None
+        The team as stated, and as estimated.
+    run : Run or None
+        Without it there are no images, marker tracks and inspections.
+    frontend : FrontendOptions
+        Options by which pairs are measured again.
+    wheels : mapping of str to WheelTrack
+        Odometry, by which robots move between stances.
+    title : str
+        Title of the page.
+    notes : tuple of str
+        Sentences on missing parts.
+    beside : Scene or None
+        Scene of another result, in a comparison: its first layer is `aside`, its edges are numbered on from `edges`.
+    landmarks : Landmarks
+        Estimated landmarks.
     """
 
     robots: tuple[str, ...]
@@ -205,7 +243,7 @@ class Scene:
         return min(max(int(np.searchsorted(self.starts, time, side="right")) - 1, 0), len(self) - 1)
 
     def middle(self, row: int) -> float:
-        """The middle of a stance [s]; 0 without any."""
+        """Return the middle of a stance [s]; 0 without any."""
         return float(self.starts[row] + self.ends[row]) / 2 if 0 <= row < len(self) else 0.0
 
     def roles(self, row: int, robot: str) -> str:
@@ -259,7 +297,7 @@ class Scene:
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Least and greatest x, y of all poses [m]; a square of a metre about 0 where there are none."""
+        """Minimum and maximum x, y of all poses [m]; a square of a metre about 0 where there are none."""
         poses = (layer.xyz[layer.there][:, :2] for layer in self.layers)
         every = np.concatenate([np.empty((0, 2)), *poses, self.landmarks.xy])
         if not len(every):

@@ -1,4 +1,4 @@
-"""A viser server on a port that is held from the start, answering only those who know its address."""
+"""A viser server on a port that is reserved from the start, which answers only requests with its token."""
 
 import contextlib
 import errno
@@ -45,7 +45,7 @@ class PrivateServer(viser.ViserServer):
 
 
 def open_listener(host: str = "127.0.0.1", port: int | None = None) -> socket.socket:
-    """Take a port, so that nobody else can while the scene is still being made.
+    """Reserve a port while the scene is still being made.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def open_listener(host: str = "127.0.0.1", port: int | None = None) -> socket.so
     Raises
     ------
     InputError
-        If the address is not one of this machine, or the port is taken.
+        The address is not one of this machine, or the port is taken.
     """
     if port is None:
         for tried in range(DEFAULT_PORT, DEFAULT_PORT + PORTS_TRIED):
@@ -77,14 +77,14 @@ def open_listener(host: str = "127.0.0.1", port: int | None = None) -> socket.so
 
 
 def start_server(host: str, listener: socket.socket, label: str) -> PrivateServer:
-    """Start viser on a listening socket, and make sure that it refuses whoever lacks the token.
+    """Start viser on a listening socket, and verify that it refuses requests without the token.
 
-    The server holds nothing yet when this is verified.
+    The server holds no data yet when this is verified.
 
     Raises
     ------
     ColocError
-        If viser answers a request without the token.
+        Viser answers a request without the token.
     """
     port = listener.getsockname()[1]
     access = Access(host, new_token())
@@ -95,7 +95,7 @@ def start_server(host: str, listener: socket.socket, label: str) -> PrivateServe
     if not gate.is_served or not _refuses_strangers(listener):
         stop_server(server)
         listener.close()
-        raise ColocError(f"viser {viser.__version__} would show the viewer to anybody: install viser 1.1")
+        raise ColocError(f"viser {viser.__version__} would serve the viewer to anybody: install viser 1.1")
     return server
 
 
@@ -120,7 +120,7 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _cannot_listen(host: str, port: int, error: OSError) -> InputError:
-    """Name the cause of a failure to listen, and the way out."""
+    """Return the error for a failure to listen, with its remedy."""
     if isinstance(error, socket.gaierror):
         return InputError(f"{host} is not an address ({error.strerror}): give one of this machine with --host")
     if error.errno == errno.EADDRINUSE:

@@ -21,10 +21,10 @@ from coloc_graph.pipeline.batch import Progress, Solution, solve
 from coloc_graph.results.folder import LANDMARKS, MEASUREMENTS, read_result
 from coloc_graph.results.measurement_table import read_measurements
 from coloc_graph.run import Run, Stance, open_run
+from coloc_graph.viewer.landmarks import landmarks_in, sighted_in
+from coloc_graph.viewer.links import links_in, links_of, wheels_of
 from coloc_graph.viewer.moments import first_poses, moment_at, moments_of
 from coloc_graph.viewer.scene import NO_EDGES, Edges, Index, Scene, layer_of
-from coloc_graph.viewer.still import landmarks_in, sighted_in
-from coloc_graph.viewer.ties import links_of, ties_in, wheels_of
 from coloc_graph.viewer.truth import true_layers
 
 #: What the methods' layers are called.
@@ -51,7 +51,7 @@ def scene_of_estimate(
     team = run.team if run is not None else None
     on_floor = run is not None and run.team.floor is not None
     true, notes = true_layers(run, graph.robots, graph.stances, estimate.trajectories, on_floor=on_floor)
-    sightings, odometry = ties_in(graph.measurements, graph.robots, graph.stances)
+    sightings, odometry = links_in(graph.measurements, graph.robots, graph.stances)
     rejected = {id(one.measurement) for one in estimate.rejected}
     sighted = sighted_in((m for m in graph.measurements if id(m) not in rejected), graph.landmarks)
     return Scene(
@@ -169,7 +169,10 @@ def _scene_of_ranges(
     measured: Sequence[tuple[float, str, str]],
     landmarks: Sequence[LandmarkRow],
 ) -> Scene:
-    """The scene of a ranging run: in each moment the first keyframe of each robot, and who `measured` whom [s]."""
+    """Make the scene of a ranging run: the first keyframe of each robot in each moment.
+
+    `measured` are (time [UTC s], observer, target).
+    """
     robots, moments = run.team.names, moments_of(trajectories)
     first = {robot: first_poses(one, moments) for robot, one in trajectories.items()}
     alignment: Alignment = "none" if on_map else "team"
@@ -194,9 +197,9 @@ def _scene_of_ranges(
 
 
 def with_other(scene: Scene, path: str | Path) -> Scene:
-    """The scene with that of another result of the same run beside it; `InputError` where it is of another run."""
+    """Add another result of the same run to a scene; `InputError` where it is of another run."""
     if scene.run is None:
-        raise InputError(f"{path} cannot be compared: there is no run that both could be of")
+        raise InputError(f"{path} cannot be compared: the scene has no run")
     other = scene_of_result(path, scene.run.path)
     layer = replace(other.layers[0], name=f"{other.title}: {other.layers[0].name}", aside=True)
     other = replace(other, layers=(layer, *other.layers[1:]))
@@ -207,8 +210,8 @@ def with_other(scene: Scene, path: str | Path) -> Scene:
 
 
 def is_run(path: str | Path) -> bool:
-    """Whether a path is to be opened as a run, and not as the folder of a result."""
-    return not os.path.isdir(path)  # noqa: PTH112  a path that is not there is opened, and says so
+    """Return whether to open a path as a run, not as the folder of a result; true of a path that does not exist."""
+    return not os.path.isdir(path)  # noqa: PTH112  opening a missing path raises the error
 
 
 def _edges(estimate: Estimate, measurements: Sequence[PairMeasurement]) -> Edges:
@@ -230,7 +233,7 @@ def _edges(estimate: Estimate, measurements: Sequence[PairMeasurement]) -> Edges
 def as_edges(
     found: Sequence[tuple[int, str, str, float, str]], robots: Sequence[str], stances: Sequence[Stance], of_what: str
 ) -> Edges:
-    """Edges of (stance, robot i, robot j, sigmas, why not), in the order of the stances."""
+    """Make edges of (stance, robot i, robot j, sigmas, reason for rejection), in the order of the stances."""
     row_of = {stance.index: row for row, stance in enumerate(stances)}
     number = {robot: n for n, robot in enumerate(robots)}
     kept = [one for one in found if one[0] in row_of and one[1] in number and one[2] in number]
@@ -248,7 +251,7 @@ def as_edges(
 
 
 def _edges_on_disk(path: Path, robots: Sequence[str], stances: Sequence[Stance]) -> Edges:
-    """The homographies of a result, with their residuals in the estimate."""
+    """Read the homographies of a result, with their residuals in the estimate."""
     found = [
         (int(row["index_i"]), row["robot_i"], row["robot_j"], float(row["residual"] or "nan"), row["reason"])
         for row in read_measurements(path, ["homography"])
@@ -257,7 +260,7 @@ def _edges_on_disk(path: Path, robots: Sequence[str], stances: Sequence[Stance])
 
 
 def _ends_on_disk(path: Path, kind: str) -> list[tuple[Node, Node]]:
-    """The ends of the used measurements of a kind; a landmark's is of the stance at which it was seen."""
+    """Read the ends of the used measurements of a kind; a landmark gets the stance in which it was seen."""
     return [
         ((row["robot_i"], int(row["index_i"])), (row["robot_j"], int(row["index_j"] or row["index_i"])))
         for row in read_measurements(path, [kind])
@@ -275,7 +278,7 @@ def _damage_named(path: Path) -> Iterator[None]:
 
 
 def _anchored(stances: Sequence[Stance], bumped: Sequence[Sequence[object]]) -> list[tuple[str, int]]:
-    """Who stayed put, and until which stance: all anchors but those that were found to have been bumped."""
+    """Return (robot, later stance) of all stay-put constraints, without those of bumped anchors."""
     moved = {(str(one[0]), one[2]) for one in bumped if len(one) == 3}
     return [
         (robot, after.index)

@@ -1,4 +1,4 @@
-"""The true poses of a run beside the estimated ones."""
+"""True poses of a run, as a layer."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ def true_layers(
     on_floor: bool,
     alignment: Alignment = "reference",
 ) -> tuple[tuple[Layer, ...], tuple[str, ...]]:
-    """The true poses in the estimate's world, at its times, if there are any; and in words where there are none."""
+    """Return the layer of true poses in the estimate's world, at its times, if any; and notes on missing truth."""
     truth = read_truth(run.path, estimated) if run is not None and any(len(one) for one in estimated.values()) else {}
     if run is None or not truth:
         return (), ()

@@ -1,4 +1,4 @@
-"""A thread beside the render thread that answers slow questions, only the newest of each kind."""
+"""Thread that answers slow requests of the render thread, only the newest of each kind."""
 
 import threading
 import traceback
@@ -20,7 +20,7 @@ class Failure:
 
 
 class Worker:
-    """One thread that answers questions; `wake` is called at each answer."""
+    """One thread that answers requests; `wake` is called at each answer."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
@@ -32,7 +32,7 @@ class Worker:
         self._thread.start()
 
     def ask(self, kind: str, key: Hashable, make: Callable[[], Any]) -> Any:
-        """Return the answer, a `Failure`, or None: not yet. A newer question of a kind replaces one that waits."""
+        """Return the answer, a `Failure`, or None while it is made. A newer request replaces one of its kind."""
         with self._changed:
             if (kind, key) in self._known:
                 self._known.move_to_end((kind, key))
@@ -61,7 +61,7 @@ class Worker:
                 answer = make()
             except ColocError as error:
                 answer = Failure(str(error))
-            except Exception as error:  # a thread that has died would look like images that never come
+            except Exception as error:  # a dead thread would look like images that never come
                 traceback.print_exc()
                 answer = Failure(f"{type(error).__name__}: {error}")
             with self._changed:

@@ -344,9 +344,9 @@ def test_a_bug_in_a_device_is_told_to_who_reads():
 
 
 @pytest.mark.parametrize(("spec", "words"), [
-    ("v4l2:/dev/video-none", "cannot be opened .No such file or directory.: is it plugged in"),
+    ("v4l2:/dev/video-none", "cannot be opened .No such file or directory.: check that it is plugged in"),
     ("v4l2:/", "/ is not a device; use video:/ for"),
-    ("v4l2:/dev/null", "is it free, and does it deliver images"),
+    ("v4l2:/dev/null", "check that it is free and delivers images"),
     ("v4l2:/dev/null?gain=high", "`gain=high` is not a setting"),
     ("v4l2:/dev/null?zoom=1", "`zoom=1` is not a setting; use exposure=NUMBER and gain=NUMBER"),
 ])  # fmt: skip

@@ -82,7 +82,7 @@ def create(robot):
 
 @pytest.mark.parametrize("model", [1, 2])
 def test_the_model_is_found_out_by_baud_and_checksum(model, monkeypatch):
-    monkeypatch.setattr("coloc_graph.robot_io.create.line.ANSWER", 0.4)
+    monkeypatch.setattr("coloc_graph.robot_io.create.line.ANSWER_TIMEOUT", 0.4)
     with CreateEmulator(model) as robot, Create(robot.port) as create:
         assert create.model == model
         assert create._line.decoder.header_counts is (model == 2)
@@ -531,7 +531,7 @@ def test_a_robot_whose_port_comes_back_is_stopped(robot, tmp_path):
 
 
 def test_a_port_that_is_not_there_or_in_use_or_silent(robot, tmp_path, monkeypatch):
-    monkeypatch.setattr("coloc_graph.robot_io.create.line.ANSWER", 0.4)
+    monkeypatch.setattr("coloc_graph.robot_io.create.line.ANSWER_TIMEOUT", 0.4)
     with pytest.raises(RobotError, match=r"cannot open .*nothing.*plugged in, free"):
         Create(str(tmp_path / "nothing")).open()
     with Create(robot.port, 2), pytest.raises(RobotError, match=r"cannot open .*free"):

@@ -272,7 +272,7 @@ def test_of_a_large_team_no_names_are_written_and_it_is_said():
     drawn = Scene(robots, made, (layer_of("joint", robots, made, paths),))
     with Viewer(drawn, port=0) as viewer:
         assert viewer.wait_idle() and not any(name.visible for name in viewer.view._names)
-        assert "no name is written: click one" in viewer.panel.status.content
+        assert "are not shown: click one" in viewer.panel.status.content
 
 
 # inspection
@@ -535,7 +535,7 @@ def test_bad_input_is_one_sentence(make, result, tmp_path, capsys):
         shutil.copy(run, tmp_path / "hallway.mcap")
         if make == "another run":
             simulate("hallway", tmp_path / "hallway.mcap", stances=2, seed=9, points=20)
-            words = "is not the run that"
+            words = "is not the run of the result"
         else:
             (copy / "measurements.csv").write_text("stance,nothing\n1,2\n")
     assert main(["view", str(copy), "--no-browser", "--port", "0"]) == 2
@@ -578,7 +578,7 @@ def test_another_result_is_compared_and_one_of_another_run_refused(scene, result
     text = inspect.robot_report(both, 1, 4)
     assert "| joint |" in text and "result: joint" in text
     write_result(short_solution, tmp_path / "other")
-    with pytest.raises(InputError, match="is not the run that"):
+    with pytest.raises(InputError, match="is not the run of the result"):
         with_other(scene, tmp_path / "other")
 
 

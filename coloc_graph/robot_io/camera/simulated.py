@@ -19,18 +19,18 @@ from coloc_graph.robot_io.camera.source import WAIT, Clock, Frame, clock_ahead
 HEADER = struct.Struct("<qII")
 MAX_PIXELS = 1 << 24  # px of an image
 MAX_LINE = 4096  # bytes of the first line in either direction
-ANSWER = 2.0  # s that the world may take to answer
+ANSWER_TIMEOUT = 2.0  # s that the world may take to answer
 
 
 class WorldCamera:
-    """A robot's camera in the live world at a Unix socket. Raises `CameraError` if there is none."""
+    """Robot's camera in the live world at a Unix socket. Raises `CameraError` if there is none."""
 
     def __init__(self, name: str, address: str, robot: str, clock: Clock) -> None:
         self._name, self._clock = name, clock
         self._buffer = bytearray()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            self._socket.settimeout(ANSWER)
+            self._socket.settimeout(ANSWER_TIMEOUT)
             self._socket.connect(address)
             self._socket.sendall(json.dumps({"robot": robot}).encode() + b"\n")
             while b"\n" not in self._buffer and len(self._buffer) < MAX_LINE:

@@ -71,7 +71,7 @@ class V4l2Camera:
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
         self._capture = cv2.VideoCapture(self._path, cv2.CAP_V4L2)
         if not self._capture.isOpened():
-            raise CameraError(f"{name} cannot be opened: is it free, and does it deliver images?")
+            raise CameraError(f"{name} cannot be opened: check that it is free and delivers images")
         try:
             self._set_up()
             self._capture.grab()  # the driver takes controls for good once it streams
@@ -151,7 +151,7 @@ def _check_device(name: str, path: str) -> None:
     try:
         is_device = stat.S_ISCHR(Path(path).stat().st_mode)
     except OSError as error:
-        raise CameraError(f"{name} cannot be opened ({error.strerror}): is it plugged in?") from error
+        raise CameraError(f"{name} cannot be opened ({error.strerror}): check that it is plugged in") from error
     if not is_device:
         raise CameraError(f"{name} cannot be opened: {path} is not a device; use video:{path} for a recorded video")
     if not os.access(path, os.R_OK | os.W_OK):

@@ -61,7 +61,7 @@ class Video:
         return images()
 
     def grab(self) -> Frame | None:
-        """The next image, once it is due."""
+        """Return the next image, once it is due."""
         ahead = self._began + self._number * self._period - time.monotonic()
         if ahead > 0:
             time.sleep(min(ahead, WAIT))
@@ -75,5 +75,5 @@ class Video:
         return Frame(stamp, image)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._release()

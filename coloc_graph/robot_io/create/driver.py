@@ -45,7 +45,7 @@ class Create:
     port
         Serial port.
     model
-        1 or 2, None to find out.
+        1 or 2, None to detect it.
     robot
         Name of the robot in odometry samples.
     max_speed, max_turn
@@ -83,7 +83,7 @@ class Create:
         epoch: float | None = None,
     ) -> None:
         if model not in (None, *WHEELS):
-            raise InputError(f"there is no Create {model}: the model is 1, 2 or None to find out")
+            raise InputError(f"there is no Create {model}: the model is 1, 2, or None to detect it")
         if isinstance(stop_on, str) or set(stop_on) - set(HAZARDS):
             raise InputError(f"stop_on is a list of {', '.join(HAZARDS)}, not {stop_on}")
         if not (max_speed > 0 and max_turn > 0):
@@ -250,7 +250,7 @@ class Create:
         if not self._wait(lambda: self._armed and self._feed.last > since, timeout):
             why = f"it did not go back to {self._mode.name.lower()} mode{self._feed.because}"
             self._halt(why)
-            raise RobotError(f"the Create on {self.port} cannot go on, {why}: put it right and try again")
+            raise RobotError(f"the Create on {self.port} cannot continue, {why}: correct that and try again")
         self._fault = None
         if self._blames is not blames:
             self._fault = "it was stopped again while it recovered"

@@ -1,4 +1,4 @@
-"""The serial line to a Create, with timeouts for all that is done on it; `CreateLine`."""
+"""Serial line to a Create, with a timeout for every operation; `CreateLine`."""
 
 import contextlib
 import errno
@@ -14,11 +14,11 @@ from coloc_graph.robot_io.create.odometry import WHEELS
 from coloc_graph.robot_io.create.state import DELTAS, STREAMED
 from coloc_graph.robot_io.create.watchdog import Watchdog
 
-ANSWER = 1.0  # s that a robot may take to answer at one baud rate
+ANSWER_TIMEOUT = 1.0  # s that a robot may take to answer at one baud rate
 WRITE = 0.2  # s that a write may take
 READ = 0.05  # s that a read waits for bytes
-BACK = 10.0  # s during which a lost port is waited for
-FREED = 0.5  # s during which a port that another driver held is waited for
+RETURN_TIMEOUT = 10.0  # s to wait for a lost port
+RELEASE_TIMEOUT = 0.5  # s to wait for a port that another driver held
 #: Commands that leave a robot standing, silent and in passive mode.
 LEAVE = oi.HALT + oi.pause_stream() + bytes([oi.START])
 
@@ -31,7 +31,7 @@ class CreateLine:
     port
         Serial port.
     model
-        1 or 2, None to find out by baud rate and checksum.
+        1 or 2, None to detect it by baud rate and checksum.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class CreateLine:
         try:
             self._serial = self._first_opened(models[0])
         except (OSError, ValueError) as error:
-            raise RobotError(f"cannot open {port} ({error}): is it plugged in, free, and yours to use?") from error
+            raise RobotError(f"cannot open {port} ({error}): check that it is plugged in, free and yours") from error
         try:
             self.model = next((one for one in models if self._answers(one)), 0)
             if not self.model:
@@ -72,7 +72,7 @@ class CreateLine:
 
     def _first_opened(self, model: int) -> serial.Serial:
         """Open the port, waiting until the watchdog of a driver that was killed has closed it."""
-        until = time.monotonic() + FREED
+        until = time.monotonic() + RELEASE_TIMEOUT
         while True:
             try:
                 return self._opened(model)
@@ -91,7 +91,7 @@ class CreateLine:
         except OSError as error:
             raise RobotError(f"{self.port} cannot be set to {WHEELS[model].baud} baud ({error})") from error
         self.send(bytes([oi.START]) + oi.stream(self.layouts[0]))
-        until = time.monotonic() + ANSWER
+        until = time.monotonic() + ANSWER_TIMEOUT
         while time.monotonic() < until and self.decoder.header_counts is None:
             self.read()
         return self.decoder.header_counts is not None
@@ -153,8 +153,8 @@ class CreateLine:
             raise RobotError(f"the line on {self.port} is lost ({self.lost}): open it again")
 
     def stop_when_back(self, ended: threading.Event) -> bool:
-        """Stop the robot if its port comes back within `BACK`; return whether it did."""
-        until = time.monotonic() + BACK
+        """Stop the robot if its port comes back within `RETURN_TIMEOUT`; return whether it did."""
+        until = time.monotonic() + RETURN_TIMEOUT
         self.close()
         while time.monotonic() < until and not ended.wait(0.05):
             with contextlib.suppress(OSError, ValueError), self._opened(self.model) as again:

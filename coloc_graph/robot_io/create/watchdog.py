@@ -28,7 +28,7 @@ _END = -1
 
 
 class Watchdog:
-    """The driver's end of a watchdog process that stands by an open serial line.
+    """Driver's end of a watchdog process for an open serial line.
 
     Parameters
     ----------

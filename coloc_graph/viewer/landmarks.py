@@ -9,9 +9,9 @@ from coloc_graph.exchange.landmarks import LandmarkRow
 from coloc_graph.measurements import Sighting
 from coloc_graph.run import Stance
 from coloc_graph.team import Landmark, Team
+from coloc_graph.viewer.links import links_of
 from coloc_graph.viewer.meshes import LED, LED_RADIUS, cylinder, painted
 from coloc_graph.viewer.scene import NO_LANDMARKS, Landmarks
-from coloc_graph.viewer.ties import links_of
 
 POST = 0.012  # m, radius of a post
 FOOT = 0.07  # m, radius of its foot
@@ -48,7 +48,7 @@ def landmarks_in(
 
 
 def sighted_in(measurements: Iterable[object], landmarks: Mapping[str, object]) -> list[tuple[str, int, str]]:
-    """The sightings of landmarks among a graph's measurements."""
+    """Return the sightings of landmarks among measurements: (observer, stance, landmark)."""
     return [
         (one.observer, one.stance, one.seen)
         for one in measurements
@@ -57,12 +57,12 @@ def sighted_in(measurements: Iterable[object], landmarks: Mapping[str, object]) 
 
 
 def landmark_of(team: Team | None, name: str) -> Landmark | None:
-    """A landmark as the team describes it."""
+    """Return a landmark of the team by name; None where there is none."""
     return None if team is None else next((one for one in team.landmarks if one.name == name), None)
 
 
 def landmark_mesh(landmark: Landmark | None) -> trimesh.Trimesh:
-    """A landmark in its frame: a foot, a post, and what is seen of it: a tag's board, or lights on a bar."""
+    """Make the mesh of a landmark in its frame: a foot, a post, and a tag's board or markers on a bar."""
     markers = None if landmark is None else landmark.seen_as
     height = TALL if markers is None else markers.height
     is_tag = landmark is not None and landmark.tag is not None

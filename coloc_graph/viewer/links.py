@@ -9,12 +9,11 @@ from coloc_graph.measurements import Measurement, Node, Odometry, Sighting
 from coloc_graph.run import Run, Stance
 from coloc_graph.viewer.scene import Links
 
-# sightings, and odometry
-Ties = tuple[Links, Links]
 
-
-def ties_in(measurements: Iterable[Measurement], robots: Sequence[str], stances: Sequence[Stance]) -> Ties:
-    """Those of a graph's measurements."""
+def links_in(
+    measurements: Iterable[Measurement], robots: Sequence[str], stances: Sequence[Stance]
+) -> tuple[Links, Links]:
+    """Return the links of measurements: sightings, and odometry."""
     every = list(measurements)
     sightings, odometry = ([m.ends for m in every if isinstance(m, kind)] for kind in (Sighting, Odometry))
     return links_of(sightings, robots, stances), links_of(odometry, robots, stances)
@@ -26,7 +25,7 @@ def links_of(
     stances: Sequence[Stance],
     seen: Sequence[str] | None = None,
 ) -> Links:
-    """Links between robots, or from robots to what is `seen`, that are there."""
+    """Make links between robots, or from robots to the landmarks `seen`; unknown ends are skipped."""
     number = {robot: n for n, robot in enumerate(robots)}
     of_seen = number if seen is None else {name: n for n, name in enumerate(seen)}
     row = {stance.index: n for n, stance in enumerate(stances)}
@@ -37,7 +36,7 @@ def links_of(
 
 
 def wheels_of(run: Run | None) -> dict[str, WheelTrack]:
-    """Wheel odometry of the robots that have any."""
+    """Read the wheel odometry of the robots that have any."""
     if run is None:
         return {}
     tracks = {robot: WheelTrack(robot, list(run.odometry(robot))) for robot in run.team.names}
