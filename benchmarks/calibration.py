@@ -1,4 +1,4 @@
-"""Cameras and mounts from images of a board: are the sigmas true, and how does it compare with OpenCV alone?
+"""Calibrate cameras and mounts by images of a board: consistency of the sigmas, and comparison with OpenCV alone.
 
     python benchmarks/calibration.py [--data FOLDER] [--splits N] [--sets N] [--json]
 

@@ -25,8 +25,7 @@ METHODS = {
 
 
 def one_seed(seed: int, points: int, stances: int) -> dict[str, list[float]]:
-    """Per method: length error of A and B [%], their end position error [cm] and heading error [deg], and of all
-    poses NEES and chi2/dof."""
+    """Return by method errors of A and B: length [%], end position [cm], heading [deg]; NEES, chi2/dof."""
     world = simulated("hallway", seed, points=points, stances=stances)
     figures = {}
     for name, options in METHODS.items():

@@ -45,8 +45,11 @@ METHODS = {
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one run: length errors of A and B [%], the larger heading error at the end [deg], chi2 and dof, NEES of all
-    poses together and how many numbers it is of, and how many measurements were refused."""
+    """Figures of one run.
+
+    Length errors of A and B [%], the larger heading error at the end [deg], chi2 and dof, NEES of all poses together
+    with its number of dimensions, and the number of outliers.
+    """
 
     lengths: tuple[float, float]
     heading: float
@@ -106,7 +109,6 @@ def tracks(seeds: int) -> dict[str, dict[str, object]]:
 
 def last_pose(seed: int, points: int) -> float:
     """NEES of A's last pose alone, planar, 3 numbers: independent from seed to seed."""
-
     world = simulated("hallway", seed, points=points, stances=12, imperfections=WRONG)
     solution, _ = solved(world, SolveOptions("joint"))
     trajectory = solution.estimate.trajectories["A"]

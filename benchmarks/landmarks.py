@@ -39,8 +39,11 @@ PICTURE = Path(__file__).parents[1] / "docs" / "images" / "landmarks.png"
 
 @dataclass(frozen=True)
 class Outcome:
-    """One run: RMS position errors of the pair by distance [m], of the end, heading there [deg], NEES of the last pose
-    that stood and of all, of the landmarks, and their errors [m]."""
+    """Figures of one run.
+
+    RMS position errors of the pair by distance [m], of the end, heading there [deg], NEES of the last standing pose and
+    of all, of the landmarks, and their errors [m].
+    """
 
     by_distance: list[float]
     end: float

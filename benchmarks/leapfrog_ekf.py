@@ -180,8 +180,11 @@ METHODS: dict[str, Callable[[PoseGraph], Estimate]] = {
 
 
 def of_seed(seed: int, imperfections: Imperfections, points: int, stances: int) -> dict[str, dict[str, list[float]]]:
-    """One run, by each method: length errors and errors of the end of A and B [% of their way], the larger of their
-    heading errors at the end [deg], NEES of all poses and of A's last, CPU time [s]."""
+    """Figures of one run by each method.
+
+    Length errors and end position errors of A and B [% of their path], the larger of their heading errors at the end
+    [deg], NEES of all poses and of A's last, CPU time [s].
+    """
     world = simulated("hallway", seed, points=points, stances=stances, imperfections=imperfections)
     run: Any = MemoryRun(world)
     paper, graph = (solve(run, SolveOptions(method)).estimate.graph for method in ("chain", "joint"))

@@ -1,4 +1,4 @@
-"""Single steps of two cameras in a messy world: is what comes of them right, or said to be nothing?
+"""Measure single steps of two cameras in a messy world: right, unusable, or false.
 
     python benchmarks/messy.py [--runs 200] [--json]
 

@@ -53,8 +53,11 @@ def world_of(robots: int, stances: int, seed: int, at_once: int | None = None) -
 
 @dataclass(frozen=True)
 class Figures:
-    """Of a run: NEES per degree of freedom of one pose, of all on average; RMS errors of the team and of the single
-    chain, and what their covariances promise [m]; chi2 and dof."""
+    """Figures of a run.
+
+    NEES per degree of freedom of one pose, and of all on average; RMS errors of the team and of the single chain, and
+    those predicted by their covariances [m]; chi2 and dof.
+    """
 
     last: float
     anees: float

@@ -1,8 +1,8 @@
-"""The paper's experiments, simulated: Figs. 4 and 5, Tables I and II, each with the paper's own figures,
-eq. (2) as the paper computes it, and our estimate, side by side.
+"""The paper's experiments, simulated: Figs. 4 and 5, Tables I and II.
 
-`fig4`, `fig5`, `table1`, `table2` run one and return its result, which `save` writes as PNG, SVG and JSON.
-Both depths go the same road: a run is simulated to a file, opened, and measured by the front end.
+Each shows the paper's own figures, eq. (2) as the paper computes it, and our estimate, side by side. `fig4`, `fig5`,
+`table1`, `table2` run one and return its result, which `save` writes as PNG, SVG and JSON. A run is simulated to a
+file, opened, and measured by the front end.
 """
 
 from coloc_graph.experiments.multi_step_results import Table1, Table2, table1, table2

@@ -149,8 +149,10 @@ class Table2:
         return rows
 
     def rms(self, method: str) -> dict[str, float]:
-        """RMS over all runs and robots, by `eq2` or `ours`: `rate_percent` and `error_cm` of the length, and
-        `end_error_cm`, the distance of the last place from the true one."""
+        """Return RMS errors over all runs and robots, by `eq2` or `ours`.
+
+        `rate_percent` and `error_cm` of the length, and `end_error_cm`, the distance of the last pose from truth.
+        """
         every = [(course, getattr(course, method)) for one in self.outings for course in one.courses.values()]
         figures = {
             "rate_percent": [course.rate_percent(places) for course, places in every],

@@ -21,11 +21,11 @@ def spread(
     cluster: str | None = None,
     progress: Progress | None = None,
 ) -> list[Result]:
-    """`work` of each item, in the order of the items, by new (spawned) processes or, with one, by this; or by the Dask
-    scheduler at the address `cluster`.
+    """Return the results of `work` on each item, in the order of the items.
 
-    What it returns does not depend on where. A script that asks for more than one needs the usual
-    `if __name__ == "__main__":`. The first error of any item ends it all and is raised here.
+    By spawned processes, in this process where `processes` is 1, or by the Dask scheduler at the address `cluster`. A
+    script that calls this with several needs the usual `if __name__ == "__main__":`. The first error of any item ends
+    all and is raised here.
     """
     results: list[Result] = []
 

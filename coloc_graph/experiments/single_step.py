@@ -35,8 +35,11 @@ LEAST_DRAWN = 8
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """Estimates of one method in the runs of a cell: `lengths` (runs,) [m], NaN where the points did not
-    determine a pose, and `overlap_px` (runs,), the pixels of image i that see what image j sees, by its H."""
+    """Estimates of one method in the runs of a cell.
+
+    `lengths` (runs,) [m], NaN where the points did not determine a pose, and `overlap_px` (runs,), the pixels of image
+    i that see the part of the plane that image j sees, by its H.
+    """
 
     lengths: Array
     overlap_px: Array

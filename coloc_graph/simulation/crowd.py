@@ -32,16 +32,20 @@ class Faults:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Detections of one camera: `images`, and for each of its detections which light it is (mover * markers + marker),
-    -1 where it is none or several."""
+    """Detections of one camera, with the light of each.
+
+    `images` are the detections; the light is mover * markers + marker, -1 where it is none or several.
+    """
 
     images: list[Detections]
     lights: list[NDArray[np.int64]]
 
 
 def wander(movers: int, seconds: float, area: ArrayLike, rng: np.random.Generator) -> Array:
-    """Poses (n, movers, 3) of x, y [m], yaw [rad], every `STEP`, of robots that drive from place to place, and make way
-    for each other, in an area (4,) of all, or (movers, 4) of each: x from and to, y from and to [m]."""
+    """Simulate robots that drive about in an area and avoid each other; return poses (n, movers, 3) every `STEP`.
+
+    Poses are x, y [m], yaw [rad]. The area (4,), or (movers, 4) for each robot, is x from and to, y from and to [m].
+    """
     areas = np.broadcast_to(np.asarray(area, float), (movers, 4))
     low, high = areas[:, ::2], areas[:, 1::2]
     poses = np.empty((movers, 3))
@@ -75,8 +79,10 @@ def wander(movers: int, seconds: float, area: ArrayLike, rng: np.random.Generato
 
 
 def lights_of(poses: Array, times: Array, p_markers: Array) -> Array:
-    """Places (k, movers, m, 3) [m] of markers (m, 3) on robots that go as `wander` has it (n, movers, 3), at `times`
-    (k,) [s] from its first pose on."""
+    """Return positions (k, movers, m, 3) [m] of markers (m, 3) on robots with poses by `wander` (n, movers, 3).
+
+    At `times` (k,) [s] since the first pose.
+    """
     n, movers, _ = poses.shape
     at = np.clip(times / STEP, 0, n - 1)
     x, y = (np.stack([np.interp(at, np.arange(n), poses[:, r, c]) for r in range(movers)], 1) for c in range(2))
@@ -96,8 +102,10 @@ def detect(
     rng: np.random.Generator,
     blinking: Sequence[Blinking] = (),
 ) -> Seen:
-    """Detect, with the camera of a standing robot, lights at (k, ..., 3) [m] at `times` (k,) [s]; where robots blink,
-    lights are at (k, movers, m, 3)."""
+    """Detect lights (k, ..., 3) [m] at `times` (k,) [s] with the camera of a standing robot.
+
+    Where robots blink, lights are (k, movers, m, 3).
+    """
     uv, inside = view.project(p_lights.reshape(len(times), -1, 3))
     for n, one in enumerate(blinking):
         own = slice(n * p_lights.shape[2], (n + 1) * p_lights.shape[2])
@@ -149,8 +157,10 @@ def crowd(
     seed: int = 0,
     start: float = 1_700_000_000.0,
 ) -> tuple[list[Seen], Array]:
-    """Detections by cameras (of robots A, B, ...) of robots that wander in an area, and positions (k, movers, m, 3) of
-    their lights, which are on all the time, or `blinking`."""
+    """Simulate detections by cameras (of robots A, B, ...) of robots that wander in an area.
+
+    Returns them with the positions (k, movers, m, 3) of the lights, which are always on, or `blinking`.
+    """
     rng = np.random.default_rng(seed)
     times = np.arange(round(seconds * fps)) / fps
     p_lights = lights_of(wander(movers, seconds + STEP, area, rng), times, p_markers)

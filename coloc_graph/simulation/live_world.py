@@ -159,8 +159,10 @@ class LiveWorld:
         link.symlink_to(self.emulators[robot].port)
 
     def poses_at(self, times: Array) -> Array:
-        """True T_world_body (robots, n, 4, 4) of all robots, in the team's order, at instants (n,) of the last minutes
-        [s, CLOCK_MONOTONIC]."""
+        """Return true T_world_body (robots, n, 4, 4) of all robots, in the team's order.
+
+        At times (n,) of the last minutes [s, CLOCK_MONOTONIC].
+        """
         planar = np.concatenate([emulator.poses_at(times) for emulator in self.emulators.values()])
         return self._floor.pose(planar).reshape(len(self.emulators), -1, 4, 4)
 

@@ -89,8 +89,11 @@ class Scenario:
 
 @dataclass(frozen=True)
 class TeamScenario(Scenario):
-    """`names` in lanes, of which the hindmost `at_once` drive about before all others in each stance, and then stand in
-    front: at `poses[s]` stands robot s modulo their number; in stance k, poses k * at_once and on are taken."""
+    """Leap-frog of robots `names` in lanes.
+
+    In each stance the hindmost `at_once` drive about in view of all others, and then stand in front. Robot s modulo
+    their number stands at `poses[s]`; in stance k, the poses from k * at_once on are taken.
+    """
 
     names: tuple[str, ...] = ()
     at_once: int = 1
@@ -125,8 +128,10 @@ class TeamScenario(Scenario):
 
 @dataclass(frozen=True)
 class CourseScenario(Scenario):
-    """A leap-frog round and round a course: `headings[k]` is the way the team goes in stance k [rad]; `landmarks` are
-    where these stand, facing those who come."""
+    """Leap-frog round a course.
+
+    `headings[k]` is the team's direction in stance k [rad]; `landmarks` are the poses of landmarks, facing the team.
+    """
 
     headings: tuple[float, ...] = ()
     landmarks: tuple[Pose, ...] = ()
@@ -190,8 +195,10 @@ def hallway(stances: int | None = None, rng: np.random.Generator | None = None, 
 def team_of(
     robots: int = 10, at_once: int | None = None, stances: int = 30, rng: np.random.Generator | None = None
 ) -> TeamScenario:
-    """`robots` in lanes, of which `at_once` (a quarter of them by default) move at a time; each stop is off by some
-    centimetres and degrees."""
+    """Team of `robots` in lanes, of which `at_once` (by default a quarter) move at a time.
+
+    Each stop has errors of some centimetres and degrees.
+    """
     at_once = max(robots // 4, 1) if at_once is None else at_once
     if not 3 <= robots <= 255:
         raise InputError(f"a team has 3 to 255 robots, not {robots}")
@@ -219,8 +226,10 @@ def course(
     rng: np.random.Generator | None = None,
     gait: Gait = COURSE_GAIT,
 ) -> CourseScenario:
-    """A leap-frog of `length` [m] in all, `laps` times round a square with round corners, landmarks on its outer wall
-    every so many metres; each stop is off by a centimetre and a degree."""
+    """Leap-frog of `length` [m] in all, `laps` times round a square with round corners.
+
+    Landmarks are on its outer wall at regular distances; each stop has errors of a centimetre and a degree.
+    """
     if laps < 1:
         raise InputError(f"`laps` is {laps}; give at least 1")
     for name, value in (("length", length), ("landmark_every", landmark_every)):

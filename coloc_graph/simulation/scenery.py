@@ -57,8 +57,10 @@ def make_scenery(world: World) -> Scenery:
 
 
 def scenery_along(first: float, last: float, rng: np.random.Generator) -> Scenery:
-    """Of robots that drive from x = `first` to `last` [m]: ceiling lamps mirrored in the floor, shining specks on it,
-    and windows."""
+    """Make scenery for robots that drive from x = `first` to `last` [m].
+
+    Ceiling lamps mirrored in the floor, shining specks on it, and windows.
+    """
     lamps_x = np.arange(first + 3.5, last + 12.0, 2.2)
     n = len(lamps_x)
     lamps = np.column_stack([lamps_x + rng.normal(0, 0.2, n), rng.uniform(-1.2, 1.2, n), np.full(n, -CEILING)])

@@ -132,8 +132,10 @@ def both_see(views: tuple[View, View], points_world: Array) -> NDArray[np.bool_]
 
 
 def _short_order(poses: Array) -> tuple[NDArray[np.int64], Array]:
-    """Order (n,) in which poses (n, 3) are soon driven through (always to the one soonest reached), and
-    for each pose whether it is passed forwards (1) or backwards (-1)."""
+    """Return a short order (n,) of poses (n, 3), always to the one soonest reached.
+
+    With the direction in which each is passed: forwards (1) or backwards (-1).
+    """
     n = len(poses)
     order, ahead = np.zeros(n, np.int64), np.ones(n)
     left = np.ones(n, bool)

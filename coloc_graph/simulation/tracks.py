@@ -43,8 +43,10 @@ class StanceTracks:
 
 
 def observe(world: World, k: int) -> tuple[StanceTracks, ...]:
-    """Detections of markers by the observers of stance k, in the order of `Stance.observers`; without their names where
-    robots blink."""
+    """Simulate detections of markers by the observers of stance k, in the order of `Stance.observers`.
+
+    Without their names where robots blink.
+    """
     rng, out = stream(world.seed, "detection", k), []
     blinks = blinking(world.true_team, stream(world.seed, "blink"))
     for capture in world.captures[k]:

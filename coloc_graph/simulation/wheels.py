@@ -22,8 +22,10 @@ FLOOR_RADIANS = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Odometry:
-    """One robot's odometry over a run: `poses` (n, 3) of x, y [m], yaw [rad] and increments' `covariances`
-    (n, 3, 3) at true `times` (n,) [UTC s]."""
+    """Odometry of one robot over a run.
+
+    `poses` (n, 3) of x, y [m], yaw [rad] and `covariances` (n, 3, 3) of the increments at true `times` (n,) [UTC s].
+    """
 
     times: Array
     poses: Array

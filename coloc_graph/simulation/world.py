@@ -255,8 +255,10 @@ class _Builder:
         self.builders[scenario.mover] = PathBuilder(time, tour.leg.knots[0], self.sigma, floor)
 
     def _gather(self, k: int, tour: Tour, time: float) -> float:
-        """Between stances: the one behind overtakes its partner, the mover goes where its next tour begins.
-        Returns when both are there."""
+        """Move the robots between stances: the one behind overtakes its partner, the mover drives to its next tour.
+
+        Returns the time when both have arrived.
+        """
         scenario, ends = self.scenario, []
         for robot, target, tilt in (
             *((robot, np.array(scenario.poses[n]), self.tilts[n]) for robot, n in scenario.leaps(k).items()),
