@@ -11,7 +11,7 @@ from typing import Self
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.estimation_worker import EstimationWorker
-from coloc_graph.online.formation import Course, Formation
+from coloc_graph.online.formation import Formation
 from coloc_graph.online.inbox import Inbox, Message, linked
 from coloc_graph.online.leap_frog import LeapFrog
 from coloc_graph.online.mission import MissionOptions, MissionStatus, in_world, roles
@@ -21,6 +21,7 @@ from coloc_graph.online.mission_states import MissionState
 from coloc_graph.online.resume import restore
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
+from coloc_graph.planning.course import Course
 from coloc_graph.robot_io.link.messages import Event, Sample, Status, Wheels
 from coloc_graph.robot_io.link.zenoh_config import Tls
 from coloc_graph.run.schemas import to_ns

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar, compose, inverse
-from coloc_graph.online.formation import STAGGER, Course, Formation
+from coloc_graph.online.formation import STAGGER, Formation
 from coloc_graph.pipeline.options import SolveOptions
+from coloc_graph.planning.course import Course
 from coloc_graph.team import Team
 
 MOVER_AHEAD = 1.28  # start of the mover ahead of the observers' middle [m]

@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 
 SPEED = 0.2  # speed of the mover [m/s]
 TURN_RATE = 1.0  # turn rate of a robot that turns on the spot [rad/s]
+COVERED = 0.84  # drive that brings half of what evenly spread images would bring in its time [m]
 SHORTEST = 1e-6  # waypoints closer to each other are one [m]
 
 
@@ -25,6 +26,17 @@ class Drive:
     def at(self, t: ArrayLike) -> Array:
         """Return poses (m, 3) at times (m,) [s]; the robot rests at the last knot."""
         return np.stack([np.interp(np.asarray(t, float), self.times, column) for column in self.knots.T], axis=-1)
+
+
+def effective_seconds(seconds: ArrayLike, speed: float) -> Array:
+    """Return the seconds (...) of evenly spread images that bring as much as the best drive of `seconds` does.
+
+    A short drive sees little of the common view. Found by comparing drives of 2 s to 35 s in four formations, at 0.2
+    and 0.4 m/s: within 15 % from 1 m on.
+    """
+    seconds = np.asarray(seconds, float)
+    length = speed * seconds
+    return np.asarray(seconds * length**2 / (length**2 + COVERED**2))
 
 
 def there_and_back(waypoints: ArrayLike, duration: float, speed: float = SPEED) -> Array:

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import between
 from coloc_graph.planning.belief import Belief, leap_model, updated
+from coloc_graph.planning.drive import effective_seconds
 from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.mission import Mission, leap_frog, leap_time, stances_of
 from coloc_graph.planning.mover_path import cells
 from coloc_graph.planning.prediction import Predictor
+from coloc_graph.planning.slip import view_margin
 from coloc_graph.team import Robot, Team
 
 Array = NDArray[np.float64]
@@ -83,8 +85,8 @@ class GaitSearch:
             raise InputError(f"a way of {length} m is none: give a length above 0 m")
         self.predictor, self.length, self.pair, self.mover = predictor, length, pair, mover
         if gaits is None:
-            # leaps that come to the end of the way in a whole number of stances
-            leaps = sorted({length / max(math.ceil(length / leap - 0.1), 1) for leap in LEAPS})
+            # leaps with which the middle of the pair comes to the end in a whole number of stances
+            leaps = sorted({length / (math.ceil(length / leap + 0.4) - 0.5) for leap in LEAPS if leap <= length})
             gaits = [PAPER, *(Gait(*one) for one in product(leaps, ABREAST, TOE_INS) if one[0] <= LEAPS[-1])]
         made = [self._candidate(gait) for gait in gaits]
         self.candidates = [one for one in made if one is not None]
@@ -98,7 +100,9 @@ class GaitSearch:
         information = []
         for k in (0, 1):
             standing = np.array([gait.stop(k), gait.stop(k + 1)])
-            found = cells(self.predictor.model((self.pair[k], self.pair[1 - k]), self.mover), standing)
+            model = self.predictor.model((self.pair[k], self.pair[1 - k]), self.mover)
+            margin = float(view_margin(2 * gait.leap, self.predictor.team[self.pair[1 - k]].camera.fx))
+            found = cells(model, standing, margin)
             if len(found.places) < 3:
                 return None
             information.append(self.predictor.fps * found.information.mean(axis=0))
@@ -114,8 +118,9 @@ class GaitSearch:
         return (time - (n - 1) * candidate.leap_time) / n
 
     def end_sigma(self, candidate: Candidate, seconds: float) -> float:
-        """Return the promised sigma of the last positions [m] with stances of this duration, evenly spread points."""
+        """Return the sigma of the last positions [m] that stances of this duration are expected to bring."""
         gait, names = candidate.gait, (*self.pair, self.mover)
+        seconds = float(effective_seconds(seconds, self.predictor.speed))
         places = gait.stop(0), gait.stop(1), (1.5, 0.0, 0.0)
         belief = Belief.start(self.predictor.team, dict(zip(names, places, strict=True)))
         P = belief.covariance

@@ -13,6 +13,7 @@ from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.mover_path import best_drives, cells, design, patrol
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor, Promise
+from coloc_graph.planning.slip import view_margin
 
 SETTLE = 2.0  # time that all robots stand before a stance [s]
 
@@ -74,8 +75,8 @@ def leap_time(start: Planar, target: Planar, speed: float) -> float:
 
 
 def stances_of(gait: Gait, length: float) -> int:
-    """Return the number of stances of a gait over a length [m]."""
-    return max(math.ceil(length / gait.leap - 0.1), 1)
+    """Return the number of stances in which the middle of a pair comes to a length [m], but for a tenth of a leap."""
+    return max(math.ceil(length / gait.leap + 0.4), 1)
 
 
 def leap_frog(
@@ -137,9 +138,10 @@ def best_stance(
     mover: str,
     seconds: float,
     goal: tuple[float, float],
+    leapt: float = 0.0,
     designed: bool = True,
 ) -> tuple[PlannedStance, Promise]:
-    """Choose the mover's drive in a stance of a team, `belief`, that stands there already.
+    """Choose the mover's drive in a stance of a team, `belief`, that stands there after a leap of `leapt` [m].
 
     Raises
     ------
@@ -147,7 +149,8 @@ def best_stance(
         If the observers see too little of the floor together.
     """
     names = tuple(standing)
-    found = cells(predictor.model(names, mover), np.array(list(standing.values())), predictor.free)
+    margin = float(view_margin(leapt, predictor.team[names[-1]].camera.fx))
+    found = cells(predictor.model(names, mover), np.array(list(standing.values())), margin, predictor.free)
     if len(found.places) < 2:
         raise InputError(
             f"{' and '.join(names)} have no common view of the floor where they are to stand: "

@@ -18,7 +18,6 @@ AHEAD = (0.3, 2.6)  # the cells begin and end this far ahead of an observer [m]
 ASIDE = 1.6  # and go this far to either side [m]
 YAWS = (0.0, np.pi / 2)  # headings at which each place is weighed [rad]
 CLEARANCE = 0.45  # distance of the mover's middle from robots that stand [m]
-MARGIN = 12.0  # distance of its markers from the borders of images: about two sigmas of a slip of the robots [px]
 ROUNDS = 12  # steps of the multiplicative algorithm
 MERGED = 0.35  # places nearer to each other are one waypoint [m]
 MOST = 5  # number of places with large shares through which drives are tried
@@ -26,6 +25,7 @@ WORTH = 0.5  # a share is large above this, relative to equal shares
 KNOTS = 8  # number of places through which drives are tried, with the outermost ones
 LONGER = 10  # number of drives through three places that are tried with a fourth
 KEPT = 3  # number of drives that are kept
+SPREAD = 14  # cells of a common view by which stances are compared
 SAMPLES = 24  # instants at which a drive is compared with the places
 
 #: Returns whether places (..., 2) [m] are free of walls by a distance [m].
@@ -48,9 +48,12 @@ class Cells:
     information: Array
 
 
-def cells(model: StanceModel, standing: Array, free: Free | None = None) -> Cells:
-    """Find the places of the common view of observers at poses (r, 3), and what an image from each brings."""
-    places = places_in_common_view(model, standing, free)
+def cells(model: StanceModel, standing: Array, margin: float, free: Free | None = None) -> Cells:
+    """Find the places of the common view of observers at poses (r, 3), and what an image from each brings.
+
+    Markers are at least `margin` [px] from the borders of the images.
+    """
+    places = places_in_common_view(model, standing, margin, free)
     if not len(places):
         return Cells(places, np.zeros((0, model.variables, model.variables)))
     drive = np.concatenate([np.column_stack([places, np.full(len(places), yaw)]) for yaw in YAWS])
@@ -58,7 +61,7 @@ def cells(model: StanceModel, standing: Array, free: Free | None = None) -> Cell
     return Cells(places, information.reshape(len(YAWS), len(places), *information.shape[1:]).mean(axis=0))
 
 
-def places_in_common_view(model: StanceModel, standing: Array, free: Free | None = None) -> Array:
+def places_in_common_view(model: StanceModel, standing: Array, margin: float, free: Free | None = None) -> Array:
     """Places (n, 2) [m] where all cameras see all markers of the mover at any heading, clear of robots and walls."""
     xy = _grid(standing)
     away = np.hypot(*np.moveaxis(xy[:, None] - standing[None, :, :2], -1, 0)).min(axis=1)
@@ -68,7 +71,7 @@ def places_in_common_view(model: StanceModel, standing: Array, free: Free | None
     reach = float(np.hypot(*model.p_markers[:, :2].T).max())
     rim = reach * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     points = np.concatenate([xy[:, None] + rim, np.full((len(xy), 4, 1), model.p_markers[0, 2])], axis=-1)
-    seen = model.in_view(standing, points.reshape(-1, 3), MARGIN).reshape(len(standing), len(xy), 4)
+    seen = model.in_view(standing, points.reshape(-1, 3), margin).reshape(len(standing), len(xy), 4)
     return np.asarray(xy[seen.all(axis=(0, 2))])
 
 
@@ -204,3 +207,48 @@ def patrol(places: Array, heading: float = 0.0) -> tuple[Waypoint, ...]:
     directions = np.array([[-1.0, 0.0], [1.0, 1.5], [1.0, -1.5]]) @ np.array([[c, s], [-s, c]])
     corners = places[np.argmax(places @ directions.T, axis=0)]
     return tuple((float(x), float(y)) for x, y in np.vstack([corners, places.mean(axis=0)]))
+
+
+def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free | None = None) -> tuple[Array, Array]:
+    """Return what an image brings in many stances, spread evenly over the common view of each.
+
+    Parameters
+    ----------
+    model
+        The stance's robots; the first observer stands in the same place in all.
+    standing
+        Poses (b, r, 3) of the observers.
+    margins
+        Distance (b,) of the markers from the borders of the images [px].
+    free
+        Returns which places are free of walls.
+
+    Returns
+    -------
+    tuple
+        Information (b, d, d), and the number (b,) of cells of the common view.
+    """
+    xy = _grid(standing[0])
+    if free is not None:
+        xy = xy[free(xy, CLEARANCE / 2)]
+    reach = float(np.hypot(*model.p_markers[:, :2].T).max())
+    rim = reach * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    points = np.concatenate([xy[:, None] + rim, np.full((len(xy), 4, 1), model.p_markers[0, 2])], axis=-1)
+    # the first observer is the same in all: what it does not see need not be asked of the others
+    alone = model.in_view(standing[:1], points.reshape(1, -1, 3), 0.0)[0, 0].reshape(-1, 4).all(axis=1)
+    xy, points = xy[alone], points[alone]
+    everywhere = np.broadcast_to(points.reshape(-1, 3), (len(standing), 4 * len(xy), 3))
+    seen = model.in_view(standing, everywhere, margins[:, None]).reshape(len(standing), -1, len(xy), 4)
+    common = seen.all(axis=(1, 3))
+    away = np.hypot(*np.moveaxis(xy[None, :, None] - standing[:, None, :, :2], -1, 0)).min(axis=2)
+    common &= away > CLEARANCE
+    count = common.sum(axis=1)
+    # a few cells of each, spread by a fixed order
+    rank = np.random.default_rng(0).permutation(len(xy))
+    chosen = np.argsort(np.where(common, rank, len(xy) + rank), axis=1)[:, :SPREAD]
+    used = np.take_along_axis(common, chosen, axis=1)
+    yaw = np.where(rank[chosen] % 2, YAWS[1], YAWS[0])
+    drive = np.concatenate([xy[chosen], yaw[..., None]], axis=-1)
+    information = model.see(standing, drive).information
+    weight = used / np.maximum(used.sum(axis=1, keepdims=True), 1)
+    return np.einsum("bn,bnij->bij", weight, information), count

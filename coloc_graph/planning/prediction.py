@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.planning.belief import Belief
 from coloc_graph.planning.drive import SPEED, drive_through, there_and_back
+from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.stance_information import StanceModel
 from coloc_graph.team import Team
@@ -43,8 +44,8 @@ class Predictor:
         False to predict without wheel odometry.
     speed
         Speed of the mover and of leaps [m/s].
-    free
-        Returns which places (..., 2) [m] are free of walls by a distance [m]; None where there are none.
+    floor_map
+        Walls; None where there are none.
     """
 
     team: Team
@@ -52,14 +53,19 @@ class Predictor:
     noise_px: float | None = None
     odometry: bool = True
     speed: float = SPEED
-    free: Callable[[Array, float], NDArray[np.bool_]] | None = None
+    floor_map: FloorMap | None = None
     _models: dict[tuple[tuple[str, ...], str], StanceModel] = field(default_factory=dict)
+
+    @property
+    def free(self) -> Callable[[Array, float], NDArray[np.bool_]] | None:
+        """Returns which places (..., 2) [m] are free of walls by a distance [m]; None without a map."""
+        return None if self.floor_map is None else self.floor_map.clear
 
     def model(self, observers: Sequence[str], mover: str) -> StanceModel:
         """Return the model of a stance of these robots."""
         key = tuple(observers), mover
         if key not in self._models:
-            self._models[key] = StanceModel(self.team, observers, mover, self.noise_px)
+            self._models[key] = StanceModel(self.team, observers, mover, self.noise_px, floor_map=self.floor_map)
         return self._models[key]
 
     def of_stance(self, before: Belief, stance: PlannedStance) -> Promise:

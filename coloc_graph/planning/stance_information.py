@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from coloc_graph.backend.camera_model import Mounts
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.lie import floor_pose, hat
+from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.team import Team
 from coloc_graph.team.shared_view import hidden
 
@@ -57,6 +58,8 @@ class StanceModel:
         Standard deviation of a marker centre per axis [px]; None for what the cameras state.
     mounts
         Errors (r, 3) of the observers' mounts as they are estimated; None for mounts as stated.
+    floor_map
+        Walls that block the view; None where there are none.
 
     Raises
     ------
@@ -71,7 +74,9 @@ class StanceModel:
         mover: str,
         noise_px: float | None = None,
         mounts: Array | None = None,
+        floor_map: FloorMap | None = None,
     ) -> None:
+        self._floor_map = floor_map
         markers = team[mover].markers
         if markers is None or len(markers.positions) < 2:
             raise InputError(f"{mover} is to be watched and has fewer than two markers: give it two")
@@ -103,21 +108,29 @@ class StanceModel:
         T = floor_pose(*np.moveaxis(standing, -1, 0))
         return T[..., :3, :3] @ self._R, (T[..., :3, :3] @ self._t[..., None])[..., 0] + T[..., :3, 3]
 
-    def in_view(self, standing: Array, points: Array, margin: float = MARGIN) -> NDArray[np.bool_]:
+    def in_view(self, standing: Array, points: Array, margin: float | Array = MARGIN) -> NDArray[np.bool_]:
         """Return which points (..., n, 3) [m] each camera sees, (..., r, n): in the image, near, and not hidden."""
         R, eyes = self.views(standing)
         p = (points[..., None, :, :] - eyes[..., None, :]) @ R
         return self._visible(standing, points, eyes, p, margin)
 
-    def _visible(self, standing: Array, points: Array, eyes: Array, p: Array, margin: float) -> NDArray[np.bool_]:
+    def _visible(
+        self, standing: Array, points: Array, eyes: Array, p: Array, margin: float | Array
+    ) -> NDArray[np.bool_]:
         seen = np.empty(p.shape[:-1], bool)
         for n, camera in enumerate(self._cameras):
             uv, inside = camera.project(p[..., n, :, :])
             size = np.array([camera.width, camera.height])
             with np.errstate(invalid="ignore"):
-                seen[..., n, :] = inside & (uv >= margin - 0.5).all(-1) & (uv <= size - 0.5 - margin).all(-1)
+                edge = np.asarray(margin)[..., None]
+                seen[..., n, :] = inside & (uv >= edge - 0.5).all(-1) & (uv <= size - 0.5 - edge).all(-1)
             others = np.delete(standing[..., :2], n, axis=-2)
             seen[..., n, :] &= ~hidden(eyes[..., n, None, :], points, others[..., None, :, :])
+            if self._floor_map is not None:
+                which = np.nonzero(seen[..., n, :])
+                shape = (*seen[..., n, :].shape, 3)
+                from_eyes = np.broadcast_to(eyes[..., n, None, :], shape)[which]
+                seen[..., n, :][which] = ~self._floor_map.blocked(from_eyes, np.broadcast_to(points, shape)[which])
         return np.asarray(seen & (np.linalg.norm(p, axis=-1) < MAX_RANGE))
 
     def see(self, standing: Array, drive: Array) -> Seen:

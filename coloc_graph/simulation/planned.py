@@ -8,14 +8,12 @@ import numpy as np
 from coloc_graph.errors import InputError
 from coloc_graph.planning.drive import drive_through, there_and_back
 from coloc_graph.planning.plan import Plan
+from coloc_graph.planning.slip import HEADING_SIGMA, stop_sigma
 from coloc_graph.simulation.paths import Array, Leg
 from coloc_graph.simulation.scenarios import Box, Pose, Scenario
 from coloc_graph.simulation.tours import Tour, both_see, no_common_view
 from coloc_graph.team.shared_view import View, hidden
 
-STOP_SIGMA = 0.01  # standard deviation of where a robot stops, per axis [m]
-STOP_PER_METRE = 0.02  # the same for each metre that it has leapt [m]
-HEADING_SIGMA_DEG = 1.0  # standard deviation of the heading with which it stops [deg]
 LEAST_POINTS = 6  # correspondences without which a stance has no homography
 
 
@@ -108,8 +106,8 @@ def planned(plan: Plan, rng: np.random.Generator | None = None) -> PlannedScenar
                 numbers[name] = at[-1][name]
                 continue
             leapt = math.dist(last[name][:2], target[:2]) if name in last else 0.0
-            sigma = math.hypot(STOP_SIGMA, STOP_PER_METRE * leapt)
-            off = rng.standard_normal(3) * (sigma, sigma, math.radians(HEADING_SIGMA_DEG))
+            sigma = float(stop_sigma(leapt))
+            off = rng.standard_normal(3) * (sigma, sigma, HEADING_SIGMA)
             numbers[name], last[name] = len(poses), target
             x, y, yaw = np.add(target, off).tolist()
             poses.append((x, y, yaw))

@@ -9,7 +9,7 @@ import pytest
 from coloc_graph.errors import RobotError
 from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.estimation_worker import EstimationWorker
-from coloc_graph.online.formation import STAGGER, Course, Formation
+from coloc_graph.online.formation import STAGGER, Formation
 from coloc_graph.online.inbox import Inbox
 from coloc_graph.online.leap_frog import CALM, LeapFrog
 from coloc_graph.online.leap_planner import LeapPlanner
@@ -19,6 +19,7 @@ from coloc_graph.online.mission_states import MissionState
 from coloc_graph.online.record import Record
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.pipeline.incremental import StanceSolver
+from coloc_graph.planning.course import Course
 from coloc_graph.robot_io.link.messages import Capture, Drive, EndCapture, Event, Halt, Reply, Status, Wheels
 from coloc_graph.run import Stance
 from coloc_graph.simulation.simulated_team import field_team

@@ -12,7 +12,7 @@ from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.geometry.se2 import compose, inverse
 from coloc_graph.online.encoder_log import Counted, EncoderLog, way_since
 from coloc_graph.online.estimation_worker import EstimationWorker
-from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Course, Formation
+from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Formation
 from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateMachine, as_dot
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_restart import DROVE, STOOD, JoinedOdometry
@@ -20,6 +20,7 @@ from coloc_graph.online.pose_tracker import PoseTracker
 from coloc_graph.online.record import Record, continued
 from coloc_graph.online.visibility import InView
 from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
+from coloc_graph.planning.course import Course
 from coloc_graph.run import Detections, OdometrySample, Stance, open_run
 from coloc_graph.simulation.rig import reference_team
 from coloc_graph.team.shared_view import View

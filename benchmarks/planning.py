@@ -1,0 +1,183 @@
+"""Plans against fixed formations: the same simulator and the same joint estimate, over paired seeds.
+
+    python benchmarks/planning.py [--seeds 40]           a straight 7.2 m at depth tracks, equal images in all
+    python benchmarks/planning.py --images 8             the same from rendered images
+    python benchmarks/planning.py --fps 30 --seconds 1.67  as many images, and less time to drive
+
+The mover drives its way at 0.2 m/s, robots hide what is behind them, and stop where their leaps slip to (1 cm and
+1 cm for each metre, 1 deg). Mounts are wrong by 1 deg and 5 mm, the span by 0.1 mm, the floor by 0.1 deg (one sigma).
+b0 is the paper's formation with its patrol, b1 the same with the best l and theta of Fig. 4, b2 the best fixed gait
+with its patrol; `gait` is the best gait with designed drives, `horizon` the receding horizon (docs/planning.md).
+"""
+
+import argparse
+import json
+import math
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from monte_carlo import over_seeds, solved, truth_of
+
+from coloc_graph.errors import ColocError
+from coloc_graph.evaluation import align
+from coloc_graph.pipeline.batch import Solution, SolveOptions, solve
+from coloc_graph.planning.formation import PAPER, Gait
+from coloc_graph.planning.gaits import GaitSearch
+from coloc_graph.planning.mission import Mission, leap_frog, stances_of
+from coloc_graph.planning.plan import Plan
+from coloc_graph.planning.prediction import Predictor
+from coloc_graph.run import open_run, whole_run
+from coloc_graph.simulation import Imperfections, World, build_world, record, reference_team
+from coloc_graph.simulation.planned import planned
+from coloc_graph.simulation.rig import stated_team
+from coloc_graph.simulation.world import stream
+from coloc_graph.team import Team
+
+WRONG = Imperfections(mount_sigma_deg=1.0, height_sigma=0.005, span_sigma=1e-4, floor_sigma_deg=0.1)
+PAIR = "A", "B"
+MOVER = "C"
+LENGTH = 7.2  # m
+BOOTSTRAPS = 2000
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One run: errors of A's and B's last poses [m], [deg], stances that measured nothing, and stances in all; `failed`
+    says why there is no estimate."""
+
+    end: tuple[float, ...] = ()
+    heading: tuple[float, ...] = ()
+    void: int = 0
+    stances: int = 0
+    failed: str = ""
+
+
+def missions(team: Team, fps: float, seconds: float) -> dict[str, Mission]:
+    """Plans of all baselines, with as many images as the paper's formation takes in stances of these `seconds`."""
+    predictor = Predictor(team, fps)
+    capture = seconds * stances_of(PAPER, LENGTH)
+    search = GaitSearch(predictor, LENGTH, PAIR, MOVER)
+    ranked = search.ranked(capture=capture)
+
+    def fixed(gait: Gait) -> Mission:
+        each = capture / stances_of(gait, LENGTH)
+        return leap_frog(predictor, gait, LENGTH, each, PAIR, MOVER, designed=False)
+
+    by_patrol = [fixed(one.gait) for one, _ in ranked[:12]]
+    return {
+        "b0": fixed(PAPER),
+        "b1": fixed(Gait.of_paper(0.6, 40.0)),
+        "b2": min(by_patrol, key=lambda mission: mission.end_sigma),
+        "gait": search.planned(ranked)[1],
+    }
+
+
+def outcome(seed: int, plan: Plan, fps: float, depth: str) -> Outcome:
+    """The run of a seed that follows a plan, solved and compared with its truth."""
+    try:
+        scenario = planned(plan, stream(seed, "formation"))
+        world = build_world(scenario, seed=seed, fps=fps, imperfections=WRONG, depth=depth)  # type: ignore[arg-type]
+        solution = solved(world, SolveOptions("joint"))[0] if depth == "tracks" else from_images(world)
+    except ColocError as error:
+        return Outcome(failed=str(error), stances=len(plan.stances))
+    true = align(solution.estimate.trajectories, truth_of(world), "A", on_floor=True)
+    end, heading = [], []
+    for robot in PAIR:
+        T, q = solution.estimate.trajectories[robot].T_world_body[-1], true[robot][-1]
+        end.append(float(np.linalg.norm(T[:2, 3] - q[:2, 3])))
+        off = math.atan2(T[1, 0], T[0, 0]) - math.atan2(q[1, 0], q[0, 0])
+        heading.append(abs(math.degrees(math.remainder(off, math.tau))))
+    return Outcome(tuple(end), tuple(heading), len(solution.unused), len(plan.stances))
+
+
+def from_images(world: World) -> Solution:
+    """A world rendered and solved."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.mcap"
+        with whole_run(path, world.team, image_format="raw") as writer:
+            record(world, writer, "images")
+        return solve(open_run(path), SolveOptions("joint"))
+
+
+def rms(outcomes: Sequence[Outcome], what: str) -> float:
+    """RMS over runs and both robots."""
+    return math.sqrt(np.mean([np.square(getattr(one, what)).mean() for one in outcomes if not one.failed]))
+
+
+def ratio(outcomes: Sequence[Outcome], base: Sequence[Outcome], what: str) -> tuple[float, float, float]:
+    """RMS as a share of the base's over paired seeds, with its bootstrap interval (95 %)."""
+    pairs = [
+        (np.square(getattr(a, what)).mean(), np.square(getattr(b, what)).mean())
+        for a, b in zip(outcomes, base, strict=True)
+        if not (a.failed or b.failed)
+    ]
+    squares = np.array(pairs)
+    drawn = np.random.default_rng(0).integers(len(squares), size=(BOOTSTRAPS, len(squares)))
+    sums = squares[drawn].sum(axis=1)
+    low, high = np.percentile(np.sqrt(sums[:, 0] / sums[:, 1]), [2.5, 97.5])
+    return float(np.sqrt(squares[:, 0].sum() / squares[:, 1].sum())), float(low), float(high)
+
+
+def table(seeds: Sequence[int], fps: float, seconds: float, depth: str, only: Sequence[str]) -> dict[str, object]:
+    """Run all plans over the seeds and print a row each."""
+    team = stated_team(reference_team(), WRONG)
+    made = {name: one for name, one in missions(team, fps, seconds).items() if name in only or not only}
+    found: dict[str, object] = {}
+    base: list[Outcome] | None = None
+    for name, mission in made.items():
+        runs = over_seeds(partial(outcome, plan=mission.plan, fps=fps, depth=depth), seeds)
+        base = runs if base is None else base
+        end, heading = ratio(runs, base, "end"), ratio(runs, base, "heading")
+        realised = rms(runs, "end")
+        row = {
+            "stances": len(mission.plan.stances),
+            "images": round(mission.capture_time * fps),
+            "mission_s": mission.duration,
+            "end_mm": 1e3 * realised,
+            "promised_mm": 1e3 * mission.end_sigma,
+            "promised_over_realised": mission.end_sigma / realised,
+            "heading_deg": rms(runs, "heading"),
+            "promised_heading_deg": math.degrees(mission.heading_sigma),
+            "end_ratio": end,
+            "heading_ratio": heading,
+            "void": sum(one.void for one in runs) / sum(one.stances for one in runs),
+            "failed": [one.failed for one in runs if one.failed],
+        }
+        found[name] = row
+        print(
+            f"{name:8} {row['stances']:3} stances {row['images']:5} images {mission.duration:4.0f} s  end "
+            f"{row['end_mm']:5.1f} mm (promised {row['promised_mm']:5.1f}, ratio {row['promised_over_realised']:.2f})  "
+            f"heading {row['heading_deg']:.3f} deg ({row['promised_heading_deg']:.3f})  of the first: end {end[0]:.2f} "
+            f"({end[1]:.2f}-{end[2]:.2f}), heading {heading[0]:.2f} ({heading[1]:.2f}-{heading[2]:.2f})  void "
+            f"{100 * row['void']:.1f} %"
+            + (f"  failed {len(row['failed'])}: {row['failed'][0]}" if row["failed"] else ""),
+            flush=True,
+        )
+    return found
+
+
+def main() -> int:
+    """Print what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=40)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--images", type=int, metavar="SEEDS")
+    parser.add_argument("--fps", type=float, default=10.0)
+    parser.add_argument("--seconds", type=float, default=5.0, help="duration of a stance of b0")
+    parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    depth, seeds = ("images", args.images) if args.images else ("tracks", args.seeds)
+    found = table(range(args.first, args.first + seeds), args.fps, args.seconds, depth, args.only)
+    if args.json:
+        args.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

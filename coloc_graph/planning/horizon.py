@@ -1,0 +1,335 @@
+"""The next stances, chosen from where a team really is: `Horizon`."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.errors import InputError
+from coloc_graph.geometry.se2 import Planar
+from coloc_graph.planning.belief import Belief, updated
+from coloc_graph.planning.course import Course
+from coloc_graph.planning.drive import effective_seconds
+from coloc_graph.planning.formation import Gait
+from coloc_graph.planning.leaps import Leaps, possible_leaps
+from coloc_graph.planning.mission import Mission, best_stance, leap_time
+from coloc_graph.planning.mover_path import evenly_seen
+from coloc_graph.planning.plan import Plan, PlannedStance
+from coloc_graph.planning.prediction import Predictor, Promise
+from coloc_graph.planning.rollout import Rollout
+
+Array = NDArray[np.float64]
+
+DEPTH = 2  # stances that are looked ahead
+DIFFERENT = 0.15  # poses are compared one by one from this distance on, in which a radian counts as 0.5 m [m]
+BEAM = 6  # plans that are followed from one stance to the next
+SHARES = (0.6, 1.0, 1.7)  # durations of a stance that are compared, relative to the pace of the mission
+PREFERRED = 1.03  # the gait's own leap is left for one that promises a variance this much smaller
+SHORTEST = 5.0  # least duration of a stance [s]
+LONGEST = 60.0  # longest duration of a stance [s]
+FEWEST = 3  # cells of the common view without which a stance is not planned
+MOST_STANCES = 2000
+ARRIVED = 0.1  # the goal is reached within this distance along the course [m]
+
+#: What decides between stances: the variance at the goal with the cost to go, the information gained, the size of the
+#: common view, or nothing.
+Objective = Literal["goal", "information", "view", "random"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Node:
+    """A team after some planned stances: what it is believed to be, and how it came there."""
+
+    belief: Belief
+    standing: Mapping[str, Planar]
+    seconds: float
+    score: float
+    choices: tuple[tuple[str, Planar, float], ...] = ()
+    by_gait: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """A planned stance with its promise, and where the team is to stand in the stances after it.
+
+    Attributes
+    ----------
+    stance, promise
+        The next stance, and what it promises.
+    ahead
+        Leaper, its target and the duration of each stance looked ahead, the next one first.
+    end_sigma
+        Expected sigma of the observers' last positions at the end of the mission [m]; NaN where it is not computed.
+    """
+
+    stance: PlannedStance
+    promise: Promise
+    ahead: tuple[tuple[str, Planar, float], ...]
+    end_sigma: float = math.nan
+
+
+class Horizon:
+    """Plans the next stances of observers along a course, with a budget of seconds in which images are taken.
+
+    Parameters
+    ----------
+    predictor
+        Predicts the stances; its map, if any, keeps robots off walls.
+    course
+        Way of the middle of the observers.
+    observers, mover
+        Names of the robots that leap, the reference among them, and of the one that drives before their cameras.
+    seconds
+        Seconds of images of the whole mission.
+    objective, depth
+        What decides, and the number of stances that are looked ahead.
+    gait
+        Formation by which the rest of the mission is expected to go; the best one by default.
+    rng
+        Random numbers of the objective "random".
+
+    Raises
+    ------
+    InputError
+        If the goal is in a wall, or the cameras share no view in any formation.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        course: Course,
+        observers: Sequence[str],
+        mover: str,
+        seconds: float,
+        *,
+        objective: Objective = "goal",
+        depth: int = DEPTH,
+        gait: Gait | None = None,
+        rng: np.random.Generator | None = None,
+    ) -> None:
+        self.predictor, self.course, self.mover = predictor, course, mover
+        self.observers, self.seconds, self.objective, self.depth = tuple(observers), seconds, objective, depth
+        self._rng = np.random.default_rng(0) if rng is None else rng
+        if predictor.floor_map is not None:
+            for way in (course.length, 0.0):
+                x, y, _ = course.at(way)
+                if not predictor.floor_map.clear(np.array([x, y]), 0.2):
+                    what = "the goal" if way else "the start"
+                    raise InputError(f"{what} at {x:.2f}, {y:.2f} is in a wall or beyond the map: give another one")
+        if len(self.observers) != 2:
+            raise InputError(
+                f"{len(self.observers)} observers are to leap, and plans are made for two and a mover: leave the "
+                "others out of the team"
+            )
+        self._rollout = Rollout(predictor, course, (self.observers[0], self.observers[1]), mover, seconds, gait)
+        self.gait = self._rollout.gait
+
+    def mission(self, belief: Belief) -> Mission:
+        """Plan the whole mission of a team from where it stands, as if all went as planned.
+
+        Raises
+        ------
+        InputError
+            If the team cannot come to the goal.
+        """
+        stances: list[PlannedStance] = []
+        promises: list[Promise] = []
+        times: list[float] = []
+        left, decision = self.seconds, self.first(belief)
+        while True:
+            before, stance = belief.poses, decision.stance
+            times.append(
+                max(
+                    (leap_time(before[one], stance.standing[one], self.predictor.speed) for one in stance.leapers),
+                    default=0.0,
+                )
+                if stances
+                else 0.0
+            )
+            stances.append(stance)
+            promises.append(decision.promise)
+            belief, left = decision.promise.belief, left - stance.duration
+            if self.arrived(stance.standing):
+                return Mission(Plan(tuple(stances)), tuple(promises), tuple(times))
+            if len(stances) > MOST_STANCES:
+                raise InputError(f"the goal is not reached in {MOST_STANCES} stances: give a nearer one, or more goals")
+            decision = self.next(belief, left)
+
+    def remaining(self, standing: Mapping[str, Planar]) -> float:
+        """Return the way that is left from the middle of the observers to the goal [m]."""
+        return self.course.length - float(np.mean([self.course.way_of(standing[name]) for name in self.observers]))
+
+    def arrived(self, standing: Mapping[str, Planar]) -> bool:
+        """Return whether the middle of the observers has reached the goal."""
+        return self.remaining(standing) < ARRIVED
+
+    def first(self, belief: Belief) -> Decision:
+        """Plan the first stance, in which all stand where they are.
+
+        Raises
+        ------
+        InputError
+            If the observers have no common view there.
+        """
+        standing = {name: belief.poses[name] for name in self.observers}
+        pace = self.seconds / max(self.course.length, ARRIVED)
+        seconds = min(max(1.5 * pace * 0.5, SHORTEST), LONGEST, self.seconds)
+        stance, promise = best_stance(self.predictor, belief, standing, (), self.mover, seconds, self._goal())
+        return Decision(stance, promise, ())
+
+    def next(self, belief: Belief, seconds: float, avoid: Sequence[Planar] = ()) -> Decision:
+        """Plan the next stance of a team that stands where `belief` has it.
+
+        Parameters
+        ----------
+        belief
+            The team after the stance before.
+        seconds
+            Seconds of images that are left.
+        avoid
+            Targets at which this stance failed.
+
+        Raises
+        ------
+        InputError
+            If no observer can leap anywhere from where it shares a view with the others.
+        """
+        standing = {name: belief.poses[name] for name in self.observers}
+        beam = [_Node(belief, standing, seconds, 0.0)]
+        best = beam
+        for depth in range(self.depth):
+            grown = [child for node in beam for child in self._expand(node, () if depth else avoid, in_lane=depth > 0)]
+            if not grown:
+                break
+            grown.sort(key=lambda node: node.score)
+            best = beam = _different(grown)
+            if self.objective != "goal" or self.arrived(best[0].standing):
+                break
+        if not best[0].choices:
+            gone = self.course.length - self.remaining(standing)
+            raise InputError(
+                f"no observer can leap from where the team stands, {gone:.1f} m along the course: the way is too "
+                "narrow for the robots, or their cameras share no view there"
+            )
+        leaper, target, duration = best[0].choices[0]
+        after = belief.after_leap(leaper, target, odometry=self.predictor.odometry)
+        anchors = tuple(name for name in self.observers if name != leaper)
+        placed = {name: after.poses[name] for name in (*anchors, leaper)}
+        leapt = math.dist(belief.poses[leaper][:2], target[:2])
+        stance, promise = best_stance(self.predictor, after, placed, anchors, self.mover, duration, self._goal(), leapt)
+        end_sigma = math.sqrt(best[0].score) if self.objective == "goal" else math.nan
+        return Decision(stance, promise, best[0].choices, end_sigma)
+
+    def _goal(self) -> tuple[float, float]:
+        x, y, _ = self.course.at(self.course.length)
+        return x, y
+
+    def _expand(self, node: _Node, avoid: Sequence[Planar], *, in_lane: bool) -> list[_Node]:
+        """Find the possible next stances of a team, each with its score: the least is the best.
+
+        The one furthest behind leaps; if it cannot now, the other one. The rest of the mission goes by the gait;
+        `in_lane` restricts them to where the gait goes on exactly.
+        """
+        by_way = sorted(self.observers, key=lambda name: self.course.way_of(node.standing[name]))
+        for leaper in by_way[:1] if in_lane else by_way:
+            grown = self._leaps_of(node, leaper, avoid, in_lane=in_lane)
+            if grown:
+                return grown
+        return []
+
+    def _leaps_of(self, node: _Node, leaper: str, avoid: Sequence[Planar], *, in_lane: bool) -> list[_Node]:
+        leaps = possible_leaps(
+            node.belief, leaper, self.course, self.gait, self.observers, self.predictor, avoid, in_lane=in_lane
+        )
+        if not len(leaps.targets):
+            return []
+        observers = (*leaps.anchors, leaps.leaper)
+        standing = np.array([[node.standing[name] for name in leaps.anchors]] * len(leaps.targets))
+        standing = np.concatenate([standing, leaps.targets[:, None]], axis=1)
+        model = self.predictor.model(observers, self.mover)
+        information, count = evenly_seen(model, standing, leaps.margins, self.predictor.free)
+        seen = np.flatnonzero(count >= FEWEST)
+        if not len(seen):
+            return []
+        if self.objective in ("view", "random"):
+            value = -count[seen] if self.objective == "view" else self._rng.random(len(seen))
+            return [
+                self._child(node, leaps, int(n), float(self._durations(node, leaps, int(n))[1]), float(v))
+                for n, v in zip(seen, value, strict=True)
+            ]
+        return self._scored(node, leaps, seen, observers, self.predictor.fps * information[seen])
+
+    def _durations(self, node: _Node, leaps: Leaps, n: int) -> Array:
+        """Durations of a stance that are compared, (3,) [s]."""
+        left = max(self.remaining(node.standing), ARRIVED)
+        share = min(leaps.gains[n] / left, 1.0) * node.seconds
+        if leaps.gains[n] > left - ARRIVED:
+            return np.full(len(SHARES), max(node.seconds, SHORTEST))
+        longest = min(LONGEST, max(node.seconds, SHORTEST))
+        return np.asarray(np.clip(share * np.array(SHARES), SHORTEST, longest))
+
+    def _scored(
+        self, node: _Node, leaps: Leaps, seen: NDArray[np.int64], observers: tuple[str, ...], information: Array
+    ) -> list[_Node]:
+        belief, at = node.belief, node.belief.index(leaps.leaper)
+        pose = slice(at, at + 6)
+        F, Q = leaps.F[seen], leaps.Q[seen]
+        P = np.repeat(belief.covariance[None], len(seen), axis=0)
+        P[:, pose] = F @ P[:, pose]
+        P[:, :, pose] = P[:, :, pose] @ F.mT
+        P[:, pose, pose] += Q
+        durations = np.array([self._durations(node, leaps, int(n)) for n in seen])
+        rows = belief.rows(observers, self.mover)
+        spread = effective_seconds(durations, self.predictor.speed)
+        after = updated(P[:, None], rows, spread[:, :, None, None] * information[:, None])
+        if self.objective == "information":
+            value = -np.linalg.slogdet(np.eye(len(rows)) + information @ P[:, rows[:, None], rows])[1]
+            return [
+                self._child(node, leaps, int(n), float(t[1]), float(v), C[1])
+                for n, t, v, C in zip(seen, durations, value, after, strict=True)
+            ]
+        used, targets = self._rollout.rows(belief), leaps.targets[seen]
+        poses = {name: np.broadcast_to(belief.poses[name], targets.shape) for name in leaps.anchors}
+        poses[leaps.leaper] = targets
+        value = np.stack([
+            self._rollout.end_variance(
+                after[:, k][:, used[:, None], used], poses, leaps.leaper, node.seconds - durations[:, k]
+            )
+            for k in range(len(SHARES))
+        ], axis=1)  # fmt: skip
+        # compared by a few places only, the best of many looks better than it is
+        value = np.where(leaps.by_gait[seen, None], value, PREFERRED * value)
+        best = value.argmin(axis=1)
+        return [
+            self._child(node, leaps, int(n), float(durations[k, b]), float(value[k, b]), after[k, b])
+            for k, (n, b) in enumerate(zip(seen, best, strict=True))
+        ]
+
+    def _child(
+        self, node: _Node, leaps: Leaps, n: int, seconds: float, score: float, covariance: Array | None = None
+    ) -> _Node:
+        x, y, yaw = leaps.targets[n].tolist()
+        target = x, y, yaw
+        poses = {**node.belief.poses, leaps.leaper: target}
+        C = node.belief.covariance if covariance is None else covariance
+        belief = replace(node.belief, poses=poses, covariance=C)
+        choice = leaps.leaper, target, seconds
+        left = node.seconds - seconds
+        standing = {**node.standing, leaps.leaper: target}
+        return _Node(belief, standing, left, score, (*node.choices, choice), bool(leaps.by_gait[n]))
+
+
+def _different(nodes: Sequence[_Node]) -> list[_Node]:
+    """Choose the best nodes whose robots stand in different poses, with the gait's own."""
+    chosen: list[_Node] = []
+    for node in nodes:
+        x, y, yaw = node.choices[-1][1]
+        others = [other.choices[-1][1] for other in chosen]
+        if node.by_gait or all(math.hypot(x - a, y - b) + 0.5 * abs(yaw - c) > DIFFERENT for a, b, c in others):
+            chosen.append(node)
+        if len(chosen) == BEAM and any(one.by_gait for one in chosen):
+            break
+    return chosen

@@ -1,0 +1,141 @@
+"""Targets to which an observer can leap: clear of walls and robots, on its way too; `Leaps`, `possible_leaps`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.geometry.se2 import Planar, between, wrap
+from coloc_graph.planning.belief import Belief, leap_model
+from coloc_graph.planning.course import Course
+from coloc_graph.planning.floor_map import FloorMap
+from coloc_graph.planning.formation import Gait
+from coloc_graph.planning.prediction import Predictor
+from coloc_graph.planning.slip import view_margin
+
+Array = NDArray[np.float64]
+
+ADVANCES = (0.25, 0.5, 0.7, 0.85, 1.0, 1.15, 1.35)  # of a target ahead of the front observer, in leaps of the gait
+WIDTHS = (0.7, 1.0, 1.7)  # of a target's distance from the course, in those of the gait
+TOE_INS = (0.0, 1.0, 1.5)  # of a target's heading against the course, in those of the gait
+AHEAD = 0.8  # a robot may look along the course this far ahead of where it stands [m]
+TURNS = (0.0, 0.35, 0.7, 1.0)  # share of a corner by which a target is turned
+BEND = 0.1  # turn of the course that is a corner [rad]
+LONGEST_LEAP = 1.5  # advance of a target [m]
+TO_WALL = 0.25  # least distance of a robot's middle from walls [m]
+TO_ROBOT = 0.42  # least distance between the middles of two robots, where they stand and on the way [m]
+STEP = 0.1  # distance between places of a leap that are checked [m]
+FAILED = 0.15  # targets nearer to one that failed are avoided [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Leaps:
+    """Leaps of one observer.
+
+    Attributes
+    ----------
+    leaper, anchors
+        The observer that leaps, and those that stay.
+    targets
+        Poses (n, 3) in the world: x [m], y [m], yaw [rad].
+    gains
+        Way (n,) by which each brings the middle of the observers on [m].
+    F, Q
+        How each leap changes the error of its pose, and the covariance that it adds, (n, 6, 6).
+    margins
+        Distance (n,) of markers from the borders of images at which the view does not miss them [px].
+    by_gait
+        True (n,) for those of the gait itself.
+    """
+
+    leaper: str
+    anchors: tuple[str, ...]
+    targets: Array
+    gains: Array
+    F: Array
+    Q: Array
+    margins: Array
+    by_gait: NDArray[np.bool_]
+
+
+def possible_leaps(
+    belief: Belief,
+    leaper: str,
+    course: Course,
+    gait: Gait,
+    observers: Sequence[str],
+    predictor: Predictor,
+    avoid: Sequence[Planar] = (),
+    *,
+    in_lane: bool = False,
+) -> Leaps:
+    """Find the leaps of an observer: those of a gait, and longer, shorter, wider ones; at corners also half turned.
+
+    Parameters
+    ----------
+    belief, leaper
+        The team where it stands, and the observer that is to leap.
+    course, gait, observers, predictor
+        The way, the gait that leads along it, the robots that leap, and their cameras, speed and map.
+    avoid
+        Targets that have failed.
+    in_lane
+        True for targets in the gait's formation alone, and, at corners, beside the course.
+    """
+    ways = {name: course.way_of(belief.poses[name]) for name in observers}
+    anchors = tuple(name for name in observers if name != leaper)
+    front = max(ways[name] for name in anchors)
+    targets, gains, by_gait = [], [], []
+    lane = -1.0 if observers.index(leaper) % 2 else 1.0
+    before = course.at(front)[2]
+    turning = any(abs(float(wrap(course.at(front + ahead)[2] - before))) > BEND for ahead in (AHEAD, 2 * AHEAD))
+    for advance, side, width, toe, turned in product(ADVANCES, (-1.0, 1.0), WIDTHS, TOE_INS, TURNS):
+        way = front + min(advance * gait.leap, LONGEST_LEAP)
+        x, y, heading = course.at(way)
+        # near a corner a robot may look into it
+        bend = float(wrap(course.at(way + AHEAD)[2] - before))
+        straight = abs(bend) < BEND
+        if straight and turned < 1.0:
+            continue
+        own = straight and side == lane and width == toe == 1.0
+        if in_lane and not own and not (turning and width == toe == 1.0):
+            continue
+        c, s = np.cos(heading), np.sin(heading)
+        lateral, turn = side * width * gait.abreast / 2, -side * toe * np.radians(gait.toe_in_deg)
+        targets.append((x - lateral * s, y + lateral * c, before + turned * bend + turn))
+        gains.append((way - ways[leaper]) / len(observers))
+        by_gait.append(own and advance == 1.0)
+    places = np.array(targets).reshape(-1, 3)
+    others = np.array([belief.poses[name][:2] for name in anchors])
+    good = _clear(np.array(belief.poses[leaper][:2]), places[:, :2], others, predictor.floor_map)
+    for x, y, yaw in (*avoid, belief.poses[leaper]):
+        near = np.hypot(places[:, 0] - x, places[:, 1] - y) < FAILED
+        good &= ~(near & (np.abs(places[:, 2] - yaw) < FAILED))
+    places, kept = places[good], np.array(gains)[good]
+    made = [
+        leap_model(between(belief.poses[leaper], (x, y, yaw)), belief.floor, odometry=predictor.odometry)
+        for x, y, yaw in places.tolist()
+    ]
+    F = np.array([one for one, _ in made]).reshape(-1, 6, 6)
+    Q = np.array([one for _, one in made]).reshape(-1, 6, 6)
+    leapt = np.hypot(*(places[:, :2] - np.array(belief.poses[leaper][:2])).T)
+    margins = view_margin(leapt, predictor.team[leaper].camera.fx)
+    return Leaps(leaper, anchors, places, kept, F, Q, margins, np.array(by_gait, bool)[good])
+
+
+def _clear(start: Array, targets: Array, others: Array, floor_map: FloorMap | None) -> NDArray[np.bool_]:
+    """Return which targets (n, 2) a robot can reach in a straight line from `start`, clear of others and walls."""
+    longest = float(np.hypot(*(targets - start).T).max(initial=STEP))
+    along = np.linspace(0.0, 1.0, int(np.ceil(longest / STEP)) + 1)[:, None]
+    way = start + along * (targets - start)[:, None]
+    good = np.ones(len(targets), bool)
+    for other in others:
+        good &= np.hypot(*np.moveaxis(targets - other, -1, 0)) > TO_ROBOT
+        # it may stand nearer already
+        least = min(TO_ROBOT, float(np.hypot(*(start - other))) - 0.01)
+        good &= np.hypot(*np.moveaxis(way - other, -1, 0)).min(axis=1) > least
+    if floor_map is not None:
+        good &= floor_map.clear(way, TO_WALL).all(axis=1) & floor_map.clear(targets, TO_WALL)
+    return np.asarray(good)

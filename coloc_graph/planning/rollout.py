@@ -1,0 +1,176 @@
+"""The rest of a mission by a periodic gait: the covariance at its end, as a function of that now; `Rollout`."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.geometry.se2 import Planar, between
+from coloc_graph.planning.belief import Belief
+from coloc_graph.planning.course import Course
+from coloc_graph.planning.drive import effective_seconds
+from coloc_graph.planning.formation import Gait
+from coloc_graph.planning.gaits import GaitSearch
+from coloc_graph.planning.prediction import Predictor
+
+Array = NDArray[np.float64]
+
+POSE = 6
+BLOCK = 9  # numbers of an observer: pose, mount
+SECONDS = tuple(0.5 * 1.3**n for n in range(20))  # durations of a stance for which the rest is computed [s]
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """What some stances make of a covariance: P -> C + A P (I + B P)^-1 A^T, (..., d, d) each."""
+
+    A: Array
+    B: Array
+    C: Array
+
+    def then(self, later: "_Steps") -> "_Steps":
+        """Return these stances followed by later ones.
+
+        Notes
+        -----
+        Sarkka and Garcia-Fernandez, "Temporal parallelization of Bayesian smoothers", 2021.
+        """
+        back = np.linalg.inv(np.eye(self.A.shape[-1]) + self.C @ later.B)
+        through = later.A @ back
+        return _Steps(
+            through @ self.A,
+            self.B + self.A.mT @ later.B @ back @ self.A,
+            later.C + through @ self.C @ later.A.mT,
+        )
+
+
+class Rollout:
+    """The rest of a mission of two observers, as the best gait at the mission's pace would do it.
+
+    Parameters
+    ----------
+    predictor
+        Predicts the stances.
+    course
+        Way of the middle of the observers.
+    pair, mover
+        Names of the observers and of the mover.
+    seconds
+        Seconds of images of the mission.
+    gait
+        The gait; the best one by default.
+
+    Raises
+    ------
+    InputError
+        If the cameras share no view in any formation.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        course: Course,
+        pair: tuple[str, str],
+        mover: str,
+        seconds: float,
+        gait: Gait | None = None,
+    ) -> None:
+        search = GaitSearch(predictor, course.length, pair, mover, None if gait is None else (gait,))
+        (best, _), *_ = search.ranked(capture=seconds)
+        self.gait: Gait = best.gait
+        self.pair, self.mover, self._course, self._speed = pair, mover, course, predictor.speed
+        most = max(math.ceil(course.length / self.gait.leap), 1) + 2
+        size = 2 * BLOCK + 2
+        eye = np.broadcast_to(np.eye(size), (len(SECONDS), size, size))
+        nothing = _Steps(eye, 0 * eye, 0 * eye)
+        one = [self._stance(best.information, best.leaps, anchor) for anchor in (0, 1)]
+        # of n stances, the first of which robot `anchor` stands still in
+        many = [[nothing], [nothing]]
+        for _ in range(most):
+            longer = [one[anchor].then(many[1 - anchor][-1]) for anchor in (0, 1)]
+            for anchor in (0, 1):
+                many[anchor].append(longer[anchor])
+        self._A, self._B, self._C = (
+            np.array([[getattr(steps, name) for steps in of] for of in many]) for name in ("A", "B", "C")
+        )
+
+    def _stance(
+        self, information: Array, leaps: tuple[tuple[Array, Array], tuple[Array, Array]], anchor: int
+    ) -> _Steps:
+        """The leap of the other observer to beside the anchor, and the stance, at each of `SECONDS`."""
+        size, leaper = 2 * BLOCK + 2, 1 - anchor
+        # the leap k of a gait is to its pose k + 1; information is in the order anchor, leaper, markers
+        F, Q = leaps[leaper]
+        A, C = np.eye(size), np.zeros((size, size))
+        at = slice(BLOCK * leaper, BLOCK * leaper + POSE)
+        A[at, at], C[at, at] = F, Q
+        order = np.concatenate([BLOCK * n + np.arange(BLOCK) for n in (anchor, leaper)] + [[size - 2, size - 1]])
+        own = np.zeros((size, size))
+        own[np.ix_(order, order)] = information[anchor]
+        B = effective_seconds(SECONDS, self._speed)[:, None, None] * own
+        eye = np.broadcast_to(np.eye(size), B.shape)
+        leap = _Steps(np.broadcast_to(A, B.shape), 0 * B, np.broadcast_to(C, B.shape))
+        return leap.then(_Steps(eye, B, 0 * B))
+
+    def rows(self, belief: Belief) -> NDArray[np.int64]:
+        """Return the rows of a belief's covariance that the rest depends on."""
+        blocks = [belief.index(name) + np.arange(BLOCK) for name in self.pair]
+        return np.concatenate([*blocks, belief.index(self.mover) + np.array([BLOCK, BLOCK + 1])])
+
+    def end_variance(self, P: Array, poses: dict[str, Array], front: str, seconds: Array) -> Array:
+        """Return the mean variance of the observers' last positions [m^2] at the end of the mission.
+
+        Parameters
+        ----------
+        P
+            Covariances (b, d, d) of `rows` now.
+        poses
+            Poses (b, 3) of both observers.
+        front
+            The observer in front, which stands still next.
+        seconds
+            Seconds (b,) of images that are left.
+        """
+        ways = np.array([self._course.way_of(pose) for pose in poses[front]])
+        P = self._in_formation(P, poses, front, ways)
+        anchor = self.pair.index(front)
+        # the gait brings the other one to a leap ahead of the front, wherever it is now
+        stances = np.maximum((self._course.length - ways) / self.gait.leap + 0.5, 0.0)
+        fewer = np.minimum(np.floor(stances).astype(int), self._A.shape[1] - 2)
+        each = np.maximum(seconds, 0.0) / np.maximum(stances, 0.5)
+        pace = np.clip(np.round(np.log(np.maximum(each, 1e-3) / SECONDS[0]) / math.log(1.3)), 0, len(SECONDS) - 1)
+        share = np.clip(stances - fewer, 0.0, 1.0)
+        few, many = (self._after(P, anchor, fewer + more, pace.astype(int)) for more in (0, 1))
+        return np.asarray((1 - share) * few + share * many)
+
+    def _after(self, P: Array, anchor: int, stances: NDArray[np.int64], pace: NDArray[np.int64]) -> Array:
+        A, B, C = (M[anchor, stances, pace] for M in (self._A, self._B, self._C))
+        left = np.linalg.solve(np.eye(P.shape[-1]) + P @ B, P)
+        places = np.array([3, 4, BLOCK + 3, BLOCK + 4])
+        a, c = A[:, places], C[:, places, places]
+        return np.asarray(((a @ left * a).sum(axis=(1, 2)) + c.sum(axis=1)) / 2)
+
+    def _in_formation(self, P: Array, poses: dict[str, Array], front: str, ways: Array) -> Array:
+        """Move the errors of robots to where the gait would have them stand: it goes on from there."""
+        M = np.broadcast_to(np.eye(P.shape[-1]), P.shape).copy()
+        for n, name in enumerate(self.pair):
+            side = 1.0 if n == 0 else -1.0
+            for b, way in enumerate(ways - (0.0 if name == front else self.gait.leap)):
+                x, y, heading = self._course.at(float(way))
+                left, turn = side * self.gait.abreast / 2, -side * math.radians(self.gait.toe_in_deg)
+                aim = x - left * math.sin(heading), y + left * math.cos(heading), heading + turn
+                here: Planar = tuple(poses[name][b].tolist())
+                M[b, BLOCK * n : BLOCK * n + POSE, BLOCK * n : BLOCK * n + POSE] = _moved(between(here, aim))
+        return M @ P @ M.mT
+
+
+def _moved(D: Planar) -> Array:
+    """Adjoint (6, 6) that takes an error of a pose T to that of T D."""
+    c, s = math.cos(D[2]), math.sin(D[2])
+    R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    cross = np.array([[0.0, 0.0, -D[1]], [0.0, 0.0, D[0]], [D[1], -D[0], 0.0]])  # w x d by w, d on the floor
+    out = np.zeros((POSE, POSE))
+    out[:3, :3] = out[3:, 3:] = R
+    out[3:, :3] = R @ cross
+    return out
