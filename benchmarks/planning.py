@@ -47,8 +47,7 @@ BOOTSTRAPS = 2000
 
 @dataclass(frozen=True)
 class Outcome:
-    """One run: errors of A's and B's last poses [m], [deg], stances that measured nothing, and stances in all; `failed`
-    says why there is no estimate."""
+    """Outcome of one run: errors of A's and B's last poses [m], [deg], void stances, all stances; or why it `failed`."""
 
     end: tuple[float, ...] = ()
     heading: tuple[float, ...] = ()

@@ -164,6 +164,7 @@ def best_stance(
         drives = best_drives(
             found, shares, belief.covariance, rows, G, duration=seconds, fps=predictor.fps, speed=predictor.speed
         )
+        drives.append(patrol(found.places))
     options = [PlannedStance(standing, anchors, mover, drive, seconds) for drive in drives]
     promises = [predictor.of_stance(belief, option) for option in options]
     best = min(range(len(options)), key=lambda n: promises[n].belief.end_variance(names, goal))

@@ -13,7 +13,7 @@ from coloc_graph.pipeline.batch import solve
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.planning.belief import Belief, leap_model, updated
 from coloc_graph.planning.formation import PAPER, Gait
-from coloc_graph.planning.mission import leap_frog
+from coloc_graph.planning.mission import best_stance, leap_frog
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.run import atomic_run, open_run
 from coloc_graph.simulation import Imperfections, build_world, record, reference_team
@@ -94,13 +94,18 @@ def test_information_on_some_variables_is_the_kalman_update():
     )
 
 
-def test_designed_drives_promise_more_than_the_patrol_at_the_same_time():
-    predictor = Predictor(team_of(), fps=10.0)
-    gait = Gait(0.6, 0.6, 10.0)
-    designed, patrol = (
-        leap_frog(predictor, gait, 1.2, 5.0, ("A", "B"), "C", designed=which).end_sigma for which in (True, False)
-    )
-    assert designed < 0.95 * patrol
+def test_designed_drives_leave_less_variance_at_the_goal_than_the_patrol():
+    predictor, goal, ratios = Predictor(team_of(), fps=10.0), (5.0, 0.0), []
+    for gait in (PAPER, Gait(0.6, 0.6, 10.0), Gait(0.9, 0.5, 25.0)):
+        standing = {"A": gait.stop(0), "B": gait.stop(1)}
+        belief = Belief.start(predictor.team, {**standing, "C": (1.5, 0.0, 0.0)})
+        variances = []
+        for designed in (True, False):
+            _, promise = best_stance(predictor, belief, standing, (), "C", 6.0, goal, designed=designed)
+            variances.append(promise.belief.end_variance(("A", "B"), goal))
+        ratios.append(variances[0] / variances[1])
+    assert max(ratios) <= 1.0
+    assert min(ratios) < 0.7
 
 
 def test_noise_that_all_images_share_is_not_averaged_away():
