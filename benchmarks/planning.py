@@ -47,7 +47,10 @@ BOOTSTRAPS = 2000
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one run: errors of A's and B's last poses [m], [deg], void stances, all stances; or why it `failed`."""
+    """Outcome of one run.
+
+    Errors of A's and B's last poses [m], [deg], the number of void stances and of all, and why it `failed`.
+    """
 
     end: tuple[float, ...] = ()
     heading: tuple[float, ...] = ()
