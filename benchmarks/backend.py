@@ -104,7 +104,7 @@ def bare_batch(team, keyed, reference, covariances):
 def keyed_measurements(team):
     """Measurements with their keys, and the reference's."""
     graph = graph_of(team)
-    return [(m, *map(graph.places.key, m.ends)) for m in team.measurements], graph.reference_key
+    return [(m, *map(graph.pose_keys.key, m.ends)) for m in team.measurements], graph.reference_key
 
 
 def clocked(work):

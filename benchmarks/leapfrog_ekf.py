@@ -136,12 +136,12 @@ def ekf(graph: PoseGraph, method: Method = "joint", steps: int = STEPS) -> Estim
         ways = [link for link in links[stance.index] if isinstance(link, Odometry)]
         seen = [link for link in links[stance.index] if not isinstance(link, Odometry)]
         for link in (*ways, *seen):  # a pose starts where wheels say, or else cameras
-            i, j = map(graph.places.key, link.ends)
+            i, j = map(graph.pose_keys.key, link.ends)
             for known, new, T in ((i, j, pose_of(link)), (j, i, pose_of(link).inverse())):
                 if known in state and new not in state:
                     state.enter(new, factors_of.start(state.values.atPose3(known).compose(T)))
                     state.take(factors_of.of_pose(new))
-        state.take(factors_of.of_link(link, *map(graph.places.key, link.ends)) for link in ways)
+        state.take(factors_of.of_link(link, *map(graph.pose_keys.key, link.ends)) for link in ways)
         now = {robot: graph.key(robot, k) for robot, k in graph.nodes if k == stance.index}
         for robot, key in now.items():
             if robot in standing and standing[robot] != key:
@@ -149,7 +149,7 @@ def ekf(graph: PoseGraph, method: Method = "joint", steps: int = STEPS) -> Estim
                 found.insert(standing[robot], pose)
         standing |= now
         for _ in range(ANCHORINGS):
-            factors = [factors_of.of_link(link, *map(graph.places.key, link.ends)) for link in seen]
+            factors = [factors_of.of_link(link, *map(graph.pose_keys.key, link.ends)) for link in seen]
             for key in {key for factor in factors for key in factor.keys()[2:]}:
                 if key not in state:
                     state.enter(key, factors_of.nominal(key))

@@ -51,7 +51,7 @@ def test_a_relative_pose_is_a_pose_and_its_covariance(pose):
 @pytest.mark.parametrize(
     ("T", "covariance", "words"),
     [
-        (np.eye(3), C, r"pose of shape \(3, 3\); give \(4, 4\)"),
+        (np.eye(3), C, r"pose of shape \(3, 3\): give \(4, 4\)"),
         (np.zeros(7), C, r"pose of shape \(7,\)"),
         ([[1.0, 0.0], [0.0]], C, "T_i_j of the relative pose of A and B at stance 0 is no array of numbers"),
         ("here", C, "no array of numbers"),
@@ -60,7 +60,7 @@ def test_a_relative_pose_is_a_pose_and_its_covariance(pose):
         (np.diag([2.0, 2.0, 2.0, 1.0]), C, "no rigid motion"),
         (np.diag([-1.0, 1.0, 1.0, 1.0]), C, "reflection"),
         (T_A_B.T, C, "its last row is not 0, 0, 0, 1"),
-        (T_A_B, C[:3, :3], r"covariance of shape \(3, 3\); give \(6, 6\)"),
+        (T_A_B, C[:3, :3], r"covariance of shape \(3, 3\): give \(6, 6\)"),
         (T_A_B, np.full((6, 6), np.inf), "covariance that is not finite"),
         (T_A_B, -C, "not positive definite"),
         (T_A_B, np.triu(C + 1e-6), "not symmetric"),
@@ -74,5 +74,5 @@ def test_what_is_no_relative_pose_is_refused_in_one_sentence(T, covariance, word
 
 def test_a_covariance_of_six_is_no_sighting():
     sighting = Sighting(0, "A", "C", 1.0, T_A_B, C)
-    with pytest.raises(ColocError, match=r"covariance of shape \(6, 6\); give \(3, 3\)"):
+    with pytest.raises(ColocError, match=r"covariance of shape \(6, 6\): give \(3, 3\)"):
         PoseGraph("A", ("A", "B", "C"), STANCES, (sighting,), Floor())

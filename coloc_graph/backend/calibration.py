@@ -127,7 +127,21 @@ def is_calibration(key: int) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedMount:
-    """A mount as stated, and its estimated `errors` (3,): height [m], tilt and roll [rad], with `covariance`."""
+    """A calibrated mount.
+
+    Parameters
+    ----------
+    key : int
+        Its GTSAM key.
+    robot : str
+        The robot.
+    stated : Mount
+        The mount as stated.
+    errors : (3,) float
+        Estimated errors of height [m], tilt and roll [rad].
+    covariance : (3, 3) float
+        Their covariance.
+    """
 
     key: int
     robot: str
@@ -167,7 +181,21 @@ class CalibratedMount:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedMarkers:
-    """Markers as stated, and their estimated `errors` (2,): span (relative) and height [m]."""
+    """Calibrated markers.
+
+    Parameters
+    ----------
+    key : int
+        Their GTSAM key.
+    robot : str
+        The robot or landmark.
+    stated : Markers
+        The markers as stated.
+    errors : (2,) float
+        Estimated errors of span (relative) and height [m].
+    covariance : (2, 2) float
+        Their covariance.
+    """
 
     key: int
     robot: str

@@ -5,7 +5,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Row:
-    """One calibrated number as stated and as estimated, each with its standard deviation, in `unit`."""
+    """One calibrated number.
+
+    Parameters
+    ----------
+    robot, what : str
+        Robot (or landmark), and the name of the number.
+    unit : str
+        Its unit; "" without one.
+    stated, stated_sigma : float
+        As stated, with its standard deviation.
+    found, found_sigma : float
+        As estimated, with its standard deviation.
+    """
 
     robot: str
     what: str

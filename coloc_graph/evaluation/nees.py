@@ -47,7 +47,22 @@ class Nees:
 
 
 def nees(estimated: Trajectory, T_true: Array, components: list[int]) -> Nees | None:
-    """Return the NEES of a trajectory with true poses (n, 4, 4); None where no pose has a covariance."""
+    """Return the NEES of a trajectory.
+
+    Parameters
+    ----------
+    estimated : Trajectory
+        Estimated poses with covariances.
+    T_true : (n, 4, 4) float
+        True poses in the same world, NaN where there is none.
+    components : list of int
+        Components of the tangent: `PLANAR` or `FREE`.
+
+    Returns
+    -------
+    Nees or None
+        None where no pose has a covariance.
+    """
     z = whitened(estimated, T_true, components)
     if not len(z):
         return None

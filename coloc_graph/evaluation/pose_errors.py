@@ -71,8 +71,24 @@ def absolute_errors(T_estimated: Array, T_true: Array) -> tuple[Array, Array]:
 def relative_errors(
     T_estimated: Array, T_true: Array, distance: float, pairs_from: PairsFrom = "estimate"
 ) -> tuple[Array, Array]:
-    """Return the errors of the relative poses of pairs that are `distance` [m] apart: metres and radians, each (m,).
+    """Return the errors of relative poses of pairs a distance apart.
 
+    Parameters
+    ----------
+    T_estimated, T_true : (n, 4, 4) float
+        Estimated and true poses.
+    distance : float
+        Path length between the poses of a pair [m].
+    pairs_from : {"estimate", "truth"}
+        Path that it is measured along.
+
+    Returns
+    -------
+    translation, rotation : (m,) float
+        Errors of each pair [m], [rad].
+
+    Notes
+    -----
     The pairs are those of evo's `--all_pairs`: for each pose the later one with the path length nearest to the
     distance, within `RPE_TOLERANCE`. Source: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems",
     2012, eq. (1).

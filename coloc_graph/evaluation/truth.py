@@ -16,10 +16,26 @@ SAME_TIME = 1e-6  # s: difference of equal times by rounding
 
 
 def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, max_gap: float = MAX_TRUTH_GAP) -> Array:
-    """Return the true poses (n, 4, 4) at an estimate's times, interpolated; NaN where there is no truth.
+    """Interpolate true poses at the times of an estimate.
 
-    Over gaps of up to `max_gap` [s]. In a longer gap a robot of an estimate with stances stood where it was before,
-    since robots stand while they observe and truth may be sparse then; of one without stances nothing is known.
+    Parameters
+    ----------
+    truth : mapping of str to Trajectory
+        True poses by robot.
+    estimated : Trajectory
+        Estimated poses of one robot.
+    max_gap : float
+        Longest gap between true poses that is interpolated [s].
+
+    Returns
+    -------
+    (n, 4, 4) float
+        True poses; NaN where there is no truth.
+
+    Notes
+    -----
+    In a longer gap a robot of an estimate with stances stood where it was before, since robots stand while they
+    observe and truth may be sparse then; of an estimate without stances nothing is known.
     """
     true = truth.get(estimated.robot)
     times = estimated.times

@@ -70,9 +70,11 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """All that is drawn at one instant. `poses` (r, 4) are x, y, z, heading of the robots, NaN if there is none.
+    """All that is drawn at one time.
 
-    `edge_ids` (m,) number the edges drawn at `edge_points` (m, 2, 3) [m]; `note` is a sentence on what was thinned out.
+    `row` is that of the stance; `poses` (r, 4) are x, y, z [m], heading [rad] of the robots, NaN if there is none, and
+    `roles` their roles. `edge_ids` (m,) number the edges drawn at `edge_points` (m, 2, 3) [m]; `note` is a sentence on
+    stances that are not drawn. The other fields are named like the controls that show them.
     """
 
     row: int

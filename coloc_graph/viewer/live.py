@@ -17,14 +17,23 @@ from coloc_graph.viewer.scene import Array, Scene, layer_of
 from coloc_graph.viewer.sources import as_edges, stayed
 
 LIVE = "live"  # name of the layer if the first scene has none
-RESIDUAL_AT_INSERTION = "of the measurement in the estimate when it came in"
+RESIDUAL_AT_INSERTION = "of the measurement in the estimate at its insertion"
 
 
 @dataclass(frozen=True, eq=False)
 class LiveStance:
-    """A stance that has just entered, where its robots stand by it, and what was measured in it.
+    """A new stance, to be published to a viewer.
 
-    `pairs` are those that were looked at, so that the ones that cannot be used are seen too.
+    Parameters
+    ----------
+    stance : Stance
+        The stance.
+    estimate : StanceEstimate
+        Poses of its robots.
+    measurements : sequence of Measurement
+        Its measurements.
+    pairs : sequence of PairMeasurement
+        Measurements of all pairs, unusable ones included, which are then shown too.
     """
 
     stance: Stance
@@ -35,9 +44,16 @@ class LiveStance:
 
 @dataclass(frozen=True, eq=False)
 class LivePoses:
-    """Poses of robots at a `time` [s], between stances too: `T_world_body` (4, 4) [m] by robot.
+    """Poses of robots at any time, to be published to a viewer.
 
-    `note` is shown with them. Robots that are not named stay at the pose of their last stance.
+    Parameters
+    ----------
+    time : float
+        Their time [s].
+    T_world_body : mapping of str to (4, 4) float
+        Poses by robot [m]; other robots stay at the pose of their last stance.
+    note : str
+        Sentence that is shown with them.
     """
 
     time: float
@@ -45,7 +61,7 @@ class LivePoses:
     note: str = ""
 
     def over(self, robots: Sequence[str], poses: Array) -> Array:
-        """`poses` (r, 4) of x, y, z, heading of `robots`, with those that are live here."""
+        """Return `poses` (r, 4) of x, y, z, heading of `robots`, with the live ones replaced."""
         out = poses.copy()
         for number, robot in enumerate(robots):
             T = self.T_world_body.get(robot)
@@ -54,12 +70,12 @@ class LivePoses:
         return out
 
     def problems(self, robots: Sequence[str]) -> str:
-        """Sentence that names the poses that cannot be shown; "" if all can."""
+        """Return a sentence on poses that cannot be shown; "" if all can."""
         strangers = sorted(set(self.T_world_body) - set(robots))
         broken = [robot for robot, T in self.T_world_body.items() if not _is_transform(T)]
         return "; ".join(
             [*(f"there is no robot {robot} in this team" for robot in strangers),
-             *(f"the live pose of robot {robot} is no finite 4x4 transform" for robot in broken)]
+             *(f"the live pose of robot {robot} is not a finite 4x4 transform" for robot in broken)]
         )  # fmt: skip
 
 
@@ -68,7 +84,7 @@ def _is_transform(T: Array) -> bool:
 
 
 class LiveScene:
-    """Grows a scene by `LiveStance`s; each costs its own arrays, the scene is made when it is asked for."""
+    """Scene that grows by `LiveStance`s; the scene itself is made on demand."""
 
     def __init__(self, start: Scene) -> None:
         self._start = start

@@ -110,10 +110,20 @@ def layer_of(
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Measurements of pairs of observers: `rows` (m,) of the stances, robots `i` and `j` (m,) by number.
+    """Measurements of pairs of observers.
 
-    `sigmas` (m,) is the residual of each, RMS in units of its noise, NaN if unknown; `of_what` names the quantity.
-    `reason` is the reason to reject a measurement, "" for one that is used.
+    Parameters
+    ----------
+    rows : (m,) int
+        Rows of the stances.
+    i, j : (m,) int
+        Robots by number.
+    sigmas : (m,) float
+        RMS residuals in units of the noise; NaN if unknown.
+    reason : tuple of str
+        Reasons for rejection; "" of used measurements.
+    of_what : str
+        Name of the quantity in `sigmas`.
     """
 
     rows: Index

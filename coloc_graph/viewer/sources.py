@@ -27,7 +27,7 @@ from coloc_graph.viewer.moments import first_poses, moment_at, moments_of
 from coloc_graph.viewer.scene import NO_EDGES, Edges, Index, Scene, layer_of
 from coloc_graph.viewer.truth import true_layers
 
-#: What the methods' layers are called.
+#: Names of the methods' layers.
 NAMES = {"chain": "chained", "smooth": "smoothed", "joint": "joint", "ranging": "ranging"}
 OF_GRAPH = "of the measurement in the estimate"
 
@@ -40,10 +40,25 @@ def scene_of_estimate(
     others: Sequence[Estimate] = (),
     frontend: FrontendOptions | None = None,
 ) -> Scene:
-    """The scene of an estimate, with `others` of the same graph beside it, and the run's truth where it has some.
+    """Make the scene of an estimate, with the run's truth if it has any.
 
-    `measurements` are all that were made, so that those which never came into the graph are shown too. Raises
-    `InputError` where a pose is not finite.
+    Parameters
+    ----------
+    estimate : Estimate
+        Of a run with stances.
+    run : Run, optional
+        The run, for images, tracks and truth.
+    measurements : sequence of PairMeasurement
+        Measurements of all pairs, so that unusable ones are shown too.
+    others : sequence of Estimate
+        Further estimates of the same graph.
+    frontend : FrontendOptions, optional
+        Options by which pairs are measured again.
+
+    Raises
+    ------
+    InputError
+        A pose is not finite.
     """
     graph = estimate.graph
     every = (estimate, *others)
@@ -74,7 +89,7 @@ def scene_of_estimate(
 
 
 def empty_scene(run: Run, method: Method, frontend: FrontendOptions | None = None) -> Scene:
-    """The scene of a run before anything is estimated, for stances to be published to."""
+    """Make the scene of a run without an estimate, for stances to be published to."""
     return Scene(
         robots=run.team.names,
         stances=(),

@@ -224,7 +224,7 @@ def test_wrong_robots_and_places_are_refused_before_the_work(call, images, team,
     assert "give --team TEAM.toml and --robot NAME" in refused(call, "mount", one, *BOARD)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "letter.txt").write_text("dear")
-    assert "holds something else" in refused(call, "camera", one, *BOARD, "--out", tmp_path / "full")
+    assert "holds files that are not a calibration" in refused(call, "camera", one, *BOARD, "--out", tmp_path / "full")
     (tmp_path / "earlier").mkdir()
     (tmp_path / "earlier" / "calibration.json").write_text("{}")
     assert "holds an earlier calibration" in refused(call, "camera", one, *BOARD, "--out", tmp_path / "earlier")

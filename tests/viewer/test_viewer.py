@@ -341,7 +341,7 @@ def test_stances_that_are_published_make_the_scene(short_solution):
     for number, robot in enumerate(grown.robots):
         want = short_solution.estimate.pose(robot, graph.stances[-1].index).translation()
         assert np.allclose(last[number], want, atol=2e-3)
-    assert len(grown.edges) == 3 and "when it came in" in grown.edges.of_what and len(grown.stayed) == 2
+    assert len(grown.edges) == 3 and "at its insertion" in grown.edges.of_what and len(grown.stayed) == 2
     estimate = short_solution.estimate
     whole = [estimate.residual(m) for m in graph.measurements if isinstance(m, RelativePose)]
     assert grown.edges.sigmas[-1] == pytest.approx(whole[-1], rel=0.05)

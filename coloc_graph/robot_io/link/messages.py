@@ -171,7 +171,21 @@ class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Event(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """An event of a robot: `kind` is one word, `text` a sentence or the kind's value."""
+    """An event of a robot.
+
+    Parameters
+    ----------
+    session : str
+        Session of its program.
+    number : int
+        Number of the event in the session, from 0.
+    stamp : int
+        Time [ns, robot's clock].
+    kind : str
+        One word.
+    text : str
+        A sentence, or the kind's value.
+    """
 
     session: str
     number: int
@@ -187,7 +201,27 @@ class Event(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Status(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """State of a robot, sent ten times a second; `session` changes when its program is restarted."""
+    """State of a robot, sent ten times a second.
+
+    Parameters
+    ----------
+    session : str
+        Session of its program, another one after each start.
+    stamp : int
+        Time [ns, robot's clock].
+    phase : str
+        Name of its present activity.
+    capture : int or None
+        Number of the capture under way.
+    moving : bool
+        It has a motion to carry out, or its wheels turn.
+    still_since : int or None
+        Time since which it has stood [ns, robot's clock].
+    fault, camera_fault : str or None
+        Reasons for which it does not drive, or has no images.
+    hazards : list of str
+        Descriptions of present hazards.
+    """
 
     session: str
     stamp: int
