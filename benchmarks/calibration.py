@@ -165,7 +165,7 @@ def cameras(sets: int) -> list[dict[str, Any]]:
 def mounts(sets: int, images: int, floor_deg: float) -> dict[str, Any]:
     """NEES and chi2 per degree of freedom over simulated mounts, with a camera that is known as `KNOWN` says."""
     rng = np.random.default_rng(2)
-    nees, chi2, dof, refused = [], 0.0, 0, 0
+    nees, chi2, dof, rejected = [], 0.0, 0, 0
     floor = Floor(tilt_sigma_deg=floor_deg, height_sigma=0.005 * floor_deg) if floor_deg else None
     for _ in range(sets):
         mount = Mount(height=rng.uniform(0.35, 0.45), tilt_deg=rng.uniform(15, 30), roll_deg=rng.normal(scale=2.0))
@@ -187,7 +187,7 @@ def mounts(sets: int, images: int, floor_deg: float) -> dict[str, Any]:
             *np.deg2rad([found.mount.tilt_deg - mount.tilt_deg, found.mount.roll_deg - mount.roll_deg]),
         ])  # fmt: skip
         nees.append(error @ np.linalg.solve(found.covariance, error) / 3)
-        chi2, dof, refused = chi2 + found.chi2, dof + found.dof, refused + len(found.refused)
+        chi2, dof, rejected = chi2 + found.chi2, dof + found.dof, rejected + len(found.rejected)
     return {
         "sets": sets,
         "images": images,
@@ -195,7 +195,7 @@ def mounts(sets: int, images: int, floor_deg: float) -> dict[str, Any]:
         "nees": float(np.mean(nees)),
         "nees_95": float(1.96 * np.std(nees) / np.sqrt(sets)),
         "chi2_per_dof": chi2 / dof if dof else None,
-        "refused": refused,
+        "rejected": rejected,
     }
 
 
@@ -232,7 +232,7 @@ def table(figures: dict[str, Any]) -> str:
         agreement = "" if one["chi2_per_dof"] is None else f", chi2/dof {one['chi2_per_dof']:.3f}"
         lines.append(
             f"  {one['images']} images, floor {one['floor_deg']} deg: NEES {one['nees']:.3f} +- {one['nees_95']:.3f}"
-            f"{agreement}, {one['refused']} images refused of {one['images'] * one['sets']}"
+            f"{agreement}, {one['rejected']} images rejected of {one['images'] * one['sets']}"
         )
     return "\n".join(lines)
 

@@ -1,6 +1,6 @@
-"""Cameras and mounts from images of a board: intrinsics, height, tilt and roll, each with how far to trust it.
+"""Calibrate cameras (intrinsics) and mounts (height, tilt, roll) from images of a board, with uncertainties.
 
-Knows OpenCV, SciPy and the team; no graph. What it finds goes into team.toml.
+Uses OpenCV, SciPy and the team; no graph. The results are written into team.toml.
 """
 
 from coloc_graph.calibration.board import Board, make_board

@@ -1,4 +1,4 @@
-"""The board: a chessboard, or a ChArUco board of which a part is enough."""
+"""Calibration boards: chessboards, which must be seen whole, and ChArUco boards, of which a part suffices."""
 
 import re
 from dataclasses import dataclass
@@ -14,10 +14,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Board:
-    """A flat board with corners on a grid, as OpenCV counts it; lengths in metres.
+    """Flat board with corners on a grid, counted as OpenCV does.
 
-    A chessboard is counted in inner corners, a ChArUco board (with a `dictionary`, "4X4_50") in squares, and its
-    `marker` is the side of a marker. `legacy` is the pattern of OpenCV before 4.6.
+    Attributes
+    ----------
+    columns, rows
+        Inner corners of a chessboard, squares of a ChArUco board.
+    square
+        Side of a square [m].
+    dictionary
+        ArUco dictionary of a ChArUco board, such as "4X4_50"; None for a chessboard.
+    marker
+        Side of a marker of a ChArUco board [m].
+    legacy
+        True for the ChArUco pattern of OpenCV before 4.6.
     """
 
     columns: int
@@ -29,12 +39,12 @@ class Board:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """Inner corners in a row, and rows of them."""
+        """Numbers of inner corners in a row and in a column."""
         return (self.columns, self.rows) if self.dictionary is None else (self.columns - 1, self.rows - 1)
 
     @property
     def points(self) -> Array:
-        """The corners on the board (n, 3), row by row, z = 0 [m]."""
+        """Inner corners on the board, row by row, z = 0, (n, 3) [m]."""
         columns, rows = self.grid
         y, x = np.mgrid[0:rows, 0:columns].reshape(2, -1)
         return np.stack([self.square * x, self.square * y, np.zeros(len(x))], axis=1)
@@ -47,22 +57,37 @@ class Board:
 
 
 def make_board(size: str, square: float, dictionary: str | None = None, marker: float | None = None) -> Board:
-    """The board of a size COLUMNSxROWS, with lengths in metres; `InputError` says what such a board cannot be."""
+    """Make a board from its size.
+
+    Parameters
+    ----------
+    size
+        COLUMNSxROWS, such as "9x6".
+    square
+        Side of a square [m].
+    dictionary, marker
+        ArUco dictionary and side of a marker [m] of a ChArUco board.
+
+    Raises
+    ------
+    InputError
+        There is no such board.
+    """
     found = re.fullmatch(r"(\d+)\s*[xX]\s*(\d+)", size.strip())
     if not found:
-        raise InputError(f"--board {size} is not a size; give COLUMNSxROWS, such as 9x6")
+        raise InputError(f"--board {size} is not a size: give COLUMNSxROWS, such as 9x6")
     columns, rows = int(found[1]), int(found[2])
     if min(columns, rows) < 3 or max(columns, rows) > 100:
-        raise InputError(f"--board {size}: a board has 3 to 100 in a row and in a column; give what is on the board")
+        raise InputError(f"--board {size}: a board has 3 to 100 corners or squares in a row and in a column")
     if not 1e-4 < square < 2.0:
-        raise InputError(f"--square {square} is not the side of a square in metres; 24.23 mm is 0.02423")
+        raise InputError(f"--square {square} is not the side of a square in metres: 24.23 mm is 0.02423")
     if dictionary is None:
         if marker is not None:
-            raise InputError("--marker is for a ChArUco board; give its dictionary with --charuco, or leave it out")
+            raise InputError("--marker applies to a ChArUco board: give its dictionary with --charuco, or omit it")
         return Board(columns, rows, square)
     if marker is None or not 0 < marker < square:
         raise InputError(
-            f"a ChArUco board needs --marker, the side of a marker in metres, less than that of a square ({square})"
+            f"a ChArUco board needs --marker, the side of a marker in metres, shorter than that of a square ({square})"
         )
     dictionary = dictionary.upper().removeprefix("DICT_")
     _dictionary(dictionary)
@@ -70,7 +95,7 @@ def make_board(size: str, square: float, dictionary: str | None = None, marker: 
 
 
 def charuco_board(board: Board) -> Any:
-    """OpenCV's own of a ChArUco board."""
+    """Return OpenCV's object for a ChArUco board."""
     import cv2
 
     assert board.dictionary is not None and board.marker is not None
@@ -86,5 +111,5 @@ def _dictionary(name: str) -> Any:
 
     known = sorted(one.removeprefix("DICT_") for one in dir(cv2.aruco) if one.startswith("DICT_"))
     if name not in known:
-        raise InputError(f"--charuco {name} is no dictionary of OpenCV; it has {', '.join(known)}")
+        raise InputError(f"--charuco {name} is not a dictionary of OpenCV, which has {', '.join(known)}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))

@@ -1,7 +1,7 @@
-"""Camera and board poses that explain the corners best: bundle adjustment, each image's pose eliminated.
+"""Bundle adjustment of intrinsics and board poses, with the pose of each image eliminated.
 
 Intrinsics are one vector: fx, fy, cx, cy [px], then OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]. A board's pose is its
-rotation vector [rad] and translation [m] in the camera, (6,), as OpenCV has it.
+rotation vector [rad] and translation [m] in the camera frame, (6,), as in OpenCV.
 """
 
 from collections.abc import Sequence
@@ -15,21 +15,29 @@ from coloc_graph.calibration.corners import View
 from coloc_graph.errors import EstimationError
 
 Array = NDArray[np.float64]
-#: Steps at most; a step that lowers the sum of squares by less than this part of it is the last: the next would move
-#: no parameter by a thousandth of its sigma.
-STEPS = 60
-STILL = 1e-11
-#: Damping to begin with: valleys are shallow (a focal length is a part in a million of the curvature), starts are good.
-DAMPING = 1e-9
-UNDETERMINED = "the images do not determine the camera; take more, with the board tilted and in all parts of the image"
+MAX_STEPS = 60
+# the next step would move no parameter by a thousandth of its standard deviation
+CONVERGED = 1e-11  # relative decrease of the sum of squares by a step below which the search ends
+INITIAL_DAMPING = 1e-9  # small: valleys are shallow (focal length: 1e-6 of the curvature) and starts are good
+UNDETERMINED = "the images do not determine the camera: take more, with the board tilted and in all parts of the image"
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """An adjusted camera: `intrinsics` (p,), `poses` (images, 6), `residuals` by image (n, 2) [px], seen - projected.
+    """Adjusted camera and board poses.
 
-    `information` (p, p) is that of the intrinsics for corners of 1 px, the poses eliminated; `influence` (images, p)
-    is what each image draws the intrinsics with, which sums to nothing at the optimum.
+    Attributes
+    ----------
+    intrinsics
+        Intrinsics, (p,).
+    poses
+        Pose of the board in each image, (images, 6).
+    residuals
+        Observed minus projected corners of each image, (n, 2) [px].
+    information
+        Information of the intrinsics for corner noise of 1 px, with the poses eliminated, (p, p).
+    influence
+        Gradient of each image on the intrinsics, (images, p), which sums to zero at the optimum.
     """
 
     intrinsics: Array
@@ -40,7 +48,7 @@ class Bundle:
 
     @property
     def rms(self) -> float:
-        """Root mean square distance of a corner from its projection, as OpenCV's calibration states it [px]."""
+        """RMS distance of corners from their projections, as OpenCV's calibration reports it [px]."""
         return rms(self.residuals)
 
 
@@ -51,16 +59,16 @@ def rms(residuals: Sequence[Array]) -> float:
 
 
 def project(intrinsics: Array, pose: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Pixels (n, 2) of a board's points (n, 3), and how they change with intrinsics (2n, p) and pose (2n, 6)."""
+    """Project points (n, 3) to pixels (n, 2), with derivatives by intrinsics (2n, p) and by pose (2n, 6)."""
     K = np.array([[intrinsics[0], 0, intrinsics[2]], [0, intrinsics[1], intrinsics[3]], [0, 0, 1.0]])
     uv, J = cv2.projectPoints(points[:, None], pose[:3], pose[3:], K, intrinsics[4:] if len(intrinsics) > 4 else None)
     return np.asarray(uv.reshape(-1, 2)), np.asarray(J[:, 6 : 6 + len(intrinsics)]), np.asarray(J[:, :6])
 
 
 def start_pose(view: View, intrinsics: Array) -> Array:
-    """A board's pose (6,) under known intrinsics, near enough for `adjust_pose`."""
+    """Initial pose (6,) of a board under known intrinsics, for `adjust_pose`."""
     K = np.array([[intrinsics[0], 0, intrinsics[2]], [0, intrinsics[1], intrinsics[3]], [0, 0, 1.0]])
-    # about its middle and in its own size, as the method wants a board to be
+    # centred and scaled to unit size, as IPPE requires
     middle, size = view.points.mean(axis=0), np.abs(view.points).max()
     _, rotation, translation = cv2.solvePnP(
         (view.points - middle) / size, view.uv, K, intrinsics[4:], flags=cv2.SOLVEPNP_IPPE
@@ -70,20 +78,30 @@ def start_pose(view: View, intrinsics: Array) -> Array:
 
 
 def adjust(views: Sequence[View], intrinsics: Array, poses: Array) -> Bundle:
-    """The bundle of least squares from a start (p,), (images, 6), by Levenberg and Marquardt.
+    """Adjust intrinsics and board poses by Levenberg-Marquardt.
 
-    Raises `EstimationError` where the images do not determine the intrinsics.
+    Parameters
+    ----------
+    views
+        Boards in images.
+    intrinsics, poses
+        Start, (p,) and (images, 6).
+
+    Raises
+    ------
+    EstimationError
+        The images do not determine the intrinsics.
     """
     intrinsics, poses = np.array(intrinsics, float), np.array(poses, float)
-    damping, at = DAMPING, _linearise(views, intrinsics, poses)
-    for _ in range(STEPS):
+    damping, at = INITIAL_DAMPING, _linearise(views, intrinsics, poses)
+    for _ in range(MAX_STEPS):
         try:
             step = _step(at, damping)
             moved = _linearise(views, intrinsics + step[0], poses + step[1])
         except np.linalg.LinAlgError:
             moved = None
         if moved is not None and moved.cost <= at.cost:
-            done = at.cost - moved.cost <= STILL * max(at.cost, 1e-12)
+            done = at.cost - moved.cost <= CONVERGED * max(at.cost, 1e-12)
             intrinsics, poses, at, damping = intrinsics + step[0], poses + step[1], moved, damping / 100
             if done:
                 break
@@ -99,11 +117,14 @@ def adjust(views: Sequence[View], intrinsics: Array, poses: Array) -> Bundle:
 
 
 def adjust_pose(view: View, intrinsics: Array, pose: Array) -> tuple[Array, Array, Array]:
-    """The pose (6,) of one board under known intrinsics, its residuals (n, 2) [px] and information (6, 6) at 1 px."""
-    pose, damping = np.array(pose, float), DAMPING
+    """Adjust the pose of one board under known intrinsics.
+
+    Returns its pose (6,), residuals (n, 2) [px], and information (6, 6) for corner noise of 1 px.
+    """
+    pose, damping = np.array(pose, float), INITIAL_DAMPING
     uv, _, B = project(intrinsics, pose, view.points)
     r = view.uv - uv
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         N = B.T @ B
         step = np.linalg.solve(N + damping * np.diag(np.diag(N)), B.T @ r.ravel())
         uv, _, moved_B = project(intrinsics, pose + step, view.points)
@@ -111,7 +132,7 @@ def adjust_pose(view: View, intrinsics: Array, pose: Array) -> tuple[Array, Arra
         gain = float((r**2).sum() - (moved**2).sum())
         if gain >= 0:
             pose, r, B, damping = pose + step, moved, moved_B, damping / 100
-            if gain <= STILL * max(float((r**2).sum()), 1e-12):
+            if gain <= CONVERGED * max(float((r**2).sum()), 1e-12):
                 break
         else:
             damping = 100 * damping
@@ -122,7 +143,7 @@ def adjust_pose(view: View, intrinsics: Array, pose: Array) -> tuple[Array, Arra
 
 @dataclass(frozen=True, eq=False)
 class _Linear:
-    """The normal equations, by image: U = A'A, W = A'B, V = B'B, a = A'r, b = B'r."""
+    """Normal equations of each image: U = A'A, W = A'B, V = B'B, a = A'r, b = B'r."""
 
     cost: float
     residuals: tuple[Array, ...]
@@ -146,7 +167,7 @@ def _linearise(views: Sequence[View], intrinsics: Array, poses: Array) -> _Linea
 
 
 def _reduced(at: _Linear, damping: float) -> tuple[Array, Array]:
-    """Information (p, p) of the intrinsics with the poses eliminated, and each image's pull (images, p)."""
+    """Information (p, p) and gradients by image (images, p) of the intrinsics with the poses eliminated."""
     V = at.V + damping * at.V * np.eye(6)
     WV = np.linalg.solve(V, at.W.mT).mT
     S = (at.U - WV @ at.W.mT).sum(axis=0) + damping * at.U.sum(axis=0) * np.eye(at.U.shape[-1])
@@ -155,7 +176,7 @@ def _reduced(at: _Linear, damping: float) -> tuple[Array, Array]:
 
 def _step(at: _Linear, damping: float) -> tuple[Array, Array]:
     S, pull = _reduced(at, damping)
-    scale = 1 / np.sqrt(np.diag(S).clip(min=1e-300))  # pixels and lens coefficients are worlds apart
+    scale = 1 / np.sqrt(np.diag(S).clip(min=1e-300))  # pixels and lens coefficients differ by orders of magnitude
     step = scale * np.linalg.solve(scale * S * scale[:, None], scale * pull.sum(axis=0))
     V = at.V + damping * at.V * np.eye(6)
     return step, np.linalg.solve(V, (at.b - at.W.mT @ step)[..., None])[..., 0]

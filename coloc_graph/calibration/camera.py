@@ -1,4 +1,4 @@
-"""A camera from images of a board: intrinsics with sigmas that hold for other images, and what speaks against it."""
+"""Calibrate a camera from images of a board, with standard deviations that hold for other images."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,42 +20,64 @@ from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
 
-#: Numbers of lens coefficients that are tried: none, k1 k2 p1 p2, k3 too, and the rational ones too.
-LENSES = (0, 4, 5, 8)
-#: So many images are the least; and of those of which sigmas are made, so many parts at most.
-LEAST_IMAGES = 6
-MOST_PARTS = 40
-#: An image whose corners are off by so many times what is usual shows another board, or one that moved or is bent.
-OUTLIER = 3.0
-#: Of more than this part of the images refused, it is not clear which ones are right.
-MOST_REFUSED = 1 / 3
-#: A focal length is none where it is known no better than by this part.
-LEAST_KNOWN = 0.1
+LENSES = (0, 4, 5, 8)  # numbers of lens coefficients tried: none; k1, k2, p1, p2; k3 too; rational
+MIN_IMAGES = 6
+MAX_PARTS = 40  # parts into which images are divided for the jackknife
+OUTLIER = 3.0  # ratio of an image's RMS to the median above which it shows another board, or one that moved or is bent
+MAX_REJECTED = 1 / 3  # share of the images above which it is unclear which are right
+MAX_FOCAL_SIGMA = 0.1  # relative standard deviation of a focal length that counts as determined
 
 
 @dataclass(frozen=True)
 class ImageFit:
-    """One image: corners, their RMS distance from the fit [px], how far the board is tilted [deg].
+    """Fit of one image.
 
-    `refused` says why it was left out; its RMS is then that under the camera of the others.
+    Attributes
+    ----------
+    name
+        Path of the image.
+    corners
+        Number of corners.
+    rms
+        RMS distance of the corners from their projections [px]; of a rejected image under the camera of the others.
+    tilt_deg
+        Angle between the board and the image plane [deg].
+    rejected
+        Reason why the image was rejected, or None.
     """
 
     name: str
     corners: int
     rms: float
     tilt_deg: float
-    refused: str | None = None
+    rejected: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """A calibrated camera.
+    """Calibrated camera.
 
-    `covariance` (p, p) of fx, fy, cx, cy [px] and the lens coefficients is the jackknife's: of what the intrinsics
-    become where one place of the board is left out, so that errors which the corners of an image share are counted.
-    `independent_covariance` takes all corners for independent, as OpenCV's stdDeviationsIntrinsics do. `shared_px` is
-    what neighbouring corners have in common, `lens_px` how well a ray's pixel is known where corners were [px an axis];
-    `camera.bias_px` is both. `places` counts images that show the board in another place than those before.
+    Attributes
+    ----------
+    camera
+        The camera; its `bias_px` combines `shared_px` and `lens_px`.
+    covariance
+        Covariance of fx, fy, cx, cy [px] and the lens coefficients, (p, p), by a jackknife over the board's positions,
+        so that errors shared by the corners of an image count.
+    independent_covariance
+        The same for independent corners, as OpenCV's stdDeviationsIntrinsics, (p, p).
+    images
+        Fits of all images.
+    trials
+        Numbers of lens coefficients that were tried.
+    places
+        Number of different positions of the board.
+    shared_px
+        Standard deviation of the error that neighbouring corners share, for each axis [px].
+    lens_px
+        Standard deviation of a ray's pixel where corners were, for each axis [px].
+    board, used, bundle
+        Board, its views that were used, and the adjustment.
     """
 
     camera: Camera
@@ -81,9 +103,9 @@ class CameraCalibration:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
-    def refused(self) -> tuple[ImageFit, ...]:
-        """The images that were left out."""
-        return tuple(image for image in self.images if image.refused)
+    def rejected(self) -> tuple[ImageFit, ...]:
+        """Rejected images."""
+        return tuple(image for image in self.images if image.rejected)
 
 
 def calibrate_camera(
@@ -92,38 +114,56 @@ def calibrate_camera(
     coefficients: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> CameraCalibration:
-    """The camera that explains a board's corners best (least squares), with the fewest coefficients that will do.
+    """Calibrate a camera by least squares, with the fewest lens coefficients that suffice.
 
-    `coefficients` is their number (0, 4, 5, 8); where it is None, more of them are taken only where they predict images
-    that were held out better than fewer do, by more than the standard error of that.
+    Parameters
+    ----------
+    seen
+        Boards in images.
+    board
+        The board.
+    coefficients
+        Number of lens coefficients, 0, 4, 5 or 8. By default more are taken only if they predict held-out images
+        better than fewer do, by more than the standard error.
+    progress
+        Called with (done, total).
 
-    Raises `InputError` where there are too few images, or too many that contradict the others; `DegenerateGeometry`
-    where the images do not determine the camera.
+    Returns
+    -------
+    CameraCalibration
+        Camera with its covariance.
+
+    Raises
+    ------
+    InputError
+        There are too few images, or too many contradict the others.
+    DegenerateGeometry
+        The images do not determine the camera.
     """
-    if len(seen.views) < LEAST_IMAGES:
+    if len(seen.views) < MIN_IMAGES:
         raise InputError(
-            f"{board} is in {len(seen.views)} of {seen.images} images, and at least {LEAST_IMAGES} are needed; "
+            f"{board} is in {len(seen.views)} of {seen.images} images, but at least {MIN_IMAGES} are needed: "
             "take more, 20 are good, with the board tilted and in all parts of the image"
         )
     start = _start(seen, 4 if coefficients is None else coefficients)
-    kept, bundle, refused = _without_outliers(seen, board, start)
+    kept, bundle, rejected = _without_outliers(seen, board, start)
     views = Views(seen.width, seen.height, tuple(kept), seen.missed)
     place = places(kept, board.square)
     count = int(place.max()) + 1
-    if count < LEAST_IMAGES:
+    if count < MIN_IMAGES:
         raise InputError(
-            f"{len(kept)} images show {board} in {count} places only, and at least {LEAST_IMAGES} are needed; "
+            f"{len(kept)} images show {board} in only {count} places, but at least {MIN_IMAGES} are needed: "
             "move the board between images"
         )
     _require_known(bundle, _independent(bundle))
     wanted = LENSES if coefficients is None else (coefficients,)
-    fit, trials = choose_lens(views, bundle, place % MOST_PARTS, wanted, progress)
+    fit, trials = choose_lens(views, bundle, place % MAX_PARTS, wanted, progress)
     best, covariance = fit.bundle, fit.covariance
-    why_not = folds(best.intrinsics, seen.width, seen.height)
-    if why_not:
+    fold = folds(best.intrinsics, seen.width, seen.height)
+    if fold:
         raise DegenerateGeometry(
             f"the images do not determine {len(best.intrinsics) - 4} lens coefficients, since with them the lens "
-            f"{why_not}; ask for fewer with --distortion, or hold the board in the corners of the image, too"
+            f"{fold}: choose fewer with --distortion, or hold the board in the corners of the image, too"
         )
     _require_known(best, covariance)
     noise, shared = noise_and_shared(kept, best.residuals, fitted_directions(kept, best), board.square)
@@ -145,7 +185,7 @@ def calibrate_camera(
         for view, pose, r in zip(kept, best.poses, best.residuals, strict=True)
     ]
     order = {view.name: index for index, view in enumerate(seen.views)}
-    images = tuple(sorted([*fitted, *refused], key=lambda image: order[image.name]))
+    images = tuple(sorted([*fitted, *rejected], key=lambda image: order[image.name]))
     return CameraCalibration(
         camera, covariance, _independent(best), images, trials, count, shared, lens, board, views, best
     )
@@ -158,9 +198,9 @@ def tilt_deg(pose: Array) -> float:
 
 
 def places(views: Sequence[View], square: float) -> NDArray[np.int64]:
-    """Which place of the board each view shows (n,), from 0: views whose corners coincide show the same.
+    """Number the board's positions in views (n,), from 0; views with coinciding corners have the same position.
 
-    They share the errors of their corners, and are no independent evidence.
+    Such views share the errors of their corners and are not independent evidence.
     """
     place: list[int] = []
     firsts: list[tuple[View, float]] = []
@@ -182,7 +222,7 @@ def places(views: Sequence[View], square: float) -> NDArray[np.int64]:
 
 
 def _start(seen: Views, coefficients: int) -> Bundle:
-    """OpenCV's calibration of all images, adjusted to the end."""
+    """Start with OpenCV's calibration of all images, adjusted to convergence."""
     flags = {
         0: cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST,
         4: cv2.CALIB_FIX_K3,
@@ -206,7 +246,7 @@ def _start(seen: Views, coefficients: int) -> Bundle:
 
 
 def _without_outliers(seen: Views, board: Board, bundle: Bundle) -> tuple[list[View], Bundle, list[ImageFit]]:
-    """The images that agree, and those that do not: the worst goes first, the others are adjusted anew."""
+    """Reject images one by one, the worst first, with a new adjustment of the others each time."""
     kept, out = list(seen.views), []
     while True:
         off = np.array([rms([r]) for r in bundle.residuals])
@@ -214,26 +254,26 @@ def _without_outliers(seen: Views, board: Board, bundle: Bundle) -> tuple[list[V
         if off[worst] <= OUTLIER * np.median(off):
             break
         out.append(kept.pop(worst))
-        if len(out) > MOST_REFUSED * len(seen.views) or len(kept) < LEAST_IMAGES:
+        if len(out) > MAX_REJECTED * len(seen.views) or len(kept) < MIN_IMAGES:
             raise InputError(
                 f"{len(out)} of {len(seen.views)} images contradict the others ({', '.join(v.name for v in out[:3])}"
-                f"{', ...' if len(out) > 3 else ''}); check that all show the same flat board, {board}, and are sharp"
+                f"{', ...' if len(out) > 3 else ''}): check that all show the same flat board, {board}, and are sharp"
             )
         bundle = adjust(kept, bundle.intrinsics, np.delete(bundle.poses, worst, axis=0))
     usual = float(np.median(off))
-    refused = []
+    rejected = []
     for view in out:
         pose, r, _ = adjust_pose(view, bundle.intrinsics, start_pose(view, bundle.intrinsics))
         why = (
-            f"its corners are off by {rms([r]):.2f} px where {usual:.2f} px are usual: "
-            "another board, or one that moved or is not flat"
+            f"its corners have an RMS error of {rms([r]):.2f} px, others have {usual:.2f} px: "
+            "it shows another board, or one that moved or is not flat"
         )
-        refused.append(ImageFit(view.name, len(r), rms([r]), tilt_deg(pose), why))
-    return kept, bundle, refused
+        rejected.append(ImageFit(view.name, len(r), rms([r]), tilt_deg(pose), why))
+    return kept, bundle, rejected
 
 
 def _independent(bundle: Bundle) -> Array:
-    """Covariance (p, p) of the intrinsics if all corners were independent."""
+    """Covariance (p, p) of the intrinsics for independent corners."""
     dof = sum(2 * len(r) - 6 for r in bundle.residuals) - len(bundle.intrinsics)
     squares = sum(float((r**2).sum()) for r in bundle.residuals)
     try:
@@ -245,12 +285,12 @@ def _independent(bundle: Bundle) -> Array:
 def _require_known(bundle: Bundle, covariance: Array) -> None:
     sigma = float(np.sqrt(np.diag(covariance)[:2]).max())
     focal = float(bundle.intrinsics[:2].min())
-    if not (math.isfinite(sigma) and focal > 0 and sigma < LEAST_KNOWN * focal):
-        raise DegenerateGeometry(_undetermined(f"the focal length comes out as {focal:.0f} +- {sigma:.0f} px"))
+    if not (math.isfinite(sigma) and focal > 0 and sigma < MAX_FOCAL_SIGMA * focal):
+        raise DegenerateGeometry(_undetermined(f"estimated focal length {focal:.0f} +- {sigma:.0f} px"))
 
 
 def _undetermined(what: str) -> str:
     return (
-        f"the images do not determine the camera, {what}; tilt the board by 20 to 45 deg, this way and that, "
+        f"the images do not determine the camera ({what}): tilt the board by 20 to 45 deg in all directions, "
         "and hold it in all parts of the image"
     )

@@ -1,4 +1,4 @@
-"""Corners of a board in images, to a fraction of a pixel."""
+"""Detect the corners of a board in images, with sub-pixel accuracy."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,18 +17,16 @@ from coloc_graph.image_file import range_of, read_image, to_8_bits, to_grey
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-#: A corner is sought in a window of this part of the way to its neighbour, at most so many pixels to each side: a
-#: larger one sees the neighbour's edges (11 px on squares of 13 px: 0.58 px RMS instead of 0.16).
-WINDOW = 0.45
-LARGEST_WINDOW = 12
-SMOOTHING = 0.7  # px, sigma of the blur against JPEG's blocks and the sensor's noise
-#: Fewer corners of a ChArUco board than this say too little about its pose.
-LEAST_CORNERS = 8
+# a larger window would see the neighbour's edges: 11 px on squares of 13 px give 0.58 px RMS instead of 0.16 px
+WINDOW = 0.45  # half side of the refinement window, as a share of the distance to the next corner
+MAX_WINDOW = 12  # px, upper bound of that half side
+SMOOTHING = 0.7  # px, sigma of the blur against JPEG blocks and sensor noise
+MIN_CORNERS = 8  # of a ChArUco board, to determine its pose
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A board in one image: `points` (n, 3) on the board [m], seen at `uv` (n, 2) [px]."""
+    """Board in one image: corners on the board (n, 3) [m], and in the image (n, 2) [px]."""
 
     name: str
     points: Array
@@ -37,7 +35,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """The boards in images of one size, and the names of images in which there was none."""
+    """Boards in images of one size, and names of the images without one."""
 
     width: int
     height: int
@@ -53,9 +51,26 @@ class Views:
 def find_boards(
     paths: Sequence[Path], board: Board, progress: Callable[[int, int], None] | None = None
 ) -> tuple[Views, Board]:
-    """The boards in images, and the board with what only its images tell (a ChArUco board's `legacy`).
+    """Find a board in images.
 
-    Raises `InputError` where an image cannot be read, where sizes differ, and where no image shows the board.
+    Parameters
+    ----------
+    paths
+        Image files.
+    board
+        The board.
+    progress
+        Called with (done, total).
+
+    Returns
+    -------
+    tuple
+        The views, and the board with `legacy` as the images show it.
+
+    Raises
+    ------
+    InputError
+        An image cannot be read, sizes differ, or no image shows the board.
     """
     values = range_of(paths, read_image(paths[0]))
     images = [(path, to_grey(to_8_bits(read_image(path), values))) for path in paths]
@@ -63,8 +78,8 @@ def find_boards(
     for path, image in images:
         if image.shape != (height, width):
             raise InputError(
-                f"{path} has {image.shape[1]}x{image.shape[0]} pixels and {paths[0]} {width}x{height}; "
-                "one camera's images have one size: leave out those of others"
+                f"{path} has {image.shape[1]}x{image.shape[0]} pixels and {paths[0]} {width}x{height}: "
+                "give images of one camera, which all have one size"
             )
     for candidate in (board, replace(board, legacy=True)) if board.dictionary else (board,):
         views, missed = [], []
@@ -79,13 +94,13 @@ def find_boards(
         if views:
             return Views(width, height, tuple(views), tuple(missed)), candidate
     raise InputError(
-        f"{board} is in none of {len(images)} images ({paths[0]}{', ...' if len(images) > 1 else ''}); "
+        f"{board} is in none of {len(images)} images ({paths[0]}{', ...' if len(images) > 1 else ''}): "
         + _remedy([image for _, image in images[:3]], board)
     )
 
 
 def find_board(image: Image, board: Board, name: str = "") -> View | None:
-    """The board in one grey image, None where it is not seen."""
+    """Find the board in one grey image; None if it is not seen."""
     if board.dictionary is None:
         size = board.grid
         found, seen = cv2.findChessboardCorners(
@@ -99,13 +114,13 @@ def find_board(image: Image, board: Board, name: str = "") -> View | None:
     else:
         # OpenCV's types have no "none found", which is what comes where none are
         seen, ids, *_ = cv2.aruco.CharucoDetector(charuco_board(board)).detectBoard(image)
-        if ids is None or len(ids) < LEAST_CORNERS:
+        if ids is None or len(ids) < MIN_CORNERS:
             return None
         uv, index = np.asarray(seen, np.float32).reshape(-1, 2), np.asarray(ids, np.int64).ravel()
         if np.linalg.matrix_rank(board.points[index, :2] - board.points[index[0], :2], tol=1e-9) < 2:
             return None
     points = board.points[index]
-    # the edges of markers, which begin at a margin from a ChArUco board's corners, would draw them just as well
+    # the window must not reach the edges of markers, which would bias a ChArUco board's corners
     free = WINDOW if board.marker is None else min(WINDOW, 0.45 * (1 - board.marker / board.square))
     return View(name, points, _refined(image, points, uv, board.square, free))
 
@@ -119,31 +134,28 @@ def neighbours(points: Array, square: float) -> NDArray[np.int64]:
 def _refined(image: Image, points: Array, uv: NDArray[np.float32], square: float, free: float) -> Array:
     pairs = neighbours(points, square)
     spacing = float(np.linalg.norm(uv[pairs[:, 0]] - uv[pairs[:, 1]], axis=1).min()) if len(pairs) else 10.0
-    half = int(np.clip(round(free * spacing), 2, LARGEST_WINDOW))
+    half = int(np.clip(round(free * spacing), 2, MAX_WINDOW))
     until = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
     smooth = cv2.GaussianBlur(image, (0, 0), SMOOTHING)
     return np.asarray(cv2.cornerSubPix(smooth, uv[:, None].copy(), (half, half), (-1, -1), until), float).reshape(-1, 2)
 
 
 def _remedy(images: Sequence[Image], board: Board) -> str:
-    """Remedy if a board is not found: another size that is seen, or the usual."""
+    """Return a remedy for a board that is not found: another size that is seen, or general advice."""
     for other in _others(board):
         if any(find_board(image, other) is not None for image in images):
             counted = "inner corners, not squares" if board.dictionary is None else "squares, columns first"
-            return f"{other} is: --board counts {counted}; give --board {other.columns}x{other.rows}"
+            return f"{other} is seen, and --board counts {counted}: give --board {other.columns}x{other.rows}"
     if board.dictionary is not None:
         detector = cv2.aruco.ArucoDetector(charuco_board(board).getDictionary())
         found: list[Any] = [ids.ravel() for image in images if (ids := detector.detectMarkers(image)[1]) is not None]
         if found:
             return (
-                f"markers of its dictionary are seen, the largest id {max(map(max, found))}, in no such order; "
+                f"markers of its dictionary are seen, up to id {max(map(max, found))}, but not in this layout; "
                 "check --board (squares, columns first) and --charuco"
             )
-        return "check --charuco, take the board nearer and sharper, in even light, with its white margin in view"
-    return (
-        "count the inner corners where four squares meet, and take the board whole, sharp and in even light, "
-        "with its white margin in view"
-    )
+        return "check --charuco, and show the board nearer, sharp, in even light, with its white margin"
+    return "count the inner corners, and show the whole board, sharp, in even light, with its white margin"
 
 
 def _others(board: Board) -> Iterator[Board]:

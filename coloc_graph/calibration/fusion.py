@@ -1,4 +1,4 @@
-"""One value from many that share errors: generalised least squares, and which of them contradict the others."""
+"""Fuse estimates with shared errors by generalised least squares, and test which contradict the others."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,24 +11,30 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Said:
-    """Estimates of one value of m numbers from n images.
+class Estimates:
+    """Estimates of one vector (m,) from n images.
 
-    `values` (n, m), the `own` covariance of each (n, m, m), and the covariance of what they share, `common`
-    (n, m, n, m).
+    Attributes
+    ----------
+    values
+        Estimates, (n, m).
+    own
+        Covariances of their independent errors, (n, m, m).
+    common
+        Covariance of their shared errors, (n, m, n, m).
     """
 
     values: Array
     own: Array
     common: Array
 
-    def of(self, kept: Sequence[int]) -> "Said":
-        """Those of some images."""
+    def of(self, kept: Sequence[int]) -> "Estimates":
+        """Select the estimates of some images by index."""
         at = list(kept)
-        return Said(self.values[at], self.own[at], self.common[at][:, :, at])
+        return Estimates(self.values[at], self.own[at], self.common[at][:, :, at])
 
     def covariance(self, scale: float = 1.0) -> Array:
-        """Of all they say (nm, nm); their own errors larger by `scale`, in variance."""
+        """Joint covariance of all estimates, (nm, nm), with the variances of independent errors scaled."""
         n, m = self.values.shape
         V = self.common.copy()
         V[np.arange(n), :, np.arange(n), :] += scale * self.own
@@ -37,9 +43,18 @@ class Said:
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """The most likely value (m,), its covariance, how they agree (`chi2` over `dof`), and the scale of own errors.
+    """Fused estimate.
 
-    `weights` (m, nm) are those of what each image says.
+    Attributes
+    ----------
+    value, covariance
+        Maximum-likelihood value, (m,), and its covariance, (m, m).
+    chi2, dof
+        Agreement of the estimates.
+    scale
+        Factor by which the variances of independent errors were scaled.
+    weights
+        Weights of the estimates, (m, nm).
     """
 
     value: Array
@@ -50,8 +65,8 @@ class Fused:
     weights: Array
 
 
-def fuse(said: Said, scale: float = 1.0) -> Fused:
-    """The value that all say, most likely."""
+def fuse(said: Estimates, scale: float = 1.0) -> Fused:
+    """Fuse estimates by generalised least squares."""
     n, m = said.values.shape
     V = said.covariance(scale)
     X = np.tile(np.eye(m), (n, 1))
@@ -63,8 +78,8 @@ def fuse(said: Said, scale: float = 1.0) -> Fused:
     return Fused(value, weights @ V @ weights.T, chi2, m * (n - 1), scale, weights)
 
 
-def fuse_scaled(said: Said, chance: float) -> Fused:
-    """`fuse`, with own errors larger where the values disagree by more than this chance; chi2 is that of the first."""
+def fuse_scaled(said: Estimates, chance: float) -> Fused:
+    """Fuse estimates, with independent errors enlarged if they disagree at this p-value; chi2 is that before."""
     first = fuse(said)
     if not first.dof or first.chi2 <= chdtri(first.dof, chance):
         return first
@@ -72,14 +87,14 @@ def fuse_scaled(said: Said, chance: float) -> Fused:
     return Fused(again.value, again.covariance, first.chi2, first.dof, again.scale, again.weights)
 
 
-def disagreement(said: Said) -> Array:
-    """The chi-square of each image's value against what all the others say (n,); m degrees of freedom each."""
+def disagreement(said: Estimates) -> Array:
+    """Chi-square (n,) of each estimate against the fusion of all others, with m degrees of freedom."""
     n, m = said.values.shape
     out = np.zeros(n)
     for index in range(n):
         others = [one for one in range(n) if one != index]
         fused = fuse(said.of(others))
-        # what is shared says little about a difference
+        # shared errors cancel in the difference
         cross = fused.weights @ said.common[others][:, :, index].reshape((n - 1) * m, m)
         apart = said.values[index] - fused.value
         V = said.own[index] + said.common[index, :, index] + fused.covariance - cross - cross.T

@@ -1,4 +1,4 @@
-"""Intrinsics in the image: the fold of a lens model, the uncertainty of a ray."""
+"""Check lens models for folds in the image, and propagate intrinsics to the uncertainty of rays."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,21 +12,21 @@ LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", 
 
 
 def camera_of(intrinsics: Array, width: int, height: int) -> Camera:
-    """The camera with intrinsics (p,): fx, fy, cx, cy and the lens coefficients."""
+    """Make a camera from intrinsics (p,): fx, fy, cx, cy and the lens coefficients."""
     fx, fy, cx, cy = intrinsics[:4].tolist()
     lens = tuple(intrinsics[4:].tolist())
     return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=lens)
 
 
 def pixel_grid(width: int, height: int, columns: int, rows: int) -> Array:
-    """Centres of the cells of an image (rows, columns, 2) [px]."""
+    """Centres of the cells of a grid over an image, (rows, columns, 2) [px]."""
     u = (np.arange(columns) + 0.5) * width / columns - 0.5
     v = (np.arange(rows) + 0.5) * height / rows - 0.5
     return np.stack(np.meshgrid(u, v), axis=-1)
 
 
 def folds(intrinsics: Array, width: int, height: int) -> str | None:
-    """Why a lens model cannot be used over the whole image, None where it can."""
+    """Explain in words why a lens model is not invertible over the whole image, or return None."""
     if (intrinsics[:2] <= 0).any():
         return "has a focal length that is not positive"
     camera = camera_of(intrinsics, width, height)
@@ -43,10 +43,24 @@ def folds(intrinsics: Array, width: int, height: int) -> str | None:
 
 
 def ray_sigmas(intrinsics: Array, covariance: Array, uv: Array, at: Array | None = None) -> Array:
-    """Standard deviation of a fixed ray (m,) [px an axis], for rays of pixels `at` (m, 2), or of `uv` (n, 2).
+    """Standard deviations (m,) of rays, for each axis [px].
 
-    A camera that is turned a little sees what one with other intrinsics would: what a rotation makes up for, the best
-    over the pixels `uv`, is left out. Rays that the model does not have come out as infinite.
+    A small rotation of the camera compensates a part of an error in the intrinsics: the best rotation over the pixels
+    `uv` is removed.
+
+    Parameters
+    ----------
+    intrinsics, covariance
+        Intrinsics, (p,), and their covariance, (p, p).
+    uv
+        Pixels of the rays, (n, 2).
+    at
+        Pixels of other rays to evaluate, (m, 2).
+
+    Returns
+    -------
+    numpy.ndarray
+        Standard deviations, infinite for pixels without a ray in the model.
     """
     size = np.concatenate([uv, uv if at is None else at]).max(axis=0) + 2
     camera = camera_of(intrinsics, int(size[0]), int(size[1]))

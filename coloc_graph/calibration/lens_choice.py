@@ -1,4 +1,4 @@
-"""Choice of the number of lens coefficients, and the intrinsics without each part of the images."""
+"""Choose the number of lens coefficients by cross-validation, which also gives the jackknife covariance."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,21 +16,30 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trial:
-    """A number of lens coefficients that was tried: RMS of the fit, and of images that were held out of it [px].
+    """Number of lens coefficients that was tried, with RMS of the fit and of held-out images [px].
 
-    `why_not` says why it was not taken.
+    `rejected` is the reason why it was not chosen.
     """
 
     coefficients: int
     rms: float
     held_out_rms: float
-    why_not: str | None = None
+    rejected: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A bundle of all images, the intrinsics without each part (parts, p), and each part's mean square residual under
-    the intrinsics without it (parts,) [px^2]."""
+    """Cross-validated fit.
+
+    Attributes
+    ----------
+    bundle
+        Adjustment of all images.
+    without
+        Intrinsics without each part of the images, (parts, p).
+    held_out
+        Mean squared residual of each part under the intrinsics without it, (parts,) [px^2].
+    """
 
     bundle: Bundle
     without: Array
@@ -38,7 +47,7 @@ class Fit:
 
     @property
     def covariance(self) -> Array:
-        """Of the intrinsics (p, p), by the jackknife."""
+        """Jackknife covariance of the intrinsics, (p, p)."""
         off, parts = self.without - self.without.mean(axis=0), len(self.without)
         return np.asarray((parts - 1) / parts * off.T @ off)
 
@@ -50,10 +59,25 @@ def choose_lens(
     wanted: Sequence[int],
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Fit, tuple[Trial, ...]]:
-    """The fit with as few lens coefficients as will do, of the numbers `wanted` in rising order, and all trials.
+    """Fit with the fewest lens coefficients that suffice.
 
-    More are taken where images that were held out are predicted better, on average over the `parts` (n,) of the images
-    by more than the standard error of that. One number alone is taken as it is.
+    More are chosen if they predict held-out images better, on average over the parts, by more than the standard error.
+
+    Parameters
+    ----------
+    views, start
+        Boards in images, and an adjustment to start from.
+    parts
+        Number of the part of each image, (n,).
+    wanted
+        Numbers of lens coefficients to try, ascending; a single one is taken as it is.
+    progress
+        Called with (done, total).
+
+    Returns
+    -------
+    tuple
+        The chosen fit, and all trials.
     """
     count = int(parts.max()) + 1
     fits: dict[int, Fit] = {}
@@ -61,9 +85,9 @@ def choose_lens(
     best = wanted[0]
     for done, coefficients in enumerate(wanted):
         bundle = adjust(views.views, _resized(start.intrinsics, coefficients), start.poses)
-        why_not = folds(bundle.intrinsics, views.width, views.height)
-        if why_not and coefficients != wanted[0]:
-            unusable[coefficients] = bundle.rms, f"the lens {why_not}"
+        fold = folds(bundle.intrinsics, views.width, views.height)
+        if fold and coefficients != wanted[0]:
+            unusable[coefficients] = bundle.rms, f"the lens {fold}"
         else:
             fits[coefficients] = _held_out(views, bundle, parts)
             better = fits[best].held_out - fits[coefficients].held_out
@@ -75,21 +99,21 @@ def choose_lens(
     trials = []
     for coefficients in wanted:
         if coefficients in unusable:
-            off, why_not = unusable[coefficients]
-            trials.append(Trial(coefficients, off, math.nan, why_not))
+            off, reason = unusable[coefficients]
+            trials.append(Trial(coefficients, off, math.nan, reason))
             continue
         fit = fits[coefficients]
         held_out = math.sqrt(np.average(fit.held_out, weights=weights))
-        trials.append(Trial(coefficients, fit.bundle.rms, held_out, _why_not(coefficients, best)))
+        trials.append(Trial(coefficients, fit.bundle.rms, held_out, _rejected(coefficients, best)))
     return fits[best], tuple(trials)
 
 
-def _why_not(coefficients: int, best: int) -> str | None:
+def _rejected(coefficients: int, best: int) -> str | None:
     if coefficients == best:
         return None
     if coefficients < best:
-        return "predicts images that were held out worse than more coefficients do"
-    return "predicts images that were held out no better than fewer coefficients do"
+        return "predicts held-out images worse than more coefficients do"
+    return "predicts held-out images no better than fewer coefficients do"
 
 
 def _held_out(views: Views, bundle: Bundle, parts: NDArray[np.int64]) -> Fit:

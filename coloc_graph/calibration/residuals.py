@@ -1,4 +1,4 @@
-"""Residuals taken apart: the error of a corner of its own, and the error that neighbours share."""
+"""Separate the residuals of corners into independent errors and errors that neighbours share."""
 
 import math
 from collections.abc import Sequence
@@ -15,11 +15,26 @@ Array = NDArray[np.float64]
 def noise_and_shared(
     views: Sequence[View], residuals: Sequence[Array], fitted: Sequence[Array], square: float
 ) -> tuple[float, float]:
-    """Standard deviations per axis [px] of the error a corner has alone, and of what it shares with its neighbours.
+    """Estimate the standard deviations of independent and of shared corner errors.
 
-    From the mean square of `residuals` (n, 2) and the mean product of those of corners one square apart, both freed of
-    what was fitted: of errors that are independent the second is then 0 on average, and where it is less than twice as
-    much as chance makes of them, it counts as 0. `fitted` are (2n, k), orthonormal: the directions that the fit took.
+    Parameters
+    ----------
+    views, residuals
+        Boards in images, and their residuals, (n, 2) [px].
+    fitted
+        Orthonormal directions of the residuals that the fit absorbed, (2n, k).
+    square
+        Side of a square [m].
+
+    Returns
+    -------
+    tuple of float
+        Standard deviations of the independent and of the shared error, for each axis [px].
+
+    Notes
+    -----
+    Both come from the mean square of residuals and the mean product of those one square apart, corrected for the fit.
+    A product below twice its standard deviation under independence counts as 0.
     """
     squares = products = taken = taken_products = 0.0
     numbers = pairs = 0
@@ -40,13 +55,13 @@ def noise_and_shared(
 
 
 def fitted_directions(views: Sequence[View], bundle: Bundle) -> list[Array]:
-    """Directions in which a bundle's poses and intrinsics absorb each image's residuals: (2n, 6 + p)."""
+    """Directions (2n, 6 + p) in which poses and intrinsics absorb each image's residuals."""
     directions = []
     for view, pose in zip(views, bundle.poses, strict=True):
         _, A, B = project(bundle.intrinsics, pose, view.points)
         Q = np.linalg.qr(B)[0]
         A = A - Q @ (Q.T @ A)
-        # the intrinsics are one for all images, so that each bears a part of what they take
+        # all images share the intrinsics, which absorb a part of each image's residuals
         of_intrinsics = np.linalg.solve(np.linalg.cholesky(bundle.information), A.T).T
         directions.append(np.hstack([Q, of_intrinsics]))
     return directions

@@ -1,4 +1,4 @@
-"""A calibration as numbers: calibration.json and --json, and what a mount's calibration reads of a camera's."""
+"""Summarise calibrations for calibration.json and --json, and read a camera's covariance back."""
 
 import dataclasses
 import math
@@ -22,7 +22,7 @@ SUMMARY = "calibration.json"
 
 
 def summarise_camera(calibration: CameraCalibration) -> dict[str, Any]:
-    """A camera's calibration: pixels, degrees where a name says so; numbers that do not exist are null."""
+    """Summarise a camera's calibration; missing numbers are null."""
     camera = msgspec.to_builtins(calibration.camera)
     return {
         "version": __version__,
@@ -45,7 +45,7 @@ def summarise_camera(calibration: CameraCalibration) -> dict[str, Any]:
 
 
 def summarise_mount(calibration: MountCalibration, missed: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A mount's calibration; the covariance is of height [m], tilt and roll [rad]."""
+    """Summarise a mount's calibration; the covariance is of height [m], tilt and roll [rad]."""
     return {
         "version": __version__,
         "mount": msgspec.to_builtins(calibration.mount),
@@ -60,9 +60,19 @@ def summarise_mount(calibration: MountCalibration, missed: tuple[str, ...] = ())
 
 
 def read_covariance(path: str | Path, camera: Camera) -> NDArray[np.float64]:
-    """Covariance (p, p) of a camera's intrinsics, from the folder or the file that `coloc calibrate camera` wrote.
+    """Read the covariance (p, p) of a camera's intrinsics from the output of `coloc calibrate camera`.
 
-    Raises `InputError` where it is none, or is of another camera.
+    Parameters
+    ----------
+    path
+        Folder, or calibration.json in it.
+    camera
+        Camera that the calibration must be of.
+
+    Raises
+    ------
+    InputError
+        The file is not a calibration, or is of another camera.
     """
     path = Path(path)
     path = path / SUMMARY if path.is_dir() else path
@@ -71,16 +81,16 @@ def read_covariance(path: str | Path, camera: Camera) -> NDArray[np.float64]:
         covariance = np.array(summary["covariance"], float)
         of = msgspec.convert(summary["camera"], Camera)
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError, msgspec.ValidationError) as error:
-        raise InputError(f"{path}: is no calibration of a camera ({error}); calibrate the camera anew") from error
+        raise InputError(f"{path}: not the calibration of a camera ({error}); calibrate the camera again") from error
     names = [name for name in CAMERA_FIELDS if name not in ("noise_px", "bias_px")]
     if any(getattr(of, name) != getattr(camera, name) for name in names):
         raise InputError(
-            f"{path}: is of another camera than the robot has in the team (fx {of.fx:.2f} and {camera.fx:.2f} px); "
-            "write this one into the team first, with `coloc calibrate camera --team`"
+            f"{path}: calibration of another camera than the robot's in the team (fx {of.fx:.2f} and {camera.fx:.2f} "
+            "px); write this one into the team first, with `coloc calibrate camera --team`"
         )
     size = 4 + len(camera.distortion)
     if covariance.shape != (size, size) or not np.isfinite(covariance).all():
-        raise InputError(f"{path}: its covariance is not {size}x{size} numbers; calibrate the camera anew")
+        raise InputError(f"{path}: its covariance is not {size}x{size} numbers; calibrate the camera again")
     return covariance
 
 

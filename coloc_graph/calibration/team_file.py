@@ -1,4 +1,4 @@
-"""Write a calibration into a team.toml: all else in it stays as it is, comments too."""
+"""Write a calibration into a team.toml and keep everything else in it, comments included."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,18 +11,18 @@ from coloc_graph.input_file import MAX_DESCRIPTION_SIZE, read_text
 from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.team import Camera, Mount, Team, parse_team
 
-#: What a calibration says of a camera, and of a mount; the rest is the robot's own.
+#: Fields that a calibration replaces.
 CAMERA_FIELDS = ("width", "height", "fx", "fy", "cx", "cy", "distortion", "noise_px", "bias_px")
 MOUNT_FIELDS = ("height", "tilt_deg", "roll_deg", "height_sigma", "tilt_sigma_deg", "roll_sigma_deg")
 
 
 def write_camera(path: str | Path, robot: str, camera: Camera, out: str | Path | None = None) -> None:
-    """Give a robot of the team at `path` this camera, in the file or in a new one at `out`; see `CAMERA_FIELDS`."""
+    """Write a camera's `CAMERA_FIELDS` for a robot into the team at `path`, or into a copy at `out`."""
     _write(Path(path), robot, "camera", _values(camera, CAMERA_FIELDS), Path(out or path))
 
 
 def write_mount(path: str | Path, robot: str, mount: Mount, out: str | Path | None = None) -> None:
-    """Give a robot of the team at `path` this mount, in the file or in a new one at `out`; see `MOUNT_FIELDS`."""
+    """Write a mount's `MOUNT_FIELDS` for a robot into the team at `path`, or into a copy at `out`."""
     _write(Path(path), robot, "mount", _values(mount, MOUNT_FIELDS), Path(out or path))
 
 
@@ -45,16 +45,16 @@ def _write(path: Path, robot: str, part: str, values: Mapping[str, Any], out: Pa
                 table[name] = value
         text = tomlkit.dumps(document)
     except (TOMLKitError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise TeamError(f"{path}: cannot be changed ({error}); write the values of `{part}` by hand") from error
+        raise TeamError(f"{path}: cannot be edited ({error}); write the values of `{part}` by hand") from error
     _require_same(path, text, team, robot, part, values)
     write_atomically(out, text)
 
 
 def _require_same(path: Path, text: str, team: Team, robot: str, part: str, values: Mapping[str, Any]) -> None:
-    """The new text says what was asked for, and of all else the same."""
+    """Raise `TeamError` unless the new text differs from the team in the given values only."""
     wanted = msgspec.to_builtins(team)
     for one in wanted["robots"]:
         if one["name"] == robot:
             one[part] |= values
     if msgspec.to_builtins(parse_team(path, text)) != wanted:
-        raise TeamError(f"{path}: cannot be changed as it is written; write the values of `{part}` by hand")
+        raise TeamError(f"{path}: cannot be edited automatically; write the values of `{part}` by hand")

@@ -1,7 +1,7 @@
-"""The command line: one module a command, nothing but parsing and printing.
+"""Command line: one module for each command, with nothing but parsing and printing.
 
-`main` is the only place where errors are caught: one sentence on stderr and exit code 2, never a traceback.
-Results go to stdout, everything else to stderr. Nothing heavy is imported before a command runs.
+`main` is the only place that catches errors: one sentence on stderr and exit code 2, never a traceback. Results go to
+stdout, everything else to stderr. Nothing heavy is imported before a command runs.
 """
 
 import argparse
@@ -32,16 +32,16 @@ from coloc_graph.errors import ColocError
 
 
 class _Parser(argparse.ArgumentParser):
-    """Wrong arguments are one sentence as any other bad input, not a page of usage."""
+    """Parser that reports wrong arguments in one sentence instead of a page of usage."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"coloc: {message}; see `{self.prog} --help`\n")
 
 
 def parser() -> argparse.ArgumentParser:
-    """The parser of all commands."""
-    top = _Parser(prog="coloc", description="Where each robot of a team is, from cameras and LED markers alone.")
-    top.add_argument("--version", action="version", version=f"coloc {__version__}")
+    """Return the parser of all commands."""
+    top = _Parser(prog="coloc", description="Localise a team of robots from cameras and LED markers.")
+    top.add_argument("--version", action="version", version=f"coloc {__version__}", help="print the version")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in (
         *(demo, team, calibrate, simulate, import_, info, solve, evaluate, view, export, experiment),
@@ -52,24 +52,24 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code."""
-    # our matrices are small: threads of BLAS would only wait for each other, and take the cores from those who work
+    """Run one command and return its exit code."""
+    # small matrices: threads of BLAS would only wait for each other, and take the cores from other processes
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     args = parser().parse_args(arguments)
     try:
         code = int(args.run(args))
-        sys.stdout.flush()  # here, so that a reader who has gone is noticed here
+        sys.stdout.flush()  # so that a closed pipe is noticed here
         return code
     except ColocError as error:
         print(f"coloc: {error}", file=sys.stderr)
         return 2
     except BrokenPipeError:
-        # whoever read us has gone: what is still buffered goes nowhere, without a word at the interpreter's end
+        # the reader of the pipe has gone: discard what is buffered, without a message when the interpreter ends
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
-        place = f" {error.filename}" if error.filename else ""
-        print(f"coloc: the system says: {error.strerror}{place}; check the path, its rights, the disk", file=sys.stderr)
+        path = f" {error.filename}" if error.filename else ""
+        print(f"coloc: system error: {error.strerror}{path}; check path, permissions and disk", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("coloc: interrupted", file=sys.stderr)

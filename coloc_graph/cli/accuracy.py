@@ -1,4 +1,4 @@
-"""The table of the paper's Table II, and where the robots are with how far to trust it."""
+"""Print accuracy as in the paper's Table II, last poses with their uncertainty, and calibrations."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from coloc_graph.frontend.learnt_noise import NoiseRow
     from coloc_graph.geometry.trajectory import Trajectory
 
-#: What was made to agree, in words.
+#: Alignments in words.
 ALIGNED: dict[Alignment, str] = {
     "reference": "aligned by the reference robot's first pose",
     "team": "aligned by all poses of the team",
@@ -22,10 +22,7 @@ ALIGNED: dict[Alignment, str] = {
 
 
 def print_accuracy(accuracy: Accuracy) -> None:
-    """Per robot true length, estimated length, error in cm and %; then the team's figures.
-
-    Of robots that stayed where they were the distances between them.
-    """
+    """Print true and estimated path length and errors of each robot, the team's figures, and distances at rest."""
     rows = []
     for row in accuracy.robots:
         percent = row.length_error_percent
@@ -60,20 +57,20 @@ def print_accuracy(accuracy: Accuracy) -> None:
 
 
 def _intervals(accuracy: Accuracy) -> str:
-    """Each robot's NEES with its 95 % interval, in brackets."""
+    """NEES of each robot with its 95 % interval, in brackets."""
     rows = [(row.robot, row.nees) for row in accuracy.robots if row.nees is not None]
     texts = [f"{robot} {one.mean:.2f}, 95 % interval {one.low:.2f} to {one.high:.2f}" for robot, one in rows]
     return f" ({'; '.join(texts)})" if texts else ""
 
 
 def print_online(accuracy: Accuracy) -> None:
-    """Per robot the RMS error of poses as they were estimated at their time."""
+    """Print the RMS error of each robot's poses as they were estimated at their time."""
     errors = [f"{row.robot} {100 * row.ate:.1f} cm" for row in accuracy.robots]
     print(f"RMS position error of each pose as estimated at its time: {', '.join(errors)}")
 
 
 def print_errors(accuracy: Accuracy) -> None:
-    """Per robot and for the team: errors over all poses (ATE) with the NEES, and over stretches of the way (RPE)."""
+    """Print errors of each robot and of the team over all poses (ATE) with NEES, and over path segments (RPE)."""
     whose: list[tuple[str, Accuracy | RobotAccuracy]] = [(row.robot, row) for row in accuracy.robots]
     if len(whose) > 1:
         whose.append(("team", accuracy))
@@ -108,7 +105,7 @@ def print_errors(accuracy: Accuracy) -> None:
 
 
 def _nees_cells(of: Accuracy | RobotAccuracy) -> list[str]:
-    if isinstance(of, Accuracy):  # robots share errors, by how much is not known: their average has no interval
+    if isinstance(of, Accuracy):  # errors of robots are correlated to an unknown degree: no interval of their mean
         return ["-" if of.anees is None else f"{of.anees:.2f}", ""]
     if of.nees is None:
         return ["-", ""]
@@ -121,7 +118,7 @@ def _or_dash(value: float | None, unit: str) -> str:
 
 
 def print_calibration(calibration: "Calibration") -> None:
-    """What was stated with a tolerance, and what it turned out to be, each with its sigma."""
+    """Print stated and estimated calibration parameters, each with its standard deviation."""
 
     def value(number: float, sigma: float, unit: str) -> str:
         if unit == "m":
@@ -139,7 +136,7 @@ def print_calibration(calibration: "Calibration") -> None:
         for row in calibration.rows
     ]
     if rows:
-        print_table(["robot", "what", "stated", "found", "off by"], rows)
+        print_table(["robot", "parameter", "stated", "estimated", "difference"], rows)
 
 
 def print_noise(rows: "Sequence[NoiseRow]") -> None:
@@ -154,7 +151,7 @@ def print_noise(rows: "Sequence[NoiseRow]") -> None:
 
 
 def print_promised(trajectories: "Mapping[str, Trajectory]") -> None:
-    """What the covariances promise of each robot's last pose, one sigma, in a line."""
+    """Print the standard deviations of each robot's last pose in one line."""
     promised = []
     for robot, trajectory in trajectories.items():
         sigmas = last_sigmas(trajectory)
@@ -165,7 +162,7 @@ def print_promised(trajectories: "Mapping[str, Trajectory]") -> None:
 
 
 def print_last_poses(trajectories: "Mapping[str, Trajectory]") -> None:
-    """Per robot the length of its path, and its last pose in the world with one sigma."""
+    """Print each robot's path length and its last pose in the world frame with standard deviations."""
     import numpy as np
 
     from coloc_graph.geometry.lie import yaw
@@ -200,5 +197,5 @@ def last_sigmas(trajectory: "Trajectory") -> tuple[float, float, float] | None:
         return None
     R, covariance = trajectory.T_world_body[-1, :3, :3], trajectory.covariances[-1]
     of_x, of_y, _ = np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T))
-    # the body stands upright but for the floor's unevenness, so that its z is the world's
+    # but for the unevenness of the floor, the body's z is the world's
     return float(of_x), float(of_y), math.sqrt(covariance[2, 2])

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Calibrate or read, write, print."""
+    """Calibrate or read a camera, write it and print it."""
     with locked_outputs(args):
         return _run(args)
 
@@ -30,9 +30,9 @@ def _run(args: argparse.Namespace) -> int:
             require_writable(path, force=args.force, what=what)
     if args.from_camera_info:
         if args.images or args.out or args.board or args.charuco or args.distortion is not None:
-            raise InputError("--from-camera-info is a calibration already; leave images, the board and --out out")
+            raise InputError("--from-camera-info is a calibration already: give no images, board or --out with it")
         if not (args.team or args.camera_info):
-            raise InputError("--from-camera-info is read to be written: give --team and --robot, or --camera-info")
+            raise InputError("--from-camera-info needs a destination: give --team and --robot, or --camera-info")
         camera, left_out = read_camera_info(args.from_camera_info, robot.camera if robot else None)
         warn(left_out, kept=False)
         figures = None
@@ -52,7 +52,8 @@ def _run(args: argparse.Namespace) -> int:
     if robot is not None:
         if (robot.camera.width, robot.camera.height) != (camera.width, camera.height):
             said = f"{robot.camera.width}x{robot.camera.height}"
-            warn([f"{args.team} said {said} px of {robot.name}, and the camera has {camera.width}x{camera.height}"])
+            size = f"{camera.width}x{camera.height}"
+            warn([f"the images of {robot.name} have {said} px in {args.team}, and {size} px in this calibration"])
         write_camera(args.team, robot.name, camera, args.out_team)
     if args.camera_info:
         write_camera_info(camera, args.robot or "camera", Path(args.camera_info))
@@ -80,7 +81,7 @@ def _calibrated(args: argparse.Namespace) -> "CameraCalibration":
 def _warn_of_images(calibration: "CameraCalibration") -> None:
     from coloc_graph.cli.printing import counted, warn
 
-    warn([f"{image.name} was left out: {image.refused}" for image in calibration.refused], kept=False)
+    warn([f"{image.name} was rejected: {image.rejected}" for image in calibration.rejected], kept=False)
     missed = calibration.used.missed
     if missed:
         named = ", ".join(missed[:5]) + (", ..." if len(missed) > 5 else "")
@@ -88,7 +89,7 @@ def _warn_of_images(calibration: "CameraCalibration") -> None:
 
 
 def _print_camera(calibration: "CameraCalibration") -> None:
-    """Parameters with their sigmas, residuals, what was tried, the verdict."""
+    """Print parameters with their standard deviations, residuals, lens models tried, and the verdict."""
     import numpy as np
 
     from coloc_graph.calibration import verdict
@@ -101,7 +102,7 @@ def _print_camera(calibration: "CameraCalibration") -> None:
         value = calibration.bundle.intrinsics[index]
         sigmas = [f"{one[index]:.{digits}f}{unit}" for one in (calibration.sigmas, independent)]
         rows.append([name, f"{value:.{digits}f}{unit}", *sigmas])
-    print_table(["", "value", "sigma", "if corners were independent"], rows)
+    print_table(["", "value", "sigma", "sigma for independent corners"], rows)
     used, camera = calibration.used, calibration.camera
     print(
         f"{calibration.bundle.rms:.3f} px RMS over {len(used.views)} of {len(calibration.images) + len(used.missed)} "
@@ -109,7 +110,5 @@ def _print_camera(calibration: "CameraCalibration") -> None:
     )
     if len(calibration.trials) > 1:
         tried = ", ".join(f"{one.coefficients}: {one.held_out_rms:.4f}" for one in calibration.trials)
-        print(
-            f"{len(camera.distortion)} lens coefficients; RMS px of images that were held out, by their number: {tried}"
-        )
+        print(f"{len(camera.distortion)} lens coefficients; RMS of held-out images [px] by their number: {tried}")
     print("verdict: " + "; ".join(verdict(calibration)))

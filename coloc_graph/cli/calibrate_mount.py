@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Calibrate, write, print."""
+    """Calibrate a mount, write it and print it."""
     with locked_outputs(args):
         return _run(args)
 
@@ -32,11 +32,11 @@ def _run(args: argparse.Namespace) -> int:
     seen, board = seen_in(args)
     if (seen.width, seen.height) != (robot.camera.width, robot.camera.height):
         raise InputError(
-            f"the images have {seen.width}x{seen.height} pixels and robot {robot.name}'s camera in {args.team} "
-            f"{robot.camera.width}x{robot.camera.height}; give images as it takes them, or calibrate the camera first"
+            f"the images have {seen.width}x{seen.height} pixels, but the camera of {robot.name} in {args.team} has "
+            f"{robot.camera.width}x{robot.camera.height}: give images of that size, or calibrate the camera first"
         )
     if known is None and robot.camera.bias_px == 0:
-        warn(["the camera is taken for exact; give --calibration DIR of `coloc calibrate camera --out DIR`"])
+        warn(["the camera is taken as exact; give --calibration DIR of `coloc calibrate camera --out DIR`"])
     calibration = calibrate_mount(
         seen.views,
         robot.camera,
@@ -47,7 +47,7 @@ def _run(args: argparse.Namespace) -> int:
         intrinsics_covariance=known,
     )
     write_mount(args.team, robot.name, calibration.mount, args.out_team)
-    warn([f"{image.name} was left out: {image.refused}" for image in calibration.refused], kept=False)
+    warn([f"{image.name} was rejected: {image.rejected}" for image in calibration.rejected], kept=False)
     warn([f"{name}: the board was not found" for name in seen.missed], kept=False)
     if args.json:
         print_json(summarise_mount(calibration, seen.missed))
@@ -58,23 +58,23 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _print_mount(calibration: "MountCalibration") -> None:
-    """Height, tilt and roll with their sigmas, and what each image says."""
+    """Print height, tilt and roll with their standard deviations, and the values of each image."""
     from pathlib import Path
 
     from coloc_graph.cli.printing import print_table
 
     rows = [
         [Path(one.name).name, f"{one.height:.4f} m", f"{one.tilt_deg:.3f} deg", f"{one.roll_deg:.3f} deg",
-         f"{one.rms:.3f} px", "left out" if one.refused else ""]
+         f"{one.rms:.3f} px", "rejected" if one.rejected else ""]
         for one in calibration.images
     ]  # fmt: skip
-    print_table(["image", "height", "tilt", "roll", "corners off", ""], rows)
+    print_table(["image", "height", "tilt", "roll", "RMS of corners", ""], rows)
     mount = calibration.mount
     print(
         f"height {mount.height:.4f} +- {mount.height_sigma:.4f} m, tilt {mount.tilt_deg:.3f} +- "
         f"{mount.tilt_sigma_deg:.3f} deg, roll {mount.roll_deg:.3f} +- {mount.roll_sigma_deg:.3f} deg"
     )
     if calibration.dof:
-        agreement = f"the images agree with chi2/dof {calibration.chi2 / calibration.dof:.2f}"
-        more = f"; sigmas of each are {calibration.scale**0.5:.1f} times larger for it" if calibration.scale > 1 else ""
+        agreement = f"agreement of the images: chi2/dof {calibration.chi2 / calibration.dof:.2f}"
+        more = f"; their sigmas are scaled by {calibration.scale**0.5:.1f}" if calibration.scale > 1 else ""
         print(agreement + more)

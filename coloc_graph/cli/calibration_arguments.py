@@ -1,4 +1,4 @@
-"""Arguments that `coloc calibrate camera` and `mount` share: the robot, the boards in images, the outputs."""
+"""Interpret the arguments that `coloc calibrate camera` and `mount` share: robot, board, images and outputs."""
 
 import argparse
 from contextlib import ExitStack
@@ -10,14 +10,14 @@ if TYPE_CHECKING:
 
 
 def robot_of(args: argparse.Namespace) -> "Robot | None":
-    """The robot that is named, None where no team is given; wrong names are errors before any work."""
+    """Return the named robot, None without a team; wrong names are errors before any work."""
     from coloc_graph.errors import InputError
     from coloc_graph.team import read_team
 
     if bool(args.team) != bool(args.robot):
-        raise InputError("--team and --robot belong together; give both, or neither")
+        raise InputError("--team and --robot belong together: give both, or neither")
     if args.out_team and not args.team:
-        raise InputError("--out-team is a copy of a team; give it with --team and --robot")
+        raise InputError("--out-team writes a copy of a team: give it with --team and --robot")
     return read_team(args.team)[args.robot] if args.team else None
 
 
@@ -35,7 +35,7 @@ def locked_outputs(args: argparse.Namespace) -> ExitStack:
 
 
 def seen_in(args: argparse.Namespace) -> "tuple[Views, Board]":
-    """The boards in the images that are named, and which board."""
+    """Return the boards found in the images, and the board."""
     from coloc_graph.calibration import find_boards, image_paths, make_board
     from coloc_graph.cli.printing import progress
 
@@ -46,7 +46,7 @@ def seen_in(args: argparse.Namespace) -> "tuple[Views, Board]":
 
 
 def say_written(args: argparse.Namespace) -> None:
-    """Print the paths of what was written, to stderr."""
+    """Print the written paths to stderr."""
     import sys
 
     for path in (getattr(args, "out", None), args.out_team or args.team, getattr(args, "camera_info", None)):

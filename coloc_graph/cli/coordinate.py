@@ -4,14 +4,14 @@ import argparse
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command's arguments."""
+    """Add the command and its arguments."""
     command = commands.add_parser(
         "coordinate",
         help="lead a team of robots, and estimate their poses online",
         description="Coordinate a mission: wait for the robots' programs (`coloc robot`), lead the leap-frog, and "
         "estimate all poses online. Run it once, where all robots can reach it. Ctrl-C stops all robots.",
     )
-    command.add_argument("team", metavar="TEAM.toml")
+    command.add_argument("team", metavar="TEAM.toml", help="description of the team")
     command.add_argument("--out", metavar="DIR", help="folder of the mission: record, log and result")
     command.add_argument(
         "--goal",

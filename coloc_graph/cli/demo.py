@@ -1,15 +1,18 @@
-"""coloc demo: the hallway from rendered images, solved, printed as the paper's Table II; or led online."""
+"""coloc demo: simulate the hallway from rendered images, solve it and print the paper's Table II, or lead it online."""
 
 import argparse
 
-#: What the demo's team is off by (1 sigma): mounts, the span of the markers, the floor.
+#: Standard deviations of mounts [deg, m], of the markers' span [m] and of the floor [deg] in the demo.
 IMPERFECTIONS = {"mount_sigma_deg": 1.0, "height_sigma": 5e-3, "span_sigma": 1e-4, "floor_sigma_deg": 0.1}
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """The command's arguments."""
+    """Add the command and its arguments."""
     command = commands.add_parser(
-        "demo", help="simulate the hallway from rendered images with mounts that are off, solve it, show it"
+        "demo",
+        help="simulate the paper's hallway from rendered images, solve it and show it",
+        description="Simulate the paper's hallway from rendered images, with mounts that differ from their stated "
+        "values, solve it, print the accuracy, and show it in the browser.",
     )
     command.add_argument(
         "--out", default="demo-out", metavar="DIR", help="folder for run and result (default: demo-out)"
@@ -20,16 +23,16 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument(
         "--online",
         action="store_true",
-        help="three programs of robots on simulated wheels and cameras drive the hallway by themselves",
+        help="run the online system instead: three robot programs with simulated wheels and cameras drive the hallway",
     )
     command.add_argument(
-        "--port", type=int, help="port of the viewer, with --online (default: 8080 or the next free one)"
+        "--port", type=int, help="port of the viewer with --online (default: 8080, or the first free one after it)"
     )
     command.set_defaults(run=lambda args: online(args) if args.online else run(args))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate, solve, print, show."""
+    """Simulate, solve, print and show."""
     import sys
     from contextlib import suppress
     from pathlib import Path
@@ -58,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
                 progress=report,
             )
     except BaseException:
-        with suppress(OSError):  # it goes again where nothing came to be in it
+        with suppress(OSError):  # remove the folder again if it is empty
             out.rmdir()
         raise
     with progress("stances measured from the images") as report:
@@ -68,12 +71,12 @@ def run(args: argparse.Namespace) -> int:
     assessed = assess(solution)
     hero_figure(solution.estimate, assessed[1] if assessed else None).savefig(picture, dpi=130)
     warn(solution.warnings)
-    assert accuracy is not None  # a simulated run holds truth
+    assert accuracy is not None  # a simulated run contains the truth
     print_accuracy(accuracy)
     print_promised(solution.estimate.trajectories)
     print_calibration(solution.estimate.calibration)
     html = out / "result" / "report.html"
-    print(f"the report: {html}, and a picture: {picture}; `coloc view {out / 'result'}` shows it")
+    print(f"report: {html}; picture: {picture}; viewer: `coloc view {out / 'result'}`")
     if not args.no_browser and sys.stdout.isatty():
         from coloc_graph.cli.view import show
         from coloc_graph.viewer import Viewer, scene_of_solution
@@ -84,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def online(args: argparse.Namespace) -> int:
-    """Lead a simulated team down the hallway, and print the result."""
+    """Lead a simulated team down the hallway and print the result."""
     import time
     from pathlib import Path
 
@@ -119,7 +122,7 @@ def online(args: argparse.Namespace) -> int:
         return 1
     slowest = max(coordinator.latencies)
     print(
-        f"{coordinator.stances} stances in {time.monotonic() - began:.0f} s; from the last image of a stance "
-        f"to its estimate at most {slowest:.2f} s; {field.truth_path} is the truth"
+        f"{coordinator.stances} stances in {time.monotonic() - began:.0f} s; delay from the last image of a stance to "
+        f"its estimate: at most {slowest:.2f} s; truth: {field.truth_path}"
     )
     return 0 if state == MissionState.DONE else 1

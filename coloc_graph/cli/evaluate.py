@@ -1,4 +1,4 @@
-"""coloc evaluate DIR, or --estimate ROBOT=FILE ... --truth ROBOT=FILE ...: an estimate against truth."""
+"""coloc evaluate DIR, or --estimate ROBOT=FILE ... --truth ROBOT=FILE ...: compare an estimate with the truth."""
 
 import argparse
 from typing import TYPE_CHECKING
@@ -11,47 +11,50 @@ ALIGNMENTS = ("reference", "team", "robot", "none")
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """The command's arguments."""
+    """Add the command and its arguments."""
     command = commands.add_parser(
         "evaluate",
-        help="compare a result, or TUM files, with truth",
+        help="compare a result, or TUM files, with the truth",
         description="Compare a result with the truth in its run, or trajectories of any program (TUM) with others: "
         "lengths, ATE, RPE, NEES, per robot and for the team. See docs/evaluation.md.",
     )
-    command.add_argument("dir", metavar="DIR", nargs="?", help="a result of `coloc solve`, or a folder of <robot>.tum")
+    command.add_argument("dir", metavar="DIR", nargs="?", help="result of `coloc solve`, or folder of <robot>.tum")
     command.add_argument(
-        "--estimate", nargs="+", default=[], metavar="ROBOT=FILE", help="instead of DIR: TUM files, or a folder of them"
+        "--truth",
+        nargs="+",
+        default=[],
+        metavar="RUN|DIR|ROBOT=FILE",
+        help="run with truth, or TUM files (default: the result's own run)",
     )
-    command.add_argument(
-        "--truth", nargs="+", default=[], metavar="RUN|DIR|ROBOT=FILE", help="a run with truth, or TUM (the run's own)"
-    )
-    command.add_argument("--run", dest="run_path", metavar="RUN", help="the run, if it is no longer where it was")
+    command.add_argument("--run", dest="run_path", metavar="RUN", help="the result's run, if it has moved")
     command.add_argument(
         "--align",
         choices=ALIGNMENTS,
-        help="by the reference's first pose (results with stances), by all poses of the team (others), each robot on "
-        "its own, or not at all",
+        help="align by the reference robot's first pose, by all poses of the team, each robot on its own, or not at "
+        "all (default: reference for results with stances, else team)",
+    )
+    command.add_argument("--robots", metavar="A,B", help="compare these robots only (default: all)")
+    command.add_argument("--rpe", metavar="M,M", type=_distances, help="distances of the RPE [m] (default: 1,2,5,10)")
+    command.add_argument(
+        "--pairs-from-truth", action="store_true", help="measure the distances of the RPE along the true path"
     )
     command.add_argument(
-        "--reference", metavar="ROBOT", help="of TUM files: whose first pose `--align reference` takes"
+        "--max-gap", type=_seconds, metavar="S", help="longest gap over which truth is interpolated [s] (default: 0.25)"
     )
-    command.add_argument("--planar", action="store_true", help="of TUM files: the robots stand on the plane z = 0")
-    command.add_argument("--robots", metavar="A,B", help="these alone")
-    command.add_argument("--rpe", metavar="M,M", type=_distances, help="distances of the RPE [m] (1,2,5,10)")
-    command.add_argument(
-        "--pairs-from-truth", action="store_true", help="distances of the RPE are those of the true path"
+    command.add_argument("--plot", metavar="FILE|DIR", help="draw one picture (.png, .svg, .pdf), or a folder of three")
+    command.add_argument("--force", action="store_true", help="replace existing pictures")
+    command.add_argument("--json", action="store_true", help="print figures as JSON")
+    files = command.add_argument_group("TUM files of any program")
+    files.add_argument(
+        "--estimate", nargs="+", default=[], metavar="ROBOT=FILE", help="TUM files, or a folder of them, instead of DIR"
     )
-    command.add_argument(
-        "--max-gap", type=_seconds, metavar="S", help="truth is interpolated over no longer a gap (0.25)"
-    )
-    command.add_argument("--plot", metavar="FILE|DIR", help="pictures: one (.png, .svg, .pdf), or a folder of three")
-    command.add_argument("--force", action="store_true", help="replace pictures that are already there")
-    command.add_argument("--json", action="store_true")
+    files.add_argument("--reference", metavar="ROBOT", help="robot of `--align reference`")
+    files.add_argument("--planar", action="store_true", help="take the robots as standing on the plane z = 0")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, draw, print."""
+    """Compare, draw and print."""
     from dataclasses import replace
 
     from coloc_graph.cli.accuracy import print_accuracy, print_errors, print_promised
@@ -61,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plot:
         from coloc_graph.report.comparison import comparison_drawings, require_plot_path, write_plots
 
-        require_plot_path(args.plot, force=args.force)  # before the work, not after it
+        require_plot_path(args.plot, force=args.force)  # before the work
     comparison = _comparison(args)
     if args.robots:
         comparison = comparison.only([robot for robot in args.robots.split(",") if robot])
@@ -85,24 +88,24 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _comparison(args: argparse.Namespace) -> "Comparison":
-    """What the arguments say is compared with what."""
+    """Return the comparison that the arguments describe."""
     from coloc_graph.errors import InputError
     from coloc_graph.results import comparison
 
     if bool(args.dir) == bool(args.estimate):
-        raise InputError("what is compared is not said; give the folder of a result, or --estimate with TUM files")
+        raise InputError("nothing to compare: give either the folder of a result, or --estimate with TUM files")
     if args.dir and comparison.is_result(args.dir):
         if args.reference or args.planar:
-            raise InputError("--reference and --planar are for TUM files; of a result its team says so")
+            raise InputError("--reference and --planar apply to TUM files only: a result has them in its team")
         return comparison.of_result(args.dir, args.run_path, args.truth, args.align)
     if args.run_path or not args.truth:
-        raise InputError("TUM files are compared with --truth; give a run with truth, or TUM files")
+        raise InputError("TUM files need --truth: give a run with truth, or TUM files")
     given = [args.dir] if args.dir else args.estimate
     return comparison.of_files(given, args.truth, args.align, reference=args.reference, on_floor=args.planar)
 
 
 def _distances(text: str) -> tuple[float, ...]:
-    """`1,2,5` as metres."""
+    """Parse `1,2,5` as distances [m]."""
     distances = sorted({_positive(part, "distances in metres, as 1,2,5") for part in text.split(",")})
     return tuple(distances)
 

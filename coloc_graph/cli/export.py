@@ -2,20 +2,20 @@
 
 import argparse
 
-FORMATS = "g2o and dot are a file, tum a file a robot, ros2 a bag (.mcap) with tf, poses and paths"
+FORMATS = "g2o and dot: one file; tum: a file for each robot; ros2: a bag (.mcap) with tf, poses and paths"
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """The command's arguments."""
-    command = commands.add_parser("export", help="a result in other people's formats")
+    """Add the command and its arguments."""
+    command = commands.add_parser("export", help="export a result as g2o, TUM, Graphviz or a ROS 2 bag")
     command.add_argument("format", choices=("g2o", "tum", "dot", "ros2"), help=FORMATS)
-    command.add_argument("result", metavar="DIR", help="the folder that `coloc solve --out` wrote")
-    command.add_argument("--out", required=True, metavar="PATH", help="the file; for tum the folder")
+    command.add_argument("result", metavar="DIR", help="result of `coloc solve`")
+    command.add_argument("--out", required=True, metavar="PATH", help="file to write; for tum a folder")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Copy what `solve` wrote, or make a bag of it, where nothing is yet."""
+    """Copy the files of a result, or write a bag of it, to a new path."""
     import os
     import shutil
     from pathlib import Path
@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
         from coloc_graph.exchange.ros_export import write_ros2
 
         if out.suffix != ".mcap":
-            raise InputError(f"{out}: is no name of a ROS 2 bag; give one that ends in .mcap")
+            raise InputError(f"{out} is not the name of a ROS 2 bag: give one that ends in .mcap")
         out.parent.mkdir(parents=True, exist_ok=True)
         poses = write_ros2(result.trajectories, result.team, out)
         print(f"wrote {out}: {poses} poses of {len(result.trajectories)} robots")
@@ -39,11 +39,11 @@ def run(args: argparse.Namespace) -> int:
     source = result.path / ("trajectories" if args.format == "tum" else f"graph.{args.format}")
     if result.is_ranging and args.format in ("g2o", "dot"):
         raise InputError(
-            f"{result.path} is of a ranging run, whose ranges and bearings {args.format} files of coloc-graph do not "
-            "hold yet: export tum or ros2"
+            f"{result.path} is the result of a ranging run, whose measurements are not exported to {args.format} yet: "
+            "export tum or ros2"
         )
     if not source.exists():
-        raise InputError(f"{result.path} does not hold {source.name}; solve the run again with this version")
+        raise InputError(f"{result.path} does not contain {source.name}: solve the run again with this version")
     out.parent.mkdir(parents=True, exist_ok=True)
     if args.format == "tum":
         shutil.copytree(source, out)

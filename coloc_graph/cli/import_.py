@@ -6,57 +6,60 @@ from coloc_graph.cli.place import add_out, require_run_place
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """The command's arguments."""
-    command = commands.add_parser("import", help="make a run of other data")
+    """Add the command and its arguments."""
+    command = commands.add_parser("import", help="convert images, tracks, a ROS bag or MR.CLAM data to a run")
     kinds = command.add_subparsers(dest="kind", required=True, metavar="KIND")
-    tracks = kinds.add_parser("tracks", help="marker tracks from a CSV: stance,time,robot,marker,u,v[,sigma]")
-    tracks.add_argument("team", metavar="TEAM.toml")
-    tracks.add_argument("tracks", metavar="TRACKS.csv")
+    tracks = kinds.add_parser("tracks", help="import marker tracks from a CSV: stance,time,robot,marker,u,v[,sigma]")
+    tracks.add_argument("team", metavar="TEAM.toml", help="description of the team")
+    tracks.add_argument("tracks", metavar="TRACKS.csv", help="marker centres [px]")
     tracks.add_argument("--planes", metavar="PLANES.csv", help="marker planes: stance,robot,nx,ny,nz,d")
-    tracks.add_argument("--moves", metavar="MOVES.csv", help="who moved before which stance: stance,robot")
+    tracks.add_argument("--moves", metavar="MOVES.csv", help="robots that moved before a stance: stance,robot")
     add_out(tracks)
     tracks.set_defaults(run=run_tracks)
-    mrclam = kinds.add_parser("mrclam", help="a UTIAS MR.CLAM dataset: range and bearing, odometry, truth")
-    mrclam.add_argument("folder", metavar="DIR")
-    mrclam.add_argument("--map-unknown", action="store_true", help="do not say where the landmarks are")
+    mrclam = kinds.add_parser("mrclam", help="import a UTIAS MR.CLAM dataset: ranges and bearings, odometry, truth")
+    mrclam.add_argument("folder", metavar="DIR", help="folder of the dataset")
+    mrclam.add_argument("--map-unknown", action="store_true", help="leave the landmarks' positions unknown")
     add_out(mrclam)
     mrclam.set_defaults(run=run_mrclam)
-    ros = kinds.add_parser("ros", help="images, odometry and truth from a ROS 1 or ROS 2 bag; needs no ROS")
-    ros.add_argument("bag", metavar="BAG", help="a ROS 1 .bag, a ROS 2 folder, or an .mcap")
-    ros.add_argument("map", metavar="MAP.toml", help="which topics are whose, see docs/ros.md")
+    ros = kinds.add_parser("ros", help="import images, odometry and truth from a ROS 1 or ROS 2 bag; needs no ROS")
+    ros.add_argument("bag", metavar="BAG", help="ROS 1 .bag, ROS 2 folder, or .mcap")
+    ros.add_argument("map", metavar="MAP.toml", help="topics of each robot, see docs/ros.md")
     ros.add_argument(
-        "--image-format", choices=("jpeg", "png", "raw"), default="jpeg", help="of images that are neither JPEG nor PNG"
+        "--image-format",
+        choices=("jpeg", "png", "raw"),
+        default="jpeg",
+        help="format for images that are neither JPEG nor PNG (default: jpeg)",
     )
-    ros.add_argument("--json", action="store_true")
+    ros.add_argument("--json", action="store_true", help="print the summary as JSON")
     add_out(ros)
     ros.set_defaults(run=run_ros)
-    images = kinds.add_parser("images", help="your own recording: a folder, a glob or a video of images a robot")
-    images.add_argument("team", metavar="TEAM.toml")
+    images = kinds.add_parser("images", help="import your own recording: a folder, glob or video for each robot")
+    images.add_argument("team", metavar="TEAM.toml", help="description of the team")
     images.add_argument(
-        "sources", nargs="+", metavar="ROBOT=SOURCE", help="as A=images/A B='images/*/B/*.png' or A=a.mp4"
+        "sources", nargs="+", metavar="ROBOT=SOURCE", help="such as A=images/A, B='images/*/B/*.png' or A=a.mp4"
     )
     images.add_argument("--times", metavar="CSV", help="time of each image [UTC s]: robot,file,time")
-    images.add_argument("--fps", type=float, help="images a second (default of a video: its container's times)")
+    images.add_argument("--fps", type=float, help="images a second (default for a video: its own times)")
     images.add_argument(
-        "--time-pattern", metavar="NAME", help="time in the images' names, as 'frame_{ms}': s, ms, us, ns"
+        "--time-pattern", metavar="NAME", help="pattern of the time in file names, such as 'frame_{ms}': s, ms, us, ns"
     )
     images.add_argument(
         "--stances",
         metavar="CSV",
-        help="stance,start,end,observers,movers,anchors (default: found by whose background is still)",
+        help="stance,start,end,observers,movers,anchors (default: detected from cameras at rest)",
     )
     images.add_argument(
         "--image-format",
         choices=("jpeg", "png", "raw"),
         default="png",
-        help="of images that cannot be kept as they are (default: png)",
+        help="format for images that cannot be kept as they are (default: png)",
     )
     add_out(images)
     images.set_defaults(run=run_images)
 
 
 def run_mrclam(args: argparse.Namespace) -> int:
-    """Import a dataset and print."""
+    """Import a dataset and print a summary."""
     from coloc_graph.cli.printing import counted, progress, warn
     from coloc_graph.exchange.mrclam import import_mrclam
 
@@ -73,7 +76,7 @@ def run_mrclam(args: argparse.Namespace) -> int:
 
 
 def run_tracks(args: argparse.Namespace) -> int:
-    """Import tracks and print."""
+    """Import tracks and print a summary."""
     from coloc_graph.cli.printing import counted, progress, warn
     from coloc_graph.exchange.tracks import import_tracks
 
@@ -89,7 +92,7 @@ def run_tracks(args: argparse.Namespace) -> int:
 
 
 def run_ros(args: argparse.Namespace) -> int:
-    """Import a bag and print."""
+    """Import a bag and print a summary."""
     from dataclasses import asdict
 
     from coloc_graph.cli.printing import counted, print_json, progress, warn
@@ -110,7 +113,7 @@ def run_ros(args: argparse.Namespace) -> int:
 
 
 def run_images(args: argparse.Namespace) -> int:
-    """Import images and print what was found."""
+    """Import images and print a summary."""
     from coloc_graph.cli.printing import counted, progress
     from coloc_graph.exchange.images import import_images
 

@@ -4,20 +4,20 @@ import argparse
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """The command's arguments."""
+    """Add the command and its arguments."""
     command = commands.add_parser(
         "info",
-        help="what is in a run, and what is wrong with it",
-        description="What is in a run, and what is wrong with it, without looking into its images. The exit code is 0 "
-        "also where problems are found (count them in --json), and 2 where the run cannot be read.",
+        help="list the contents of a run and its problems",
+        description="List the contents of a run and its problems, without decoding images. The exit code is 0 even if "
+        "there are problems (count them with --json), and 2 if the run cannot be read.",
     )
-    command.add_argument("run_path", metavar="RUN", help="the run (.mcap)")
-    command.add_argument("--json", action="store_true")
+    command.add_argument("run_path", metavar="RUN", help="run (.mcap)")
+    command.add_argument("--json", action="store_true", help="print the contents as JSON")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Look and print."""
+    """Inspect a run and print its contents."""
     from coloc_graph.cli.printing import counted, print_json, print_table
     from coloc_graph.pipeline.inspection import inspect, landmarks_seen
     from coloc_graph.run import open_run, truth_counts
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     if landmarks:
         in_images = any(opened.has_images(robot) and not opened.has_detections(robot) for robot in opened.team.names)
         print_table(
-            ["landmark", "seen as", "on the map", "stances", "seen by"],
+            ["landmark", "kind", "on the map", "stances", "seen by"],
             [
                 [
                     one.landmark.name,
@@ -71,9 +71,9 @@ def run(args: argparse.Namespace) -> int:
             ],
         )
         if in_images:
-            print("images are not looked into: which landmarks are in them is found when the run is solved")
+            print("images are not decoded: landmarks in them are found when the run is solved")
     if not findings:
-        print("nothing wrong was found")
+        print("no problem found")
     for finding in findings:
         print(f"problem: {finding.where}: {finding.what}")
     return 0

@@ -1,4 +1,4 @@
-"""A mission in the viewer while it goes on, and its result at the end."""
+"""Show a mission in the viewer while it runs, and its result at the end."""
 
 import logging
 import sys
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class MissionListener:
-    """Callbacks of a mission, as `Coordinator` takes them; None where nobody looks."""
+    """Callbacks of a mission for `Coordinator`, None without a viewer."""
 
     on_stance: "Callable[[EnteredStance], None] | None" = None
     on_status: "Callable[[MissionStatus], None] | None" = None
@@ -28,7 +28,7 @@ class MissionListener:
 
 @contextmanager
 def watched(team: "Team", port: int | None, *, browser: bool, view: bool = True) -> Iterator[MissionListener]:
-    """Show a mission in a viewer while it goes on; yield its callbacks, which are None without `view`."""
+    """Show a mission in a viewer while it runs; yield its callbacks, which are None without `view`."""
     if not view:
         yield MissionListener()
         return
@@ -47,10 +47,10 @@ def watched(team: "Team", port: int | None, *, browser: bool, view: bool = True)
 
 
 def report(folder: Path, truth_path: Path | None = None, *, stopped: bool = False) -> bool:
-    """Solve the record of a mission as it was solved on the way, write the result beside it, and print it.
+    """Solve the record of a mission again as online, write the result beside it, and print it.
 
-    After a mission that a signal `stopped` nothing is printed where nobody reads it: it must end by itself. Return
-    whether it was printed.
+    If a signal `stopped` the mission and nobody reads stdout, nothing is printed, so that the program ends. Return
+    whether the result was printed.
     """
     from coloc_graph.cli.accuracy import print_accuracy, print_calibration, print_last_poses, print_promised
     from coloc_graph.cli.printing import warn
@@ -75,5 +75,5 @@ def report(folder: Path, truth_path: Path | None = None, *, stopped: bool = Fals
     estimate = solution.estimate
     agreement = f", chi2/dof {estimate.chi2 / estimate.dof:.2f}" if estimate.dof > 0 else ""
     stances = len(solution.run.stances)
-    print(f"{stances} stances{agreement}; {folder / 'run.mcap'} is the record, {folder / 'result'} the result")
+    print(f"{stances} stances{agreement}; record: {folder / 'run.mcap'}; result: {folder / 'result'}")
     return True

@@ -1,4 +1,4 @@
-"""Logging that never waits for whoever reads stderr; `NonBlockingHandler`."""
+"""Log without ever blocking on the reader of stderr: `NonBlockingHandler`."""
 
 import contextlib
 import logging
@@ -6,8 +6,8 @@ import os
 import queue
 import threading
 
-CAPACITY = 2000  # messages that wait to be written
-LAST_WAIT = 0.5  # time to write what is left when the program ends [s]
+CAPACITY = 2000  # messages waiting to be written
+LAST_WAIT = 0.5  # s, to write remaining messages when the program ends
 
 
 class NonBlockingHandler(logging.Handler):
@@ -35,7 +35,7 @@ class NonBlockingHandler(logging.Handler):
                 self._dropped += 1
 
     def close(self) -> None:
-        """Write what is left, if somebody reads within `LAST_WAIT`."""
+        """Write the remaining messages, unless that takes longer than `LAST_WAIT`."""
         with contextlib.suppress(queue.Full):
             self._waiting.put_nowait(None)
             self._writer.join(LAST_WAIT)

@@ -20,7 +20,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         description="Choose the formation of a leap-frog, its leaps, and the mover's drives, for the least uncertainty "
         "at the end of a straight way. Prints what the best plan and the paper's formation promise.",
     )
-    command.add_argument("team", metavar="TEAM.toml")
+    command.add_argument("team", metavar="TEAM.toml", help="description of the team")
     command.add_argument("--length", type=float, default=7.2, metavar="M", help="length of the way [m] (default: 7.2)")
     wanted = command.add_mutually_exclusive_group()
     wanted.add_argument("--sigma-end", type=_length, metavar="S", help="wanted sigma of the last positions, as in 5mm")

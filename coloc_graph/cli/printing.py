@@ -1,4 +1,4 @@
-"""Progress to stderr and tables to stdout."""
+"""Print progress to stderr and tables to stdout."""
 
 import json
 import sys
@@ -9,7 +9,7 @@ from typing import Any
 
 @contextmanager
 def progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar on a terminal, a line at each quarter elsewhere; call what it yields with (done, total)."""
+    """Yield a callback (done, total) that shows a bar on a terminal, and a line at each quarter elsewhere."""
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -32,17 +32,17 @@ def progress(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def counted(n: int, what: str) -> str:
-    """`1 stance`, `2 stances`."""
+    """Format a number with its noun: `1 stance`, `2 stances`."""
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
 def print_json(value: Any) -> None:
-    """Figures for programs."""
+    """Print a value as JSON."""
     print(json.dumps(value, indent=2))
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A plain table, its columns as wide as what is in them; the first is a name, the others are figures."""
+    """Print a plain table with a left-aligned column of names and right-aligned columns of figures."""
     widths = [max(len(row[column]) for row in (header, *rows)) for column in range(len(header))]
     for row in (header, *rows):
         cells = [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
@@ -50,7 +50,7 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 
 
 def warn(warnings: Sequence[str], *, kept: bool = True) -> None:
-    """Warnings, one a line; of many that a result keeps, the first few and how many more there are."""
+    """Print warnings to stderr, one a line; of many that are `kept` in a result, the first and the number of others."""
     shown = 8 if kept else len(warnings)
     for warning in warnings[:shown]:
         print(f"warning: {warning}", file=sys.stderr)

@@ -4,7 +4,7 @@ import argparse
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add the command's arguments."""
+    """Add the command and its arguments."""
     command = commands.add_parser(
         "robot",
         help="run a robot: its camera and wheels, led by the coordinator",
@@ -12,7 +12,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "coordinator's command. Without the coordinator it stands. Ctrl-C stops the wheels and ends it.",
     )
     command.add_argument("name", metavar="NAME", help="name of this robot in the team")
-    command.add_argument("team", metavar="TEAM.toml")
+    command.add_argument("team", metavar="TEAM.toml", help="description of the team")
     command.add_argument("--out", required=True, metavar="DIR", help="folder for its record")
     command.add_argument(
         "--connect",
@@ -28,7 +28,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the robot until a signal comes."""
+    """Run the robot until a signal arrives."""
     from coloc_graph.cli.running import until_signal
     from coloc_graph.online.robot import RobotProgram
     from coloc_graph.robot_io.link.zenoh_config import tls_of

@@ -1,4 +1,4 @@
-"""Signals and logging of programs that run until they are stopped."""
+"""Handle signals and logging of programs that run until they are stopped."""
 
 import logging
 import select
@@ -11,15 +11,15 @@ from contextlib import contextmanager
 from coloc_graph.cli.nonblocking_log import NonBlockingHandler
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-READER_WAIT = 2.0  # time for whoever reads stdout and stderr to make room, after a signal [s]
+READER_WAIT = 2.0  # s, for which stdout and stderr may block after a signal
 
 
 @contextmanager
 def until_signal() -> Iterator[threading.Event]:
-    """An event that SIGINT, SIGTERM or SIGHUP sets; log messages go to stderr meanwhile, without ever waiting for it.
+    """Yield an event that SIGINT, SIGTERM or SIGHUP sets, and log to stderr meanwhile without ever blocking on it.
 
-    SIGHUP stays ignored where it was ignored before, as under nohup. SIGINT, which shells ignore for programs in the
-    background, is not.
+    SIGHUP stays ignored if it was ignored before, as under nohup. SIGINT, which shells ignore for programs in the
+    background, does not.
     """
     stop = threading.Event()
     numbers = [n for n in SIGNALS if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]

@@ -16,7 +16,11 @@ GAITS = {"hallway": 0.185, "landmarks": 0.25}
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command and its arguments."""
-    command = commands.add_parser("simulate", help="write a run of a simulated team, with truth in it")
+    command = commands.add_parser(
+        "simulate",
+        help="simulate a team and write its run, with ground truth",
+        description="Simulate a team in a scenario and write its run, with ground truth.",
+    )
     command.add_argument("scenario", help="single-step, six-step, hallway, team or landmarks")
     add_out(command)
     command.add_argument(

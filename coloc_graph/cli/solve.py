@@ -19,46 +19,54 @@ if TYPE_CHECKING:
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """The command's arguments."""
-    command = commands.add_parser("solve", help="estimate the poses of a run, or of each run in a folder")
-    command.add_argument(
-        "run_path", metavar="RUN|FOLDER|GRAPH", help="the run (.mcap), a folder of runs, or a pose graph (.g2o)"
+    """Add the command and its arguments."""
+    command = commands.add_parser(
+        "solve",
+        help="estimate the poses of a run, of each run in a folder, or of a pose graph",
+        description="Estimate the poses of all robots of a run and write them, with covariances, measurements and a "
+        "report, to a folder.",
     )
-    command.add_argument("--out", required=True, metavar="DIR", help="folder for the result, or for one of each run")
     command.add_argument(
+        "run_path", metavar="RUN|FOLDER|GRAPH", help="run (.mcap), folder of runs, or pose graph (.g2o)"
+    )
+    command.add_argument("--out", required=True, metavar="DIR", help="folder for the result, or for those of all runs")
+    command.add_argument("--incremental", action="store_true", help="solve stance by stance, as online")
+    command.add_argument("--json", action="store_true", help="print the summary as JSON")
+    viewer = command.add_argument_group("viewer")
+    viewer.add_argument(
+        "--view", action="store_true", help="show the result in the browser; with --incremental, while solving"
+    )
+    viewer.add_argument("--port", type=int, help="port of --view (default: 8080, or the first free one after it)")
+    viewer.add_argument("--no-browser", action="store_true", help="do not open a browser with --view")
+    stances = command.add_argument_group("runs with stances")
+    stances.add_argument(
         "--method",
         choices=("chain", "smooth", "joint"),
-        help="of runs with stances: chain is the paper's, joint calibrates mounts along (default: joint)",
+        help="chain: the paper's method; smooth: pose graph; joint: also calibrate mounts (default: joint)",
     )
-    command.add_argument(
+    stances.add_argument(
         "--scale",
         choices=("heights", "span"),
-        help="of runs with stances: the plane's distance from the heights of camera and markers, or from the markers' "
-        "span (default: heights)",
+        help="take the marker plane's distance from the heights of camera and markers, or from the markers' span "
+        "(default: heights)",
     )
-    command.add_argument("--incremental", action="store_true", help="feed it stance by stance, as in the field")
-    command.add_argument(
-        "--view", action="store_true", help="see it in the browser; with --incremental, while it is solved"
-    )
-    command.add_argument("--port", type=int, help="port of --view (default: 8080, or the first free one after it)")
-    command.add_argument("--no-browser", action="store_true", help="with --view, do not open a browser")
-    command.add_argument("--without-odometry", action="store_true", help="of runs with stances: ignore wheel odometry")
-    command.add_argument(
-        "--without-robots", action="store_true", help="of runs with ranges: ignore those between robots"
-    )
-    command.add_argument("--processes", type=int, metavar="N", help="of a folder, so many at a time (one a core)")
-    command.add_argument("--cluster", metavar="ADDRESS", help="of a folder, by the Dask scheduler at tcp://HOST:PORT")
-    command.add_argument(
+    stances.add_argument("--without-odometry", action="store_true", help="ignore wheel odometry")
+    ranges = command.add_argument_group("runs with ranges and bearings")
+    ranges.add_argument("--without-robots", action="store_true", help="ignore measurements between robots")
+    folder = command.add_argument_group("folder of runs")
+    folder.add_argument("--processes", type=int, metavar="N", help="number of worker processes (default: CPU count)")
+    folder.add_argument("--cluster", metavar="ADDRESS", help="use the Dask scheduler at tcp://HOST:PORT instead")
+    graph = command.add_argument_group("pose graph")
+    graph.add_argument(
         "--lenient",
         action="store_true",
-        help="of a pose graph: project information matrices that are not positive definite, and say how many",
+        help="project information matrices that are not positive definite, and report their number",
     )
-    command.add_argument("--json", action="store_true", help="print the summary as JSON")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve, write, print; with --view, show."""
+    """Solve, write and print, and show the result with --view."""
     from contextlib import nullcontext
 
     if Path(args.run_path).suffix.lower() == ".g2o":
@@ -93,12 +101,12 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
         assert frontend is not None  # resolved
         options = replace(options, frontend=replace(frontend, scale=args.scale))
     if args.lenient:
-        raise InputError(f"{args.run_path} is no pose graph (.g2o); --lenient is for one")
+        raise InputError(f"{args.run_path} is not a pose graph (.g2o): --lenient applies to pose graphs only")
     if Path(args.run_path).is_dir():
         return solve_folder(args, options)
     if args.processes is not None or args.cluster is not None:
-        raise InputError(f"{args.run_path} is not a folder of runs; --processes and --cluster are for one")
-    require_output_folder(args.out)  # before the work, not after it
+        raise InputError(f"{args.run_path} is not a folder of runs: --processes and --cluster apply to folders only")
+    require_output_folder(args.out)  # before the work
     with _earlier_result_named(args.out):
         logged = open_run(args.run_path)
         kind = require_applicable(logged, options)
@@ -123,7 +131,7 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
 
         announce(viewer, browser=not args.no_browser)
         solution = _solved(args, logged, options, on_update)
-        with suppress(KeyboardInterrupt):  # the result is there: whoever ends it now ends the viewer
+        with suppress(KeyboardInterrupt):  # the result is written: Ctrl-C ends the viewer only
             viewer.publish(scene_of_solution(solution))
             viewer.wait_closed()
     return 0
@@ -131,7 +139,7 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
 
 @contextmanager
 def _earlier_result_named(out: str) -> Iterator[None]:
-    """An error says that an earlier result is still there, so that nobody takes it for the new one."""
+    """Mention in errors that an earlier result is still there, so that it is not taken for the new one."""
     from coloc_graph.errors import ColocError
     from coloc_graph.results.folder import holds_result
 
@@ -149,7 +157,7 @@ def _solved(
     options: "SolveOptions",
     on_update: "Callable[[EnteredStance | Latest], None] | None" = None,
 ) -> "Solution":
-    """Solve, write, print."""
+    """Solve, write and print."""
     from coloc_graph.pipeline.batch import solve
     from coloc_graph.pipeline.contents import kind_of
     from coloc_graph.results.writer import summarise, with_truth_warning, write_result
@@ -167,12 +175,12 @@ def _solved(
         print_json(summarise(solution, accuracy))
     else:
         _print(solution, accuracy, args.out)
-    sys.stdout.flush()  # who reads a pipe does not wait until the viewer is closed
+    sys.stdout.flush()  # a pipe must not wait until the viewer is closed
     return solution
 
 
 def _print(solution: "Solution", accuracy: "Accuracy | None", out: str) -> None:
-    """Print accuracy or last poses, calibration, and what the estimate was made of."""
+    """Print accuracy or last poses, calibration, and the numbers of measurements."""
     import statistics
 
     from coloc_graph.cli.accuracy import (
@@ -200,7 +208,7 @@ def _print(solution: "Solution", accuracy: "Accuracy | None", out: str) -> None:
     if solution.seconds_updates:
         median, longest = 1000 * statistics.median(solution.seconds_updates), 1000 * max(solution.seconds_updates)
         what = "a second of the run" if estimate.is_ranging else "a stance"
-        print(f"{what} entered in {median:.1f} ms (median; at most {longest:.1f} ms)")
+        print(f"update time for {what}: median {median:.1f} ms, maximum {longest:.1f} ms")
     agreement = f", chi2/dof {estimate.chi2 / estimate.dof:.2f}" if estimate.dof > 0 else ""
     count = solution.count
     others = [

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def solve_graph(args: argparse.Namespace) -> int:
-    """Solve a pose graph, write it, print."""
+    """Solve a pose graph, write it and print a summary."""
     from coloc_graph.errors import InputError
     from coloc_graph.pipeline.pose_graph import solve_pose_graph
     from coloc_graph.results.folder import require_output_folder
@@ -23,7 +23,7 @@ def solve_graph(args: argparse.Namespace) -> int:
         if getattr(args, name)
     ]
     if given:
-        raise InputError(f"{args.run_path} is a pose graph; --{given[0].replace('_', '-')} is for runs")
+        raise InputError(f"{args.run_path} is a pose graph: --{given[0].replace('_', '-')} applies to runs only")
     require_output_folder(args.out)
     with locked_output(args.out):
         solution = solve_pose_graph(args.run_path, lenient=args.lenient)

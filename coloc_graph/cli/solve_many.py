@@ -1,4 +1,4 @@
-"""coloc solve FOLDER --out DIR: every run in a folder."""
+"""coloc solve FOLDER --out DIR: solve every run in a folder."""
 
 import argparse
 import sys
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
-    """Solve all of them, print a line for each; 1 where one could not be solved."""
+    """Solve all runs and print a line for each; return 1 if one of them failed."""
     import os
     from functools import partial
 
@@ -22,7 +22,7 @@ def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
     from coloc_graph.run.output_lock import locked_output
 
     if args.view:
-        raise InputError("--view shows one run; solve the folder without it, and view one of its results")
+        raise InputError("--view shows one run: solve the folder without it, and view one of its results")
     runs = runs_in(args.run_path)
     places = result_folders(runs, args.run_path, args.out)
     processes = min(os.cpu_count() or 1 if args.processes is None else args.processes, len(runs))
@@ -31,7 +31,7 @@ def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
     def on_outcome(outcome: "Outcome") -> None:
         nonlocal done
         done += 1
-        what = outcome.failed or ("is there already" if outcome.resumed else "solved")
+        what = outcome.failed or ("solved before" if outcome.resumed else "solved")
         named = what if what.startswith(str(outcome.run)) else f"{outcome.run}: {what}"
         print(f"{done} of {len(runs)}: {named}", file=sys.stderr, flush=True)
 
@@ -46,8 +46,8 @@ def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
         print_table(header, [_row(str(one.run.relative_to(args.run_path)), one) for one in outcomes])
         resumed = sum(one.resumed for one in outcomes)
         print(
-            f"{counted(len(runs), 'run')}: {len(runs) - len(failed) - resumed} solved, {resumed} there already, "
-            f"{len(failed)} failed; {args.out} holds a result of each"
+            f"{counted(len(runs), 'run')}: {len(runs) - len(failed) - resumed} solved, {resumed} solved before, "
+            f"{len(failed)} failed; results are in {args.out}"
         )
     return 1 if failed else 0
 

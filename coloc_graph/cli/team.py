@@ -7,12 +7,12 @@ if TYPE_CHECKING:
     from coloc_graph.team import Team
 
 TEMPLATE_HEAD = """\
-# Who the robots are; docs/team.md has every field. Lengths in metres, angles in degrees.
-# Measure and correct the numbers; `coloc calibrate` finds cameras and mounts, `coloc team check` looks it through.
-reference = "{reference}"            # the world frame is where this robot stands at the first stance
+# Description of the team; docs/team.md explains every field. Lengths in metres, angles in degrees.
+# Measure and correct the numbers; `coloc calibrate` finds cameras and mounts, `coloc team check` checks the file.
+reference = "{reference}"            # its pose at the first stance is the world frame
 
-[floor]                    # leave out where the robots stand on no common floor
-tilt_sigma_deg = 0.1       # how uneven, one sigma
+[floor]                    # remove this table if the robots do not share one floor
+tilt_sigma_deg = 0.1       # unevenness, 1 sigma
 height_sigma = 0.0005
 """
 TEMPLATE_ROBOT = '\n[[robots]]\nname = "{name}"\n'
@@ -23,14 +23,14 @@ width = {width}                # px
 height = {height}
 fx = {focal}               # px; half the width divided by the tangent of half the horizontal angle of view
 fy = {focal}
-cx = {cx}                 # px, the centre where it is not calibrated
+cx = {cx}                 # px, the image's centre unless calibrated
 cy = {cy}
 fps = {fps}
 
 [robots.mount]             # how the camera sits on the body
 height = {camera_height}               # of the optical centre above the floor
 tilt_deg = {tilt}            # looking down is positive
-height_sigma = 0.005       # tolerances, one sigma: they are found along with the poses
+height_sigma = 0.005       # tolerances, 1 sigma; the values are estimated together with the poses
 tilt_sigma_deg = 1.0
 roll_sigma_deg = 1.0
 """
@@ -39,34 +39,34 @@ TEMPLATE_MARKERS = """\
 [robots.markers]
 height = {marker_height}              # of both lights above the floor
 positions = [[0.0, {half}], [0.0, -{half}]]  # x ahead, y to the left, on the body
-span_sigma = 0.0005        # how well the distance between them is known
+span_sigma = 0.0005        # uncertainty of the distance between them, 1 sigma
 """
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """The command's arguments."""
-    command = commands.add_parser("team", help="begin a team.toml, or look one through")
+    """Add the command and its arguments."""
+    command = commands.add_parser("team", help="write a template of a team.toml, or check one")
     kinds = command.add_subparsers(dest="kind", required=True, metavar="KIND")
-    new = kinds.add_parser("new", help="write a team.toml to correct: robots with cameras and two lights each")
-    new.add_argument("robots", nargs="+", metavar="ROBOT", help="names; the first is the reference")
-    new.add_argument("--out", required=True, metavar="TEAM.toml")
-    new.add_argument("--force", action="store_true", help="replace a file that is there")
-    new.add_argument("--no-camera", action="append", default=[], metavar="ROBOT", help="a robot that only moves")
-    new.add_argument("--size", default="640x480", help="of the images [px] (default: 640x480)")
-    new.add_argument("--view-deg", type=float, default=60.0, help="horizontal angle of view (default: 60)")
+    new = kinds.add_parser("new", help="write a team.toml to correct: robots with a camera and two lights each")
+    new.add_argument("robots", nargs="+", metavar="ROBOT", help="names of the robots; the first is the reference")
+    new.add_argument("--out", required=True, metavar="TEAM.toml", help="file to write")
+    new.add_argument("--force", action="store_true", help="replace an existing file")
+    new.add_argument("--no-camera", action="append", default=[], metavar="ROBOT", help="robot without a camera")
+    new.add_argument("--size", default="640x480", help="size of the images [px] (default: 640x480)")
+    new.add_argument("--view-deg", type=float, default=60.0, help="horizontal angle of view [deg] (default: 60)")
     new.add_argument("--fps", type=float, default=30.0, help="images a second (default: 30)")
-    new.add_argument("--camera-height", type=float, default=0.4, help="above the floor [m] (default: 0.4)")
-    new.add_argument("--tilt-deg", type=float, default=20.0, help="of the camera, down (default: 20)")
-    new.add_argument("--marker-height", type=float, default=0.15, help="above the floor [m] (default: 0.15)")
-    new.add_argument("--span", type=float, default=0.25, help="between a robot's two lights [m] (default: 0.25)")
+    new.add_argument("--camera-height", type=float, default=0.4, help="camera above the floor [m] (default: 0.4)")
+    new.add_argument("--tilt-deg", type=float, default=20.0, help="tilt of the camera, down [deg] (default: 20)")
+    new.add_argument("--marker-height", type=float, default=0.15, help="lights above the floor [m] (default: 0.15)")
+    new.add_argument("--span", type=float, default=0.25, help="distance between two lights [m] (default: 0.25)")
     new.set_defaults(run=run_new)
-    check = kinds.add_parser("check", help="read a team.toml and name what a run of it could not use")
-    check.add_argument("team", metavar="TEAM.toml")
+    check = kinds.add_parser("check", help="check a team.toml for errors and implausible numbers")
+    check.add_argument("team", metavar="TEAM.toml", help="file to check")
     check.set_defaults(run=run_check)
 
 
 def run_new(args: argparse.Namespace) -> int:
-    """Write a team."""
+    """Write a template."""
     import math
     from pathlib import Path
 
@@ -114,7 +114,7 @@ def run_new(args: argparse.Namespace) -> int:
 
 
 def run_check(args: argparse.Namespace) -> int:
-    """Read a team and print what it allows, and what is doubtful."""
+    """Print a team, its problems and its implausible numbers; return 1 if it has problems."""
     from coloc_graph.team import read_team
 
     team = read_team(args.team)
@@ -129,29 +129,29 @@ def run_check(args: argparse.Namespace) -> int:
             else "no markers",
         ]
         print(f"{robot.name}: {', '.join(parts)}")
-    problems, doubts = findings(team)
+    problems, implausible = findings(team)
     for one in problems:
         print(f"problem: {one}")
-    for one in doubts:
-        print(f"doubtful: {one}")
-    if not problems and not doubts:
-        print("nothing wrong was found")
+    for one in implausible:
+        print(f"check: {one}")
+    if not problems and not implausible:
+        print("no problem found")
     return 1 if problems else 0
 
 
 def findings(team: "Team") -> tuple[list[str], list[str]]:
-    """Reasons why no run of a team gives a pose, and numbers of it that are doubtful."""
+    """Return problems that make a team unusable, and numbers that are implausible, in words."""
     import math
 
     watching = [robot for robot in team.robots if robot.camera_if_any is not None]
     marked = [robot for robot in team.robots if robot.markers is not None]
-    problems, doubts = [], []
+    problems, implausible = [], []
     if len(watching) < 2 and not any(robot.ranging for robot in team.robots):
-        problems.append("fewer than two robots have a camera, and a stance needs two that watch")
+        problems.append("fewer than two robots have a camera, but a stance needs two observers")
     if watching and not marked:
-        problems.append("no robot carries markers, so that there is nothing to watch: give one [robots.markers]")
+        problems.append("no robot carries markers to observe: give one [robots.markers]")
     if len(team.robots) == 2 and watching and not any(robot.ranging for robot in team.robots):
-        doubts.append("two robots cannot watch a third: add the one that moves, even one without a camera")
+        implausible.append("there is no third robot to observe: add the one that moves, even without a camera")
     for robot in watching:
         camera, mount = robot.camera, robot.mount
         for other in marked:
@@ -162,27 +162,27 @@ def findings(team: "Team") -> tuple[list[str], list[str]]:
                     f"({other.markers.height:g} m): mount it higher, or the markers lower (metres?)"
                 )
         if not 0.02 < mount.height < 5:
-            doubts.append(f"the camera of {robot.name} is {mount.height:g} m high: metres?")
+            implausible.append(f"the camera of {robot.name} is {mount.height:g} m high: metres?")
         view = math.degrees(2 * math.atan(camera.width / 2 / camera.fx))
         if not 15 < view < 150:
-            doubts.append(
+            implausible.append(
                 f"the camera of {robot.name} sees {view:.0f} deg across: is fx ({camera.fx:g} px) of this size?"
             )
         if (
             abs(camera.cx - camera.width / 2) > 0.2 * camera.width
             or abs(camera.cy - camera.height / 2) > 0.2 * camera.height
         ):
-            doubts.append(f"the principal point of {robot.name} is far from the image's middle: is it of this size?")
+            implausible.append(f"the principal point of {robot.name} is far from the middle: is it of this image size?")
         top = mount.tilt_deg - math.degrees(math.atan(camera.height / 2 / camera.fy))
         bottom = mount.tilt_deg + math.degrees(math.atan(camera.height / 2 / camera.fy))
         if bottom <= 0 or top >= 90:
-            doubts.append(f"the camera of {robot.name} does not see the floor at a tilt of {mount.tilt_deg:g} deg")
+            implausible.append(f"the camera of {robot.name} does not see the floor at a tilt of {mount.tilt_deg:g} deg")
         if mount.tilt_sigma_deg == 0 and mount.roll_sigma_deg == 0 and mount.height_sigma == 0:
-            doubts.append(f"the mount of {robot.name} is exact: state its tolerances, and it is found along")
+            implausible.append(f"the mount of {robot.name} has no tolerances: state them, and it is calibrated too")
     for robot in marked:
         assert robot.markers is not None
         if robot.markers.span is None:
-            doubts.append(f"{robot.name} carries one marker, which does not tell its heading: give it two")
+            implausible.append(f"{robot.name} carries one marker, which does not tell its heading: give it two")
         elif not 0.01 < robot.markers.span < 3:
-            doubts.append(f"the markers of {robot.name} are {robot.markers.span:g} m apart: metres?")
-    return problems, doubts
+            implausible.append(f"the markers of {robot.name} are {robot.markers.span:g} m apart: metres?")
+    return problems, implausible

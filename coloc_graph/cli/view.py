@@ -11,29 +11,27 @@ if TYPE_CHECKING:
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """The command's arguments."""
+    """Add the command and its arguments."""
     command = commands.add_parser(
         "view",
-        help="see a result, or a run or pose graph that is solved for it, in the browser",
-        description="See a result, or a run or pose graph that is solved for it, in the browser: robots, graph, "
-        "covariances, and what is behind each edge. Ctrl-C ends it.",
+        help="show a result, a run or a pose graph in the browser",
+        description="Show a result in the browser: robots, graph, covariances, and the measurement behind each edge. A "
+        "run or pose graph is solved first. Ctrl-C ends the viewer.",
     )
-    command.add_argument("path", metavar="RUN|DIR|GRAPH", help="a run (.mcap), a result of `coloc solve`, or a .g2o")
-    command.add_argument("--run", dest="run_path", metavar="RUN", help="the run of a result, if it is no longer there")
-    command.add_argument("--compare", metavar="DIR2", help="another result of the same run, beside the first")
+    command.add_argument("path", metavar="RUN|DIR|GRAPH", help="run (.mcap), result of `coloc solve`, or .g2o file")
+    command.add_argument("--run", dest="run_path", metavar="RUN", help="the result's run, if it has moved")
+    command.add_argument("--compare", metavar="DIR2", help="show another result of the same run beside the first")
     command.add_argument("--host", default="127.0.0.1", help="address to listen on (default: 127.0.0.1, this machine)")
     command.add_argument("--port", type=int, help="port to listen on (default: 8080, or the first free one after it)")
     command.add_argument("--no-browser", action="store_true", help="do not open a browser")
-    command.add_argument("--dark", action="store_true", help="dark colours")
-    command.add_argument(
-        "--export", metavar="HTML", help="write what is shown to one page that needs no server, and end"
-    )
-    command.add_argument("--png", metavar="PNG", help="write a picture of it, and end; needs Chromium")
+    command.add_argument("--dark", action="store_true", help="use dark colours")
+    command.add_argument("--export", metavar="HTML", help="write a web page that needs no server, and end")
+    command.add_argument("--png", metavar="PNG", help="write a picture, and end; needs Chromium")
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the scene, and show or write it."""
+    """Make the scene and show or write it."""
     from pathlib import Path
 
     from coloc_graph.cli.printing import warn
@@ -46,15 +44,15 @@ def run(args: argparse.Namespace) -> int:
     writes = bool(args.export or args.png)
     for out in (args.export, args.png):
         if out and not Path(out).absolute().parent.is_dir():
-            raise InputError(f"{out} cannot be written: its folder does not exist; make it, or give another place")
+            raise InputError(f"{out} cannot be written: its folder does not exist; make it, or give another path")
     if args.png:
         require_browser()
     host, port = ("127.0.0.1", 0) if writes else (args.host, args.port)
-    with take_port(port, host) as listener:  # before the work, not after it
+    with take_port(port, host) as listener:  # before the work
         scene = _scene(args)
         warn(missing_parts(scene))
         if not is_loopback(host):
-            warn([f"whoever knows the address of this viewer and reaches {host} can see and steer it, unencrypted"])
+            warn([f"the viewer is open to anyone who knows its address and reaches {host}, without encryption"])
         with Viewer(scene, host=host, dark=args.dark, listener=listener) as viewer:
             if args.export:
                 viewer.export(args.export)
@@ -68,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _scene(args: argparse.Namespace) -> "Scene":
-    """Scene of the arguments."""
+    """Return the scene that the arguments describe."""
     from coloc_graph.cli.printing import progress
     from coloc_graph.errors import InputError
     from coloc_graph.run import open_run
@@ -83,7 +81,7 @@ def _scene(args: argparse.Namespace) -> "Scene":
 
     if is_pose_graph(args.path):
         if args.compare or args.run_path:
-            raise InputError(f"{args.path} is a pose graph; --compare and --run are for results of runs")
+            raise InputError(f"{args.path} is a pose graph: --compare and --run apply to results of runs only")
         return scene_of_pose_graph(args.path)
     if is_run(args.path):
         with progress("stances measured") as report:
@@ -123,7 +121,7 @@ def take_port(port: int | None, host: str = "127.0.0.1", say: "Callable[[str], N
 
 
 def show(viewer: "Viewer", *, browser: bool) -> None:
-    """Say where a viewer is, open it on a terminal, and wait for Ctrl-C, which ends it."""
+    """Print a viewer's address, open it if stdout is a terminal, and wait for Ctrl-C."""
     from contextlib import suppress
 
     with suppress(KeyboardInterrupt):
@@ -132,7 +130,7 @@ def show(viewer: "Viewer", *, browser: bool) -> None:
 
 
 def announce(viewer: "Viewer", *, browser: bool) -> None:
-    """Say where a viewer is, and open it on a terminal."""
+    """Print a viewer's address, and open it if stdout is a terminal."""
     import sys
     import webbrowser
 

@@ -92,12 +92,12 @@ def residuals_figure(calibration: CameraCalibration) -> Figure:
     images = calibration.images
     at = np.arange(len(images))
     off = np.array([image.rms for image in images])
-    colours = [BAD if image.refused else COLOURS[0] for image in images]
+    colours = [BAD if image.rejected else COLOURS[0] for image in images]
     bars.bar(at, off, color=colours)
-    usual = max(image.rms for image in images if not image.refused)
+    usual = max(image.rms for image in images if not image.rejected)
     bars.set_ylim(0, 1.25 * min(off.max(), 4 * usual))
     for x, image in zip(at, images, strict=True):
-        if image.refused:
+        if image.rejected:
             bars.text(x, 0.02 * usual, f"rejected: {image.rms:.2f}", rotation=90, ha="center", va="bottom", size=8)
     bars.axhline(calibration.bundle.rms, color=GREY, linewidth=1, linestyle="--")
     bars.set_ylabel("RMS of an image, px")

@@ -124,9 +124,9 @@ def test_a_charuco_board_is_found_and_figures_are_printed_for_people(call, image
     assert code == 0, err
     rows = {line.split()[0]: line.split() for line in text.splitlines() if line[:2] in ("fx", "cx")}
     assert abs(float(rows["fx"][1]) - CAMERA.fx) < 10 and float(rows["fx"][3]) > 0
-    assert "verdict: " in text and " of 8 images" in text and "lens coefficients; RMS px of images" in text
+    assert "verdict: " in text and " of 8 images" in text and "lens coefficients; RMS of held-out images" in text
     said = refused(call, "camera", images / "charuco", "--board", "6x8", *board[2:])
-    assert "squares, columns first; give --board 8x6" in said
+    assert "squares, columns first: give --board 8x6" in said
 
 
 def test_a_board_given_the_other_way_round_is_the_same_board(call, images):
@@ -162,8 +162,8 @@ def test_a_board_that_does_not_lie_is_refused_by_name(call, images, team, tmp_pa
     camera = f"camera = {{ {values}, distortion = [-0.11, 0.03, 5e-4, -3e-4] }}"
     team.write_text(TEAM[: TEAM.index("camera = {")] + camera + "\nmount = { height = 0.3 }\n")
     code, text, err = call("mount", *floor, tmp_path / "leaning.png", *BOARD, "--team", team, "--robot", "B")
-    assert code == 0 and "leaning.png was left out: its board is not in the plane of the others" in err
-    assert "height 0.4" in text and "left out" in text and "the images agree with chi2/dof" in text
+    assert code == 0 and "leaning.png was rejected: its board is not in the plane of the others" in err
+    assert "height 0.4" in text and "rejected" in text and "agreement of the images: chi2/dof" in text
     assert read_team(team)["B"].mount.tilt_deg == pytest.approx(25.0, abs=0.3)
 
 
@@ -187,7 +187,7 @@ def test_a_board_that_is_not_found_says_what_was_sought_and_what_to_try(call, im
     few = sorted((images / "held").glob("[1-3].png"))
     said = refused(call, "camera", *few, "--board", "8x6", "--square", 0.03)
     assert "a chessboard of 8x6 inner corners is in none of 3 images" in said
-    assert "--board counts inner corners, not squares; give --board 7x5" in said
+    assert "--board counts inner corners, not squares: give --board 7x5" in said
     blank = tmp_path / "blank.png"
     cv2.imwrite(str(blank), np.full((240, 320), 90, np.uint8))
     assert "count the inner corners" in refused(call, "camera", blank, *BOARD)
@@ -195,22 +195,22 @@ def test_a_board_that_is_not_found_says_what_was_sought_and_what_to_try(call, im
     assert "check --charuco" in refused(call, "camera", blank, "--board", "8x6", *charuco)
     shown = images / "charuco" / "1.png"
     said = refused(call, "camera", shown, "--board", "11x9", *charuco)
-    assert "markers of its dictionary are seen, the largest id " in said
+    assert "markers of its dictionary are seen, up to id " in said
     assert "is in 3 of 3 images, and at least 6 are needed" in refused(call, "camera", *few, *BOARD)
 
 
 @pytest.mark.parametrize(("arguments", "says"), [
     (("--board", "9by6", "--square", 0.03), "--board 9by6 is not a size"),
-    (("--board", "1x6", "--square", 0.03), "3 to 100 in a row"),
+    (("--board", "1x6", "--square", 0.03), "3 to 100 corners or squares in a row"),
     (("--board", "7x5", "--square", 24.23), "--square 24.23 is not the side of a square in metres"),
     (("--board", "7x5", "--square", "nan"), "--square nan is not the side"),
     (("--board", "7x5"), "give images, --board and --square"),
-    ((*BOARD, "--marker", 0.02), "--marker is for a ChArUco board"),
+    ((*BOARD, "--marker", 0.02), "--marker applies to a ChArUco board"),
     ((*BOARD, "--charuco", "4X4_50"), "a ChArUco board needs --marker"),
-    ((*BOARD, "--charuco", "4X4_50", "--marker", 0.04), "less than that of a square"),
-    ((*BOARD, "--charuco", "9Y9", "--marker", 0.02), "--charuco 9Y9 is no dictionary of OpenCV; it has 4X4_100"),
+    ((*BOARD, "--charuco", "4X4_50", "--marker", 0.04), "shorter than that of a square"),
+    ((*BOARD, "--charuco", "9Y9", "--marker", 0.02), "--charuco 9Y9 is not a dictionary of OpenCV, which has 4X4_100"),
     ((*BOARD, "--robot", "A"), "--team and --robot belong together"),
-    ((*BOARD, "--out-team", "x.toml"), "--out-team is a copy of a team"),
+    ((*BOARD, "--out-team", "x.toml"), "--out-team writes a copy of a team"),
     ((*BOARD, "--from-camera-info", "x.yaml"), "is a calibration already"),
     ((*BOARD, "--distortion", "6"), "invalid choice: 6"),
 ])  # fmt: skip
@@ -230,7 +230,7 @@ def test_wrong_robots_and_places_are_refused_before_the_work(call, images, team,
     assert "holds an earlier calibration" in refused(call, "camera", one, *BOARD, "--out", tmp_path / "earlier")
     large = tmp_path / "large.png"
     cv2.imwrite(str(large), cv2.resize(cv2.imread(str(one)), (640, 480)))
-    assert "the images have 640x480 pixels and robot A's camera" in refused(
+    assert "the images have 640x480 pixels, but the camera of A" in refused(
         call, "mount", large, *BOARD, "--team", team, "--robot", "A"
     )
     assert "is no calibration of a camera" in refused(
@@ -251,7 +251,7 @@ def test_a_camera_info_goes_into_a_team_and_out_again_unchanged(call, team, tmp_
     )
     code, _, err = call("camera", "--from-camera-info", first, "--team", team, "--robot", "A",
                         "--camera-info", second)  # fmt: skip
-    assert code == 0 and "said 320x240 px of A, and the camera has 640x480" in err
+    assert code == 0 and "the images of A have 320x240 px" in err
     camera = read_team(team)["A"].camera
     assert (camera.fx, camera.distortion) == (501.123456789, (-0.1, 0.02, 1e-05, -2.5e-4, 0.0)) and camera.fps == 60.0
     assert tomllib.loads(team.read_text())["robots"][0]["camera"]["cx"] == 319.1

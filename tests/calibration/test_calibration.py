@@ -1,4 +1,4 @@
-"""Cameras and mounts from the corners of a board: what is found, whether its sigmas are true, what is refused."""
+"""Cameras and mounts from the corners of a board: what is found, whether its sigmas are true, what is rejected."""
 
 import os
 from pathlib import Path
@@ -12,7 +12,7 @@ from coloc_graph.calibration import View, Views, calibrate_camera, calibrate_mou
 from coloc_graph.calibration.bundle import adjust, rms, start_pose
 from coloc_graph.calibration.camera import places
 from coloc_graph.calibration.corners import image_paths, neighbours
-from coloc_graph.calibration.fusion import Said, disagreement, fuse, fuse_scaled
+from coloc_graph.calibration.fusion import Estimates, disagreement, fuse, fuse_scaled
 from coloc_graph.calibration.lens import ray_sigmas
 from coloc_graph.calibration.residuals import noise_and_shared
 from coloc_graph.calibration.verdict import GOOD
@@ -96,7 +96,7 @@ def test_the_evidence_decides_how_many_coefficients_there_are(rng, lens, coeffic
     found = calibrate_camera(held(rng, 12, camera=replace(CAMERA, distortion=lens)), BOARD)
     assert len(found.camera.distortion) == coefficients
     assert [trial.coefficients for trial in found.trials] == [0, 4, 5, 8]
-    assert [trial.coefficients for trial in found.trials if trial.why_not is None] == [coefficients]
+    assert [trial.coefficients for trial in found.trials if trial.rejected is None] == [coefficients]
     asked = calibrate_camera(held(rng, 12), BOARD, 5)
     assert len(asked.camera.distortion) == 5 and len(asked.trials) == 1
 
@@ -146,8 +146,8 @@ def test_an_image_of_another_board_is_refused_by_name_and_changes_nothing(rng):
     view = seen.views[5]
     smeared = with_view(seen, 5, View("moved.png", view.points, view.uv + rng.normal(scale=2.0, size=view.uv.shape)))
     found = calibrate_camera(smeared, BOARD, 4)
-    (refused,) = found.refused
-    assert refused.name == "moved.png" and "another board, or one that moved" in refused.refused
+    (rejected,) = found.rejected
+    assert rejected.name == "moved.png" and "another board, or one that moved" in rejected.rejected
     without = Views(seen.width, seen.height, tuple(one for one in seen.views if one is not view))
     np.testing.assert_allclose(
         found.bundle.intrinsics, calibrate_camera(without, BOARD, 4).bundle.intrinsics, rtol=1e-6, atol=1e-7
@@ -165,12 +165,12 @@ def test_many_images_that_contradict_are_no_calibration(rng):
 
 
 def test_too_few_images_or_places_are_refused_with_their_number(rng):
-    with pytest.raises(InputError, match=r"8x5 inner corners is in 5 of 5 images, and at least 6"):
+    with pytest.raises(InputError, match=r"8x5 inner corners is in 5 of 5 images, but at least 6"):
         calibrate_camera(held(rng, 5), BOARD)
     few = held(rng, 3)
     again = [View(f"again{i}", v.points, v.uv + rng.normal(scale=0.1, size=v.uv.shape))
              for i, v in enumerate(few.views * 3)]  # fmt: skip
-    with pytest.raises(InputError, match="in 3 places only"):
+    with pytest.raises(InputError, match="in only 3 places"):
         calibrate_camera(Views(640, 480, (*few.views, *again)), BOARD)
 
 
@@ -210,7 +210,7 @@ def test_the_verdict_says_that_a_board_was_not_tilted(rng):
     flat, tilted = held(rng, 20, tilt_deg=10.0), held(rng, 40)
     tilted = [view for view in tilted.views if _tilt(view) > 30][:2]
     said = verdict(calibrate_camera(Views(640, 480, (*flat.views, *tilted)), BOARD, 0))
-    assert said[0].startswith("the board was tilted in 2 of 22 images only")
+    assert said[0].startswith("the board was tilted in only 2 of 22 images")
 
 
 def _tilt(view):
@@ -224,7 +224,7 @@ def test_the_verdict_is_good_where_nothing_is_to_be_done(rng):
 
 def test_the_verdict_says_where_a_lens_is_uncertain_and_that_corners_are_bad(rng):
     said = " ".join(verdict(calibrate_camera(held(rng, 8, noise=1.5), BOARD, 4)))
-    assert "px RMS: the images are blurred" in said and "the lens is uncertain by" in said and "8 places only" in said
+    assert "px: the images are blurred" in said and "the lens is uncertain by" in said and "only 8 places" in said
 
 
 # --- the mount
@@ -282,7 +282,7 @@ def test_a_mounts_sigmas_are_true(known, floor):
         error = error_of(found, mount)
         nees.append(error @ np.linalg.solve(found.covariance, error) / 3)
         chi2, dof = chi2 + found.chi2, dof + found.dof
-        assert not found.refused
+        assert not found.rejected
     assert 0.65 < np.mean(nees) < 1.4  # 120 numbers: 1 +- 0.13
     assert chi2 / dof == pytest.approx(1.0, abs=0.2)
 
@@ -332,21 +332,21 @@ def test_a_board_that_is_not_on_the_floor_is_refused_by_name(rng):
     facing = replace(MOUNT, yaw_deg=0.0, x=0.0, y=0.0)
     views = lying(rng, 5, mount=facing)
     found = calibrate_mount([*views[:2], lifted(views[2], facing), *views[3:]], CAMERA, facing, BOARD.square)
-    (refused,) = found.refused
-    assert refused.name == "lifted.png" and "not in the plane of the others, by" in refused.refused
+    (rejected,) = found.rejected
+    assert rejected.name == "lifted.png" and "not in the plane of the others, by" in rejected.rejected
     assert np.abs(error_of(found, facing) / np.sqrt(np.diag(found.covariance))).max() < 4
     with pytest.raises(InputError, match=r"lifted.png contradict each other by .* one board was not flat"):
         calibrate_mount([views[0], lifted(views[1], facing)], CAMERA, facing, BOARD.square)
     moved = View("moved.png", views[0].points, views[0].uv + rng.normal(scale=2.0, size=views[0].uv.shape))
-    (refused,) = calibrate_mount([*views, moved], CAMERA, facing, BOARD.square).refused
-    assert refused.name == "moved.png" and "one that moved" in refused.refused
+    (rejected,) = calibrate_mount([*views, moved], CAMERA, facing, BOARD.square).rejected
+    assert rejected.name == "moved.png" and "one that moved" in rejected.rejected
 
 
 def test_where_all_boards_are_a_little_off_sigmas_are_larger_and_none_is_refused(rng):
     uneven = Floor(tilt_sigma_deg=0.3, height_sigma=0.001)
     found = calibrate_mount(lying(rng, 8, floor=uneven), CAMERA, MOUNT, BOARD.square)  # nobody said that it is
     flat = calibrate_mount(lying(rng, 8), CAMERA, MOUNT, BOARD.square)
-    assert flat.scale == 1.0 and found.scale > 3 and not found.refused
+    assert flat.scale == 1.0 and found.scale > 3 and not found.rejected
     assert found.mount.tilt_sigma_deg > 2 * flat.mount.tilt_sigma_deg
 
 
@@ -355,17 +355,17 @@ def test_how_far_one_of_many_is_from_the_others_counts_what_they_share_once(rng)
     n, m = 4, 2
     own = np.array([k * np.array([[2.0, 0.5], [0.5, 1.0]]) for k in range(1, n + 1)])
     loads = 3 * (rng.normal(size=(m, 3)) + 0.3 * rng.normal(size=(n, m, 3)))  # of three errors that all share
-    said = Said(np.zeros((n, m)), own, np.einsum("nip,mjp->nimj", loads, loads))
+    said = Estimates(np.zeros((n, m)), own, np.einsum("nip,mjp->nimj", loads, loads))
     drawn = rng.multivariate_normal(np.zeros(n * m), said.covariance(), size=600).reshape(-1, n, m)
-    found = np.mean([disagreement(Said(values, own, said.common)) for values in drawn], axis=0)
+    found = np.mean([disagreement(Estimates(values, own, said.common)) for values in drawn], axis=0)
     np.testing.assert_allclose(found / m, 1.0, atol=0.13)
-    fused = np.array([fuse(Said(values, own, said.common)).value for values in drawn])
+    fused = np.array([fuse(Estimates(values, own, said.common)).value for values in drawn])
     np.testing.assert_allclose(np.cov(fused.T), fuse(said).covariance, rtol=0.2, atol=0.5)
 
 
 def test_where_values_disagree_their_own_errors_are_as_much_larger_as_they_scatter(rng):
     own = np.tile(0.01 * np.eye(3), (40, 1, 1))
-    said = Said(rng.normal(size=(40, 3)), own, np.zeros((40, 3, 40, 3)))  # ten sigmas each
+    said = Estimates(rng.normal(size=(40, 3)), own, np.zeros((40, 3, 40, 3)))  # ten sigmas each
     fused = fuse_scaled(said, 0.01)
     assert fused.scale == pytest.approx(100, rel=0.4) and fused.scale == pytest.approx(fused.chi2 / fused.dof)
     np.testing.assert_allclose(fused.covariance, fused.scale * fuse(said).covariance)
@@ -393,7 +393,7 @@ def real_images():
 def test_real_images_are_explained_to_a_sixth_of_a_pixel_and_halves_agree():
     seen, board = find_boards(image_paths(real_images()), make_board("9x6", 0.02423))
     found = calibrate_camera(seen, board)
-    assert len(seen.views) == 29 and not found.refused and len(found.camera.distortion) == 4
+    assert len(seen.views) == 29 and not found.rejected and len(found.camera.distortion) == 4
     assert found.bundle.rms < 0.165 and found.bundle.rms <= opencv(seen)[0] * (1 + 1e-9)
     ratios = []
     for split in range(6):

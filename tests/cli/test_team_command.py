@@ -15,7 +15,7 @@ def test_a_new_team_reads_back_and_has_nothing_wrong(tmp_path, capsys):
     assert (team["A"].camera.width, team["A"].camera.height) == (320, 240)
     capsys.readouterr()
     assert main(["team", "check", str(path)]) == 0
-    assert "nothing wrong was found" in capsys.readouterr().out
+    assert "no problem found" in capsys.readouterr().out
     assert main(["team", "new", "A", "B", "C", "--out", str(path)]) == 2
     assert "replace it with --force" in capsys.readouterr().err
 

@@ -193,7 +193,7 @@ def test_a_result_is_exported(result, tmp_path, capsys):
 
 def test_solve_incrementally_says_what_a_stance_costs(short, tmp_path, capsys):
     assert main(["solve", str(short), "--out", str(tmp_path / "a"), "--incremental"]) == 0
-    assert "a stance entered in" in capsys.readouterr().out
+    assert "update time for a stance" in capsys.readouterr().out
     assert main(["solve", str(short), "--out", str(tmp_path / "b")]) == 0
     a, b = (read_tum(tmp_path / way / "trajectories" / "B.tum") for way in "ab")
     np.testing.assert_allclose(a.T_world_body, b.T_world_body, atol=1e-6)
@@ -240,7 +240,7 @@ def test_a_disconnected_graph_and_options_of_runs_are_refused(tmp_path, capsys):
     assert main(["solve", str(path), "--out", str(tmp_path / "out")]) == 2
     assert "2 of 4 vertices, as " in (said := capsys.readouterr().err) and "are disconnected from vertex" in said
     assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--incremental"]) == 2
-    assert "is a pose graph; --incremental is for runs" in capsys.readouterr().err
+    assert "is a pose graph: --incremental applies to runs only" in capsys.readouterr().err
     odd = square(2, [(0, 1)]).replace(" 1 0 0 1 0 1", " 1 0 0 1 0 0")
     path.write_text(odd)
     assert main(["solve", str(path), "--out", str(tmp_path / "out")]) == 2

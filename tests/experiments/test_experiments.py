@@ -244,7 +244,7 @@ def test_the_commands_options_reach_the_experiment(single, tmp_path, capsys, mon
         (["fig4", "--runs", "0"], "`runs` is 0"),
         (["fig5", "--draws", "3"], "`draws` is 3"),
         (["fig4", "--draws", "251"], "`draws` is 251"),
-        (["table1", "--draws", "50"], "--draws belongs to fig4 and fig5"),
+        (["table1", "--draws", "50"], "--draws applies to fig4 and fig5"),
         (["table2", "--seed", "-1"], "`seed` is -1"),
         (["table2", "--processes", "0"], "`processes` is 0"),
         *(

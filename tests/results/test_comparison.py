@@ -229,8 +229,8 @@ def test_times_that_do_not_meet_are_said_with_their_ends(refused, tums, tmp_path
 
 def test_what_is_not_said_or_said_in_vain(refused, call, tums, result, tmp_path):
     estimate, true = tums / "est", ["--truth", tums / "true"]
-    assert "what is compared is not said" in refused()
-    assert "what is compared is not said" in refused(result, "--estimate", estimate)
+    assert "nothing to compare" in refused()
+    assert "nothing to compare" in refused(result, "--estimate", estimate)
     assert "TUM files are compared with --truth" in refused(estimate)
     assert "choose from A, B, C" in refused(estimate, *true, "--robots", "A,Z")
     assert "the reference robot is not named: name one of A, B, C" in refused(estimate, *true, "--align", "reference")

@@ -102,7 +102,7 @@ def test_the_command_prints_a_table_and_says_which_failed(folder, tmp_path, caps
     out = tmp_path / "out"
     assert main(["solve", str(folder), "--out", str(out), "--processes", "1"]) == 1
     printed = capsys.readouterr()
-    assert "3 runs: 2 solved, 0 there already, 1 failed" in printed.out
+    assert "3 runs: 2 solved, 0 solved before, 1 failed" in printed.out
     assert printed.err.count(str(folder / "bad.mcap")) == 1
     assert main(["solve", str(folder), "--out", str(out), "--processes", "1", "--json"]) == 1
     states = [row["state"] for row in json.loads(capsys.readouterr().out)]
