@@ -32,6 +32,18 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "--longest", type=float, default=40.0, metavar="S", help="longest duration of a stance [s] (default: 40)"
     )
     command.add_argument(
+        "--plan",
+        action="store_true",
+        help="plan leaps, drives and their durations anew after each stance, for the least uncertainty at the goal",
+    )
+    command.add_argument(
+        "--formation", choices=("paper", "plan"), default="paper", help="`plan` is --plan (default: paper)"
+    )
+    command.add_argument(
+        "--pace", type=float, default=8.0, metavar="S", help="with --plan: seconds of images a metre (default: 8)"
+    )
+    command.add_argument("--map", metavar="YAML", help="with --plan: ROS map_server map of the walls")
+    command.add_argument(
         "--clock-limit",
         type=float,
         default=1.0,
@@ -82,6 +94,10 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("a mission needs a folder: give one with --out")
     if not 0 < args.speed <= 0.5:
         raise InputError(f"a Create drives at up to 0.5 m/s, not at {args.speed}: give --speed between 0 and 0.5")
+    if not 0 < args.pace < 1e4:
+        raise InputError(f"--pace is {args.pace}; give seconds of images a metre, above 0")
+    if args.map is not None and not (args.plan or args.formation == "plan"):
+        raise InputError("--map is of plans: give --plan, too")
     team = read_team(args.team)
     options = MissionOptions(
         goals=tuple(args.goal) if args.goal else MissionOptions.goals,
@@ -90,6 +106,9 @@ def run(args: argparse.Namespace) -> int:
         speed=args.speed,
         longest=args.longest,
         clock_limit=args.clock_limit / 1e3,
+        formation="plan" if args.plan else args.formation,
+        pace=args.pace,
+        map_path=None if args.map is None else Path(args.map),
     )
     out = Path(args.out)
     viewer = watched(team, args.port, browser=not args.no_browser, view=args.view)

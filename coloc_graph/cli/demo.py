@@ -26,6 +26,12 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         help="run the online system instead: three robot programs with simulated wheels and cameras drive the hallway",
     )
     command.add_argument(
+        "--plan", action="store_true", help="with --online: plan the stances anew after each one, over the same way"
+    )
+    command.add_argument(
+        "--formation", choices=("paper", "plan"), default="paper", help="with --online: `plan` is --plan"
+    )
+    command.add_argument(
         "--port", type=int, help="port of the viewer with --online (default: 8080, or the first free one after it)"
     )
     command.set_defaults(run=lambda args: online(args) if args.online else run(args))
@@ -97,13 +103,18 @@ def online(args: argparse.Namespace) -> int:
     from coloc_graph.online.coordinator import Coordinator
     from coloc_graph.online.mission import MissionOptions
     from coloc_graph.online.mission_states import MissionState
+    from coloc_graph.planning.formation import PAPER
     from coloc_graph.simulation.simulated_team import SimulatedTeam, field_team, free_address
 
     out = Path(args.out) / "online"
     if out.exists():
         raise InputError(f"{out} exists: remove it, or give another folder with --out")
     team, address = field_team(), free_address()
-    options = MissionOptions(goals=((100.0, 0.0),), stances=args.stances, speed=0.4)
+    if args.plan or args.formation == "plan":
+        way = max(args.stances * PAPER.leap, 2 * PAPER.leap)
+        options = MissionOptions(goals=((way, 0.0),), speed=0.4, formation="plan")
+    else:
+        options = MissionOptions(goals=((100.0, 0.0),), stances=args.stances, speed=0.4)
     with (
         until_signal() as stop,
         watched(team, args.port, browser=not args.no_browser) as listener,

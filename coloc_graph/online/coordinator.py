@@ -12,8 +12,10 @@ from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.estimation_worker import EstimationWorker
 from coloc_graph.online.formation import Formation
+from coloc_graph.online.horizon_planner import HorizonPlanner
 from coloc_graph.online.inbox import Inbox, Message, linked
 from coloc_graph.online.leap_frog import LeapFrog
+from coloc_graph.online.leap_planner import LeapPlanner, StancePlanner
 from coloc_graph.online.mission import MissionOptions, MissionStatus, in_world, roles
 from coloc_graph.online.mission_folder import MissionFolder
 from coloc_graph.online.mission_log import MissionLog
@@ -22,6 +24,7 @@ from coloc_graph.online.resume import restore
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
 from coloc_graph.planning.course import Course
+from coloc_graph.planning.floor_map import read_floor_map
 from coloc_graph.robot_io.link.messages import Event, Sample, Status, Wheels
 from coloc_graph.robot_io.link.zenoh_config import Tls
 from coloc_graph.run.schemas import to_ns
@@ -76,7 +79,8 @@ class Coordinator:
         options = options or MissionOptions()
         mover, observers = roles(team, options.mover)
         starts, waypoints = in_world(team, mover, options.goals)
-        formation = Formation(Course(waypoints), observers)
+        course = Course(waypoints)
+        floor_map = None if options.map_path is None else read_floor_map(options.map_path)
         self._on_status, self._status_time = on_status, 0.0
         self._inbox = Inbox()
         self._solver = StanceSolver(team, options.solve)
@@ -98,12 +102,20 @@ class Coordinator:
                 link, self._registry, options.speed, lambda name: self._log.note("drive resumed", robot=name)
             )
             undo.callback(self._commander.halt_all)
+            planner: StancePlanner
+            if options.formation == "plan":
+                planner = HorizonPlanner(
+                    team, mover, observers, course, self._registry,
+                    pace=options.pace, speed=options.speed, floor_map=floor_map,
+                )  # fmt: skip
+            else:
+                planner = LeapPlanner(team, mover, Formation(course, observers), self._registry)
             self._close = undo.pop_all()
         self.link = link
         self._mission = LeapFrog(
             team,
             options,
-            formation,
+            planner,
             registry=self._registry,
             commander=self._commander,
             worker=worker,

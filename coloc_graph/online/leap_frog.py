@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 
 from coloc_graph.errors import ColocError, RobotError
+from coloc_graph.geometry.se2 import Planar
 from coloc_graph.online.bumps import displaced, pushed
 from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.estimation_worker import EstimationWorker
-from coloc_graph.online.formation import STAGGER, Formation
-from coloc_graph.online.leap_planner import LeapPlanner, StancePlan
+from coloc_graph.online.leap_planner import StancePlan, StancePlanner
 from coloc_graph.online.mission import MissionOptions, roles
 from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateChange, StateMachine
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.stance_attempt import OUT_OF_VIEW, StanceAttempt
-from coloc_graph.online.visibility import InView
+from coloc_graph.online.visibility import InView, Precision
 from coloc_graph.pipeline.incremental import EnteredStance
 from coloc_graph.robot_io.link.messages import Body, Capture, EndCapture, Halt, Recover
 from coloc_graph.run import Detections, Stance
@@ -51,8 +51,8 @@ class LeapFrog:
     ----------
     team, options
         The team, and the mission's goals and limits.
-    formation
-        Formation of the observers along the course.
+    planner
+        Planner of the stances.
     registry, commander, worker, log
         States of the robots, commands to them, the estimator's thread, and the mission's log.
     synchronised
@@ -65,7 +65,7 @@ class LeapFrog:
         self,
         team: Team,
         options: MissionOptions,
-        formation: Formation,
+        planner: StancePlanner,
         *,
         registry: RobotRegistry,
         commander: Commander,
@@ -74,7 +74,7 @@ class LeapFrog:
         synchronised: Callable[[str], bool],
         on_stance: Callable[[EnteredStance], None] | None = None,
     ) -> None:
-        self._team, self._options, self._formation = team, options, formation
+        self._team, self._options, self._planner = team, options, planner
         self._registry, self._commander, self._worker, self._log = registry, commander, worker, log
         self._synchronised, self._on_stance = synchronised, on_stance
         self.mover, self.observers = roles(team, options.mover)
@@ -82,8 +82,8 @@ class LeapFrog:
         self.latencies: list[float] = []
         self.attempt: StanceAttempt | None = None
         self.states = StateMachine(self._note_state)
-        self._planner = LeapPlanner(team, self.mover, formation, registry)
         self._plan: StancePlan | None = None
+        self._leap: tuple[str, Planar] | None = None  # a leap that is still to be commanded
         self._failures = 0  # attempts at the present stance that failed
         self._captures = time.time_ns() // 1_000_000  # capture numbers are unique across coordinators
         self._recovered = -math.inf
@@ -157,14 +157,23 @@ class LeapFrog:
         self._plan = self._planner.plan(self._index, self.stances[-1] if self.stances else None, self._failures)
         for robot in self._registry.robots.values():
             robot.arrived, robot.drive = True, None
-        if self._plan.leap is not None:
-            leaper, (x, y, yaw) = self._plan.leap
-            self._commander.drive(leaper, [(x, y)], yaw, backwards=False)
+        self._leap = self._plan.leap
+        if not self._plan.mover_first:
+            self._send_leaper()
         self._commander.drive(self.mover, self._plan.patrol[:1])
         self._enter(MissionState.PLACING)
 
+    def _send_leaper(self) -> None:
+        """Send off the observer that is to leap, unless it is on its way."""
+        if self._leap is not None:
+            leaper, (x, y, yaw) = self._leap
+            self._leap = None
+            self._commander.drive(leaper, [(x, y)], yaw, backwards=False)
+
     def _place(self) -> None:
         self._commander.resume_drives()
+        if self._registry[self.mover].arrived:
+            self._send_leaper()
         under_way = [name for name, robot in self._registry.robots.items() if not robot.arrived]
         if under_way:
             if self.states.lasted(DRIVE_TIME):
@@ -216,7 +225,7 @@ class LeapFrog:
         found = self._worker.judged()
         if found is not None:
             attempt.precision = found
-            if found.suffices(self._options):
+            if self._enough(found, attempt):
                 self._end_capture("the stance is precise enough")
                 return
         left = attempt.stance.start + self._options.longest - self._registry.utc()
@@ -227,6 +236,13 @@ class LeapFrog:
             self._commander.drive(self.mover, attempt.next_round())
         if left < 0:
             self._end_capture(f"{self._options.longest:g} s are over")
+
+    def _enough(self, found: Precision, attempt: StanceAttempt) -> bool:
+        """Return whether a stance, as it was judged, may end: it is precise enough, or has lasted as planned."""
+        planned = None if self._plan is None else self._plan.duration
+        if planned is None:
+            return found.suffices(self._options)
+        return not found.why and self._registry.utc() - attempt.stance.start >= planned
 
     def _keep_in_view(self, attempt: StanceAttempt) -> None:
         """Send the mover back where it has left an observer's view."""
@@ -269,6 +285,7 @@ class LeapFrog:
         latency = self._registry.utc() - self._attempted().last_image
         self.latencies.append(latency)
         self._registry.follow(one)
+        self._planner.take(one)
         self._log.note(
             "entered",
             stance=one.stance.index,
@@ -376,8 +393,7 @@ class LeapFrog:
     def _at_goal(self) -> bool:
         if self._options.stances is not None and len(self.stances) >= self._options.stances:
             return True
-        reached = self._formation.progress(self._registry.poses(self.observers))
-        return reached >= self._formation.course.length - STAGGER / 2
+        return self._planner.at_goal(self._registry.poses(self.observers))
 
     def _enter(self, state: MissionState, reason: str = "") -> None:
         self.states.enter(state, self._index, reason)

@@ -1,6 +1,8 @@
 """The next stance's plan: the observer that leaps, its target, and the mover's waypoints; `LeapPlanner`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from coloc_graph.geometry.se2 import Planar
 from coloc_graph.online.formation import STAGGER, Formation
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.visibility import InView
+from coloc_graph.pipeline.incremental import EnteredStance
 from coloc_graph.run import Stance
 from coloc_graph.team import Team
 
@@ -23,11 +26,33 @@ class StancePlan:
         Observer that leaps and its target in the world (x [m], y [m], yaw [rad]); None where nobody leaps.
     patrol
         Waypoints (n, 2) [m] of the mover, in the world, spread over what all observers see.
+    duration
+        Time of the mover's drive after which the stance ends [s]; None to end it once it is precise enough.
+    mover_first
+        True if the observer leaps only once the mover is where its drive begins: their ways come near each other.
     """
 
     index: int
     leap: tuple[str, Planar] | None
     patrol: NDArray[np.float64]
+    duration: float | None = None
+    mover_first: bool = False
+
+
+class StancePlanner(Protocol):
+    """Planner of a mission's stances."""
+
+    def plan(self, index: int, before: Stance | None, attempt: int) -> StancePlan:
+        """Plan stance `index` after the one `before` it; `attempt` counts the attempts at it that failed."""
+
+    def drives(self, robot: str) -> bool:
+        """Return whether a robot drives in the present plan."""
+
+    def take(self, entered: EnteredStance) -> None:
+        """Take in a stance that has entered the estimate."""
+
+    def at_goal(self, poses: Mapping[str, Planar]) -> bool:
+        """Return whether the observers have come to the goal."""
 
 
 class LeapPlanner:
@@ -64,6 +89,13 @@ class LeapPlanner:
         """Return whether a robot drives in the present plan."""
         leap = self._plan.leap if self._plan is not None else None
         return robot == self._mover or (leap is not None and leap[0] == robot)
+
+    def take(self, entered: EnteredStance) -> None:
+        """Take in a stance that has entered the estimate: the formation stays as it is."""
+
+    def at_goal(self, poses: Mapping[str, Planar]) -> bool:
+        """Return whether the middle of the observers has come within half a stagger of the goal."""
+        return self._formation.progress(poses) >= self._formation.course.length - STAGGER / 2
 
     def _next_leap(self, before: Stance, poses: dict[str, Planar]) -> tuple[str, Planar]:
         """Choose the observer that leaps, and its target.

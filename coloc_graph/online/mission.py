@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +42,12 @@ class MissionOptions:
         A stance does not begin while the standard deviation of a robot's clock is above this [s].
     attempts
         Number of attempts at one stance, after which the mission fails.
+    formation
+        "paper" for the paper's formation, "plan" for stances that are planned anew after each one.
+    pace
+        Seconds of images for each metre of the way, with formation "plan".
+    map_path
+        YAML file of a ROS map_server map whose walls are kept clear of, with formation "plan"; None for no walls.
     solve
         Options of the estimator.
     """
@@ -54,6 +62,9 @@ class MissionOptions:
     speed: float = 0.3
     clock_limit: float = 1e-3
     attempts: int = 20
+    formation: Literal["paper", "plan"] = "paper"
+    pace: float = 8.0
+    map_path: Path | None = None
     solve: SolveOptions = field(default_factory=SolveOptions)
 
 

@@ -177,7 +177,7 @@ class Horizon:
         standing = {name: belief.poses[name] for name in self.observers}
         pace = self.seconds / max(self.course.length, ARRIVED)
         seconds = min(max(1.5 * pace * 0.5, SHORTEST), LONGEST, self.seconds)
-        stance, promise = best_stance(self.predictor, belief, standing, (), self.mover, seconds, self._goal())
+        stance, promise = best_stance(self.predictor, belief, standing, (), self.mover, seconds, self.goal)
         return Decision(stance, promise, ())
 
     def next(self, belief: Belief, seconds: float, avoid: Sequence[Planar] = ()) -> Decision:
@@ -219,11 +219,13 @@ class Horizon:
         anchors = tuple(name for name in self.observers if name != leaper)
         placed = {name: after.poses[name] for name in (*anchors, leaper)}
         leapt = math.dist(belief.poses[leaper][:2], target[:2])
-        stance, promise = best_stance(self.predictor, after, placed, anchors, self.mover, duration, self._goal(), leapt)
+        stance, promise = best_stance(self.predictor, after, placed, anchors, self.mover, duration, self.goal, leapt)
         end_sigma = math.sqrt(best[0].score) if self.objective == "goal" else math.nan
         return Decision(stance, promise, best[0].choices, end_sigma)
 
-    def _goal(self) -> tuple[float, float]:
+    @property
+    def goal(self) -> tuple[float, float]:
+        """The last point of the course, x, y [m]."""
         x, y, _ = self.course.at(self.course.length)
         return x, y
 

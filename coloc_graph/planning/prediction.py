@@ -16,6 +16,7 @@ from coloc_graph.team import Team
 Array = NDArray[np.float64]
 
 INSTANTS = 48  # instants of a drive at which its pixels are linearised; each stands for several images
+NOTABLE = 0.1  # relative change of the noise for which models are made anew
 MOMENT = 0.01  # time over which the mover's velocity is taken [s]
 LEAST_POINTS = 6  # correspondences without which a stance has no homography
 
@@ -67,6 +68,12 @@ class Predictor:
         if key not in self._models:
             self._models[key] = StanceModel(self.team, observers, mover, self.noise_px, floor_map=self.floor_map)
         return self._models[key]
+
+    def learn_noise(self, noise_px: float) -> None:
+        """Set the noise of marker centres [px] to what stances have shown, if it has changed by a tenth."""
+        if self.noise_px is None or abs(noise_px / self.noise_px - 1) > NOTABLE:
+            self.noise_px = noise_px
+            self._models.clear()
 
     def of_stance(self, before: Belief, stance: PlannedStance) -> Promise:
         """Predict one stance, after the leaps to it."""

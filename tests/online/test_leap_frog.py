@@ -58,7 +58,7 @@ class Mission:
         self.leap_frog = LeapFrog(
             self.team,
             OPTIONS,
-            self.formation,
+            LeapPlanner(self.team, "C", self.formation, self.registry),
             registry=self.registry,
             commander=self.commander,
             worker=self.worker,

@@ -1,0 +1,95 @@
+"""Stances of a mission planned by the receding horizon, with a registry and without a network."""
+
+import math
+
+import numpy as np
+import pytest
+
+from coloc_graph.errors import InputError
+from coloc_graph.geometry.se2 import between
+from coloc_graph.online.horizon_planner import HorizonPlanner
+from coloc_graph.online.mission import in_world
+from coloc_graph.online.record import Record
+from coloc_graph.online.robot_registry import RobotRegistry
+from coloc_graph.pipeline.incremental import StanceSolver, measure_stance
+from coloc_graph.planning.course import Course
+from coloc_graph.planning.formation import Gait
+from coloc_graph.planning.plan import Plan, PlannedStance
+from coloc_graph.run import Stance, atomic_run, open_run
+from coloc_graph.simulation import Imperfections, build_world, record
+from coloc_graph.simulation.planned import planned
+from coloc_graph.simulation.simulated_team import field_team
+
+GAIT = Gait(0.8, 0.6, 20.0)
+BEFORE = Stance(0, 0.0, 10.0, ("A", "B"), ("C",), ())
+
+
+class Mission:
+    """A team at the start of a mission."""
+
+    def __init__(self, folder):
+        self.team = field_team()
+        starts, waypoints = in_world(self.team, "C", ((4.0, 0.0),))
+        self.registry = RobotRegistry(Record(folder / "run.mcap", self.team), starts, lambda _: lambda t: t, 0, {})
+        self.course = Course(waypoints)
+        self.planner = self.make(("A", "B"))
+
+    def make(self, observers):
+        return HorizonPlanner(
+            self.team, "C", observers, self.course, self.registry, pace=8.0, speed=0.4, gait=GAIT
+        )  # fmt: skip
+
+
+@pytest.fixture
+def mission(tmp_path):
+    return Mission(tmp_path)
+
+
+def test_the_first_stance_is_where_the_robots_stand_and_the_second_after_a_leap(mission):
+    first = mission.planner.plan(0, None, 0)
+    assert first.leap is None and first.duration > 3
+    second = mission.planner.plan(1, BEFORE, 0)
+    leaper, target = second.leap
+    poses = mission.registry.poses()
+    ways = {name: mission.course.way_of(poses[name]) for name in ("A", "B")}
+    assert leaper == min(ways, key=ways.get)
+    assert mission.course.way_of(target) > max(ways.values()) + 0.1
+    assert mission.planner.drives(leaper) and mission.planner.drives("C")
+    # the mover stays clear of where the observers then stand
+    standing = {**poses, leaper: target}
+    for waypoint in second.patrol:
+        assert min(math.dist(waypoint, standing[name][:2]) for name in ("A", "B")) > 0.4
+
+
+def test_another_attempt_turns_the_drive_round_and_a_third_chooses_another_target(mission):
+    mission.planner.plan(0, None, 0)
+    plans = [mission.planner.plan(1, BEFORE, attempt) for attempt in range(3)]
+    assert plans[1].leap == plans[0].leap
+    np.testing.assert_array_equal(plans[1].patrol, plans[0].patrol[::-1])
+    x, y, yaw = between(plans[0].leap[1], plans[2].leap[1])
+    assert math.hypot(x, y) + abs(yaw) > 0.1
+
+
+def test_a_stance_that_came_makes_the_team_better_known_and_spends_its_time(mission, tmp_path):
+    plan = mission.planner.plan(0, None, 0)
+    poses = mission.registry.poses()
+    came = PlannedStance({name: poses[name] for name in ("A", "B")}, (), "C", tuple(map(tuple, plan.patrol)), 10.0)
+    world = build_world(planned(Plan((came,))), team=mission.team, fps=15.0, imperfections=Imperfections(noise_px=0.2))
+    with atomic_run(tmp_path / "came.mcap", mission.team) as writer:
+        record(world, writer, "tracks")
+    run = open_run(tmp_path / "came.mcap")
+    solver = StanceSolver(mission.team)
+    (stance,) = run.stances
+    pairs = solver.measure(run, stance, measure_stance(run, stance, solver.options))
+    entered = solver.enter(run, stance, pairs)
+    left = mission.planner.seconds_left
+    mission.planner.take(entered)
+    assert left - mission.planner.seconds_left == pytest.approx(stance.end - stance.start)
+    assert mission.planner.promised.position_sigma(("B",)) < 0.01
+    # the noise of the next stances is that which was seen
+    assert mission.planner.noise_px == pytest.approx(0.2, rel=0.2)
+
+
+def test_three_observers_are_refused(mission):
+    with pytest.raises(InputError, match="plans are made for two and a mover"):
+        mission.make(("A", "B", "C"))
