@@ -35,7 +35,7 @@ from coloc_graph.planning.horizon import Horizon, Objective
 from coloc_graph.planning.mission import Mission, leap_frog, stances_of
 from coloc_graph.planning.plan import Plan
 from coloc_graph.planning.prediction import Predictor
-from coloc_graph.run import open_run, atomic_run
+from coloc_graph.run import atomic_run, open_run
 from coloc_graph.simulation import Imperfections, World, build_world, record, reference_team
 from coloc_graph.simulation.planned import planned
 from coloc_graph.simulation.rig import stated_team
