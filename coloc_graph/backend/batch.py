@@ -347,13 +347,13 @@ def _with_bump(graph: PoseGraph, bump: Bump) -> PoseGraph:
     if not bump.alternative:
         return graph
     xi = gtsam.Pose3.Logmap(bump.T_before_after)[2:5]
-    loosened = {
+    uncertain = {
         id(one): replace(
             one, covariance=one.covariance + np.diag(np.square(np.maximum(np.abs(xi), np.abs(xi).max() / 2)))
         )
         for one in bump.alternative
     }
-    measurements = tuple(loosened.get(id(one), one) for one in graph.measurements)
+    measurements = tuple(uncertain.get(id(one), one) for one in graph.measurements)
     return replace(graph, measurements=measurements)
 
 

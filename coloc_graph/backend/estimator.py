@@ -260,7 +260,7 @@ class Estimator:
         stance : Stance
             The stance; its index is larger than those before.
         measurements : iterable of Measurement
-            Measured in the stance, and on the way to it.
+            Measured in the stance, and on the way into it.
         after : int or None
             Index of its predecessor, since which its anchors have stayed; None: the one numbered before it.
 
@@ -285,7 +285,7 @@ class Estimator:
             )
         require_robots(stance, self.robots)
         require_valid(taken, self.floor)
-        # the first stance is the one that has no anchors: nobody can have stayed since another
+        # the first stance is the one that has no anchors: no robot can have stayed since another
         is_first = not self._stances and after is None and not stance.anchors
         if is_first:
             require_reference(self.reference, stance)

@@ -109,7 +109,10 @@ class InsertionPlanner:
     def _refine(
         self, T_i_j: gtsam.Pose3, i: int, j: int, start: dict[int, gtsam.Pose3], rough: dict[int, float]
     ) -> bool:
-        """Return whether a measurement is within the innovation gate; then it places what only odometry had placed."""
+        """Return whether a measurement is within the innovation gate.
+
+        Then a key with an initial pose by odometry alone gets one by the measurement.
+        """
         T_world_i, T_world_j = self._pose_of(i, start), self._pose_of(j, start)
         off = T_world_i.between(T_world_j).between(T_i_j)
         near = max(INNOVATION_GATE, INNOVATION_GATE_SIGMAS * max(rough.get(i, 0.0), rough.get(j, 0.0)))

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 _LOOKS = (("eq2", EQ2, EQ2_MARKER, EQ2_LABEL), ("ours", OURS, OURS_MARKER, OURS_LABEL))
 #: Errors below this are drawn on it [cm]: a logarithmic axis has no zero.
-_LEAST_CM = 0.01
+_MIN_CM = 0.01
 
 
 @styled
@@ -81,18 +81,18 @@ def _draw_plan(axes: Axes, outing: Outing) -> None:
 
 def _draw_errors(axes: Axes, result: Table1) -> None:
     at = np.arange(len(TABLE1), dtype=np.float64)
-    paper = [max(abs(segment.error_cm), _LEAST_CM) for segment in TABLE1]
+    paper = [max(abs(segment.error_cm), _MIN_CM) for segment in TABLE1]
     axes.plot(
         at, paper, linestyle="", marker=PAPER_MARKER, markersize=21, markeredgewidth=2.2, color=PAPER, zorder=5,
         label="the paper", gid="paper",
     )  # fmt: skip
     for side, (method, colour, marker, label) in zip((-0.17, 0.17), _LOOKS, strict=True):
-        every = np.array([result.errors_cm(segment, method) for segment in TABLE1]).clip(_LEAST_CM)
+        every = np.array([result.errors_cm(segment, method) for segment in TABLE1]).clip(_MIN_CM)
         axes.plot(
             np.repeat(at + side, every.shape[1]), every.ravel(), linestyle="", marker=marker, markersize=3.4,
             color=colour, alpha=0.4, markeredgewidth=0, zorder=2,
         )  # fmt: skip
-        means = [max(result.errors_cm(segment, method).mean(), _LEAST_CM) for segment in TABLE1]
+        means = [max(result.errors_cm(segment, method).mean(), _MIN_CM) for segment in TABLE1]
         axes.plot(
             at + side, means, linestyle="", marker=marker, markersize=8, color=colour, markeredgecolor="white",
             zorder=4, label=f"{label} (mean {np.mean(means):.2f} cm)", gid=method,
@@ -100,7 +100,7 @@ def _draw_errors(axes: Axes, result: Table1) -> None:
     axes.axhline(1.0, color=GREY, linewidth=0.9, linestyle="--", zorder=1)
     axes.axvline(5.5, color=PALE, linewidth=1.2, zorder=1)
     axes.set_yscale("log")
-    axes.set_ylim(0.8 * _LEAST_CM, None)
+    axes.set_ylim(0.8 * _MIN_CM, None)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xticks(at, [segment.name for segment in TABLE1])
     axes.grid(False, axis="x")

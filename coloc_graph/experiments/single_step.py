@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 CELLS: tuple[tuple[float, float], ...] = tuple(product(BASELINES, ANGLES))
 
 #: Fewer points than this are no use to a homography with outliers among them.
-LEAST_DRAWN = 8
+MIN_DRAWN = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +87,8 @@ def measure_cells(
     cell has no common view, and `DegenerateGeometry` where a cell cannot be measured.
     """
     check(depth, seed, runs, processes)
-    if not LEAST_DRAWN <= draws <= RECORDED:
-        raise InputError(f"`draws` is {draws}; give {LEAST_DRAWN} to {RECORDED} points a run")
+    if not MIN_DRAWN <= draws <= RECORDED:
+        raise InputError(f"`draws` is {draws}; give {MIN_DRAWN} to {RECORDED} points a run")
     work = partial(_measure_cell, depth=depth, seed=seed, runs=runs, draws=draws)
     return tuple(spread(work, list(cells), processes, cluster, progress))
 

@@ -15,8 +15,8 @@ from coloc_graph.run.atomic_file import write_atomically
 
 FURTHEST = 5.0  # a longer distance means that the robot was carried, or its counters were reset [m]
 SHARE = 0.1  # sigma of a motion of which only the end is known, as a share of its length
-LEAST = 0.01  # its least value [m]
-LEAST_TURN = 0.02  # its least value of the heading [rad]
+MIN_SIGMA = 0.01  # its least value [m]
+MIN_YAW_SIGMA = 0.02  # its least value of the heading [rad]
 
 
 class Counted(msgspec.Struct, frozen=True):
@@ -54,5 +54,5 @@ def way_since(counted: Counted, ticks: tuple[int, int]) -> tuple[Planar, tuple[f
     if max(abs(left), abs(right)) > FURTHEST:
         return None
     rolled = abs(left) + abs(right)
-    place = LEAST + SHARE * rolled
-    return arc(left, right, wheels.base), (place, place, LEAST_TURN + SHARE * rolled / wheels.base)
+    place = MIN_SIGMA + SHARE * rolled
+    return arc(left, right, wheels.base), (place, place, MIN_YAW_SIGMA + SHARE * rolled / wheels.base)

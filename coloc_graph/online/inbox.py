@@ -10,7 +10,7 @@ from coloc_graph.robot_io.link.zenoh_config import Tls
 from coloc_graph.team import Team
 
 Message = Sample | Wheels | Event | Status | bool  # a bool is presence: the robot's program came, or has gone
-LONGEST = 0.3  # time after which messages that keep coming are interrupted [s]
+MAX_DRAIN_TIME = 0.3  # time after which messages that keep coming are interrupted [s]
 
 
 class Inbox:
@@ -27,9 +27,9 @@ class Inbox:
         self._queue.put((robot, message))
 
     def messages(self, seconds: float) -> Iterator[tuple[str, Message]]:
-        """Yield messages as they come for `seconds` [s], and those that wait then, for `LONGEST` more at most."""
+        """Yield messages as they come for `seconds` [s], and then those that wait, for `MAX_DRAIN_TIME` at most."""
         until = time.monotonic() + seconds
-        while (now := time.monotonic()) < until + LONGEST:
+        while (now := time.monotonic()) < until + MAX_DRAIN_TIME:
             try:
                 yield self._queue.get(timeout=max(until - now, 0.001))
             except queue.Empty:

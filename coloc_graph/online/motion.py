@@ -13,7 +13,7 @@ SET_OFF = 0.06  # the robot drives straight once it heads at the waypoint to wit
 BRAKE = 2.0  # speed per distance to the waypoint [1/s]
 STEER = 2.5  # turn rate per heading error [1/s]
 MIN_SPEED = 0.02  # slowest speed [m/s]
-LEAST_TURN = 0.08  # slowest turn rate [rad/s]
+MIN_TURN_RATE = 0.08  # slowest turn rate [rad/s]
 
 
 @dataclass(frozen=True)
@@ -83,4 +83,4 @@ class Follower:
         return (x - bx) * (bx - ax) + (y - by) * (by - ay) >= 0
 
     def _turning(self, off: float) -> float:
-        return math.copysign(min(self._turn, max(STEER * abs(off), LEAST_TURN)), off)
+        return math.copysign(min(self._turn, max(STEER * abs(off), MIN_TURN_RATE)), off)

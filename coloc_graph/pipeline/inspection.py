@@ -107,7 +107,7 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
             if any(motion.moving for motion in run.motions(robot, before.end, stance.start))
         ]
     times, named, measurable = {}, {}, True
-    for place, robot in enumerate(stance.observers):
+    for number, robot in enumerate(stance.observers):
         seen: list[Detections] = []
         if run.has_detections(robot):
             seen = list(run.detections(robot, stance.start, stance.end))
@@ -119,7 +119,7 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
         if not len(times[robot]):
             findings.append(Finding(where, f"{robot} recorded neither detections nor images: check its camera"))
             measurable = False
-        if place == len(stance.observers) - 1 and place > 0:
+        if number == len(stance.observers) - 1 and number > 0:
             continue  # a pair needs the plane of its first observer
         try:
             stance_plane(run, stance, robot)
@@ -133,8 +133,8 @@ def _stance_findings(run: Run, before: Stance | None, stance: Stance) -> list[Fi
         landmarks = [(robot, tracks.landmarks(robot)) for robot in named]
     except InputError as why:  # of an unknown marker
         return [*findings, Finding(where, str(why).removeprefix(f"{run.path}: {where}: "))]
-    for doubt in describe_unused(sight_landmarks(run, stance, landmarks)[1]):
-        findings.append(Finding(where, doubt.removeprefix(f"{where}: ")))
+    for sentence in describe_unused(sight_landmarks(run, stance, landmarks)[1]):
+        findings.append(Finding(where, sentence.removeprefix(f"{where}: ")))
     for i, j in itertools.combinations(stance.observers, 2):
         if run.team.clock_sigma == 0 and not len(pair_by_time(times[i], times[j])):
             nearest = np.abs(times[i][:, None] - times[j][None]).min()

@@ -140,8 +140,8 @@ def _trajectories(figure: FigureBase, estimated: Mapping[str, Trajectory], true:
     """Draw the team from above, in the estimate's world."""
     axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]")
     handles = []
-    for place, (robot, one) in enumerate(estimated.items()):
-        colour, marker = COLOURS[place % len(COLOURS)], MARKERS[place % len(MARKERS)]
+    for number, (robot, one) in enumerate(estimated.items()):
+        colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
         xy = one.positions[:, :2]
         (line,) = axes.plot(*xy.T, color=colour, linewidth=1.6, zorder=3, label=robot, gid="estimate")
         axes.plot(*xy[:1].T, color=colour, marker=marker, markersize=7, linestyle="", zorder=4)
@@ -163,22 +163,22 @@ def _errors(
     begin = min(float(one.times[0]) for one in estimated.values())
     banded = accuracy.anees is not None  # otherwise the covariances are not of these errors
     any_band = False
-    for place, (robot, one) in enumerate(estimated.items()):
-        colour = COLOURS[place % len(COLOURS)]
+    for number, (robot, one) in enumerate(estimated.items()):
+        colour = COLOURS[number % len(COLOURS)]
         position, rotation = world_covariances(one)
         offs = 100 * (one.positions - true[robot][:, :3, 3])
         turned = yaw(one.T_world_body) - yaw(true[robot])
         values = [*offs.T[: len(columns) - 1], np.rad2deg(wrap(turned))]
         sigmas = [100 * np.sqrt(position[:, i, i].clip(min=0)) for i in range(len(columns) - 1)]
         sigmas.append(np.rad2deg(np.sqrt(rotation[:, 2, 2].clip(min=0))))
-        for axes, value, sigma in zip(grid[place], values, sigmas, strict=True):
+        for axes, value, sigma in zip(grid[number], values, sigmas, strict=True):
             if banded and np.isfinite(sigma).any():
                 any_band = True
                 _band(axes, one.times - begin, 2 * sigma, colour)
-            marker = MARKERS[place % len(MARKERS)] if len(one) <= 60 else ""
+            marker = MARKERS[number % len(MARKERS)] if len(one) <= 60 else ""
             axes.plot(one.times - begin, value, color=colour, linewidth=1.4, marker=marker, markersize=3, gid="error")
             axes.axhline(0, color=GREY, linewidth=0.7)
-        grid[place][0].set_ylabel(robot, rotation=0, ha="right", weight="bold", color=colour)
+        grid[number][0].set_ylabel(robot, rotation=0, ha="right", weight="bold", color=colour)
     for axes, name in zip(grid[0], columns, strict=True):
         axes.set_title(f"{name} [{'°' if name == 'heading' else 'cm'}]", fontsize=9.5)
     for axes in grid[-1]:
@@ -198,8 +198,8 @@ def _band(axes: Axes, times: Array, reach: Array, colour: str) -> None:
 def _rpe(figure: FigureBase, accuracy: Accuracy) -> None:
     """Draw relative errors by distance: translation in % of it, and rotation."""
     left, right = figure.subplots(1, 2)
-    rows = [(row.robot, row.relative, COLOURS[place % len(COLOURS)], MARKERS[place % len(MARKERS)], 1.2)
-            for place, row in enumerate(accuracy.robots)]  # fmt: skip
+    rows = [(row.robot, row.relative, COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)], 1.2)
+            for number, row in enumerate(accuracy.robots)]  # fmt: skip
     if len(rows) > 1:
         rows.append(("team", accuracy.relative, INK, "o", 2.2))
     for name, relative, colour, marker, width in rows:

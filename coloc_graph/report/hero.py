@@ -99,8 +99,8 @@ def _distance_and_sigma(one: Trajectory) -> tuple[float, float]:
     return round(float(np.linalg.norm(one.positions[-1] - one.positions[0])), 2), sigma
 
 
-def _panel(figure: Figure, place: tuple[float, float, float, float]) -> Axes:
-    axes = figure.add_axes(place, facecolor=_FLOOR, xticks=[], yticks=[])
+def _panel(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
+    axes = figure.add_axes(box, facecolor=_FLOOR, xticks=[], yticks=[])
     axes.spines[:].set(visible=True, color="#d0d7de", linewidth=0.8)
     return axes
 
@@ -118,10 +118,10 @@ def _frame(axes: Axes, low: Array, high: Array) -> None:
 
 def _draw_whole(axes: Axes, estimate: Estimate, trajectory: Trajectory, true: Array | None, fov_deg: float) -> None:
     colour, xy = colour_of(estimate, trajectory.robot), trajectory.positions[:, :2]
-    places = new_poses(trajectory)
-    for index in thinned(places, 6):
+    poses = new_poses(trajectory)
+    for index in thinned(poses, 6):
         _draw_camera(axes, trajectory.T_world_body[index], colour, fov_deg, 0.55, 0.13)
-    shown = thinned(places).tolist()
+    shown = thinned(poses).tolist()
     axes.plot(
         *xy.T, color=colour, linewidth=2.2, marker=marker_of(estimate, trajectory.robot), markersize=6,
         markevery=shown, markeredgecolor="white", markeredgewidth=0.8, zorder=4,
@@ -153,13 +153,13 @@ def _draw_first_leaps(axes: Axes, estimate: Estimate, truth: Truth | None, fov_d
         _frame(axes, seen.min(axis=0) - _BEFORE, seen.max(axis=0) + _AHEAD)
     side_of = [one.positions[0, 1] for one in trajectories]
     for trajectory in trajectories:
-        colour, places = colour_of(estimate, trajectory.robot), _first_poses(trajectory)
+        colour, poses = colour_of(estimate, trajectory.robot), _first_poses(trajectory)
         side = 1 if trajectory.positions[0, 1] >= np.mean(side_of) else -1
-        for number, T in enumerate(places):
-            last = number == len(places) - 1
+        for number, T in enumerate(poses):
+            last = number == len(poses) - 1
             _draw_camera(axes, T, colour, fov_deg, 0.75, 0.14 if last else 0.07)
             _draw_body(axes, T, colour, "white" if not last else colour)
-        for T, T_next in itertools.pairwise(places):
+        for T, T_next in itertools.pairwise(poses):
             here, there = (tuple(one[:2, 3] + (0, 1.15 * BODY_RADIUS * side)) for one in (T, T_next))
             arc = f"arc3,rad={-0.5 * side}"
             look: dict[str, Any] = {"mutation_scale": 12, "color": colour, "linewidth": 1.4, "zorder": 6}

@@ -59,8 +59,8 @@ def _draw(axis: Axes, mission: Mission) -> None:
                 angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
                 axis.add_patch(Ellipse((px, py), width, height, angle=angle, facecolor="none", edgecolor=colour))
     for name in robots:
-        places = np.array([stance.standing[name][:2] for stance in stances if name in stance.standing])
-        axis.plot(*places.T, color=PALE, zorder=0)
-        axis.annotate(name, places[0], xytext=(-12, 0), textcoords="offset points", color=GREY)
+        positions = np.array([stance.standing[name][:2] for stance in stances if name in stance.standing])
+        axis.plot(*positions.T, color=PALE, zorder=0)
+        axis.annotate(name, positions[0], xytext=(-12, 0), textcoords="offset points", color=GREY)
     axis.set_aspect("equal")
     axis.margins(x=0.02, y=0.1)

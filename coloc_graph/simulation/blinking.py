@@ -13,7 +13,7 @@ from coloc_graph.team import Blink, Team
 
 #: One standard deviation of how wrong a robot's own clock goes, as a share: that of a ceramic resonator.
 CLOCK_SIGMA = 1e-3
-LEAST_APART = 3  # bits, least distance between two zeros of a code
+MIN_ZERO_DISTANCE = 3  # bits, least distance between two zeros of a code
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def blinking(team: Team, rng: np.random.Generator) -> Mapping[str, Blinking]:
 def with_codes(team: Team, bit: float = 0.1) -> Team:
     """A team whose robots all blink, each with one of the shortest codes that there are."""
     codes: list[str] = []
-    for n in itertools.count(LEAST_APART):
+    for n in itertools.count(MIN_ZERO_DISTANCE):
         if len(codes) >= len(team.robots):
             break
         found = {Blink(code="".join("1" * (k - 1) + "0" for k in parts)).cycle for parts in _compositions(n)}
@@ -56,8 +56,8 @@ def with_codes(team: Team, bit: float = 0.1) -> Team:
 
 
 def _compositions(n: int) -> Iterator[tuple[int, ...]]:
-    """All ways to make n of numbers of at least `LEAST_APART`, in order."""
-    for first in range(LEAST_APART, n - LEAST_APART + 1):
+    """All ways to make n of numbers of at least `MIN_ZERO_DISTANCE`, in order."""
+    for first in range(MIN_ZERO_DISTANCE, n - MIN_ZERO_DISTANCE + 1):
         yield from ((first, *rest) for rest in _compositions(n - first))
-    if n >= LEAST_APART:
+    if n >= MIN_ZERO_DISTANCE:
         yield (n,)

@@ -23,7 +23,7 @@ TAG = 0.2
 #: Who surveys them knows where they stand to so much [m, deg].
 SURVEYED = 0.005
 SURVEYED_DEG = 0.5
-FARTHEST = 3.0  # m, largest distance at which a landmark is recorded
+MAX_LANDMARK_DISTANCE = 3.0  # m, largest distance at which a landmark is recorded
 ASIDE = math.radians(70.0)  # rad, largest angle to the direction it faces
 
 
@@ -94,7 +94,9 @@ def in_view(view: View, true: Team, T_world_landmark: dict[str, Array]) -> tuple
         markers, T = landmark.seen_as, T_world_landmark[landmark.name]
         assert markers is not None
         toward = T[:3, :3].T @ (eye - T[:3, 3])
-        near = math.hypot(toward[0], toward[1]) < FARTHEST and abs(math.atan2(toward[1], toward[0])) < ASIDE
+        near = (
+            math.hypot(toward[0], toward[1]) < MAX_LANDMARK_DISTANCE and abs(math.atan2(toward[1], toward[0])) < ASIDE
+        )
         if near and view.sees(markers.p_body @ T[:3, :3].T + T[:3, 3], 1.0).all():
             names.append(landmark.name)
     return tuple(names)

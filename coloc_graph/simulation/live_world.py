@@ -42,7 +42,7 @@ TRUTH_TAKEN = 1.0  # s, period at which they are read from the wheels, which kee
 LENGTH = 10.0  # m, depth of the region of bright objects ahead of the start
 AHEAD = 0.36 / math.tan(HALF_ANGLE)  # m, distance ahead at which the observers look, where the mover stands
 #: No path of a Unix socket may be longer [bytes].
-LONGEST_PATH = 100
+MAX_PATH_POINTS = 100
 
 
 def start_poses(robots: int) -> tuple[Pose, ...]:
@@ -97,7 +97,7 @@ class LiveWorld:
             folder = Path(tempfile.mkdtemp(prefix="coloc-"))
             undo.callback(shutil.rmtree, folder, ignore_errors=True)
             self.address = str(folder / "cameras")
-            if len(self.address.encode()) > LONGEST_PATH:
+            if len(self.address.encode()) > MAX_PATH_POINTS:
                 raise InputError(f"the folder for temporary files, {folder.parent}, has too long a path for a socket")
             self.emulators: dict[str, CreateEmulator] = {}
             self.ports: dict[str, str] = {}

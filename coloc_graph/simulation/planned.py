@@ -14,7 +14,7 @@ from coloc_graph.simulation.scenarios import Box, Pose, Scenario
 from coloc_graph.simulation.tours import Tour, both_see, no_common_view
 from coloc_graph.team.shared_view import View, hidden
 
-LEAST_POINTS = 6  # correspondences without which a stance has no homography
+MIN_POINTS = 6  # correspondences without which a stance has no homography
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class PlannedScenario(Scenario):
         for view in views:
             others = [other.T_world_camera[:2, 3] for other in views if other is not view]
             recorded &= ~hidden(view.T_world_camera[:3, 3], points, np.array(others))
-        if recorded.sum() < LEAST_POINTS:
+        if recorded.sum() < MIN_POINTS:
             raise no_common_view(where)
         leg = Leg(start + np.append(drive.times, stance.duration), np.vstack([drive.knots, drive.knots[-1:]]))
         if drive.times[-1] > stance.duration:

@@ -16,7 +16,7 @@ RUN_IN = 0.03
 
 #: Between the captures of one burst [s], and how many fit the straight stretch.
 BURST_SPACING = 0.05
-LONGEST_BURST = 5
+MAX_BURST = 5
 
 #: Robots and their images stay this far [px] from the border: tracks; images, where a spot has a size.
 TRACK_MARGIN = 1.0

@@ -17,7 +17,7 @@ from coloc_graph.simulation.paths import Array, Path, PathBuilder, drive, tilt_r
 from coloc_graph.simulation.planned import PlannedScenario
 from coloc_graph.simulation.rig import IMAGE_BIAS, MILD_LENS, Imperfections, reference_team, stated_team, true_team
 from coloc_graph.simulation.scenarios import Pose, Scenario
-from coloc_graph.simulation.tours import LONGEST_BURST, Tour, patrol, scatter
+from coloc_graph.simulation.tours import MAX_BURST, Tour, patrol, scatter
 from coloc_graph.team import Team
 from coloc_graph.team.shared_view import View
 
@@ -138,8 +138,8 @@ def build_world(
         raise InputError(f"`fps` is {fps}; give frames a second, above 0")
     if seed < 0:
         raise InputError(f"`seed` is {seed}; give a whole number that is not negative")
-    if burst is not None and not 1 <= burst <= LONGEST_BURST:
-        raise InputError(f"`burst` is {burst}; give 1 to {LONGEST_BURST} captures")
+    if burst is not None and not 1 <= burst <= MAX_BURST:
+        raise InputError(f"`burst` is {burst}; give 1 to {MAX_BURST} captures")
     imperfections = imperfections or Imperfections()
     nominal = team or (reference_team(MILD_LENS, IMAGE_BIAS) if depth == "images" else reference_team())
     stated = with_landmarks(stated_team(nominal, imperfections), scenario, tags=depth == "images")

@@ -62,7 +62,7 @@ def page_of(scene: Scene, state: ViewState) -> str:
                 if full:
                     show(time)
                 else:
-                    view.place(frame_of(scene, replace(bare, time=time)).poses)
+                    view.move_robots(frame_of(scene, replace(bare, time=time)).poses)
             recording.insert_sleep(each / steps)
             frame = show(scene.middle(then), _images(scene, then) if full else None)
         if len(rows) > 1:

@@ -229,15 +229,15 @@ class _Parts:
         drawn = covariance_shapes(layer)
         number, at = np.nonzero(drawn.known[:, rows])
         at = rows[at]
-        places = layer.xyz[number, at].astype(np.float32)
-        places[:, 1] += state.aside if layer.aside else 0.0
+        positions = layer.xyz[number, at].astype(np.float32)
+        positions[:, 1] += state.aside if layer.aside else 0.0
         axes = np.ones((2, len(at), 3), np.float32)
         axes[0, :, :2] = np.maximum(state.k_sigma * drawn.axes[number, at], 1e-5)
         half = np.tan(np.minimum(state.k_sigma * layer.yaw_sigma[number, at], 1.2))
         axes[1, :, 0], axes[1, :, 1] = WEDGE_REACH, WEDGE_REACH * np.maximum(half, 0.01)
         colour = palette.faded(colours, state.dark, 0.5 if layer.aside else 0.0)[number]
-        self.ellipses.append(Batch(drawn.position_wxyz[number, at], _raised(places, Z_ELLIPSE), axes[0], colour))
-        self.wedges.append(Batch(drawn.heading_wxyz[number, at], _raised(places, Z_WEDGE), axes[1], colour))
+        self.ellipses.append(Batch(drawn.position_wxyz[number, at], _raised(positions, Z_ELLIPSE), axes[0], colour))
+        self.wedges.append(Batch(drawn.heading_wxyz[number, at], _raised(positions, Z_WEDGE), axes[1], colour))
 
     def add_edges(self, layer: Layer, edges: Edges, first: int, row: int, most: int, state: ViewState) -> None:
         """Add edges up to a row: those of its stance, earlier ones, rejected ones as dashes, and the picked one."""
@@ -293,10 +293,10 @@ def _landmark_ellipses(landmarks: Landmarks, state: ViewState) -> Batch:
     axes, direction = ellipse_axes(landmarks.covariance)
     scales = np.ones((len(landmarks), 3), np.float32)
     scales[:, :2] = np.maximum(state.k_sigma * axes, 1e-5)
-    places = np.zeros((len(landmarks), 3), np.float32)
-    places[:, :2], places[:, 2] = landmarks.xy, Z_ELLIPSE
+    positions = np.zeros((len(landmarks), 3), np.float32)
+    positions[:, :2], positions[:, 2] = landmarks.xy, Z_ELLIPSE
     colours = np.broadcast_to(palette.LANDMARK, (len(landmarks), 3))
-    return Batch(about_z(direction), places, scales, colours)
+    return Batch(about_z(direction), positions, scales, colours)
 
 
 def _rings(scene: Scene, layer: Layer, row: int, most: int, colours: Colours) -> Batch:
@@ -307,8 +307,8 @@ def _rings(scene: Scene, layer: Layer, row: int, most: int, colours: Colours) ->
     number, at = number[there], at[there]
     wxyz = np.zeros((len(number), 4), np.float32)
     wxyz[:, 0] = 1.0
-    places = layer.xyz[number, at].astype(np.float32)
-    return Batch(wxyz, _raised(places, Z_RING), np.ones((len(number), 3), np.float32), colours[number])
+    positions = layer.xyz[number, at].astype(np.float32)
+    return Batch(wxyz, _raised(positions, Z_RING), np.ones((len(number), 3), np.float32), colours[number])
 
 
 def joined(parts: Sequence[Lines]) -> Lines:
@@ -320,8 +320,8 @@ def _batch(parts: Sequence[Batch]) -> Batch:
     return parts[0] if len(parts) == 1 else Batch(*map(np.concatenate, zip(NO_BATCH, *parts, strict=True)))
 
 
-def _raised(places: Float32, z: float) -> Float32:
-    out = places.copy()
+def _raised(positions: Float32, z: float) -> Float32:
+    out = positions.copy()
     out[:, 2] = z
     return out
 

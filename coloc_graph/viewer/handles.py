@@ -186,7 +186,7 @@ class GraphView:
         batches = {"ellipses": frame.ellipses, "wedges": frame.wedges, "rings": frame.rings}
         tints = {name: palette.linear(palette.flat(one.colours)) for name, one in batches.items()}
         with self.server.atomic():  # only assignments from here on
-            self.place(frame.poses)
+            self.move_robots(frame.poses)
             first = int(np.isfinite(frame.poses).all(axis=1).argmax())  # that is somewhere
             for number, handle in enumerate(self.robots):
                 role = frame.roles[number]
@@ -218,7 +218,7 @@ class GraphView:
             for frustum in self._frustums.values():
                 frustum.scale, frustum.position = FRUSTUM * size, share * frustum.position
 
-    def place(self, poses: NDArray[np.float64]) -> None:
+    def move_robots(self, poses: NDArray[np.float64]) -> None:
         """Show the robots at poses (r, 4) of x, y, z, heading; hide those with NaN."""
         turned = about_z(np.nan_to_num(poses[:, 3]))
         for number, (handle, pose) in enumerate(zip(self.robots, poses, strict=True)):

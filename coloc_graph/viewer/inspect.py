@@ -188,10 +188,17 @@ def marker_trajectories(scene: Scene, row: int, measured: Sequence[PairMeasureme
     estimated = []
     for one in measured:
         h = one.homography
-        places = {robot: base.xyz[number[robot], row] for robot in (h.robot_i, h.robot_j)}
-        if one.tracks is None or one.correspondences is None or not all(np.isfinite(p).all() for p in places.values()):
+        positions = {robot: base.xyz[number[robot], row] for robot in (h.robot_i, h.robot_j)}
+        if (
+            one.tracks is None
+            or one.correspondences is None
+            or not all(np.isfinite(p).all() for p in positions.values())
+        ):
             continue
-        T = {robot: floor_pose(places[robot][0], places[robot][1], base.yaw[number[robot], row]) for robot in places}
+        T = {
+            robot: floor_pose(positions[robot][0], positions[robot][1], base.yaw[number[robot], row])
+            for robot in positions
+        }
         for robot, tracks in zip((h.robot_i, h.robot_j), one.tracks, strict=True):
             if robot not in seen:
                 seen[robot] = [
@@ -234,13 +241,13 @@ def _with_team(run: Run, team: Team) -> Run:
 def _joined(parts: Sequence[tuple[Array, Array, palette.Colours]]) -> Lines:
     """Trajectories as segments between finite points that are consecutive in time."""
     points, colours = [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3), np.uint8)]
-    for times, places, colour in parts:
+    for times, positions, colour in parts:
         good = (
             (np.diff(times) <= max_gap(times))
-            & np.isfinite(places[:-1]).all(axis=1)
-            & np.isfinite(places[1:]).all(axis=1)
+            & np.isfinite(positions[:-1]).all(axis=1)
+            & np.isfinite(positions[1:]).all(axis=1)
         )
-        segments = np.stack([places[:-1], places[1:]], axis=1)[good]
+        segments = np.stack([positions[:-1], positions[1:]], axis=1)[good]
         segments[..., 2] = 0.012  # on the floor, like the robots' trajectories
         points.append(segments)
         colours.append(np.broadcast_to(colour, segments.shape))

@@ -75,12 +75,12 @@ def landmark_mesh(landmark: Landmark | None) -> trimesh.Trimesh:
             board.apply_translation((thickness / 2 if colour is _BLACK else -BOARD / 2, 0.0, height))
             parts.append(painted(board, colour))
     elif markers is not None:
-        places = markers.p_body
-        bar = trimesh.creation.cylinder(0.008, segment=places[:2], sections=16)
+        positions = markers.p_body
+        bar = trimesh.creation.cylinder(0.008, segment=positions[:2], sections=16)
         parts.append(painted(bar, _AMBER))
-        for place in places:
+        for position in positions:
             led = trimesh.creation.icosphere(2, 1.3 * LED_RADIUS)
-            led.apply_translation(place)
+            led.apply_translation(position)
             parts.append(painted(led, LED))
     else:
         top = trimesh.creation.icosphere(2, 0.03)

@@ -108,7 +108,7 @@ class LiveScene:
         self._landmarks |= said.landmarks
         used = [m for m in one.measurements if id(m) not in rejected]
         self._sighted[stance.index] = sighted_in(used, self._landmarks)
-        # an estimate of a later stance, which had waited for this one, says nothing of this one's measurements
+        # an estimate of a later stance, which had waited for this one, has no residuals of this one
         told = said.residuals if said.stance == stance.index else ()
         residuals = {id(m): off for m, off in zip(one.measurements, told, strict=False)}
         self._found[stance.index] = [

@@ -15,7 +15,7 @@ from coloc_graph.viewer.frame import Frame
 from coloc_graph.viewer.plots import error_curves, residual_curves, with_cursor
 from coloc_graph.viewer.scene import TRUE, Scene
 
-NOBODY = "nobody"
+NOT_FOLLOWED = "none"
 HELP = "Click an edge or a robot. Space plays, arrow keys step."
 WIDTH = 330
 INSPECTOR_WIDTH = 480
@@ -44,7 +44,7 @@ class Panel:
             self.time = gui.add_slider("Time [s]", 0.0, 1.0, 0.1, 0.0)
             self.play = gui.add_checkbox("Play", False, hint="space; arrow keys step")
             self.speed = gui.add_slider("Speed", 1, 100, 1, 10, hint="seconds of the run per second")
-            self.follow = gui.add_dropdown("Follow", (NOBODY, *scene.robots))
+            self.follow = gui.add_dropdown("Follow", (NOT_FOLLOWED, *scene.robots))
         with gui.add_folder("Show"):
             self._layers: dict[str, viser.GuiCheckboxHandle] = {}
             self._layer_folder = gui.add_folder("Trajectories")
@@ -151,12 +151,12 @@ class Panel:
             self._say(f"**{scene.title}** no poses yet", notes)
             return
         stance = scene.stances[frame.row]
-        drivers = ", ".join(stance.movers) or "nobody"
-        anchors = ", ".join(stance.anchors) or "nobody"
-        said = f"**Stance {stance.index}** of {len(scene)}: {drivers} moves, {anchors} kept its pose"
-        if not stance.observers:  # of a drive
-            said = f"**Moment {stance.index}** of {len(scene)}: {drivers} drive, nobody stands and watches"
-        self._say(said, notes)
+        drivers = ", ".join(stance.movers) or "none"
+        anchors = ", ".join(stance.anchors) or "none"
+        text = f"**Stance {stance.index}** of {len(scene)}: moving {drivers}; anchors {anchors}"
+        if not stance.observers:  # of a ranging run
+            text = f"**Moment {stance.index}** of {len(scene)}: moving {drivers}"
+        self._say(text, notes)
         at = round(min(max(moment - float(scene.starts[0]), 0.0), self.time.max), 1)
         self._lead(self.stance, "stance", frame.row, 0)
         self._lead(self.time, "time", at, 0.05)

@@ -47,14 +47,14 @@ def error_curves(scene: Scene) -> tuple[Array, Array]:
 def with_cursor(x: Array, curves: Array, at: float) -> tuple[Array, ...]:
     """x, the curves, and one more that is a vertical line at `at`: three points there, of which the middle is high."""
     curves = np.atleast_2d(curves)
-    place = int(np.searchsorted(x, at))
+    at_row = int(np.searchsorted(x, at))
     high = max(float(curves.max(initial=0.0)), 1e-9)
     here = [np.full(3, np.interp(at, x, curve)) for curve in curves]
     spike = np.zeros(len(x) + 3)
-    spike[place + 1] = high
+    spike[at_row + 1] = high
     return (
-        np.insert(x, place, [at] * 3),
-        *(np.concatenate([c[:place], h, c[place:]]) for c, h in zip(curves, here, strict=True)),
+        np.insert(x, at_row, [at] * 3),
+        *(np.concatenate([c[:at_row], h, c[at_row:]]) for c, h in zip(curves, here, strict=True)),
         spike,
     )
 

@@ -131,7 +131,7 @@ class Renderer:
             return
         self.frame = self._with_live_poses(self.frame)
         with self._server.atomic():
-            self.view.place(self.frame.poses)
+            self.view.move_robots(self.frame.poses)
             self._tell(self.frame)
         self.cameras.follow(self._panel.follow.value, self.scene, self.frame)
 

@@ -24,7 +24,7 @@ from coloc_graph.robot_io.camera.source import STALE
 from coloc_graph.robot_io.create.physics import Body, Physics
 from coloc_graph.run import read_true_team, read_truth
 from coloc_graph.simulation import MILD_LENS, Imperfections, Sensor, reference_team
-from coloc_graph.simulation.live_world import LONGEST_PATH, TRUTH_RATE, LiveWorld, start_poses
+from coloc_graph.simulation.live_world import MAX_PATH_POINTS, TRUTH_RATE, LiveWorld, start_poses
 from coloc_graph.simulation.rig import stated_team
 from coloc_graph.simulation.uneven_floor import UnevenFloor
 from coloc_graph.team import write_team
@@ -196,7 +196,7 @@ def test_only_cameras_that_somebody_has_opened_are_rendered(world):
 def test_the_socket_is_its_users_alone(world):
     folder = Path(world.address).parent
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert len(world.address) < LONGEST_PATH
+    assert len(world.address) < MAX_PATH_POINTS
 
 
 @pytest.mark.parametrize(("line", "words"), [

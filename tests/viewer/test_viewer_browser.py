@@ -15,7 +15,7 @@ from browser import browser, client_of, page_of, pixel_of, place_of, until  # no
 from coloc_graph.backend import replay
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.viewer import LivePoses, LiveStance, Viewer, empty_scene, scene_of_result, scene_of_solution
-from coloc_graph.viewer.panel import NOBODY, set_value
+from coloc_graph.viewer.panel import NOT_FOLLOWED, set_value
 
 pytestmark = pytest.mark.slow
 
@@ -101,7 +101,7 @@ def test_slider_click_and_keys(scene, page_of):
             viewer.go(row)
             assert until(lambda row=row: viewer.frame.row == row) and viewer.wait_idle()
             assert until(lambda: np.allclose(client.camera.look_at, viewer.frame.poses[0, :3], atol=0.02))
-        set_value(viewer.panel.follow, NOBODY)
+        set_value(viewer.panel.follow, NOT_FOLLOWED)
 
         # a click on a robot opens its panel
         assert viewer.wait_idle()
