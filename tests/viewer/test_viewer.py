@@ -430,7 +430,7 @@ def test_live_poses_that_cannot_be_shown_are_named_and_the_others_shown(short_so
     robots = short_solution.run.team.names
     poses = LivePoses(0.0, {"A": at(1.0, 0.0, 0.0), "B": np.full((4, 4), np.nan), "Z": np.eye(4), "C": np.eye(3)})
     words = poses.problems(robots)
-    assert "no robot Z" in words and "robot B is no finite" in words and "robot C is no finite" in words
+    assert "no robot Z" in words and "robot B is not a finite" in words and "robot C is no finite" in words
     shown = poses.over(robots, np.zeros((3, 4)))
     assert np.allclose(shown[0, :2], (1, 0)) and not shown[1:].any()
     with Viewer(empty_scene(short_solution.run, "joint"), port=0) as viewer:
