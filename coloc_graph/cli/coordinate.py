@@ -16,7 +16,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument(
         "--goal",
         action="append",
-        type=_waypoint,
+        type=waypoint,
         metavar="X,Y",
         help="waypoint of the middle of the observers [m], x ahead and y left of its start; repeat it for a path with "
         "corners (default: 7.2,0)",
@@ -66,7 +66,8 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.set_defaults(run=run)
 
 
-def _waypoint(text: str) -> tuple[float, float]:
+def waypoint(text: str) -> tuple[float, float]:
+    """Parse a waypoint `X,Y` [m]."""
     try:
         x, y = map(float, text.split(","))
     except ValueError:

@@ -3,13 +3,18 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from coloc_graph.cli.coordinate import waypoint
 from coloc_graph.cli.printing import print_json, print_table, warn
 
 if TYPE_CHECKING:
     from coloc_graph.planning.formation import Gait
     from coloc_graph.planning.mission import Mission
+    from coloc_graph.planning.prediction import Predictor
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0}
+
+
+_HEADER = ["", "leap", "abreast", "toe-in", "stances", "a stance", "images", "mission", "end", "heading"]
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -29,6 +34,15 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         help="duration of the mission, as in 10min (default: as many images as the paper's formation takes in 5 s a "
         "stance)",
     )  # fmt: skip
+    command.add_argument(
+        "--goal", action="append", type=waypoint, metavar="X,Y",
+        help="instead of --length: waypoint of the middle of the observers [m], from 0,0 on, x ahead; repeat it for "
+        "corners",
+    )  # fmt: skip
+    command.add_argument(
+        "--pace", type=float, default=8.0, metavar="S", help="with --goal: seconds of images a metre (default: 8)"
+    )
+    command.add_argument("--map", metavar="YAML", help="with --goal: ROS map_server map of the walls")
     command.add_argument("--mover", metavar="NAME", help="robot that drives before the others' cameras (default: last)")
     command.add_argument("--speed", type=float, default=0.2, metavar="V", help="speed of robots [m/s] (default: 0.2)")
     command.add_argument("--fps", type=float, help="images a second (default: those of the slowest camera)")
@@ -84,6 +98,10 @@ def run(args: argparse.Namespace) -> int:
         warn([f"{', '.join(left)} stay out of this plan, which is of two observers and a mover"])
     fps = min(team[name].camera.fps for name in pair) if args.fps is None else args.fps
     predictor = Predictor(team, fps, args.noise, odometry=not args.without_odometry, speed=args.speed)
+    if args.goal is not None:
+        return _along(args, predictor, pair, mover)
+    if args.map is not None:
+        raise InputError("a map needs a goal on it: give --goal X,Y")
     search = GaitSearch(predictor, args.length, pair, mover)
     capture = PAPER_SECONDS * stances_of(PAPER, args.length) if args.time is None and args.sigma_end is None else None
     time = search.shortest(args.sigma_end) if args.sigma_end is not None else args.time
@@ -99,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"{args.length:g} m with {asked}; {pair[0]} and {pair[1]} observe, {mover} moves")
         print_table(
-            ["", "leap", "abreast", "toe-in", "stances", "a stance", "images", "mission", "end", "heading"],
+            _HEADER,
             [_row(name, one, mission, fps) for name, one, mission in rows],
         )
         print("end and heading: promised standard deviations of the observers' last poses")
@@ -111,6 +129,47 @@ def run(args: argparse.Namespace) -> int:
         from coloc_graph.report.plan import plan_figure
 
         plan_figure([(name, mission) for name, _, mission in rows]).savefig(args.draw, dpi=130)
+    return 0
+
+
+def _along(args: argparse.Namespace, predictor: "Predictor", pair: tuple[str, str], mover: str) -> int:
+    """Plan a mission along goals by the receding horizon."""
+    from dataclasses import replace
+
+    from coloc_graph.errors import InputError
+    from coloc_graph.planning.belief import Belief
+    from coloc_graph.planning.course import Course
+    from coloc_graph.planning.floor_map import read_floor_map
+    from coloc_graph.planning.horizon import Horizon
+    from coloc_graph.planning.plan import write_plan
+
+    if args.time is not None or args.sigma_end is not None:
+        raise InputError("--time and --sigma-end are of straight ways: leave out --goal, or give its --pace")
+    if not 0 < args.pace < 1e4:
+        raise InputError(f"--pace is {args.pace}; give seconds of images a metre, above 0")
+    if args.map is not None:
+        predictor = replace(predictor, floor_map=read_floor_map(args.map))
+    course = Course(((0.0, 0.0), *args.goal))
+    horizon = Horizon(predictor, course, pair, mover, args.pace * course.length)
+    starts = {}
+    for k, name in enumerate(pair):
+        x, y, yaw = horizon.gait.stop(k)
+        starts[name] = x - horizon.gait.leap / 2, y, yaw
+    best = horizon.mission(Belief.start(predictor.team, {**starts, mover: (1.5, 0.0, 0.0)}))
+    if args.json:
+        print_json({"the plan": figures(horizon.gait, best)})
+    else:
+        print(
+            f"{course.length:.1f} m with {args.pace:g} s of images a metre; {' and '.join(pair)} observe, {mover} moves"
+        )
+        print_table(_HEADER, [_row("the plan", horizon.gait, best, predictor.fps)])
+        print("leap, abreast and toe-in: those by which the rest of the way is expected to go")
+    if args.poses is not None:
+        write_plan(best.plan, args.poses)
+    if args.draw is not None:
+        from coloc_graph.report.plan import plan_figure
+
+        plan_figure([("the plan", best)], predictor.floor_map).savefig(args.draw, dpi=130)
     return 0
 
 

@@ -226,7 +226,8 @@ class LeapFrog:
         if found is not None:
             attempt.precision = found
             if self._enough(found, attempt):
-                self._end_capture("the stance is precise enough")
+                planned = self._plan is not None and self._plan.duration is not None
+                self._end_capture("the stance is as long as planned" if planned else "the stance is precise enough")
                 return
         left = attempt.stance.start + self._options.longest - self._registry.utc()
         if not self._worker.judging and (stance := attempt.to_judge(left)) is not None:

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.mission import Mission
 from coloc_graph.report.drawing import COLOURS, GREY, INK, K_95, PALE, styled
 
@@ -15,17 +16,25 @@ ARROW = 0.22  # length of an arrow that shows where a camera looks [m]
 
 
 @styled
-def plan_figure(missions: Sequence[tuple[str, Mission]]) -> Figure:
+def plan_figure(missions: Sequence[tuple[str, Mission]], floor_map: FloorMap | None = None) -> Figure:
     """Draw plans one above the other, each with its name and what it promises.
 
     Parameters
     ----------
     missions
         Name and mission of each plan.
+    floor_map
+        Walls to draw, too; None for none.
     """
-    figure = Figure(figsize=(11, 2.6 * len(missions) + 0.3), layout="constrained")
+    height = 2.6 if floor_map is None else 6.0
+    figure = Figure(figsize=(11, height * len(missions) + 0.3), layout="constrained")
     axes = figure.subplots(len(missions), 1, sharex=True, squeeze=False)[:, 0]
     for axis, (name, mission) in zip(axes, missions, strict=True):
+        if floor_map is not None:
+            rows, columns = floor_map.distance.shape
+            x, y = floor_map.origin
+            extent = x, x + columns * floor_map.resolution, y, y + rows * floor_map.resolution
+            axis.imshow(floor_map.distance <= 0, extent=extent, origin="lower", cmap="Greys", alpha=0.4, zorder=-1)
         _draw(axis, mission)
         axis.set_title(
             f"{name}: {len(mission.plan.stances)} stances, {mission.duration:.0f} s; promised at the end "

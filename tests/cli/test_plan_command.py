@@ -3,6 +3,7 @@
 import json
 import re
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -75,6 +76,10 @@ def test_a_tighter_sigma_takes_a_longer_mission():
         (["--time", "4"], "`4` has no unit; give it as in 10min"),
         (["--mover", "X"], "there is no robot X in the team: name one of A, B, C"),
         (["--length", "-2"], "a way of -2.0 m is none"),
+        (["--map", "map.yaml"], "a map needs a goal on it"),
+        (["--goal", "2,0", "--time", "5min"], "--time and --sigma-end are of straight ways"),
+        (["--goal", "2"], "`2` is not a waypoint"),
+        (["--goal", "2,0", "--map", "none.yaml"], "none.yaml"),
         (["--fps", "0"], "--fps is 0.0; give a number above 0"),
     ],
 )
@@ -96,3 +101,22 @@ def test_cameras_that_look_away_share_no_view(tmp_path, capsys):
     write_team(new(team, robots=up), tmp_path / "team.toml")
     assert main(["plan", str(tmp_path / "team.toml")]) == 2
     assert "share no view of C's markers in any formation" in capsys.readouterr().err
+
+
+def test_a_plan_along_goals_keeps_off_the_walls_of_a_map(team, tmp_path, capsys):
+    free = np.zeros((60, 80), np.uint8)
+    free[20:40, 5:75] = 254  # a corridor of 2 m
+    cv2.imwrite(str(tmp_path / "map.png"), free)
+    text = "image: map.png\nresolution: 0.1\norigin: [-2.0, -3.0, 0.0]\nnegate: 0\nfree_thresh: 0.2\n"
+    (tmp_path / "map.yaml").write_text(text)
+    poses, picture = str(tmp_path / "plan.csv"), str(tmp_path / "plan.png")
+    walls = ["--map", str(tmp_path / "map.yaml"), "--draw", picture]
+    assert main(["plan", team, "--goal", "2,0", *walls, "--fps", "10", "--json", "--poses", poses]) == 0
+    found = json.loads(capsys.readouterr().out)["the plan"]
+    plan = read_plan(poses)
+    assert len(plan.stances) == found["stances"] > 1
+    places = np.array([pose[:2] for stance in plan.stances for pose in stance.standing.values()])
+    assert np.abs(places[:, 1]).max() < 0.75
+    assert places[-2:, 0].mean() == pytest.approx(2.0, abs=0.5)
+    assert main(["plan", team, "--goal", "2,3", "--map", str(tmp_path / "map.yaml")]) == 2
+    assert "the goal at 2.00, 3.00 is in a wall or beyond the map" in capsys.readouterr().err
