@@ -5,7 +5,7 @@ translation [m], in the body frame of the right-hand side: T_true = T_measured e
 covariance (3, 3) of the tangent's heading, x and y.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,8 @@ class HomographyMeasurement:
         markers are not independent.
     doubt : str or None
         Reason for which only the paper's chain uses it.
+    shared : (8, 8) float or None
+        Part of the covariance of h by errors that all samples of a marker share.
     """
 
     stance: int
@@ -106,6 +108,15 @@ class HomographyMeasurement:
     warning: str | None = None
     share: float = 1.0
     doubt: str | None = None
+    shared: Array | None = None
+
+    def at_shared(self, size: float) -> "HomographyMeasurement":
+        """Return the measurement with shared errors `size` times as large."""
+        if self.shared is None:
+            return self
+        covariance = np.linalg.inv(self.information) + (size**2 - 1) * self.shared
+        information = np.linalg.inv((covariance + covariance.T) / 2)
+        return replace(self, information=(information + information.T) / 2, shared=size**2 * self.shared)
 
     @property
     def residual(self) -> float:
@@ -178,6 +189,20 @@ class RelativePose:
 
     def __post_init__(self) -> None:
         _as_arrays(self, "T_i_j", "covariance")
+
+    def at_shared(self, size: float) -> "RelativePose":
+        """Return the measurement with shared errors of pixels `size` times as large; its own covariance stays."""
+        if self.homography is None:
+            return self
+        spans = tuple(replace(one, shared=size * one.shared) for one in self.spans)
+        return replace(self, homography=self.homography.at_shared(size), spans=spans)
+
+    def at_shared(self, size: float) -> "RelativePose":
+        """Return the measurement with shared errors of pixels `size` times as large; its own covariance stays."""
+        if self.homography is None:
+            return self
+        spans = tuple(replace(one, shared=size * one.shared) for one in self.spans)
+        return replace(self, homography=self.homography.at_shared(size), spans=spans)
 
     @property
     def ends(self) -> tuple[Node, Node]:

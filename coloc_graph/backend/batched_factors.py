@@ -107,7 +107,7 @@ class BatchedFactors:
     """Context manager within which factors are evaluated in batches."""
 
     def __init__(self, members: Sequence[FactorEvaluator]) -> None:
-        self._members = members
+        self.members = tuple(members)
         self._poses = list(dict.fromkeys(key for one in members for key in one.poses))
         self._variables = sorted({key for one in members for _, key in one.variable})
         indices = {key: index for index, key in enumerate(self._poses)}
@@ -126,14 +126,14 @@ class BatchedFactors:
         self._found: list[tuple[Array, list[Array]]] = []
 
     def __enter__(self) -> "BatchedFactors":
-        for one in self._members:
+        for one in self.members:
             one.among = self
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, why: BaseException | None, where: TracebackType | None
     ) -> None:
-        for one in self._members:
+        for one in self.members:
             one.among = None
 
     def at(self, member: FactorEvaluator, values: gtsam.Values) -> tuple[Array, list[Array]] | None:

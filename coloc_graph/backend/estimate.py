@@ -216,7 +216,7 @@ class Estimate:
         """Return the RMS residual of a measurement in units of its noise; NaN where an end of it has no pose."""
         if isinstance(measurement, RangeBearing):
             return self.ranging.residual(measurement)
-        values, graph = self._values, self.graph
+        values, graph = self.values, self.graph
         i, j = (graph.key(*end) for end in measurement.ends)
         if not (values.exists(i) and values.exists(j)) or i == j:
             return float("nan")
@@ -227,7 +227,8 @@ class Estimate:
         return float(np.sqrt(2 * factor.error(values) / factors.rows(measurement, factor)))
 
     @cached_property
-    def _values(self) -> gtsam.Values:
+    def values(self) -> gtsam.Values:
+        """Poses and calibration variables as GTSAM has them."""
         values = gtsam.Values()
         for robot, trajectory in self.trajectories.items():
             assert trajectory.stances is not None
@@ -245,9 +246,9 @@ class Estimate:
     def _marginals(self) -> Marginals:
         used = self.graph.without(one.measurement for one in self.rejected)
         factors_of = Factors(self.graph.floor, self.calibration.variables)
-        factors, _, batched = factors_of.of_graph(used, poses_in(self._values))
+        factors, _, batched = factors_of.of_graph(used, poses_in(self.values))
         with batched:
-            return Marginals(factors, self._values)
+            return Marginals(factors, self.values)
 
     @cached_property
     def _index(self) -> dict[Node, int]:

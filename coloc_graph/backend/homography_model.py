@@ -57,6 +57,8 @@ class HomographyModel:
             self.by_offset, self.by_offset
         )
         root = np.linalg.cholesky(np.linalg.inv((own + own.T) / 2)).T
+        #: Logarithm of the square root of the determinant of its information, but for a constant.
+        self.log_det = float(np.log(root.diagonal()).sum() - 0.5 * sum(one.log_det for one in self.spans))
         # linear in h: the whitening, then the effect on the spans
         self.by_h = np.vstack([root, *(one.by_h for one in self.spans)])
 
@@ -171,6 +173,11 @@ class StatedPlaneModel:
 
     rows = 8
     kind = "stated plane"
+
+    @property
+    def log_det(self) -> float:
+        """Logarithm of the square root of the determinant of its information."""
+        return float(0.5 * np.linalg.slogdet(self.measured.information)[1])
 
     @staticmethod
     def batch(models: Sequence["StatedPlaneModel"]) -> "_StatedPlanes":

@@ -80,7 +80,8 @@ class SpanModel:
     """Residual (3,) of covariance 1 of the spans of one mover: a function of the plane, the span and the homography.
 
     `weights` (3, k) @ (lengths - `noise` - span) + `by_h` (3, 8) @ h, at the k instants whose rays are clear of the
-    horizon. `noise` (k,) is the bias of each length by noise, `length` [m] the span as stated.
+    horizon. `noise` (k,) is the bias of each length by noise, `length` [m] the span as stated. `log_det` is the logarithm
+    of how much larger errors that samples share make the covariance of the residual (its determinant).
     """
 
     mover: str
@@ -89,6 +90,7 @@ class SpanModel:
     noise: Array
     weights: Array
     by_h: Array
+    log_det: float
 
     @classmethod
     def near(
@@ -138,12 +140,22 @@ class SpanModel:
         # errors that all rays to one marker share do not average out
         each = apart((by_x[:, :, None] @ shared)[:, :, 0].reshape(len(x_i), -1))
         root = weights @ each
-        weights = np.linalg.solve(np.linalg.cholesky(np.eye(3) + root @ root.mT), weights)
+        factor = np.linalg.cholesky(np.eye(3) + root @ root.mT)
+        weights = np.linalg.solve(factor, weights)
+        log_det = 2 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
         by_h = weights @ apart((by_x[:, :, None] @ by_h)[:, :, 0].sum(axis=1))
         noise = _lengthening(X, u, n, covariance)
         ends = np.cumsum(count)
         return tuple(
-            cls(span.mover, length, x_i[end - k : end], noise[end - k : end], weights[at, :, :k], by_h[at])
+            cls(
+                span.mover,
+                length,
+                x_i[end - k : end],
+                noise[end - k : end],
+                weights[at, :, :k],
+                by_h[at],
+                float(log_det[at]),
+            )
             for at, ((span, length), k, end) in enumerate(zip(some, count, ends, strict=True))
         )
 

@@ -404,6 +404,7 @@ def _measurement(
         chi2=fit.chi2,
         dof=fit.dof,
         overlap_px=overlap(fit.H, camera_i, camera_j),
+        shared=shared if shared.any() else None,
     )
 
 

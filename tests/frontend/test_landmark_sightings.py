@@ -332,7 +332,9 @@ def test_landmarks_come_in_stance_by_stance_as_they_do_at_once(lap, solved):
     for name, place in zip(shown.names, shown.xy, strict=True):
         np.testing.assert_allclose(place, solved.estimate.landmarks[name].planar[:2], atol=0.02)
     for name, placed in solved.estimate.landmarks.items():
-        assert placed.T_world_body.equals(by_stance.estimate.landmarks[name].T_world_body, 1e-5)
+        # but for the noise of pixels, of which the first stances knew less
+        off = placed.T_world_body.localCoordinates(by_stance.estimate.landmarks[name].T_world_body)
+        assert (np.abs(off) < 0.3 * np.sqrt(np.diag(placed.covariance))).all(), (off, placed.covariance)
     assert not by_stance.estimate.rejected
 
 

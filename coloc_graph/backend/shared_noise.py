@@ -1,0 +1,102 @@
+"""Errors that all samples of a marker share in a stance, learnt from how stances contradict each other.
+
+The residuals of one homography do not show what is the same in all its points: the next stances do. Its size is a
+variance component of the whole graph, by restricted maximum likelihood under a log-normal prior.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.backend.factors import factors_for, poses_in
+from coloc_graph.backend.graph import PoseGraph
+from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
+from coloc_graph.measurements import RelativePose
+
+Array = NDArray[np.float64]
+
+MAX_STANCES = 60  # of a longer run, whose first part tells as much as is needed; the search takes their square
+REACH = 2.5  # of the search, in standard deviations of the prior
+STEPS = 9  # sizes that are tried
+
+
+@dataclass(frozen=True)
+class SharedNoise:
+    """Size of the shared errors relative to what is stated: a median, known within a factor.
+
+    Attributes
+    ----------
+    size, factor
+        The median, and the factor within which it is known (one standard deviation of its logarithm).
+    expected
+        Square root of the expected square: wide where little is known.
+    """
+
+    size: float
+    factor: float
+    expected: float
+
+    @classmethod
+    def prior(cls, factor: float) -> "SharedNoise":
+        """Return what is known before a run: the stated size, within a factor."""
+        return cls(1.0, factor, math.exp(math.log(factor) ** 2))
+
+
+def learn_shared_noise(graph: PoseGraph, values: gtsam.Values, factor: float) -> SharedNoise:
+    """Learn the size of shared errors from a graph at its optimum.
+
+    Parameters
+    ----------
+    graph
+        The graph, without outliers; robots are known to it (`PoseGraph.of`).
+    values
+        Its joint estimate.
+    factor
+        Factor within which the stated size is known.
+
+    Returns
+    -------
+    SharedNoise
+        The size relative to what is stated.
+    """
+    graph = graph.up_to(MAX_STANCES)
+    sigma = math.log(factor)
+    logs = np.linspace(-REACH * sigma, REACH * sigma, STEPS)
+    likelihood = [restricted_log_likelihood(_at_size(graph, math.exp(one)), values) for one in logs.tolist()]
+    posterior = np.array(likelihood) - 0.5 * (logs / sigma) ** 2
+    # between the sizes that were tried it is smooth
+    fine = np.linspace(logs[0], logs[-1], 401)
+    smooth = np.polynomial.Polynomial.fit(logs, posterior, 6)(fine)
+    weights = np.exp(smooth - smooth.max())
+    weights /= weights.sum()
+    mean = float(weights @ fine)
+    spread = math.sqrt(float(weights @ (fine - mean) ** 2))
+    return SharedNoise(math.exp(mean), math.exp(spread), math.sqrt(float(weights @ np.exp(2 * fine))))
+
+
+def _at_size(graph: PoseGraph, size: float) -> PoseGraph:
+    measurements = (one.at_shared(size) if isinstance(one, RelativePose) else one for one in graph.measurements)
+    return replace(graph, measurements=tuple(measurements))
+
+
+def restricted_log_likelihood(graph: PoseGraph, values: gtsam.Values) -> float:
+    """Return the restricted log likelihood of a graph's noise, but for a constant, linearised at its joint estimate."""
+    factors_of = factors_for("joint", graph, values)
+    factors, _, batched = factors_of.of_graph(graph, poses_in(values))
+    keys = set(map(int, factors.keyVector()))
+    at = gtsam.Values()
+    for key in poses_in(values):
+        if key in keys:
+            at.insert(key, values.atPose3(key))
+    for key in sorted(keys - set(map(int, at.keys()))):
+        at.insert(key, values.atVector(key) if values.exists(key) else factors_of.nominal(key))
+    with batched:
+        A, b = factors.linearize(at).jacobian()
+    R = np.linalg.qr(np.column_stack([A, b]), mode="r")
+    n = A.shape[1]
+    models = (one.model for one in batched.members)
+    noise = sum(one.log_det for one in models if isinstance(one, HomographyModel | StatedPlaneModel))
+    return float(noise - 0.5 * R[n, n] ** 2 - np.log(np.abs(R.diagonal()[:n])).sum())
