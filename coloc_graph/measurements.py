@@ -197,13 +197,6 @@ class RelativePose:
         spans = tuple(replace(one, shared=size * one.shared) for one in self.spans)
         return replace(self, homography=self.homography.at_shared(size), spans=spans)
 
-    def at_shared(self, size: float) -> "RelativePose":
-        """Return the measurement with shared errors of pixels `size` times as large; its own covariance stays."""
-        if self.homography is None:
-            return self
-        spans = tuple(replace(one, shared=size * one.shared) for one in self.spans)
-        return replace(self, homography=self.homography.at_shared(size), spans=spans)
-
     @property
     def ends(self) -> tuple[Node, Node]:
         """The two nodes that it relates, i then j."""

@@ -25,27 +25,20 @@ STEPS = 9  # sizes that are tried
 
 @dataclass(frozen=True)
 class SharedNoise:
-    """Size of the shared errors relative to what is stated: a median, known within a factor.
-
-    Attributes
-    ----------
-    size, factor
-        The median, and the factor within which it is known (one standard deviation of its logarithm).
-    expected
-        Square root of the expected square: wide where little is known.
-    """
+    """Size of the shared errors relative to what is stated: a median, known within a factor."""
 
     size: float
     factor: float
-    expected: float
-
-    @classmethod
-    def prior(cls, factor: float) -> "SharedNoise":
-        """Return what is known before a run: the stated size, within a factor."""
-        return cls(1.0, factor, math.exp(math.log(factor) ** 2))
 
 
-def learn_shared_noise(graph: PoseGraph, values: gtsam.Values, factor: float) -> SharedNoise:
+def shared_part(graph: PoseGraph) -> float:
+    """Return the mean part of the covariance of homographies that is by shared errors; 0 where there are none."""
+    used = [one.homography for one in graph.measurements if isinstance(one, RelativePose) and one.homography]
+    parts = [0.0 if one.shared is None else float((one.information * one.shared).sum()) / 8 for one in used]
+    return float(np.mean(parts)) if parts else 0.0
+
+
+def learn_shared_noise(graph: PoseGraph, values: gtsam.Values, factor: float, median: float = 1.0) -> SharedNoise:
     """Learn the size of shared errors from a graph at its optimum.
 
     Parameters
@@ -54,8 +47,8 @@ def learn_shared_noise(graph: PoseGraph, values: gtsam.Values, factor: float) ->
         The graph, without outliers; robots are known to it (`PoseGraph.of`).
     values
         Its joint estimate.
-    factor
-        Factor within which the stated size is known.
+    factor, median
+        Prior of the size, relative to the measurements': its median, and the factor within which that is known.
 
     Returns
     -------
@@ -64,9 +57,10 @@ def learn_shared_noise(graph: PoseGraph, values: gtsam.Values, factor: float) ->
     """
     graph = graph.up_to(MAX_STANCES)
     sigma = math.log(factor)
-    logs = np.linspace(-REACH * sigma, REACH * sigma, STEPS)
+    prior = math.log(median)
+    logs = prior + np.linspace(-REACH * sigma, REACH * sigma, STEPS)
     likelihood = [restricted_log_likelihood(_at_size(graph, math.exp(one)), values) for one in logs.tolist()]
-    posterior = np.array(likelihood) - 0.5 * (logs / sigma) ** 2
+    posterior = np.array(likelihood) - 0.5 * ((logs - prior) / sigma) ** 2
     # between the sizes that were tried it is smooth
     fine = np.linspace(logs[0], logs[-1], 401)
     smooth = np.polynomial.Polynomial.fit(logs, posterior, 6)(fine)
@@ -74,7 +68,7 @@ def learn_shared_noise(graph: PoseGraph, values: gtsam.Values, factor: float) ->
     weights /= weights.sum()
     mean = float(weights @ fine)
     spread = math.sqrt(float(weights @ (fine - mean) ** 2))
-    return SharedNoise(math.exp(mean), math.exp(spread), math.sqrt(float(weights @ np.exp(2 * fine))))
+    return SharedNoise(math.exp(mean), math.exp(max(spread, 1e-3)))
 
 
 def _at_size(graph: PoseGraph, size: float) -> PoseGraph:
@@ -95,7 +89,7 @@ def restricted_log_likelihood(graph: PoseGraph, values: gtsam.Values) -> float:
         at.insert(key, values.atVector(key) if values.exists(key) else factors_of.nominal(key))
     with batched:
         A, b = factors.linearize(at).jacobian()
-    R = np.linalg.qr(np.column_stack([A, b]), mode="r")
+    R = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))
     n = A.shape[1]
     models = (one.model for one in batched.members)
     noise = sum(one.log_det for one in models if isinstance(one, HomographyModel | StatedPlaneModel))

@@ -80,8 +80,8 @@ class SpanModel:
     """Residual (3,) of covariance 1 of the spans of one mover: a function of the plane, the span and the homography.
 
     `weights` (3, k) @ (lengths - `noise` - span) + `by_h` (3, 8) @ h, at the k instants whose rays are clear of the
-    horizon. `noise` (k,) is the bias of each length by noise, `length` [m] the span as stated. `log_det` is the logarithm
-    of how much larger errors that samples share make the covariance of the residual (its determinant).
+    horizon. `noise` (k,) is the bias of each length by noise, `length` [m] the span as stated. `log_det` is the
+    logarithm of the determinant by which errors that samples share make the residual's covariance larger.
     """
 
     mover: str

@@ -5,7 +5,7 @@ by stance.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from coloc_graph.team.centre_noise import COMPONENTS
 
 Array = NDArray[np.float64]
 
+BIAS_PX = 0.002  # median of the shared error where a team states nothing
 PARTS = (("stated sigma times", "scale", ""), ("white floor", "floor", "px"), ("saturated spots", "saturated", "px"))
 
 
@@ -51,6 +52,9 @@ class NoiseBelief:
         Numbers of marker centres that they are learnt from, (r,).
     typical
         Mean stated variance of the centres [px^2] and share of saturated ones, (r, 2).
+    bias_px, bias_factor
+        Medians of the errors that all centres of a marker share in a stance [px], and the factors within which they
+        are known, (r,).
     """
 
     robots: tuple[str, ...]
@@ -58,6 +62,8 @@ class NoiseBelief:
     covariance: Array
     points: NDArray[np.int64]
     typical: Array
+    bias_px: Array
+    bias_factor: Array
 
     @classmethod
     def of(cls, team: Team) -> "NoiseBelief":
@@ -65,8 +71,16 @@ class NoiseBelief:
         robots = tuple(robot.name for robot in team.robots if robot.camera_if_any is not None)
         logs = [(team[name].camera.centre_noise or CentreNoise()).logs for name in robots]
         means, sigmas = ([value for one in logs for value in one[which]] for which in (0, 1))
-        none = np.zeros((len(robots), 2))
-        return cls(robots, np.array(means), np.diag(np.square(sigmas)), np.zeros(len(robots), np.int64), none)
+        cameras = [team[name].camera for name in robots]
+        return cls(
+            robots,
+            np.array(means),
+            np.diag(np.square(sigmas)),
+            np.zeros(len(robots), np.int64),
+            np.zeros((len(robots), 2)),
+            np.array([one.bias_px or BIAS_PX for one in cameras]),
+            np.array([one.bias_factor for one in cameras]),
+        )
 
     def updated(self, measured: Sequence[PairMeasurement]) -> "NoiseBelief":
         """Return the belief updated by measurements."""
@@ -79,7 +93,12 @@ class NoiseBelief:
         for robot, number, mean_of_points in (seen for _, both in made for seen in both):
             points[robot] += number
             sums[robot] += number * mean_of_points
-        return NoiseBelief(self.robots, mean, covariance, points, sums / np.maximum(points, 1)[:, None])
+        typical = sums / np.maximum(points, 1)[:, None]
+        return replace(self, mean=mean, covariance=covariance, points=points, typical=typical)
+
+    def with_bias(self, size: float, factor: float) -> "NoiseBelief":
+        """Return the belief with shared errors of `size` times those of before, known within a factor."""
+        return replace(self, bias_px=size * self.bias_px, bias_factor=np.full(len(self.robots), factor))
 
     def _evidence(self, measured: PairMeasurement) -> tuple[NoiseEvidence, list[tuple[int, int, Array]]] | None:
         """Evidence of a fit, and for either camera its index, number of points, and their typical values."""
@@ -133,6 +152,10 @@ class NoiseBelief:
                 ends = f"_{unit}" * bool(unit), "_factor"
                 values = (getattr(one, f"{name}{end}") for one in (stated, learnt) for end in ends)
                 rows.append(NoiseRow(robot, what, unit, *values))
+            number = self.robots.index(robot)
+            before = NoiseBelief.of(team)
+            values = (one[number] for one in (before.bias_px, before.bias_factor, self.bias_px, self.bias_factor))
+            rows.append(NoiseRow(robot, "shared in a stance", "px", *map(float, values)))
         return rows
 
     def used(self, team: Team) -> Team:
@@ -149,22 +172,30 @@ class NoiseBelief:
             if self.points[self.robots.index(name)]:
                 widening = np.full(len(mean), 2 * math.log(self.sigma(name)[1]) ** 2)
             noises[name] = CentreNoise.of_logs((mean + widening).tolist(), [0.0] * len(COMPONENTS))
-        return with_centre_noise(team, noises)
+        expected = self.bias_px * np.exp(np.log(self.bias_factor) ** 2)  # root of the expected square
+        return _with_noise(team, noises, dict(zip(self.robots, expected, strict=True)))
 
     def learnt(self, team: Team) -> Team:
         """Return a team that states the learnt noise of its cameras."""
         noises = {name: self.noise(name) for name, n in zip(self.robots, self.points, strict=True) if n}
-        return with_centre_noise(team, noises)
+        bias = dict(zip(self.robots, self.bias_px, strict=True))
+        return _with_noise(team, noises, bias, dict(zip(self.robots, self.bias_factor, strict=True)))
 
 
-def with_centre_noise(team: Team, noises: dict[str, CentreNoise]) -> Team:
-    """Return a team with the noise of some robots' cameras replaced."""
-    robots = [
-        structs.replace(one, camera_if_any=structs.replace(one.camera, centre_noise=noises[one.name]))
-        if one.name in noises
-        else one
-        for one in team.robots
-    ]
+def _with_noise(
+    team: Team,
+    noises: Mapping[str, CentreNoise],
+    bias_px: Mapping[str, float],
+    bias_factor: Mapping[str, float] | None = None,
+) -> Team:
+    """Return a team with other noise of some robots' cameras."""
+    robots = []
+    for robot in team.robots:
+        if robot.name in noises:
+            camera, factor = robot.camera, (bias_factor or {}).get(robot.name, robot.camera.bias_factor)
+            noise = {"centre_noise": noises[robot.name], "bias_px": float(bias_px[robot.name])}
+            robot = structs.replace(robot, camera_if_any=structs.replace(camera, **noise, bias_factor=float(factor)))
+        robots.append(robot)
     return structs.replace(team, robots=tuple(robots))
 
 

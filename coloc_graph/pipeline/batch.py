@@ -1,11 +1,15 @@
 """From a run to an estimate, whatever the run holds: `solve`. Stances as in sections III and IV of the paper."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from coloc_graph.backend import Estimate, PoseGraph, chain, diagnose, joint, smooth
 from coloc_graph.backend.planar import Latest, optimise_keyframes
+from coloc_graph.backend.shared_noise import SharedNoise, learn_shared_noise, shared_part
 from coloc_graph.errors import EstimationError
 from coloc_graph.frontend import PairMeasurement, UnusedSighting, describe_unused, share_clock_offsets
 from coloc_graph.frontend.keyframes import keyframes_of
@@ -36,6 +40,8 @@ from coloc_graph.team import Team
 __all__ = ["METHODS", "EnteredStance", "Progress", "Solution", "SolveOptions", "StanceSolver", "solve"]
 
 NOISE_ROUNDS = 2  # of learning the noise and measuring again: which points are inliers depends on it
+
+LEAST_SHARED = 0.02  # part of homographies' covariance by shared errors below which their size is not looked for
 
 BATCH = {"chain": chain, "smooth": smooth, "joint": joint}
 
@@ -141,12 +147,32 @@ def _in_batch(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
     measured, clock_warnings = share_clock_offsets(alone, run.team.clock_sigma)
     for _ in range(NOISE_ROUNDS):
         noise = belief.updated(measured)
-        team = noise.used(run.team)
-        measured = measured_again(measured, team)
-    measured = tuple(replace(one, with_team=None) for one in measured)
-    poses = [m.relative_pose for m in measured if m.relative_pose is not None]
+        measured = measured_again(measured, noise.used(run.team))
     _require_poses(run, options, measured)
     made = time.perf_counter()
+    graph, sources = _graph_of(run, options, measured, noise.used(run.team))
+    _require_ties(run, graph, measured)
+    assert options.method is not None  # resolved
+    estimate = BATCH[options.method](graph)
+    if options.method == "joint":
+        shared = _shared_noise(estimate, noise)
+        if shared is not None:
+            noise = noise.with_bias(shared.size, shared.factor)
+            measured = measured_again(measured, noise.used(run.team))
+            graph, sources = _graph_of(run, options, measured, noise.used(run.team))
+            _require_ties(run, graph, measured)
+            estimate = joint(graph, start=estimate.values)
+    measured = tuple(replace(one, with_team=None) for one in measured)
+    warnings = _warnings(run, options, estimate, measured, clock_warnings, sources.unused)
+    missing = without_poses(run, options, estimate, measured, sources.unused)
+    return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise)
+
+
+def _graph_of(
+    run: Run, options: SolveOptions, measured: Sequence[PairMeasurement], team: Team
+) -> tuple[PoseGraph, OdometryAndSightings]:
+    """The graph of all measurements, with the noise of a team's cameras, and the source of its other measurements."""
+    poses = [m.relative_pose for m in measured if m.relative_pose is not None]
     motions, sources = [], OdometryAndSightings(run.team, odometry=options.odometry)
     if options.method != "chain" and run.team.floor is not None:
         # the paper's chain uses neither, and wheels measure on a floor only
@@ -154,13 +180,19 @@ def _in_batch(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
             pairs = [m for m in measured if m.homography.stance == stance.index]
             motions += sources.of_stance(Restated(run, team), stance, pairs)
     graph = PoseGraph.of(run.team, run.stances, [*poses, *motions])
-    graph = replace(graph, robot_models=options.robot_models(run.team) or graph.robot_models)
-    _require_ties(run, graph, measured)
-    assert options.method is not None  # resolved
-    estimate = BATCH[options.method](graph)
-    warnings = _warnings(run, options, estimate, measured, clock_warnings, sources.unused)
-    missing = without_poses(run, options, estimate, measured, sources.unused)
-    return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise)
+    return replace(graph, robot_models=options.robot_models(run.team) or graph.robot_models), sources
+
+
+def _shared_noise(estimate: Estimate, noise: NoiseBelief) -> SharedNoise | None:
+    """The size of shared errors relative to that of an estimate's measurements; None where they hardly count."""
+    factor = float(np.median(noise.bias_factor))
+    used = estimate.graph.without(one.measurement for one in estimate.rejected)
+    if estimate.dof <= 0 or shared_part(used) < LEAST_SHARED:
+        return None
+    # the measurements were made with what is expected of the prior, which is more than its median
+    expected = math.exp(math.log(factor) ** 2)
+    learnt = learn_shared_noise(used, estimate.values, factor, 1 / expected)
+    return replace(learnt, size=learnt.size * expected)
 
 
 def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: OnUpdate | None) -> _Solved:

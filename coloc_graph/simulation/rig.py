@@ -12,9 +12,6 @@ from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Team
 #: A mild lens, OpenCV's (k1, k2, p1, p2): what the images are rendered through.
 MILD_LENS = (-0.10, 0.02, 5e-4, -3e-4)
 
-#: What the rendered scene's backgrounds leave as a common error of our detected centres (measured) [px].
-IMAGE_BIAS = 0.01
-
 
 @dataclass(frozen=True)
 class Imperfections:

@@ -14,7 +14,7 @@ import msgspec
 
 from coloc_graph.errors import RobotError
 from coloc_graph.simulation import Imperfections
-from coloc_graph.simulation.rig import IMAGE_BIAS, MILD_LENS, reference_team, stated_team
+from coloc_graph.simulation.rig import MILD_LENS, reference_team, stated_team
 from coloc_graph.team import Team, write_team
 
 #: Images a second of a simulated camera.
@@ -27,7 +27,7 @@ FIELD = Imperfections(mount_sigma_deg=0.5, height_sigma=0.003, span_sigma=1e-4, 
 
 def field_team(imperfections: Imperfections = FIELD, fps: float = FPS) -> Team:
     """The reference rig as its people would describe it, with tolerances; its cameras do not expose together."""
-    team = stated_team(reference_team(MILD_LENS, IMAGE_BIAS), imperfections)
+    team = stated_team(reference_team(MILD_LENS), imperfections)
     new = msgspec.structs.replace
     return new(
         team,

@@ -15,7 +15,7 @@ from coloc_graph.simulation.landmarks import drawn, in_view, standing_landmarks,
 from coloc_graph.simulation.meander import meander
 from coloc_graph.simulation.paths import Array, Path, PathBuilder, drive, tilt_rotation
 from coloc_graph.simulation.planned import PlannedScenario
-from coloc_graph.simulation.rig import IMAGE_BIAS, MILD_LENS, Imperfections, reference_team, stated_team, true_team
+from coloc_graph.simulation.rig import MILD_LENS, Imperfections, reference_team, stated_team, true_team
 from coloc_graph.simulation.scenarios import Pose, Scenario
 from coloc_graph.simulation.tours import MAX_BURST, Tour, patrol, scatter
 from coloc_graph.team import Team
@@ -141,7 +141,7 @@ def build_world(
     if burst is not None and not 1 <= burst <= MAX_BURST:
         raise InputError(f"`burst` is {burst}; give 1 to {MAX_BURST} captures")
     imperfections = imperfections or Imperfections()
-    nominal = team or (reference_team(MILD_LENS, IMAGE_BIAS) if depth == "images" else reference_team())
+    nominal = team or (reference_team(MILD_LENS) if depth == "images" else reference_team())
     stated = with_landmarks(stated_team(nominal, imperfections), scenario, tags=depth == "images")
     true = true_team(stated, stream(seed, "team"))
     true = with_fields(true, landmarks=drawn(true.landmarks, stream(seed, "landmarks")))

@@ -37,7 +37,9 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         Variance that one grey level of light adds to a pixel [grey levels]; determines the covariance of a centre.
     bias_px : float
         Standard deviation per axis of an error that all centres of one marker share during a stance [px]: residual
-        lens distortion, a bright background.
+        lens distortion, a bright background. A median; 0 states nothing.
+    bias_factor : float
+        Factor within which `bias_px` is known (one standard deviation of its logarithm).
     centre_noise : CentreNoise or None
         Noise beyond that stated by detections, with tolerances; None for the defaults.
     """
@@ -53,6 +55,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     noise_px: float = 0.3
     shot_gain: float = 0.1
     bias_px: float = 0.0
+    bias_factor: float = 2.0
     centre_noise: CentreNoise | None = None
 
     def __post_init__(self) -> None:
@@ -64,6 +67,8 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             if getattr(self, name) > MAX_SIDE:
                 raise ValueError(f"`{name}` is {quoted(getattr(self, name))}; give pixels, {MAX_SIDE} at most")
         require_not_negative(self, ("shot_gain", "bias_px"))
+        if not 1 < self.bias_factor <= 100:
+            raise ValueError(f"`bias_factor` is {self.bias_factor}; give a number above 1, 100 at most")
         if len(self.distortion) not in (0, 4, 5, 8):
             raise ValueError(
                 f"`distortion` has {len(self.distortion)} numbers; give none, or OpenCV's 4, 5 or 8 coefficients"

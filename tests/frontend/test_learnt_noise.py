@@ -103,7 +103,12 @@ def test_learnt_noise_is_in_the_team_that_a_result_writes_and_the_next_run_start
     assert noise.floor_px == pytest.approx(0.3, rel=0.2)
     assert NoiseBelief.of(learnt).noise("A").floor_factor == pytest.approx(noise.floor_factor)
     rows = json.loads((tmp_path / "out" / "summary.json").read_text())["centre_noise"]
-    assert {row["what"] for row in rows} == {"typical centre", "stated sigma times", "white floor"}
+    assert {row["what"] for row in rows} == {
+        "typical centre",
+        "stated sigma times",
+        "white floor",
+        "shared in a stance",
+    }
     assert "Noise of marker centres" in (tmp_path / "out" / "report.html").read_text()
 
 
