@@ -34,6 +34,7 @@ from coloc_graph.frontend.pairing.correspondence import (
 )
 from coloc_graph.frontend.pairing.floor_checks import of_some_span, on_one_floor, require_on_floor
 from coloc_graph.frontend.pairing.observer_pairs import Pair, information_weight, pairs_of
+from coloc_graph.frontend.stance_hindsight import track_choices, why_broken
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, stance_plane
 from coloc_graph.frontend.tracks.interpolation import MAX_GAP
 from coloc_graph.frontend.tracks.marker_pairs import longest_pair, named_pair, span_samples
@@ -47,6 +48,7 @@ Array = NDArray[np.float64]
 
 MAX_SIGMA_RATIO = 0.5  # of a clock offset to its prior, above which the offset counts as not observed
 LITTLE_IN_COMMON = 30  # points below which two of many observers may be left unmeasured without a warning
+WELL_EXPLAINED = 0.8  # share of inliers from which on no other tracks are tried
 NOT_OBSERVABLE = (
     "the clock offset is not observable, since the mover drove at constant speed: let it stop and go "
     "(the offset stays at its prior, `clock_sigma`)"
@@ -216,30 +218,49 @@ def measure_pair(
     PairMeasurement
         The measurement.
     """
-    found: Correspondences | None = None
     tracks = tracks or StanceTracks(run, stance, options.tracker)
+    made: list[PairMeasurement] = []
     try:
         plane = stance_plane(run, stance, robot_i)
-        tracks_i, tracks_j = tracks.pair(robot_i, robot_j, stance.end, _window(run))
-        every = tracks.all(stance.end) | {robot_i: tracks_i, robot_j: tracks_j}
         pairs = pairs or measured_pairs(tracks, stance.end)
-        seen = _Seen(run, run.team, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j, pairs, every)
-        if run.team.clock_sigma > 0:
-            made = _measure_with_clocks(seen, alone)
-        else:
-            found = correspond(tracks_i, tracks_j, *seen.cameras, alone=seen.alone, plausible=seen.plausible)
-            made = _measured_from(seen, found, run.team)
-    except UnpairedTracks as why:
-        seen_instead = tracks.why_broken(robot_i, robot_j, stance.end)
-        reason = f"{why.what}; {seen_instead}" if seen_instead else str(why)
-        made = PairMeasurement(_unusable(stance, robot_i, robot_j, found, reason), None, found)
+        for tracks_i, tracks_j in track_choices(tracks, robot_i, robot_j, stance.end, _window(run)):
+            every = tracks.all(stance.end) | {robot_i: tracks_i, robot_j: tracks_j}
+            seen = _Seen(run, run.team, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j, pairs, every)
+            one = _measure(seen, tracks, alone)
+            made.append(one)
+            if _inliers(one) >= WELL_EXPLAINED * max(one.homography.points, 1):
+                break
     except DegenerateGeometry as why:
-        made = PairMeasurement(_unusable(stance, robot_i, robot_j, found, str(why)), None, found)
+        made.append(PairMeasurement(_unusable(stance, robot_i, robot_j, None, str(why)), None, None))
     return replace(
-        made,
+        max(made, key=_inliers),
         standing=(tracks.standing(robot_i), tracks.standing(robot_j)),
         landmarks=(tracks.landmarks(robot_i), tracks.landmarks(robot_j)),
     )
+
+
+def _measure(seen: _Seen, tracks: StanceTracks, alone: bool) -> PairMeasurement:
+    """What some tracks of two observers measure."""
+    stance, robot_i, robot_j = seen.stance, seen.robot_i, seen.robot_j
+    found: Correspondences | None = None
+    try:
+        if seen.team.clock_sigma > 0:
+            return _measure_with_clocks(seen, alone)
+        found = correspond(seen.tracks_i, seen.tracks_j, *seen.cameras, alone=seen.alone, plausible=seen.plausible)
+        return _measured_from(seen, found, seen.team)
+    except UnpairedTracks as why:
+        seen_instead = why_broken(tracks, robot_i, robot_j, stance.end)
+        reason = f"{why.what}; {seen_instead}" if seen_instead else str(why)
+        return PairMeasurement(_unusable(stance, robot_i, robot_j, found, reason), None, found)
+    except DegenerateGeometry as why:
+        return PairMeasurement(_unusable(stance, robot_i, robot_j, found, str(why)), None, found)
+
+
+def _inliers(made: PairMeasurement) -> int:
+    """Number of a measurement's points that are inliers; all where it is left to `at_offset`, -1 where unusable."""
+    if made.homography.unusable is None:
+        return made.homography.inliers
+    return made.homography.points if made.offset_evidence is not None else -1
 
 
 def _measure_with_clocks(seen: _Seen, alone: bool) -> PairMeasurement:

@@ -1,7 +1,7 @@
 """Track the markers of one stance in the observers' cameras, and provide the marker plane of each."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -13,20 +13,15 @@ from coloc_graph.frontend.homography.plane import plane_from_mount
 from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.images.detection import Blobs, detector_for
 from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks
-from coloc_graph.frontend.pairing.rigid_alignment import align_paths
 from coloc_graph.frontend.tracks.blink_codes import BlinkCodes
 from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers, merge_named
-from coloc_graph.frontend.tracks.rigid_path import RigidPath, rigid_path
+from coloc_graph.frontend.tracks.rigid_path import RigidPath
 from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.measurements import Plane
 from coloc_graph.run import Detections, Flag, Recorded, Stance
 from coloc_graph.team import Markers
 
 Array = NDArray[np.float64]
-
-MIN_SAMPLES = 25  # mean length of causal tracks below which a lone mover is tracked in a batch
-MIN_SEEN = 0.5  # share of the images with both lights below which the mover was out of view
-FAST = 0.35  # step of a light from image to image, as a share of the distance between both, that is large
 
 
 def stance_markers(run: Recorded, stance: Stance) -> Markers | None:
@@ -109,7 +104,8 @@ class StanceTracks:
         self._landmarks = {landmark.name for landmark in run.team.landmarks}
         self._named_landmarks: dict[str, list[Track]] = {}
         self._watches: dict[str, LandmarkWatch] = {}
-        self._paths: dict[str, tuple[float, RigidPath]] = {}
+        #: Paths of a lone mover by observer, each with the instant up to which it goes [UTC s]; see `stance_hindsight`.
+        self.paths: dict[str, tuple[float, RigidPath]] = {}
 
     def of(self, robot: str, end: float | None = None) -> list[Track]:
         """Tracks of an observer up to a time [UTC s].
@@ -132,81 +128,19 @@ class StanceTracks:
             self._made[robot] = made = end, self._of(robot, end)
         return made[1]
 
-    def pair(self, robot_i: str, robot_j: str, end: float, window: float) -> tuple[list[Track], list[Track]]:
-        """Tracks of two observers up to a time.
+    def checked(self, robot: str) -> list[Track]:
+        """Those of an observer up to where `of` was last asked for, cut where both directions of time disagree."""
+        trackers = self._trackers.get(robot, {})
+        return self._bound(robot, {hue: tracker.checked_tracks() for hue, tracker in trackers.items()})
 
-        If one robot with two markers moves alone and the causal tracker broke often, as for lights that move far from
-        image to image, its path is found in a batch, and the order of its lights with both cameras.
-
-        Parameters
-        ----------
-        robot_i, robot_j
-            Names of the observers.
-        end
-            End time [UTC s].
-        window
-            Time difference up to which two images are of one instant [s].
-        """
-        tracks = self.of(robot_i, end), self.of(robot_j, end)
-        if not any(map(self._broken, tracks)):
-            return tracks
-        paths = align_paths(self._path(robot_i, end), self._path(robot_j, end), window)
-        found = paths[0].tracks(self.stance.movers[0]), paths[1].tracks(self.stance.movers[0])
-        return found if all(found) else tracks
-
-    def why_broken(self, robot_i: str, robot_j: str, end: float) -> str | None:
-        """Explain in words why two observers' tracks of a lone mover broke, or return None."""
-        robots = robot_i, robot_j
-        if not any(self._broken(self.of(robot, end)) for robot in robots):
-            return None
-        paths = [self._path(robot, end) for robot in robots]
-        shares = [float((path.lights >= 2).mean()) if len(path.lights) else 0.0 for path in paths]
-        saw = [
-            f"{path.robot} saw 2 lights or more in {100 * share:.0f} % of its {len(path.lights)} images"
-            + (
-                f", {path.apart:.0f} px apart, median step {path.step:.0f} px, and its tracks broke "
-                f"{max(path.pieces, (len(self.of(path.robot, end)) + 1) // 2) - 1} times"
-                if len(path) > 1
-                else ""
-            )
-            for path, share in zip(paths, shares, strict=True)
-        ]
-        if min(shares) < MIN_SEEN:
-            remedy = "keep the mover in both fields of view, and check exposure and threshold of the lights"
-        elif any(path.step > FAST * path.apart for path in paths):
-            remedy = "record more images a second, or let the mover drive and turn slower"
-        elif any(len(path) < MIN_SEEN * (path.lights >= 2).sum() for path in paths):
-            remedy = "check heights, tilt, span and units in the team: on the marker plane few lights are a span apart"
-        else:
-            remedy = "let the mover drive further and turn, or record for longer"
-        return f"{'; '.join(saw)}: {remedy}"
-
-    def _broken(self, tracks: Sequence[Track]) -> bool:
-        movers = self.stance.movers
-        markers = self.run.team[movers[0]].markers if len(movers) == 1 else None
-        if markers is None or len(markers.positions) != 2 or any(track.marker for track in tracks):
-            return False
-        return sum(map(len, tracks)) < MIN_SAMPLES * max(len(tracks), 2)
-
-    def _path(self, robot: str, end: float) -> RigidPath:
-        made = self._paths.get(robot)
-        if made is None or made[0] != end:
-            run, (mover,) = self.run, self.stance.movers
-            markers = run.team[mover].markers
-            assert markers is not None and markers.span is not None
-            planes = plausible_planes(stance_plane(run, self.stance, robot), run.team[robot].mount)
-            seen = list(self._seen(robot, end))
-            self._paths[robot] = made = end, rigid_path(robot, seen, run.team[robot].camera, planes, markers.span)
-        return made[1]
-
-    def _seen(self, robot: str, end: float) -> Iterator[Detections]:
-        """Detections of the lone mover's markers in an observer's whole images, up to a time [UTC s]."""
-        run, (mover,) = self.run, self.stance.movers
+    def detections(self, robot: str, end: float) -> Iterator[Detections]:
+        """Detections of the movers' markers, of one colour, in an observer's whole images up to an instant [UTC s]."""
+        run, stance = self.run, self.stance
         if run.has_detections(robot):
-            yield from run.detections(robot, self.stance.start, end)
+            yield from run.detections(robot, stance.start, end)
             return
-        detector = detector_for(run.team[mover].markers, run.team[robot].camera)
-        for image in run.images(robot, self.stance.start, end):
+        detector = detector_for(stance_markers(run, stance), run.team[robot].camera)
+        for image in run.images(robot, stance.start, end):
             blobs = detector(image.pixels)
             names = ("",) * len(blobs)
             yield Detections(robot, image.time, blobs.uv, blobs.covariance, names, blobs.flags, blobs.peak, blobs.area)
@@ -273,11 +207,17 @@ class StanceTracks:
                     if watch is not None:
                         watch.look(image)
                     self._taken[robot] = number + 1
-        planes, tracks = plausible_planes(stance_plane(run, stance, robot), run.team[robot].mount), []
-        for hue, tracker in trackers.items():
-            names = self._by_hue.get(hue, []) if len(trackers) > 1 else list(stance.movers)
+        return self._bound(robot, {hue: tracker.tracks() for hue, tracker in trackers.items()})
+
+    def _bound(self, robot: str, by_hue: Mapping[float | None, list[Track]]) -> list[Track]:
+        """The tracks of an observer, by colour, that are of movers' markers, with the robot or body of each."""
+        run, stance, camera = self.run, self.stance, self.run.team[robot].camera
+        planes = plausible_planes(stance_plane(run, stance, robot), run.team[robot].mount)
+        tracks: list[Track] = []
+        for hue, own in by_hue.items():
+            names = self._by_hue.get(hue, []) if len(by_hue) > 1 else list(stance.movers)
             spans = {m.span for name in names if (m := run.team[name].markers) and m.span}
-            own, codes = tracker.tracks(), self._codes(names)
+            codes = self._codes(names)
             if len(names) > 1 and codes is not None:
                 own = codes.name_tracks(own)
             own = markers_of_movers(own, camera, planes, sorted(spans), len(names))

@@ -1,5 +1,7 @@
 """Markers followed through images: where is looked, who is who, and when a track ends."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -209,3 +211,29 @@ def test_a_marker_that_turns_back_at_once_is_followed(speed):
             assert tracker._filters.velocity[0, 0] == pytest.approx(-speed, abs=0.2 * speed)
     (track,) = tracker.tracks()
     assert len(track) == 200
+
+
+def light_changes(track, seen):
+    """How often the samples of a track change from one light to another."""
+    number = {one.time: n for n, one in enumerate(seen.images)}
+    of = []
+    for time, uv in zip(track.times.tolist(), track.uv, strict=True):
+        image, lights = seen.images[number[time]], seen.lights[number[time]]
+        of.append(int(lights[np.argmin(np.abs(image.uv - uv).sum(axis=1))]))
+    real = [one for one in of if one >= 0]
+    return sum(a != b for a, b in itertools.pairwise(real))
+
+
+@pytest.mark.parametrize("seed", [1, 17])
+def test_tracks_that_are_checked_backward_are_cut_where_lights_were_swapped(seed):
+    team = reference_team()
+    view = View(team["A"].camera, floor_pose(0.0, 0.4, -0.3) @ team["A"].mount.T_body_camera)
+    (seen,), _ = crowd([view], team["C"].markers.p_body, movers=5, seconds=20, fps=5, seed=seed)
+    tracker = MarkerTracker("A", Detector(), size=SIZE)
+    for one in seen.images:
+        tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
+    causal, checked = tracker.tracks(), tracker.checked_tracks()
+    assert sum(light_changes(track, seen) for track in checked) == 0
+    assert sum(light_changes(track, seen) for track in causal) > 0
+    assert sum(map(len, checked)) > 0.9 * sum(map(len, causal))
+    assert all((np.diff(track.times) > 0).all() for track in checked)

@@ -10,7 +10,7 @@ start, after a loss, and periodically for markers that came into view.
 
 import math
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -32,6 +32,7 @@ CONFIRMED = 22.0  # log likelihood ratio of a light against false detections, ab
 AMBIGUOUS = 3.0  # log likelihood ratio of two assignments below which neither is trusted
 OVERLAP_PX = 6.0  # px between two lights that may be seen as one
 RIM = 3.0  # px from the border of the image, within which a missed light has left it
+MIN_PIECE = 4  # samples of a piece on which both directions of time agree
 ROUGH_SIGMA = 0.5  # px, of a candidate's approximate centre
 
 
@@ -164,6 +165,7 @@ class MarkerTracker:
         self._parked: list[_Live] = []
         self._taken: list[tuple[Array, Array, float, bool]] = []
         self._searched = -math.inf  # when the full frame was searched last
+        self._images: list[tuple[float, Array, Array, Sequence[Candidate | int]]] = []  # as `_advance` took them
 
     def step(self, image: Image) -> None:
         """Take in the next image."""
@@ -186,8 +188,27 @@ class MarkerTracker:
 
     def tracks(self) -> list[Track]:
         """Measure the samples of all tracks, ended or live, and return them, oldest first."""
+        return self._measured(self._confirmed())
+
+    def checked_tracks(self) -> list[Track]:
+        """Return the tracks as far as they go on alike forward and backward in time, cut where they do not.
+
+        At a crossing, or where a light turns sharply, one direction may take the other light's detection; both seldom
+        do.
+        """
+        back = MarkerTracker(self.robot, self._detector, self._options, self._size)
+        for time, uv, covariance, samples in reversed(self._images):
+            back._filters.predict(-time)
+            back._advance(-time, uv, covariance, samples, births=True)
+        number = {_key(sample): n for n, live in enumerate(back._confirmed()) for sample in live.samples}
+        pieces = [piece for live in self._confirmed() for piece in _agreeing(live, number)]
+        return self._measured([piece for piece in pieces if len(piece.times) >= MIN_PIECE])
+
+    def _confirmed(self) -> list[_Live]:
         lives = [live for live in self._ended + self._parked + self._live if live.confirmed and live.times]
-        lives.sort(key=lambda live: live.times[0])
+        return sorted(lives, key=lambda live: live.times[0])
+
+    def _measured(self, lives: Sequence[_Live]) -> list[Track]:
         candidates = [one for live in lives for one in live.samples if isinstance(one, Candidate)]
         if not candidates:
             return [self._track(live, [self._taken[one] for one in live.samples]) for live in lives]  # type: ignore[index]
@@ -243,6 +264,7 @@ class MarkerTracker:
     def _advance(
         self, time: float, uv: Array, covariance: Array, samples: Sequence[Candidate | int], *, births: bool
     ) -> None:
+        self._images.append((time, uv, covariance, samples))
         places: list[tuple[float, float]] = [(u, v) for u, v in uv.tolist()]
         free = [index for index, place in enumerate(places) if not self._is_parked(place)]
         if len(free) < len(places):
@@ -398,3 +420,22 @@ def _between(live: _Live) -> Array:
     """Times of images in which a track was missed between its first and its last sample, (k,) [s]."""
     missed = np.array(live.missed)
     return missed[(missed > live.times[0]) & (missed < live.times[-1])]
+
+
+def _key(sample: Candidate | int) -> int:
+    """What tells a sample from all others of its tracker."""
+    return sample if isinstance(sample, int) else id(sample)
+
+
+def _agreeing(live: _Live, number: Mapping[int, int]) -> list[_Live]:
+    """The pieces of a track whose samples have one `number` each; samples without one are left out."""
+    pieces: list[_Live] = []
+    last = -1
+    for time, place, sample in zip(live.times, live.uv, live.samples, strict=True):
+        now = number.get(_key(sample), -1)
+        if now >= 0 and now != last:
+            pieces.append(_Live(confirmed=True, missed=live.missed))
+        if now >= 0:
+            pieces[-1].take(time, place, sample)
+        last = now if now >= 0 else last
+    return pieces
