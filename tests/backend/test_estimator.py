@@ -307,10 +307,10 @@ def test_a_checkpoint_keeps_what_was_rejected_revoked_and_withdrawn(tmp_path):
     [
         (lambda text: text[:-30], "is not a checkpoint, or a damaged one"),
         (lambda text: "{}", "is not a checkpoint"),
-        (lambda text: text.replace("checkpoint-4", "checkpoint-3"), "not a checkpoint of this version"),
+        (lambda text: text.replace("checkpoint-5", "checkpoint-4"), "not a checkpoint of this version"),
         (lambda text: text.replace('"relative_pose"', '"guess"', 1), "no kind of measurement `guess`"),
         (lambda text: text.replace('"rejected":{}', '"rejected":{"9":"why"}'), "that is not there is rejected"),
-        (lambda text: _with(text, "journal", json.loads(text)["journal"] * 2), "damaged checkpoint"),
+        (lambda text: _with(text, "journal", json.loads(text)["checkpoint"]["journal"] * 2), "damaged checkpoint"),
     ],
 )
 def test_a_bad_checkpoint_is_one_sentence(team, tmp_path, spoil, words):
@@ -325,7 +325,8 @@ def test_a_bad_checkpoint_is_one_sentence(team, tmp_path, spoil, words):
 
 
 def _with(text, name, value):
-    return json.dumps(json.loads(text) | {name: value})
+    file = json.loads(text)
+    return json.dumps(file | {"checkpoint": file["checkpoint"] | {name: value}})
 
 
 def test_a_checkpoint_that_is_not_there_or_cannot_be_written_is_one_sentence(team, tmp_path):
