@@ -2,7 +2,9 @@
 
 import time
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -12,6 +14,10 @@ from scipy.sparse.csgraph import connected_components
 from coloc_graph.backend.solver import optimise, with_stack
 from coloc_graph.errors import EstimationError
 from coloc_graph.exchange.g2o import G2oGraph, read_g2o
+
+MAX_GAUSS_NEWTON = 30  # iterations
+CONVERGED = 1e-8  # change of half the squared error, relative and absolute
+MAX_CHI2_PER_ROW = 4.0  # of a fit from the file's poses that is no local minimum; noise as stated has less than 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,32 +70,89 @@ def solve_pose_graph(path: str | Path, *, lenient: bool = False) -> PoseGraphSol
     path, began = Path(path), time.perf_counter()
     graph = read_g2o(path, lenient=lenient)
     _require_connected(path, graph)
-    edges = gtsam.NonlinearFactorGraph()
-    for number in range(len(graph.fixed), graph.factors.size()):
-        edges.add(graph.factors.at(number))
     size = graph.values.size()
-    values, iterations = with_stack(size, lambda: optimise(graph.factors, graph.values))
+    values, iterations = with_stack(size, lambda: optimum_of(graph))
     rows = 3 if graph.planar else 6
     return PoseGraphSolution(
         path=path,
         graph=graph,
         values=values,
-        chi2_before=2 * edges.error(graph.values),
-        chi2=2 * edges.error(values),
-        dof=rows * (edges.size() - (size - len(graph.fixed))),
+        chi2_before=2 * graph.edges.error(graph.values),
+        chi2=2 * graph.edges.error(values),
+        dof=rows * (len(graph.ends) - (size - len(graph.fixed))),
         iterations=iterations,
         seconds=time.perf_counter() - began,
     )
 
 
+def optimum_of(graph: G2oGraph) -> tuple[gtsam.Values, int]:
+    """Values at the optimum, and iterations.
+
+    Gauss-Newton from the poses of the file; where it fails or leaves a poor fit, also from poses made of the edges by
+    a linear estimate of the rotations, and by Levenberg-Marquardt. The lowest error wins.
+
+    Source: Carlone, Aragues, Castellanos, Bona, "A Linear Approximation for Graph-Based Simultaneous Localization and
+    Mapping", 2011 (2D); Carlone, Tron, Daniilidis, Dellaert, "Initialization Techniques for 3D SLAM", 2015 (3D).
+    """
+    good = MAX_CHI2_PER_ROW / 2 * (3 if graph.planar else 6) * len(graph.ends)
+    starts = [graph.values]
+    found = _gauss_newton(graph, graph.values)
+    converged = [found] if found else []
+    if found is None or found[0] > good:
+        if (start := linear_start(graph)) is not None:
+            starts.append(start)
+            if found := _gauss_newton(graph, start):
+                converged.append(found)
+        if not converged or min(error for error, _, _ in converged) > good:
+            start = min([*starts, *(values for _, values, _ in converged)], key=graph.factors.error)
+            values, iterations = optimise(graph.factors, start, roughly_first=True)
+            converged.append((graph.factors.error(values), values, iterations))
+    _, values, iterations = min(converged, key=itemgetter(0))
+    return values, iterations
+
+
+def _gauss_newton(graph: G2oGraph, start: gtsam.Values) -> tuple[float, gtsam.Values, int] | None:
+    """Error, values and iterations of Gauss-Newton with Cholesky; None where it does not converge."""
+    parameters = gtsam.GaussNewtonParams()
+    parameters.setMaxIterations(MAX_GAUSS_NEWTON)
+    parameters.setRelativeErrorTol(CONVERGED)
+    parameters.setAbsoluteErrorTol(CONVERGED)
+    optimiser = gtsam.GaussNewtonOptimizer(graph.factors, start, parameters)
+    before = optimiser.error()
+    try:
+        values = optimiser.optimize()
+    except RuntimeError:  # of a linear system that is not positive definite
+        return None
+    error, iterations = optimiser.error(), int(optimiser.iterations())
+    return (error, values, iterations) if error <= before and iterations < MAX_GAUSS_NEWTON else None
+
+
+def linear_start(graph: G2oGraph) -> gtsam.Values | None:
+    """Poses from the edges alone: rotations by a linear least squares problem, then translations.
+
+    None where GTSAM has none for the graph.
+    """
+    try:
+        if not graph.planar:
+            return gtsam.InitializePose3.initialize(graph.factors)
+        diagonal = gtsam.NonlinearFactorGraph()  # all that GTSAM's takes
+        for number, (i, j) in enumerate(graph.ends):
+            edge: Any = graph.edges.at(number)
+            noise = gtsam.noiseModel.Diagonal.Precisions(np.diag(edge.noiseModel().information()))
+            diagonal.add(gtsam.BetweenFactorPose2(i, j, edge.measured(), noise))
+        key = graph.fixed[0]
+        diagonal.add(gtsam.PriorFactorPose2(key, graph.values.atPose2(key), gtsam.noiseModel.Unit.Create(3)))
+        return gtsam.lago.initialize(diagonal)
+    except (RuntimeError, IndexError):  # a singular system; a vertex that its spanning tree does not reach
+        return None
+
+
 def _require_connected(path: Path, graph: G2oGraph) -> None:
-    keys = list(graph.values.keys())
-    index = {key: n for n, key in enumerate(keys)}
-    ends = [list(map(index.__getitem__, graph.factors.at(n).keys())) for n in range(graph.factors.size())]
-    pairs = np.array([pair for pair in ends if len(pair) == 2], np.int64).reshape(-1, 2)
+    keys = sorted(graph.values.keys())
+    pairs = np.searchsorted(np.array(keys, np.uint64), np.array(graph.ends, np.uint64).reshape(-1, 2))
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(keys), len(keys)))
     _, component = connected_components(links, directed=False)
-    fixed = {component[index[key]] for key in graph.fixed}
+    fixed = {component[keys.index(key)] for key in graph.fixed}
     disconnected = [key for key, one in zip(keys, component.tolist(), strict=True) if one not in fixed]
     if disconnected:
         raise EstimationError(

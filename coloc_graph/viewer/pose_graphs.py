@@ -55,7 +55,7 @@ def scene_of_pose_graph(path: str | Path) -> Scene:
     nodes = _nodes(graph)
     robots = tuple(dict.fromkeys(robot for robot, _ in nodes.values()))
     stances = tuple(Stance(k, float(k), k + 1.0, (), robots) for k in range(1 + max(n for _, n in nodes.values())))
-    ends = [(nodes[a], nodes[b]) for a, b in _ends(graph)]
+    ends = [(nodes[a], nodes[b]) for a, b in graph.ends]
     consecutive = {(a, b) for a, b in ends if a[0] == b[0] and abs(a[1] - b[1]) == 1}
     planar = graph.planar
     return Scene(
@@ -78,12 +78,6 @@ def _nodes(graph: G2oGraph) -> dict[int, Node]:
         named = graph.names.get(key)
         of[named[0][0] if named else letter if letter.isalpha() and letter.isascii() else "x"].append(key)
     return {key: (robot, number) for robot, own in of.items() for number, key in enumerate(own)}
-
-
-def _ends(graph: G2oGraph) -> list[tuple[int, int]]:
-    """Ids of the vertices of each edge."""
-    every = (graph.factors.at(number).keys() for number in range(len(graph.fixed), graph.factors.size()))
-    return [(int(ends[0]), int(ends[1])) for ends in every]
 
 
 def _layer(

@@ -19,6 +19,7 @@ from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import read_g2o
 from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.exchange.tum import read_tum
+from coloc_graph.pipeline.pose_graph import solve_pose_graph
 from coloc_graph.team import Slip
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "pose_graphs"
@@ -108,6 +109,17 @@ def test_ids_of_64_bits_comments_marks_and_windows_line_ends_are_read(tmp_path):
     assert sorted(read.values.keys()) == sorted([a, b]) and read.fixed == (a, b)
     assert read.factors.size() == 3 and not read.names and not read.stay_puts and not read.planar
     assert list(read.factors.at(2).keys()) == [a, b]
+
+
+def test_numbers_and_spaces_that_json_does_not_have_are_read(tmp_path):
+    path = tmp_path / "two.g2o"
+    path.write_text("VERTEX_SE2\t7 +1 .5 1.\nVERTEX_SE2  8 01 2   3e0 \nEDGE_SE2 7 8\t1 0 0 1 0 0 1 0 1\n")
+    read = read_g2o(path)
+    assert read.ends == ((7, 8),) and read.planar
+    assert [read.values.atPose2(key).x() for key in (7, 8)] == [1, 1] and read.values.atPose2(7).y() == 0.5
+    path.write_text(path.read_text() + "VERTEX_SE2 9 1 2\nVERTEX_SE2 10 1 2 3 4\n")  # as many numbers as two have
+    with pytest.raises(InputError, match="line 4: `VERTEX_SE2` has 3 numbers; 4"):
+        read_g2o(path)
 
 
 def test_lenient_projects_information_that_is_not_positive_definite_and_counts(tmp_path):
@@ -232,6 +244,23 @@ def test_solve_of_a_pose_graph_in_3d_is_gtsams_optimum(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["chi2"] == pytest.approx(estimate.chi2, rel=1e-6)
     before, after = (read_g2o(one / "graph.g2o") for one in (tmp_path, tmp_path / "result"))
     assert after.names == before.names and after.stay_puts == before.stay_puts
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_a_loop_is_closed_from_poses_that_are_far_off(tmp_path, planar):
+    path, count, rng = tmp_path / "loop.g2o", 60, np.random.default_rng(0)
+    turn = 2 * np.pi / count
+    vertex = "VERTEX_SE2 {} {} {} {}" if planar else "VERTEX_SE3:QUAT {} {} {} 0 {} {} {} {}"
+    information = E2[-11:] if planar else E3[-41:]
+    edge = f"1 0 {turn}" if planar else f"1 0 0 0 0 {np.sin(turn / 2)} {np.cos(turn / 2)}"
+    lines = []
+    for k in range(count):
+        q = rng.normal(size=4)
+        lines.append(vertex.format(k, *rng.normal(size=2) * 20, *([3 * q[0]] if planar else q / np.linalg.norm(q))))
+        kind = "EDGE_SE2" if planar else "EDGE_SE3:QUAT"
+        lines.append(f"{kind} {k} {(k + 1) % count} {edge} {information}")
+    path.write_text("\n".join(lines))
+    assert solve_pose_graph(path).chi2 < 1e-6
 
 
 def test_a_disconnected_graph_and_options_of_runs_are_refused(tmp_path, capsys):
