@@ -208,7 +208,8 @@ def test_solve_incrementally_says_what_a_stance_costs(short, tmp_path, capsys):
     assert "update time for a stance" in capsys.readouterr().out
     assert main(["solve", str(short), "--out", str(tmp_path / "b")]) == 0
     a, b = (read_tum(tmp_path / way / "trajectories" / "B.tum") for way in "ab")
-    np.testing.assert_allclose(a.T_world_body, b.T_world_body, atol=1e-6)
+    # incrementally the noise is learnt from the stances that came before
+    np.testing.assert_allclose(a.T_world_body, b.T_world_body, atol=3e-4)
     assert main(["solve", str(short), "--out", str(tmp_path / "c"), "--incremental", "--method", "chain"]) == 2
     assert "cannot be incremental" in capsys.readouterr().err
 
