@@ -80,7 +80,8 @@ class HorizonPlanner:
     def plan(self, index: int, before: Stance | None, attempt: int) -> StancePlan:
         """Plan a stance after the one `before` it.
 
-        Another attempt at it drives the other way round; after some, another target is chosen.
+        Another attempt at it begins in the middle of the drive and goes the other way round; after some, another target
+        is chosen.
 
         Raises
         ------
@@ -102,8 +103,11 @@ class HorizonPlanner:
             leap = self._leap(decision)
         self._decision = decision
         drive = np.array(decision.stance.waypoints)
-        if attempt % 2:
-            drive = drive[::-1]
+        # the middle comes last, which is where a mover that has left a view goes back to
+        middle = drive.mean(axis=0, keepdims=True)
+        drive = np.concatenate([drive[::-1] if attempt % 2 else drive, middle])
+        if attempt:
+            drive = np.concatenate([middle, drive])
         first = self._mover_first(leap, drive)
         self._plan = StancePlan(index, leap, drive, decision.stance.duration, first)
         return self._plan
@@ -115,7 +119,7 @@ class HorizonPlanner:
 
     def take(self, entered: EnteredStance) -> None:
         """Take in a stance that has entered the estimate: where all stood, and the points and noise that it brought."""
-        if self._decision is None:
+        if self._decision is None or self._plan is None:
             return
         found = [pair.correspondences for pair in entered.pairs if pair.correspondences is not None]
         points = min((len(one) for one in found), default=0)
@@ -132,7 +136,8 @@ class HorizonPlanner:
         anchors = tuple(name for name in self._observers if name in entered.stance.anchors)
         standing = {name: belief.poses[name] for name in (*anchors, *(o for o in self._observers if o not in anchors))}
         seconds = entered.stance.end - entered.stance.start
-        came = PlannedStance(standing, anchors, self._mover, self._decision.stance.waypoints, seconds)
+        driven = tuple((float(x), float(y)) for x, y in self._plan.patrol)
+        came = PlannedStance(standing, anchors, self._mover, driven, seconds)
         information, expected = self._predictor.information(came)
         if expected > 0:
             share = min(points / expected, 1.5)

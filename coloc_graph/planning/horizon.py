@@ -61,14 +61,15 @@ class Decision:
         The next stance, and what it promises.
     ahead
         Leaper, its target and the duration of each stance looked ahead, the next one first.
-    end_sigma
-        Expected sigma of the observers' last positions at the end of the mission [m]; NaN where it is not computed.
+    expected
+        Expected sigma of the observers' last poses at the end of the mission [m], as `Rollout.end_variance` has it; NaN
+        where it is not computed.
     """
 
     stance: PlannedStance
     promise: Promise
     ahead: tuple[tuple[str, Planar, float], ...]
-    end_sigma: float = math.nan
+    expected: float = math.nan
 
 
 class Horizon:
@@ -220,8 +221,8 @@ class Horizon:
         placed = {name: after.poses[name] for name in (*anchors, leaper)}
         leapt = math.dist(belief.poses[leaper][:2], target[:2])
         stance, promise = best_stance(self.predictor, after, placed, anchors, self.mover, duration, self.goal, leapt)
-        end_sigma = math.sqrt(best[0].score) if self.objective == "goal" else math.nan
-        return Decision(stance, promise, best[0].choices, end_sigma)
+        expected = math.sqrt(best[0].score) if self.objective == "goal" else math.nan
+        return Decision(stance, promise, best[0].choices, expected)
 
     @property
     def goal(self) -> tuple[float, float]:

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 POSE = 6
 BLOCK = 9  # numbers of an observer: pose, mount
+HEADING_ARM = 2.0  # a last heading counts as what it displaces at this distance [m]
 SECONDS = tuple(0.5 * 1.3**n for n in range(20))  # durations of a stance for which the rest is computed [s]
 
 
@@ -119,7 +120,9 @@ class Rollout:
         return np.concatenate([*blocks, belief.index(self.mover) + np.array([BLOCK, BLOCK + 1])])
 
     def end_variance(self, P: Array, poses: dict[str, Array], front: str, seconds: Array) -> Array:
-        """Return the mean variance of the observers' last positions [m^2] at the end of the mission.
+        """Return the mean variance of the observers' last poses [m^2] at the end of the mission.
+
+        This is that of their positions, and that of their headings times the square of `HEADING_ARM`.
 
         Parameters
         ----------
@@ -147,9 +150,10 @@ class Rollout:
     def _after(self, P: Array, anchor: int, stances: NDArray[np.int64], pace: NDArray[np.int64]) -> Array:
         A, B, C = (M[anchor, stances, pace] for M in (self._A, self._B, self._C))
         left = np.linalg.solve(np.eye(P.shape[-1]) + P @ B, P)
-        places = np.array([3, 4, BLOCK + 3, BLOCK + 4])
-        a, c = A[:, places], C[:, places, places]
-        return np.asarray(((a @ left * a).sum(axis=(1, 2)) + c.sum(axis=1)) / 2)
+        numbers = np.array([2, 3, 4, BLOCK + 2, BLOCK + 3, BLOCK + 4])
+        weight = np.array([HEADING_ARM**2, 1.0, 1.0] * 2) / 2
+        a, c = A[:, numbers], C[:, numbers, numbers]
+        return np.asarray(((a @ left * a).sum(axis=2) + c) @ weight)
 
     def _in_formation(self, P: Array, poses: dict[str, Array], front: str, ways: Array) -> Array:
         """Move the errors of robots to where the gait would have them stand: it goes on from there."""
