@@ -138,7 +138,7 @@ def test_no_file_is_a_drawer():
     assert not [path for path in everything if {path.stem, path.parent.name} & drawers]
 
 
-MAX_MODULE_LINES = 320  # lines of code of a module, without docstrings, comments and blanks
+MAX_MODULE_LINES = 340  # lines of code of a module, without docstrings, comments and blanks
 
 
 def lines_of_code(text):

@@ -161,7 +161,7 @@ class HorizonPlanner:
 
     @property
     def promised(self) -> Belief:
-        """What is known of the team after the last stance."""
+        """Belief of the team after the last stance."""
         return self._believed()
 
     @property

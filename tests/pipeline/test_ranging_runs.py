@@ -9,7 +9,7 @@ from msgspec.structs import replace as with_fields
 from coloc_graph.backend.planar import IncrementalKeyframes, optimise_keyframes
 from coloc_graph.backend.planar.factors import DriveFactors, State
 from coloc_graph.backend.planar.filter import Models, filter_forward
-from coloc_graph.backend.planar.placing import Placing
+from coloc_graph.backend.planar.initial_pose import RigidAlignmentRansac
 from coloc_graph.backend.planar.slices import Slices, Summary, slices_of
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError, RunError
@@ -308,14 +308,14 @@ def test_a_robot_is_placed_by_points_that_agree_and_not_by_those_that_do_not():
     local = rng.uniform(-2, 2, (8, 2))
     c, s = np.cos(0.7), np.sin(0.7)
     world = local @ np.array([[c, s], [-s, c]]) + (1.0, -2.0)
-    placing = Placing()
+    placing = RigidAlignmentRansac()
     for n in range(3):
         placing.add(tuple(local[n]), tuple(world[n]))
-    assert placing.place() is None  # too few to be sure
+    assert placing.pose() is None  # too few to be sure
     placing.add(tuple(local[3]), tuple(world[3] + 3.0))  # read wrong
     for n in range(4, 8):
         placing.add(tuple(local[n]), tuple(world[n]))
-    assert placing.place() == pytest.approx((1.0, -2.0, 0.7))
+    assert placing.pose() == pytest.approx((1.0, -2.0, 0.7))
 
 
 def write(path, *, odometry=True, target="L", ranging=True, away=False):
@@ -333,12 +333,12 @@ def write(path, *, odometry=True, target="L", ranging=True, away=False):
 
 def test_a_run_without_odometry_says_so(tmp_path):
     run = open_run(write(tmp_path / "run.mcap", odometry=False))
-    with pytest.raises(InputError, match="robot A measured ranges, and has no odometry"):
+    with pytest.raises(InputError, match="robot A measured ranges, but has no odometry"):
         keyframes_of(run)
 
 
 def test_ranges_of_who_is_not_in_the_team_cannot_be_written(tmp_path):
-    with pytest.raises(RunError, match="name `X`, which is no other robot and no landmark"):
+    with pytest.raises(RunError, match="name `X`, which is neither another robot nor a landmark"):
         write(tmp_path / "run.mcap", target="X")
     with pytest.raises(RunError, match="name `A`, which is no other"):
         write(tmp_path / "run.mcap", target="A")
@@ -392,7 +392,7 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     assert main(["solve", str(run.path), "--out", str(out), "--method", "chain"]) == 2
     capsys.readouterr()
     assert main(["export", "g2o", str(out), "--out", str(tmp_path / "x.g2o")]) == 2
-    assert "is of a ranging run, whose ranges and bearings g2o files" in capsys.readouterr().err
+    assert "is the result of a ranging run, whose measurements are not exported to g2o" in capsys.readouterr().err
     assert main(["export", "ros2", str(out), "--out", str(tmp_path / "x.mcap")]) == 0
     landmarks = (out / "landmarks.csv").read_text().splitlines()
     assert (

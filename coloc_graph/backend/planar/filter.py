@@ -1,9 +1,9 @@
-"""A centralised EKF over a drive: where each robot is at the time, and where the search for the best of all starts.
+"""Centralised EKF of a ranging run: current poses, and the initial values of the optimisation.
 
-It estimates robots, landmarks and what is off of wheels and sensors, and needs no first poses: a robot is placed once
-its measurements say where it is. Source: Leung, Barfoot, Liu, "Decentralized localization of sparsely-communicating
-robot networks", 2010, for what is centralised there; Smith, Self, Cheeseman, "Estimating uncertain spatial
-relationships in robotics", 1990.
+It estimates robots, landmarks and errors of wheels and sensors, and needs no initial poses: a robot gets one when its
+first measurements determine it. Sources: Leung, Barfoot, Liu, "Decentralized localization of sparsely-communicating
+robot networks", 2010 (its centralised filter); Smith, Self, Cheeseman, "Estimating uncertain spatial relationships in
+robotics", 1990.
 """
 
 import math
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.planar.initial_pose import RigidAlignmentRansac
 from coloc_graph.backend.planar.model import (
     RANGING,
     WHEELS,
@@ -19,25 +20,34 @@ from coloc_graph.backend.planar.model import (
     Sensors,
     WheelsModel,
 )
-from coloc_graph.backend.planar.placing import Placing
 from coloc_graph.geometry.se2 import between, compose, wrap
 from coloc_graph.measurements import Drive
 from coloc_graph.team import Ranging, Team, Wheels
 
 Array = NDArray[np.float64]
 
-#: A measurement further off than this (chi2 of two numbers, chance 1e-4) is left out.
-GATE = 18.4
-#: A robot that was just placed is known to this [m, m, rad]; a landmark, before it is measured, to this [m].
-PLACED = (0.15, 0.15, 0.1)
-ANYWHERE = 30.0
+INNOVATION_GATE = 18.4  # squared Mahalanobis distance (two dimensions, p-value 1e-4) above which one is rejected
+INITIAL_SIGMAS = (0.15, 0.15, 0.1)  # m, m, rad: of a robot's initial pose
+LANDMARK_SIGMA = 30.0  # m: of a landmark's initial position
 
 
 @dataclass(eq=False)
 class Filtered:
-    """What a filter went through: `poses` (n, 3) of each robot's keyframes at their time, NaN before it was placed, and
-    `covariances` (n, 3, 3) of x, y, heading; `landmarks` (m, 2) at the end, NaN where never seen; errors of wheels
-    (robots, 3) and ranging (robots, 7) at the end; which measurements were `used`."""
+    """Result of a filter.
+
+    Parameters
+    ----------
+    poses, covariances : list of (n, 3) and (n, 3, 3) float
+        x, y [m], heading [rad] of each robot's keyframes at their times; NaN before its initial pose.
+    landmarks : (m, 2) float
+        Positions at the end [m]; NaN of landmarks that were never seen.
+    wheels, ranging : (robots, 3) and (robots, 7) float
+        Calibration errors at the end.
+    used : (k,) bool
+        True of used measurements.
+    placed_at : dict of int to int
+        Keyframe of each robot's initial pose, by its number.
+    """
 
     poses: list[Array]
     covariances: list[Array]
@@ -48,7 +58,7 @@ class Filtered:
     placed_at: dict[int, int] = field(default_factory=dict)
 
     def whole(self, drive: Drive, models: "Models") -> list[Array]:
-        """Poses of all keyframes: those before a robot was placed by following its wheels back."""
+        """Return the poses of all keyframes, those before a robot's initial pose by odometry backwards."""
         out = []
         for robot, poses in enumerate(self.poses):
             poses = poses.copy()
@@ -62,7 +72,7 @@ class Filtered:
 
 
 class Models:
-    """The wheels and sensors of a team, with what is known of their errors."""
+    """Wheels and sensors of a team, with the tolerances of their errors."""
 
     def __init__(self, team: Team, drive: Drive) -> None:
         self.team = team
@@ -82,17 +92,17 @@ class Models:
 
     @property
     def map_known(self) -> bool:
-        """Whether any landmark's position is stated, so that the world is the map's."""
+        """True if a landmark's position is stated: the world is then the map."""
         return bool(np.isfinite(self.map).any())
 
 
 def filter_forward(team: Team, drive: Drive) -> Filtered:
-    """Run the filter over all of a drive."""
+    """Run the filter over all keyframes and measurements."""
     return Filter(team, drive).run()
 
 
 class Filter:
-    """The filter's state: robots, their errors, landmarks, in one mean and one covariance."""
+    """EKF whose state is the robots, their calibration errors and the landmarks."""
 
     def __init__(self, team: Team, drive: Drive) -> None:
         self.drive, self.models = drive, Models(team, drive)
@@ -112,8 +122,8 @@ class Filter:
             self.P[at, at] = np.eye(2) * self.models.map_sigmas[n] ** 2
         self._at = [0] * robots
         self._placed = [False] * robots
-        self._placing = [Placing() for _ in range(robots)]
-        # where each robot is in a frame of its own, until it is placed
+        self._placing = [RigidAlignmentRansac() for _ in range(robots)]
+        # odometry pose of each robot in a frame of its own, until it has an initial pose
         self._own: list[Pose] = [(0.0, 0.0, 0.0)] * robots
         reference = drive.robots.index(team.reference)
         if not self.models.map_known:
@@ -131,7 +141,7 @@ class Filter:
             self._note(reference)
 
     def run(self) -> Filtered:
-        """All measurements in the order of time, then to the last keyframes."""
+        """Process all measurements in the order of time, then the steps to the last keyframes."""
         for index in range(len(self.drive.measured)):
             self.take(index)
         for robot, times in enumerate(self.drive.times):
@@ -142,7 +152,7 @@ class Filter:
         return self.out
 
     def take(self, index: int) -> None:
-        """Take in the next measurement."""
+        """Process the next measurement."""
         m = self.drive.measured
         robot, target = int(m.robot[index]), int(m.target[index])
         range_, bearing = float(m.range[index]), float(m.bearing[index])
@@ -153,12 +163,12 @@ class Filter:
             self.out.used[index] = self._update(robot, target, range_, bearing, m.share[index].tolist())
 
     def landmark(self, number: int) -> Array | None:
-        """Where a landmark is (2,) [m]; None while it is not known."""
+        """Return the position (2,) of a landmark [m]; None while it is not known."""
         at = self._marks + 2 * number
         return self.mean[at : at + 2] if self._known[number] else None
 
     def _ready(self, robot: int, target: int, range_: float, bearing: float) -> bool:
-        """Whether both ends of a measurement have a place; else it may help to find one."""
+        """Return whether both ends of a measurement have poses; otherwise use it for an initial one."""
         is_robot = target < self._robots
         seen = self.models.sensors.place(robot, range_, bearing, is_robot)
         if not self._placed[robot]:
@@ -176,18 +186,18 @@ class Filter:
         if not is_robot and not self._known[target - self._robots]:
             at = self._marks + 2 * (target - self._robots)
             self.mean[at : at + 2] = world
-            self.P[at : at + 2, at : at + 2] = np.eye(2) * ANYWHERE**2
+            self.P[at : at + 2, at : at + 2] = np.eye(2) * LANDMARK_SIGMA**2
             self._known[target - self._robots] = True
         return True
 
     def _place(self, robot: int, local: tuple[float, float], world: tuple[float, float]) -> None:
         self._placing[robot].add(local, world)
-        frame = self._placing[robot].place()
+        frame = self._placing[robot].pose()
         if frame is None:
             return
         at = slice(3 * robot, 3 * robot + 3)
         self.mean[at] = compose(frame, self._own[robot])
-        self.P[at, at] = np.diag(np.square(PLACED))
+        self.P[at, at] = np.diag(np.square(INITIAL_SIGMAS))
         self._placed[robot] = True
         self.out.placed_at[robot] = self._at[robot]
         self._note(robot)
@@ -200,7 +210,7 @@ class Filter:
         self.out.poses[robot][k], self.out.covariances[robot][k] = self.mean[at], self.P[at, at]
 
     def _go(self, robot: int, k: int) -> None:
-        """Follow a robot's wheels up to a keyframe."""
+        """Predict a robot's pose by odometry up to a keyframe."""
         model = self.models.wheels[robot]
         of_errors = slice(self._wheels + WHEELS * robot, self._wheels + WHEELS * (robot + 1))
         at = slice(3 * robot, 3 * robot + 3)
@@ -243,7 +253,7 @@ class Filter:
         off = np.array([range_, bearing]) - expected.values[0]
         off[1] = wrap(off[1])
         gain = np.linalg.solve(S, PH.T).T
-        if off @ np.linalg.solve(S, off) > GATE:
+        if off @ np.linalg.solve(S, off) > INNOVATION_GATE:
             return False
         self.mean += gain @ off
         self.P -= gain @ PH.T

@@ -1,6 +1,6 @@
-"""What wheels and a sensor of range and bearing measure of poses on the floor, with derivatives, for many at once.
+"""Models of wheel odometry and of range and bearing on the floor, with derivatives, vectorised.
 
-Poses are (x [m], y [m], heading [rad]). Calibration errors are what is off what the team states: of wheels (scale, turn
+Poses are (x [m], y [m], heading [rad]). Calibration errors are relative to the team's values: of wheels (scale, turn
 scale, delay [s]), of ranging (offset [m], scale, bearing [rad], x, y of the sensor [m], depth, offset of robots [m]).
 """
 
@@ -18,17 +18,14 @@ from coloc_graph.team import Ranging, Wheels
 Array = NDArray[np.float64]
 Pose = Planar
 
-#: How many errors wheels have, and a sensor.
-WHEELS = 3
-RANGING = 7
-#: Less of a turn than this in a step is none [rad].
-STRAIGHT = 1e-6
-#: A depth is at least this part of the distance: what is beside a camera is not seen by it.
-LEAST_PART = 0.1
+WHEELS = 3  # number of calibration errors of wheels
+RANGING = 7  # number of calibration errors of a range and bearing sensor
+STRAIGHT = 1e-6  # rad, turn of a step up to which it is straight
+MIN_DEPTH = 0.1  # depth relative to distance: a camera does not see targets beside it
 
 
 class WheelsModel:
-    """One robot's steps as its wheels say them, which are off by errors (scale, turn scale, delay)."""
+    """Odometry of one robot as a function of its errors (scale, turn scale, delay)."""
 
     def __init__(self, steps: Steps, wheels: Wheels) -> None:
         self.wheels = wheels
@@ -39,7 +36,7 @@ class WheelsModel:
         return int(self._twists.shape[1])
 
     def steps(self, k: NDArray[np.int64] | slice, errors: Array) -> tuple[Array, Array]:
-        """Poses (n, 3) of keyframes k + 1 in k, and by how much they change with each error (n, 3, 3)."""
+        """Return poses (n, 3) of keyframes k + 1 in k, and their derivatives (n, 3, 3) by the errors."""
         twists, slopes = self._twist(k, self.wheels.delay + float(errors[2]))
         scales = np.array([self.wheels.scale + errors[0]] * 2 + [self.wheels.turn_scale + errors[1]])
         x, y, w = (scales * twists).T
@@ -60,27 +57,29 @@ class WheelsModel:
         return steps, by_twist @ twist_by_errors
 
     def step(self, k: int, errors: Array) -> tuple[Pose, Array]:
-        """One of these: the pose of keyframe k + 1 in k, and by how much it changes with each error (3, 3)."""
+        """Return the pose of keyframe k + 1 in k, and its derivative (3, 3) by the errors."""
         steps, by_errors = self.steps(slice(k, k + 1), errors)
         x, y, yaw = steps[0].tolist()
         return (x, y, yaw), by_errors[0]
 
     def _twist(self, k: NDArray[np.int64] | slice, delay: float) -> tuple[Array, Array]:
-        """The twists that odometry says at a delay, and by how much they change with it."""
+        """Return the twists of the odometry at a delay, and their derivatives by it."""
         delays, twists = self._delays, self._twists[:, k]
         if len(delays) == 1:
             return twists[0], np.zeros_like(twists[0])
         n = int(np.clip(np.searchsorted(delays, delay, side="right"), 1, len(delays) - 1))
         share = (delay - delays[n - 1]) / (delays[n] - delays[n - 1])
-        if not 0 <= share <= 1:  # beyond what was looked at it stays as it is at the end
+        if not 0 <= share <= 1:  # constant beyond the range of evaluated delays
             return twists[n - 1 if share < 0 else n], np.zeros_like(twists[0])
         slopes = (twists[n] - twists[n - 1]) / (delays[n] - delays[n - 1])
         return twists[n - 1] + (delay - delays[n - 1]) * slopes, slopes
 
 
 class Expected(NamedTuple):
-    """What sensors are expected to say: `values` (n, 2) of range [m] and bearing [rad], not wrapped; by how much both
-    change with the target's x and y in the body (n, 2, 2), and with each error (n, 2, 7)."""
+    """Predicted measurements: `values` (n, 2) of range [m] and bearing [rad], not wrapped.
+
+    With their derivatives by the target's x and y in the body, (n, 2, 2), and by the errors, (n, 2, 7).
+    """
 
     values: Array
     by_xy: Array
@@ -88,7 +87,7 @@ class Expected(NamedTuple):
 
 
 class Sensors:
-    """What a team's sensors say of targets, which are off by errors; robots by number, (n,) of who measures."""
+    """Range and bearing sensors of a team as functions of their errors; `robots` (n,) are observers by number."""
 
     def __init__(self, ranging: Sequence[Ranging]) -> None:
         self.ranging = tuple(ranging)
@@ -107,12 +106,12 @@ class Sensors:
         self.tolerances[:, 2] = np.deg2rad(self.tolerances[:, 2])
 
     def sigmas(self, robots: NDArray[np.int64], ranges: Array) -> Array:
-        """Standard deviations (n, 2) of ranges [m] and bearings [rad] that were measured at some ranges."""
+        """Return standard deviations (n, 2) of ranges [m] and bearings [rad] at measured `ranges` (n,)."""
         range_sigma, per_m2, bearing_sigma, across = self._noise[robots].T
         return np.stack([range_sigma + per_m2 * ranges**2, np.hypot(bearing_sigma, across / ranges)], axis=-1)
 
     def expected(self, robots: NDArray[np.int64], xy: Array, errors: Array, of_robot: NDArray[np.bool_]) -> Expected:
-        """What is expected of targets at xy (n, 2) in the body, robots or landmarks, with errors (n, 7)."""
+        """Predict the measurements of targets at xy (n, 2) in the body, robots or landmarks, with errors (n, 7)."""
         offset, scale, turned, x0, y0, depth, more = (self._stated[robots] + errors).T
         x, y = xy[:, 0] - x0, xy[:, 1] - y0
         distance = np.maximum(np.hypot(x, y), 1e-6)
@@ -133,8 +132,8 @@ class Sensors:
         return Expected(values, by_xy, by_errors)
 
     def place(self, robot: int, range_: float, bearing: float, of_robot: bool) -> tuple[float, float]:
-        """Where in the body a target is that was measured so, if nothing is off."""
+        """Return the position in the body of a measured target, without calibration errors."""
         offset, scale, turned, x0, y0, depth, more = self._stated[robot].tolist()
-        part = max(1 - depth * (1 - math.cos(bearing)), LEAST_PART)
+        part = max(1 - depth * (1 - math.cos(bearing)), MIN_DEPTH)
         distance = (range_ - offset - more * of_robot) / (scale * part)
         return x0 + distance * math.cos(bearing - turned), y0 + distance * math.sin(bearing - turned)

@@ -1,4 +1,4 @@
-"""The estimate of a ranging run, made of what an optimiser found: `ranging_estimate`."""
+"""Estimate of a ranging run from an optimiser's result: `ranging_estimate`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,8 +24,11 @@ OUTLIER = 6.0  # residual of a range or bearing beyond which a measurement is an
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What was found, robots and landmarks by number: the `state` of all keyframes and of what is shared, with
-    `covariances` (n, 3, 3) of the poses in the body frame; `landmarks` (2,) with covariances; `errors` by robot."""
+    """Result of an optimiser, robots and landmarks by number.
+
+    `state` of all keyframes and shared variables, with `covariances` (n, 3, 3) of the poses in the body frame;
+    `landmarks` (2,) with covariances; `errors` by robot.
+    """
 
     state: State
     covariances: Array
@@ -34,7 +37,7 @@ class Found:
 
 
 def measured_off(factors: DriveFactors, state: State) -> Array:
-    """How far measurements are off (n, 2) in their own sigmas, whatever their share; NaN where an end has no place."""
+    """Return residuals (n, 2) in units of the measurements' sigmas, without shares; NaN where an end has no pose."""
     m = factors.drive.measured
     return factors.measured(state, np.arange(len(m))).residuals / np.sqrt(m.share)
 
@@ -42,10 +45,9 @@ def measured_off(factors: DriveFactors, state: State) -> Array:
 def ranging_estimate(
     factors: DriveFactors, found: Found, taken: NDArray[np.bool_], iterations: int, absorbed: float | None = None
 ) -> Estimate:
-    """Return the estimate of what was found, of the measurements that were taken in.
+    """Return the estimate of an optimiser's result by the measurements `taken`.
 
-    `absorbed` are the degrees of freedom that a fit of all of it together leaves beyond what shares say; without it
-    there is no chi2.
+    `absorbed` are the degrees of freedom of a batch fit beyond the shares; without it there is no chi2.
     """
     drive, models = factors.drive, factors.models
     off = np.where(taken[:, None], measured_off(factors, found.state), np.nan)

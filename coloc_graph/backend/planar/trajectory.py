@@ -8,8 +8,7 @@ from coloc_graph.geometry.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-#: Where a pose (x, y, heading) is among the tangent components of one in space.
-PLACE = np.array([3, 4, 2])
+PLACE = np.array([3, 4, 2])  # tangent components of x, y, heading in those of a pose in space
 FLAT = 1e-6  # standard deviation of roll, pitch [rad] and height [m] of a pose on the floor
 
 

@@ -1,4 +1,4 @@
-"""Where a robot is when its first measurements say it: its own track, laid on what is known of the world."""
+"""Initial pose of a robot: rigid alignment of its own track with known points, by RANSAC over all pairs."""
 
 import itertools
 import math
@@ -10,40 +10,39 @@ from coloc_graph.backend.planar.model import Pose
 
 Array = NDArray[np.float64]
 
-#: So many points must agree, this far apart [m], to so much [m]; and this part of all.
-LEAST = 4
-APART = 0.5
-NEAR = 0.3
-MOST_OF = 0.7
-#: The newest so many are looked at.
-NEWEST = 24
+MIN_POINTS = 4  # points that must agree
+MIN_SEPARATION = 0.5  # m, between the points of a pair
+TOLERANCE = 0.3  # m, within which a point agrees
+MIN_AGREEMENT = 0.7  # share of the points that must agree
+NEWEST = 24  # newest points that are used
 
 
-class Placing:
-    """Points of a robot's own frame, and where they are in the world: `place` says where its frame is."""
+class RigidAlignmentRansac:
+    """Rigid alignment of points in a robot's own frame with the same points in the world."""
 
     def __init__(self) -> None:
         self._local: list[tuple[float, float]] = []
         self._world: list[tuple[float, float]] = []
 
     def add(self, local: tuple[float, float], world: tuple[float, float]) -> None:
-        """Take in a point."""
+        """Add a point."""
         self._local, self._world = [*self._local, local][-NEWEST:], [*self._world, world][-NEWEST:]
 
-    def place(self) -> Pose | None:
-        """The pose of the robot's own frame in the world; None while too little agrees."""
-        if len(self._local) < LEAST:
+    def pose(self) -> Pose | None:
+        """Return the pose of the robot's own frame in the world; None while too few points agree."""
+        if len(self._local) < MIN_POINTS:
             return None
         local, world = np.array(self._local), np.array(self._world)
+        needed = max(MIN_POINTS, MIN_AGREEMENT * len(local))
         best: NDArray[np.bool_] | None = None
         for i, j in itertools.combinations(range(len(local)), 2):
             d_local, d_world = local[j] - local[i], world[j] - world[i]
-            if min(np.hypot(*d_local), np.hypot(*d_world)) < APART:
+            if min(np.hypot(*d_local), np.hypot(*d_world)) < MIN_SEPARATION:
                 continue
             turn = math.atan2(d_world[1], d_world[0]) - math.atan2(d_local[1], d_local[0])
             pose = _laid(local[[i, j]], world[[i, j]], turn)
-            agree = np.hypot(*(_moved(pose, local) - world).T) < NEAR
-            if agree.sum() >= max(LEAST, MOST_OF * len(local)) and (best is None or agree.sum() > best.sum()):
+            agree = np.hypot(*(_moved(pose, local) - world).T) < TOLERANCE
+            if agree.sum() >= needed and (best is None or agree.sum() > best.sum()):
                 best = agree
         if best is None:
             return None
@@ -54,7 +53,7 @@ class Placing:
 
 
 def _laid(local: Array, world: Array, turn: float) -> Pose:
-    """The pose that turns by so much and lays the middle of the ones on that of the others."""
+    """Return the pose of a given turn that maps the centre of the local points to that of the world's."""
     middle = _moved((0.0, 0.0, turn), local.mean(axis=0, keepdims=True))[0]
     x, y = world.mean(axis=0) - middle
     return float(x), float(y), turn
