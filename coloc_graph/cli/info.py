@@ -1,6 +1,7 @@
 """coloc info RUN."""
 
 import argparse
+import dataclasses
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -19,6 +20,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 def run(args: argparse.Namespace) -> int:
     """Inspect a run and print its contents."""
     from coloc_graph.cli.printing import counted, print_json, print_table
+    from coloc_graph.pipeline.clock_table import HEADER, clock_table
     from coloc_graph.pipeline.inspection import inspect, landmarks_seen
     from coloc_graph.run import open_run, truth_counts
     from coloc_graph.run.schemas import topic_of
@@ -27,6 +29,7 @@ def run(args: argparse.Namespace) -> int:
     findings, landmarks = inspect(opened), landmarks_seen(opened)
     truth = dict(sorted(truth_counts(args.run_path).items()))
     topics = opened.topics | {topic_of(robot, "truth"): count for robot, count in truth.items()}
+    clocks = clock_table(opened)
     seconds = (opened.end - opened.start) if opened.start is not None and opened.end is not None else 0.0
     if args.json:
         print_json(
@@ -47,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
                     }
                     for one in landmarks
                 ],
+                "clocks": [dataclasses.asdict(row) for row in clocks],
                 "problems": [{"where": finding.where, "what": finding.what} for finding in findings],
             }
         )
@@ -55,6 +59,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"team: {', '.join(opened.team.names)}; reference {opened.team.reference}")
     print(f"truth: {', '.join(truth) if truth else 'none'}")
     print_table(["topic", "messages"], [[topic, str(count)] for topic, count in sorted(topics.items())])
+    if clocks:
+        print_table(list(HEADER), [list(dataclasses.astuple(row)) for row in clocks])
     if landmarks:
         in_images = any(opened.has_images(robot) and not opened.has_detections(robot) for robot in opened.team.names)
         print_table(

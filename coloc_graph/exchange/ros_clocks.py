@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.run.messages import RobotClock as RobotRecord
 from coloc_graph.run.schemas import to_seconds
 
 Array = NDArray[np.float64]
@@ -81,6 +82,18 @@ class RobotClock:
         segment = int(np.searchsorted(self.steps, received, side="right"))
         return round(1e9 * float(self.offsets[segment]) + self.drift * (received - self.origin))
 
+    def record(self) -> RobotRecord:
+        """The same as a run records it."""
+        steps = zip(self.steps.tolist(), np.diff(self.offsets).tolist(), strict=True)
+        return RobotRecord(
+            robot=self.robot,
+            offset=float(self.offsets[0]),
+            drift=self.drift,
+            steps=tuple((to_seconds(at), jump) for at, jump in steps if jump),
+            jitter=self.jitter,
+            known=f"stamps against reception of {', '.join(self.topics)}",
+        )
+
     def sentences(self) -> Iterator[str]:
         """Descriptions of what is corrected."""
         named = f"{self.robot}'s clock ({', '.join(self.topics)})"
@@ -103,6 +116,15 @@ class BagClocks:
 
     clocks: Mapping[str, RobotClock]
     sigma: float
+
+    def records(self) -> tuple[RobotRecord, ...]:
+        """Records of the clocks, one a robot: that of most of its topics."""
+        clocks: dict[str, RobotClock] = {}
+        for clock in self.clocks.values():
+            before = clocks.get(clock.robot)
+            if before is None or len(clock.topics) > len(before.topics):
+                clocks[clock.robot] = clock
+        return tuple(one.record() for _, one in sorted(clocks.items()))
 
     def sentences(self) -> list[str]:
         """Descriptions of what is corrected, and how."""

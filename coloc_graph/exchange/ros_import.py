@@ -24,7 +24,7 @@ from coloc_graph.exchange.ros_robots import (
     with_cameras,
 )
 from coloc_graph.exchange.stances import Movements, derive_stances
-from coloc_graph.run import EncodedImage, Image, Motion, OdometrySample, RunWriter, Stance, atomic_run
+from coloc_graph.run import Clocks, EncodedImage, Image, Motion, OdometrySample, RunWriter, Stance, atomic_run
 from coloc_graph.run.encode import ImageFormat
 from coloc_graph.run.schemas import to_seconds
 from coloc_graph.team import Team
@@ -94,6 +94,8 @@ def import_ros(
         moves = movements_of(the_map, recording, odometry)
         stances = _stances(bag, map_path, the_map, team, recording, moves)
         with atomic_run(out, team, image_format=image_format) as writer:
+            if records := recording.clocks.records():
+                writer.write(Clocks(stances[0].start, records))
             events = _Events(writer, stances, odometry, moves, truth)
             _write_images(bag, images, recording, team, events, lambda done: told(count + done))
             events.write_until(np.inf)

@@ -99,6 +99,8 @@ class PairMeasurement:
         Function that repeats the measurement at a known clock offset, if clocks may differ.
     tracks
         Tracks of the movers' markers in both cameras, None if the measurement ended before.
+    seen
+        The same tracks, also if the pair is unusable; None if there are none.
     standing
         Tracks of the markers of robots at rest in both cameras.
     landmarks
@@ -111,6 +113,7 @@ class PairMeasurement:
     offset_evidence: ClockOffset | None = None
     at_offset: "Callable[[ClockOffset], PairMeasurement] | None" = None
     tracks: tuple[list[Track], list[Track]] | None = None
+    seen: tuple[list[Track], list[Track]] | None = None
     standing: tuple[list[Track], list[Track]] = ([], [])
     landmarks: tuple[SeenLandmarks, SeenLandmarks] = (SeenLandmarks(), SeenLandmarks())
     fit: HomographyFit | None = None
@@ -227,7 +230,7 @@ def measure_pair(
             every = tracks.all(stance.end) | {robot_i: tracks_i, robot_j: tracks_j}
             seen = _Seen(run, run.team, stance, robot_i, robot_j, options, plane, tracks_i, tracks_j, pairs, every)
             one = _measure(seen, tracks, alone)
-            made.append(one)
+            made.append(replace(one, seen=(tracks_i, tracks_j)))
             if _inliers(one) >= WELL_EXPLAINED * max(one.homography.points, 1):
                 break
     except DegenerateGeometry as why:

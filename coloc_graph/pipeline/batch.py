@@ -15,6 +15,7 @@ from coloc_graph.frontend import PairMeasurement, UnusedSighting, describe_unuse
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.pipeline.clocks import RunClocks, clocks_of_run, contradicts
 from coloc_graph.pipeline.contents import require_applicable, unused_in
 from coloc_graph.pipeline.explanations import (
     implausible_planes,
@@ -139,12 +140,20 @@ def solve(
     )
 
 
-def _in_batch(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
-    """Solve all stances together."""
-    started = time.perf_counter()
+def _in_batch(
+    run: Run, options: SolveOptions, measure: "_Counted", clocks: RunClocks | None = None, before: float = 0.0
+) -> _Solved:
+    """Solve all stances together, and again with corrected stamps if `clocks` turn out to be wrong.
+
+    `before` are the seconds that were spent on measurements before.
+    """
+    started = time.perf_counter() - before
     belief = NoiseBelief.of(run.team)
     alone = [one for stance in run.stances for one in measure(stance, belief.used(run.team))]
     measured, clock_warnings = share_clock_offsets(alone, run.team.clock_sigma)
+    if clocks is None and (clocks := clocks_of_run(run, measured)) is not None:
+        run = clocks.corrected(run)
+        return _in_batch(run, options, measure.of(run), clocks, time.perf_counter() - started)
     for _ in range(NOISE_ROUNDS):
         noise = belief.updated(measured)
         measured = measured_again(measured, noise.used(run.team))
@@ -154,6 +163,9 @@ def _in_batch(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
     _require_ties(run, graph, measured)
     assert options.method is not None  # resolved
     estimate = BATCH[options.method](graph)
+    if clocks is None and contradicts(estimate) and (clocks := clocks_of_run(run, measured, any_pair=True)) is not None:
+        run = clocks.corrected(run)
+        return _in_batch(run, options, measure.of(run), clocks, made - started)
     if options.method == "joint":
         shared = _shared_noise(estimate, noise)
         if shared is not None:
@@ -163,7 +175,8 @@ def _in_batch(run: Run, options: SolveOptions, measure: "_Counted") -> _Solved:
             _require_ties(run, graph, measured)
             estimate = joint(graph, start=estimate.values)
     measured = tuple(replace(one, with_team=None) for one in measured)
-    warnings = _warnings(run, options, estimate, measured, clock_warnings, sources.unused)
+    of_clocks = [*(clocks.sentences() if clocks else ()), *clock_warnings]
+    warnings = _warnings(run, options, estimate, measured, of_clocks, sources.unused)
     missing = without_poses(run, options, estimate, measured, sources.unused)
     return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise)
 
@@ -266,6 +279,10 @@ class _Counted:
     def __init__(self, run: Run, options: SolveOptions, progress: Progress | None) -> None:
         self._run, self._options, self._progress = run, options, progress
         self._done = 0
+
+    def of(self, run: Run) -> "_Counted":
+        """Return the same of a run with corrected stamps."""
+        return _Counted(run, self._options, self._progress)
 
     def __call__(self, stance: Stance, team: Team) -> Iterator[PairMeasurement]:
         yield from measure_stance(Restated(self._run, team), stance, self._options)

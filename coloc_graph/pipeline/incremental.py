@@ -5,6 +5,7 @@ import time
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from coloc_graph.backend import Estimate, Estimator, StanceEstimate
 from coloc_graph.backend.graph import PoseKeys, slips_of
@@ -26,9 +27,11 @@ from coloc_graph.frontend import (
     sight_standing,
     unsighted_movers,
 )
+from coloc_graph.frontend.clock_evidence import ClockEvidence
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Drive, Measurement, Sighting
+from coloc_graph.pipeline.clocks import CorrectedRun, RunClocks, run_clocks, stance_evidence
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import OdometrySample, Recorded, Stance
 from coloc_graph.run.recorded import Restated
@@ -122,7 +125,7 @@ class OdometryAndSightings:
         made: list[Measurement] = [*sightings]
         for robot in sorted((here - standing) & known.last.keys()) if self._odometry else ():
             before, begun = known.last[robot]
-            driven = wheels[robot].between(before, stance.index, begun, now[robot][1], self.team.clock_sigma)
+            driven = wheels[robot].between(before, stance.index, begun, now[robot][1], run.team.clock_sigma)
             made += [] if driven is None else [driven]
         return made
 
@@ -192,6 +195,9 @@ class StanceSolver:
         self.measured: tuple[PairMeasurement, ...] = ()
         #: Warnings on clocks.
         self.warnings: list[str] = []
+        #: Clocks that turned out to be wrong; their stamps are corrected from then on.
+        self.clocks: RunClocks | None = None
+        self._evidence: list[ClockEvidence] = []
         #: Time of the front end and of the estimator for each stance [s].
         self.seconds: list[tuple[float, float]] = []
         #: Noise of marker centres as it is known from the stances that are in, and before the last.
@@ -207,11 +213,28 @@ class StanceSolver:
         `pairs` come from `measure_stance`, here or in another process.
         """
         started = time.perf_counter()
-        if pairs is None:
-            pairs = measure_stance(Restated(run, self.noise.used(self.team)), stance, self.options)
-        shared, self.warnings = share_clock_offsets(list(pairs), self.team.clock_sigma, self.measured)
+        as_it_is, run = run, self._as_corrected(run)
+
+        def again() -> tuple[tuple[PairMeasurement, ...], list[str]]:
+            noisy = Restated(run, self.noise.used(run.team))
+            return share_clock_offsets(
+                list(measure_stance(noisy, stance, self.options)), run.team.clock_sigma, self.measured
+            )
+
+        if pairs is None or self.clocks is not None:
+            shared, warnings = again()
+        else:
+            shared, warnings = share_clock_offsets(list(pairs), run.team.clock_sigma, self.measured)
+        if said := stance_evidence(run, stance, shared):
+            before = [one for one in self._evidence if one.stance != stance.index]
+            self._evidence = [*before, *(self.clocks.of_stamps(one) if self.clocks else one for one in said)]
+            clocks = run_clocks(self.team, (*self.estimator.stances, stance), self._evidence)
+            if clocks is not None:
+                self.clocks, run = clocks, clocks.corrected(as_it_is)
+                shared, warnings = again()
+        self.warnings = [*(self.clocks.sentences() if self.clocks else ()), *warnings]
         self._next_noise = self.noise.updated(shared)
-        shared = measured_again(shared, self._next_noise.used(self.team))
+        shared = measured_again(shared, self._next_noise.used(run.team))
         self._measuring = time.perf_counter() - started
         return shared
 
@@ -226,6 +249,7 @@ class StanceSolver:
             A stance after the first has no anchor and no odometry into it.
         """
         shared = self.measure(run, stance) if measured is None else measured
+        run = self._as_corrected(run)
         started = time.perf_counter()
         noisy = Restated(run, self._next_noise.used(self.team))
         motions = [] if self.team.floor is None else self._motions.of_stance(noisy, stance, shared)
@@ -244,6 +268,9 @@ class StanceSolver:
         self.measured += tuple(replace(one, with_team=None) for one in shared)
         self._earlier_noise, self.noise = self.noise, self._next_noise
         return EnteredStance(here, said, made, shared)
+
+    def _as_corrected(self, run: Any) -> Any:
+        return run if self.clocks is None or isinstance(run, CorrectedRun) else self.clocks.corrected(run)
 
     @property
     def unused(self) -> list[UnusedSighting]:

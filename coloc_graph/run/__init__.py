@@ -6,6 +6,7 @@ A run is one MCAP file that Foxglove opens; docs/run-format.md is its specificat
 
 from coloc_graph.run.index import is_mcap
 from coloc_graph.run.messages import (
+    Clocks,
     Detections,
     EncodedImage,
     Flag,
@@ -14,6 +15,7 @@ from coloc_graph.run.messages import (
     OdometrySample,
     Planes,
     Ranges,
+    RobotClock,
     Stance,
 )
 from coloc_graph.run.reader import Run, open_run, read_true_team, read_truth, run_id, truth_counts
@@ -21,6 +23,7 @@ from coloc_graph.run.recorded import Recorded
 from coloc_graph.run.writer import RunWriter, atomic_run
 
 __all__ = [
+    "Clocks",
     "Detections",
     "EncodedImage",
     "Flag",
@@ -30,6 +33,7 @@ __all__ = [
     "Planes",
     "Ranges",
     "Recorded",
+    "RobotClock",
     "Run",
     "RunWriter",
     "Stance",

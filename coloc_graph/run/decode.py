@@ -11,7 +11,18 @@ from coloc_graph.errors import RunError
 from coloc_graph.run import schemas
 from coloc_graph.run.encode import check_planes, check_ranges, check_stance
 from coloc_graph.run.image_header import read_image_header, too_large
-from coloc_graph.run.messages import Detections, Flag, Image, Motion, OdometrySample, Planes, Ranges, Stance
+from coloc_graph.run.messages import (
+    Clocks,
+    Detections,
+    Flag,
+    Image,
+    Motion,
+    OdometrySample,
+    Planes,
+    Ranges,
+    RobotClock,
+    Stance,
+)
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
@@ -103,6 +114,13 @@ def decode_planes(ns: int, data: memoryview) -> Planes:
     except RunError as error:
         raise MalformedError(str(error)) from error
     return planes
+
+
+def decode_clocks(ns: int, data: memoryview) -> Clocks:
+    """Errors of clocks by which the run's stamps were corrected."""
+    wire = _json(data, schemas.ClocksWire)
+    found = (RobotClock(one.robot, one.offset, one.drift, one.steps, one.jitter, one.known) for one in wire.clocks)
+    return Clocks(schemas.to_seconds(ns), tuple(found))
 
 
 def decode_image(robot: str, ns: int, schema: str, data: memoryview) -> Image:

@@ -12,6 +12,7 @@ from coloc_graph.errors import RunError
 from coloc_graph.geometry.lie import quaternion
 from coloc_graph.run import schemas
 from coloc_graph.run.messages import (
+    Clocks,
     Detections,
     EncodedImage,
     Flag,
@@ -20,13 +21,14 @@ from coloc_graph.run.messages import (
     OdometrySample,
     Planes,
     Ranges,
+    RobotClock,
     Stance,
 )
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
 ImageFormat = Literal["jpeg", "png", "raw"]
-Record = Detections | Image | EncodedImage | OdometrySample | Motion | Ranges | Stance | Planes
+Record = Detections | Image | EncodedImage | OdometrySample | Motion | Ranges | Stance | Planes | Clocks
 
 JPEG_QUALITY = 95  # of OpenCV's scale from 0 to 100
 
@@ -72,6 +74,8 @@ def encode_record(record: Record, image_format: ImageFormat) -> tuple[str, str, 
             return _json(schemas.STANCE_TOPIC, record.start, _stance(record))
         case Planes():
             return _json(schemas.PLANES_TOPIC, record.time, _planes(record))
+        case Clocks():
+            return _json(schemas.CLOCKS_TOPIC, record.time, _clocks(record))
     raise TypeError(f"a {type(record).__name__} is not a record of a run")
 
 
@@ -213,6 +217,25 @@ def _planes(record: Planes) -> schemas.PlanesWire:
 def _four(plane: Any) -> tuple[float, float, float, float]:
     nx, ny, nz, d = (float(value) for value in plane)
     return nx, ny, nz, d
+
+
+def _clocks(record: Clocks) -> schemas.ClocksWire:
+    return schemas.ClocksWire(clocks=tuple(map(_clock, record.clocks)))
+
+
+def _clock(clock: RobotClock) -> schemas.ClockWire:
+    numbers = (clock.offset, clock.drift, clock.jitter, *(value for step in clock.steps for value in step))
+    if not all(map(math.isfinite, numbers)):
+        raise RunError(f"the clock of {clock.robot} has a number that is not finite; give seconds")
+    steps = tuple((float(time), float(change)) for time, change in clock.steps)
+    return schemas.ClockWire(
+        robot=clock.robot,
+        offset=float(clock.offset),
+        drift=float(clock.drift),
+        steps=steps,
+        jitter=float(clock.jitter),
+        known=clock.known,
+    )
 
 
 def check_planes(planes: Planes, where: str) -> None:

@@ -201,3 +201,27 @@ class Planes:
     time: float
     planes: dict[str, tuple[float, float, float, float]] = field(default_factory=dict)
     sigmas: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RobotClock:
+    """Error of a robot's clock as it was found when the run was made; the run's stamps are corrected by it.
+
+    `offset` [s] against the other robots' clocks (positive: ahead), `drift` [s/s], `steps` (time [UTC s], change [s])
+    within the recording, `jitter` [s] of the stamps, and the measurements by which all of it is `known`.
+    """
+
+    robot: str
+    offset: float
+    drift: float
+    steps: tuple[tuple[float, float], ...]
+    jitter: float
+    known: str
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """Clocks of a run's robots, at most one message a run, at any `time` [UTC s]."""
+
+    time: float
+    clocks: tuple[RobotClock, ...]

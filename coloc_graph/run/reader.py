@@ -12,7 +12,7 @@ from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.run import decode, schemas
 from coloc_graph.run.encode import check_robots, check_targets
 from coloc_graph.run.index import Index, build_index
-from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Planes, Ranges, Stance
+from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Planes, Ranges, RobotClock, Stance
 from coloc_graph.run.topics import Item, decoded, read_near, read_topic, time_span
 from coloc_graph.team import Team
 
@@ -88,6 +88,14 @@ class Run:
         for one in decoded(self._index, items, lambda item: decode.decode_ranges(robot, item.ns, item.data)):
             check_targets(self.team, one, f"{self.path}: the ranges of {robot} at {one.time} s")
             yield one
+
+    def clocks(self) -> tuple[RobotClock, ...]:
+        """Errors of the robots' clocks by which the stamps were corrected when the run was made."""
+        items = schemas.CLOCKS_TOPIC, read_topic(self._index, schemas.CLOCKS_TOPIC)
+        found = decoded(self._index, items, lambda item: decode.decode_clocks(item.ns, item.data))
+        clocks = tuple(clock for one in found for clock in one.clocks)
+        check_robots(self.team, tuple(clock.robot for clock in clocks), f"{self.path}: the record of clocks")
+        return clocks
 
     @property
     def has_ranges(self) -> bool:

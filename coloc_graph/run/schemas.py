@@ -20,6 +20,7 @@ TEAM_TOPIC = "/team"
 TRUE_TEAM_TOPIC = "/truth/team"
 STANCE_TOPIC = "/stance"
 PLANES_TOPIC = "/planes"
+CLOCKS_TOPIC = "/clocks"
 
 RAW_IMAGE = "foxglove.RawImage"
 COMPRESSED_IMAGE = "foxglove.CompressedImage"
@@ -85,6 +86,23 @@ class PlanesWire(Wire, frozen=True):
     sigmas: dict[str, tuple[float, float]] = {}
 
 
+class ClockWire(Wire, frozen=True):
+    """Error of one robot's clock: offset [s], drift [s/s], steps (UTC s, s), jitter [s], and by what it is known."""
+
+    robot: str
+    offset: float
+    drift: float
+    steps: tuple[tuple[float, float], ...]
+    jitter: float
+    known: str
+
+
+class ClocksWire(Wire, frozen=True):
+    """Errors of clocks by which the run's stamps were corrected."""
+
+    clocks: tuple[ClockWire, ...]
+
+
 #: Last parts of a robot's topics, `/<robot>/...`, with the schemas that their messages can have.
 ROBOT_SCHEMAS: Mapping[str, tuple[str, ...]] = {
     "image": (RAW_IMAGE, COMPRESSED_IMAGE),
@@ -99,6 +117,7 @@ TEAM_SCHEMAS: Mapping[str, tuple[str, ...]] = {
     TRUE_TEAM_TOPIC: ("coloc_graph.Team",),
     STANCE_TOPIC: ("coloc_graph.Stance",),
     PLANES_TOPIC: ("coloc_graph.Planes",),
+    CLOCKS_TOPIC: ("coloc_graph.Clocks",),
 }
 JSON_TYPES: Mapping[str, type[msgspec.Struct]] = {
     "coloc_graph.Team": Team,
@@ -108,6 +127,7 @@ JSON_TYPES: Mapping[str, type[msgspec.Struct]] = {
     "coloc_graph.Ranges": RangesWire,
     "coloc_graph.Stance": StanceWire,
     "coloc_graph.Planes": PlanesWire,
+    "coloc_graph.Clocks": ClocksWire,
 }
 
 

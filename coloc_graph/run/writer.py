@@ -25,7 +25,7 @@ from coloc_graph.run.encode import (
     encode_record,
     encode_team,
 )
-from coloc_graph.run.messages import Planes, Ranges, Stance
+from coloc_graph.run.messages import Clocks, Planes, Ranges, Stance
 from coloc_graph.run.output_lock import OutputLock, locked_output
 from coloc_graph.team import Team
 
@@ -127,6 +127,8 @@ class RunWriter:
                 check_robots(self.team, (*record.observers, *record.movers, *record.anchors), where)
             case Planes():
                 check_robots(self.team, tuple(record.planes), f"the planes of stance {record.stance}")
+            case Clocks():
+                check_robots(self.team, tuple(clock.robot for clock in record.clocks), "the record of clocks")
             case _:
                 check_robots(self.team, (record.robot,), f"the {type(record).__name__}")
         if isinstance(record, Ranges):

@@ -50,7 +50,8 @@ def share_clock_offsets(
         pair, _ = _in_order(one, None)
         offset = fused[pair] if pair == (one.homography.robot_i, one.homography.robot_j) else fused[pair].reversed()
         again = one if one.at_offset is None else one.at_offset(offset)
-        shared.append(replace(again, offset_evidence=one.offset_evidence, at_offset=None))
+        same = {name: getattr(one, name) for name in ("offset_evidence", "seen", "standing", "landmarks")}
+        shared.append(replace(again, at_offset=None, **same))
     return tuple(shared), warnings
 
 

@@ -1,0 +1,219 @@
+"""Share of drawn faults whose true cause is named, alone or among equals, and of innocent robots that are blamed.
+
+    python benchmarks/blame.py [--seeds 60] [--first 0] [--json]
+
+Each seed is a hallway, or a team of four, of 12 stances at depth tracks, with one fault: a clock, an odometry jump, a
+lever arm of odometry, a robot that moved and is called an anchor, a bump, or a wrong homography; and the same without.
+A fault counts where it moves a pose by more than 3 sigma, if nothing is named.
+"""
+
+import argparse
+import json
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from monte_carlo import MemoryRun, over_seeds, simulated
+
+from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.se2 import compose
+from coloc_graph.measurements import Odometry, RelativePose
+from coloc_graph.pipeline.batch import Solution, SolveOptions, solve
+from coloc_graph.run import Detections, OdometrySample, Stance
+from coloc_graph.simulation import Imperfections
+from coloc_graph.simulation.scenarios import team_of
+from coloc_graph.simulation.teams import build_team_world
+
+STANCES = 12  # stances of a run
+POINTS = 100  # points of a stance of a hallway
+TEAM_POINTS = 600  # points of a pair of a stance of a team: 7.5 images a second
+KINDS = ("clock", "jump", "arm", "moves", "bump", "homography")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A drawn fault of a `kind` of a robot, from a stance on; `size` is in m or s."""
+
+    kind: str
+    robot: str
+    stance: int
+    size: float
+    T_before_after: np.ndarray
+
+
+class Faulty:
+    """A run with a fault."""
+
+    def __init__(self, run: MemoryRun, fault: Fault) -> None:
+        self._run, self.fault = run, fault
+        self.stances = tuple(self._stances())
+        self._since = run.stances[fault.stance].start
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._run, name)
+
+    def _stances(self) -> Iterator[Stance]:
+        for stance in self._run.stances:
+            if self.fault.kind == "moves" and stance.index == self.fault.stance:
+                stance = replace(stance, anchors=(*stance.anchors, self.fault.robot))
+            yield stance
+
+    def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
+        """As the camera sees it, with the fault."""
+        fault, mine = self.fault, robot == self.fault.robot
+        late = fault.size if mine and fault.kind == "clock" else 0.0
+        last = self._run.stances[fault.stance].end
+        for one in self._run.detections(robot, start - late, end - late):
+            displaced = fault.kind == "bump" or (fault.kind == "homography" and one.time <= last)
+            if mine and displaced and one.time >= self._since:
+                one = self._moved(one)
+            yield replace(one, time=one.time + late) if late else one
+
+    def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
+        """As the wheels say, with the fault."""
+        fault = self.fault
+        if robot != fault.robot or fault.kind not in ("clock", "jump", "arm"):
+            yield from self._run.odometry(robot, start, end)
+            return
+        late = fault.size if fault.kind == "clock" else 0.0
+        lower, upper = (None if one is None else one - late for one in (start, end))
+        for one in self._run.odometry(robot, lower, upper):
+            if fault.kind == "arm":
+                x, y, yaw = one.pose
+                yield replace(one, pose=np.array([*(x + fault.size * np.cos(yaw), y + fault.size * np.sin(yaw)), yaw]))
+            elif fault.kind == "jump" and one.time >= self._since:
+                T = fault.T_before_after
+                by = (T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0]))
+                yield replace(one, pose=np.array(compose(by, tuple(one.pose.tolist()))))
+            else:
+                yield replace(one, time=one.time + late)
+
+    def _moved(self, one: Detections) -> Detections:
+        robot = self._run.team[self.fault.robot]
+        T_bc, camera = robot.mount.T_body_camera, robot.camera
+        height = next(r.markers.height for r in self._run.team.robots if r.markers)
+        rays = np.column_stack([camera.normalise(one.uv), np.ones(len(one.uv))]) @ T_bc[:3, :3].T
+        p_body = T_bc[:3, 3] + rays * ((height - T_bc[2, 3]) / rays[:, 2])[:, None]
+        T = self.fault.T_before_after @ T_bc
+        return replace(one, uv=camera.project((p_body - T[:3, 3]) @ T[:3, :3])[0])
+
+
+def drawn(run: MemoryRun, kind: str, rng: np.random.Generator) -> Fault:
+    """A fault of a kind that the run can have."""
+    far, way = rng.uniform(0.08, 0.3), rng.uniform(0, 2 * np.pi)
+    T = floor_pose(far * np.cos(way), far * np.sin(way), np.radians(rng.uniform(4, 15)) * rng.choice([-1, 1]))
+    k = int(rng.integers(2, len(run.stances) - 2))
+    stance = run.stances[k]
+    if kind == "moves":
+        moved = [(s.index, r) for a, s in zip(run.stances, run.stances[1:], strict=False)
+                 for r in s.observers if r not in s.anchors and r in a.observers]  # fmt: skip
+        inner = [one for one in moved if 1 < one[0] < len(run.stances) - 2] or moved
+        if not inner:  # all who moved before a stance had moved within the one before it
+            return drawn(run, "bump", rng)
+        index, robot = inner[rng.integers(len(inner))]
+        return Fault(kind, robot, index, far, T)
+    if kind == "bump":
+        return Fault(kind, str(rng.choice(stance.anchors)), k, far, T)
+    if kind == "homography":
+        return Fault(kind, str(rng.choice(stance.observers)), k, far, T)
+    if kind == "clock":
+        return Fault(kind, str(rng.choice(stance.observers)), 0, float(rng.choice([-1, 1]) * rng.uniform(0.1, 2.0)), T)
+    driving = [name for name in run.team.names if any(True for _ in run.odometry(name))]
+    return Fault(kind, str(rng.choice(driving)), k, 0.2 + far, T)
+
+
+def accusations(solution: Solution) -> list[set[tuple[str, str]]]:
+    """Every fault that is named as the causes that are said to explain it equally well: (kind, robot)."""
+    said: list[set[tuple[str, str]]] = [
+        {("moved", bump.stay_put.robot), *(("odometry", one.robot) for one in bump.alternative)}
+        for bump in solution.estimate.bumped
+    ]
+    for one in solution.estimate.rejected:
+        m = one.measurement
+        if isinstance(m, Odometry):
+            said.append({("odometry", m.robot)})
+        elif isinstance(m, RelativePose):
+            said.append({(f"homography {m.stance}", robot) for robot in (m.robot_i, m.robot_j)})
+    for sentence in solution.warnings:
+        said += [
+            {(what, robot)}
+            for what in ("clock", "odometry")
+            for robot in solution.run.team.names
+            if f"{robot}'s {what}" in sentence or f"the {what} of {robot} " in sentence
+        ]
+    return said
+
+
+def verdict(solution: Solution, fault: Fault) -> tuple[bool, bool]:
+    """Return whether the right cause is named, and whether a sentence names innocent robots alone."""
+    kinds = {"clock": "clock", "jump": "odometry", "arm": "odometry", "moves": "moved", "bump": "moved"}
+    right = (kinds.get(fault.kind, f"homography {fault.stance}"), fault.robot)
+    said = accusations(solution)
+    return any(right in one for one in said), any(all(robot != fault.robot for _, robot in one) for one in said)
+
+
+def world_of(seed: int) -> MemoryRun:
+    """A hallway, or a team of four."""
+    imperfections = Imperfections(mount_sigma_deg=0.3, height_sigma=0.002, floor_sigma_deg=0.1)
+    if seed % 2 == 0:
+        return MemoryRun(simulated("hallway", seed, points=POINTS, stances=STANCES, imperfections=imperfections))
+    world = build_team_world(team_of(4, 1, STANCES), seed=seed, points=TEAM_POINTS, imperfections=imperfections)
+    return MemoryRun(world)
+
+
+def one_seed(seed: int) -> dict[str, Any]:
+    """One fault, drawn by the seed, or none where it is negative (of the same world)."""
+    world = world_of(abs(seed))
+    rng = np.random.default_rng((abs(seed), 7))
+    began = time.process_time()
+    if seed < 0:
+        said = accusations(solve(world, SolveOptions()))  # type: ignore[arg-type]
+        return {"kind": "healthy", "seed": seed, "said": [sorted(one) for one in said]}
+    kind = KINDS[(seed // 2) % len(KINDS)]
+    fault = drawn(world, kind, rng)
+    row: dict[str, Any] = {"kind": kind, "seed": seed, "robot": fault.robot, "stance": fault.stance}
+    row["size"] = round(fault.size, 3)
+    try:
+        solution = solve(Faulty(world, fault), SolveOptions())  # type: ignore[arg-type]
+    except Exception as error:  # one failure must not end the others
+        return {**row, "error": f"{type(error).__name__}: {error}"}
+    right, innocent = verdict(solution, fault)
+    said = [sorted(one) for one in accusations(solution)]
+    row["kind"] = fault.kind
+    return {**row, "right": right, "innocent": innocent, "said": said, "seconds": time.process_time() - began,
+            "warnings": list(solution.warnings)}  # fmt: skip
+
+
+def main() -> None:
+    """Run it, print it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=60)
+    parser.add_argument("--first", type=int, default=1, help="first seed (default: 1)")
+    parser.add_argument("--healthy", action="store_true", help="run the same worlds without a fault")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--json", action="store_true", help="print every seed, one after the other")
+    options = parser.parse_args()
+    seeds = range(options.first, options.first + options.seeds)
+    drawn_seeds = [-seed if options.healthy else seed for seed in seeds]
+    if options.json:
+        for seed in drawn_seeds:
+            print(json.dumps(one_seed(seed), default=str), flush=True)
+        return
+    rows = over_seeds(one_seed, drawn_seeds, options.processes)
+    counts: Counter[tuple[str, str]] = Counter()
+    for row in rows:
+        counts[row["kind"], "drawn"] += 1
+        for what in ("right", "innocent", "error"):
+            counts[row["kind"], what] += bool(row.get(what))
+        counts[row["kind"], "named"] += bool(row.get("said"))
+    print(f"{'fault':12} {'drawn':>6} {'named':>6} {'right':>6} {'innocent alone':>15} {'no result':>10}")
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        cells = [counts[kind, what] for what in ("drawn", "named", "right", "innocent", "error")]
+        print(f"{kind:12} {cells[0]:6} {cells[1]:6} {cells[2]:6} {cells[3]:15} {cells[4]:10}")
+
+
+if __name__ == "__main__":
+    main()

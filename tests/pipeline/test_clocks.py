@@ -1,0 +1,105 @@
+"""Clocks of robots that differ by seconds, or are set: found from motion, corrected, and told."""
+
+from dataclasses import replace
+
+import msgspec
+import pytest
+
+from coloc_graph.evaluation import align, evaluate
+from coloc_graph.pipeline.batch import SolveOptions, solve
+from coloc_graph.pipeline.clock_table import clock_table
+from coloc_graph.run import Clocks, RobotClock, RunWriter, open_run, read_truth
+from coloc_graph.simulation import simulate
+
+STANCES = 5
+
+
+@pytest.fixture(scope="module")
+def right(tmp_path_factory):
+    """A run of four robots whose clocks are right."""
+    path = tmp_path_factory.mktemp("clocks") / "run.mcap"
+    simulate("team", path, robots=4, stances=STANCES, points=300, seed=4)
+    return open_run(path)
+
+
+def with_clock(run, path, robot, error, kinds=("detections", "odometry")):
+    """The same run where one robot's stamps are off by `error` [s] at each time."""
+    records = [*run.stances]
+    for name in run.team.names:
+        wrong = name == robot
+        for kind in ("detections", "odometry"):
+            every = list(getattr(run, kind)(name))
+            if wrong and kind in kinds:
+                every = [replace(one, time=one.time + error(one.time)) for one in every]
+            records += every
+    with RunWriter(path, run.team, flush_every=None) as writer:
+        for one in sorted(records, key=lambda one: getattr(one, "time", getattr(one, "start", 0.0))):
+            writer.write(one)
+    return open_run(path)
+
+
+def ate(solution, run):
+    true = align(solution.estimate.trajectories, read_truth(run.path), run.team.reference, on_floor=True)
+    return evaluate(solution.estimate.trajectories, true, on_floor=True).ate
+
+
+def middle(run):
+    return (run.stances[1].end + run.stances[2].start) / 2
+
+
+CASES = {
+    "a second ahead": (lambda run: lambda t: 1.0, "B's clock is 1.00", "ahead of"),
+    "three seconds behind": (lambda run: lambda t: -3.0, "s behind the other robots'", "B's clock is "),
+    "set": (lambda run: lambda t: 1.0 if t > middle(run) else 0.0, "B's clock was set ahead by 1.00", "by motion"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_clock_that_is_off_is_found_from_motion_and_told_and_costs_no_accuracy(right, tmp_path, case):
+    error, told, way = CASES[case]
+    solution = solve(with_clock(right, tmp_path / "wrong.mcap", "B", error(right)))
+    sentences = [one for one in solution.warnings if "clock" in one and "not observable" not in one]
+    assert len(sentences) == 1, sentences
+    sentence = sentences[0]
+    assert told in sentence and way in sentence
+    assert not solution.estimate.bumped and not solution.estimate.rejected
+    assert ate(solution, right) < 1.5 * ate(solve(right), right) + 2e-4
+
+
+def test_wheels_whose_clock_is_off_are_found_against_the_cameras(right, tmp_path):
+    solution = solve(with_clock(right, tmp_path / "wrong.mcap", "D", lambda t: 0.6, kinds=("odometry",)))
+    sentences = [one for one in solution.warnings if "clock" in one and "not observable" not in one]
+    assert len(sentences) == 1 and "the clock of D's odometry is 0.6" in sentences[0]
+    assert not solution.estimate.bumped and not solution.estimate.rejected
+    assert ate(solution, right) < 1.5 * ate(solve(right), right) + 2e-4
+
+
+def test_a_clock_that_is_off_is_found_stance_by_stance(right, tmp_path):
+    solution = solve(with_clock(right, tmp_path / "wrong.mcap", "B", lambda t: 0.7), SolveOptions(incremental=True))
+    assert any("B's clock is 0.70" in one for one in solution.warnings)
+    assert not solution.estimate.bumped and not solution.estimate.rejected
+
+
+def test_clocks_that_are_right_are_left_alone(right):
+    assert not any("clock" in one for one in solve(right).warnings)
+
+
+def test_the_table_shows_offsets_by_motion(right, tmp_path):
+    rows = clock_table(with_clock(right, tmp_path / "wrong.mcap", "B", lambda t: 1.0))
+    offsets = {(row.robot, row.known.split(", ")[1]): float(row.offset.split(" s")[0]) for row in rows}
+    assert offsets["B", "camera"] == pytest.approx(1.0, abs=0.01)
+    assert all(abs(one) < 0.03 for (robot, _), one in offsets.items() if robot != "B")
+
+
+def test_the_table_shows_what_an_import_found_and_who_is_unknown(right, tmp_path):
+    found = RobotClock("B", -1.0, 1e-4, ((right.stances[1].start, 0.5),), 2e-3, "stamps against reception of /B/odom")
+    with RunWriter(tmp_path / "run.mcap", msgspec.structs.replace(right.team, clock_sigma=5e-3)) as writer:
+        writer.write(Clocks(right.stances[0].start, (found,)))
+        for name in "AB":
+            writer.write(next(iter(right.odometry(name))))
+    run = open_run(tmp_path / "run.mcap")
+    assert run.clocks() == (found,) and not run.warnings
+    unknown, row = clock_table(run)
+    assert (row.robot, row.offset, row.drift, row.jitter) == ("B", "-1.0000 s", "+100 ppm", "2.0 ms")
+    assert row.steps.startswith("+0.500 s at") and "/B/odom (corrected)" in row.known
+    assert unknown.robot == "A" and "5 ms (clock_sigma)" in unknown.known
