@@ -26,7 +26,6 @@ from coloc_graph.team import Team
 
 T = TypeVar("T")
 
-T = TypeVar("T")
 FIRST_CHECKED = 6  # stances that are compared first, of those in which clocks are doubted
 UNFIT_P_VALUE = 1e-6  # probability of a fit as bad as this by noise below which clocks are doubted
 LEAST_INLIERS = 0.8  # share of inliers below which they are doubted, too
