@@ -13,7 +13,7 @@ from coloc_graph.frontend.tracks.rigid_path import RigidPath, rigid_path
 from coloc_graph.frontend.tracks.tracking import Track
 
 MIN_SAMPLES = 25  # mean samples of a causal track below which it broke often
-LEAST_SEEN = 0.5  # share of the images with both lights below which the mover was out of view
+MIN_SEEN = 0.5  # share of the images with both lights below which the mover was out of view
 FAST = 0.35  # share of the distance between two lights that is a large step from one image to the next
 
 #: Tracks of two observers.
@@ -72,11 +72,11 @@ def why_broken(tracks: StanceTracks, robot_i: str, robot_j: str, end: float) -> 
         )
         for path, share, own in zip(paths, shares, causal, strict=True)
     ]
-    if min(shares) < LEAST_SEEN:
+    if min(shares) < MIN_SEEN:
         remedy = "keep the mover in both fields of view, and check exposure and threshold of the lights"
     elif any(path.step > FAST * path.apart for path in paths):
         remedy = "record more images a second, or let the mover drive and turn slower"
-    elif any(len(path) < LEAST_SEEN * (path.lights >= 2).sum() for path in paths):
+    elif any(len(path) < MIN_SEEN * (path.lights >= 2).sum() for path in paths):
         remedy = "check heights, tilt, span and units in the team: on the marker plane few lights are a span apart"
     else:
         remedy = "let the mover drive further and turn, or record for longer"

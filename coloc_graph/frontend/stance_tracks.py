@@ -210,7 +210,7 @@ class StanceTracks:
         return self._bound(robot, {hue: tracker.tracks() for hue, tracker in trackers.items()})
 
     def _bound(self, robot: str, by_hue: Mapping[float | None, list[Track]]) -> list[Track]:
-        """The tracks of an observer, by colour, that are of movers' markers, with the robot or body of each."""
+        """Return the tracks of movers' markers of an observer, by colour, with the robot or body of each."""
         run, stance, camera = self.run, self.stance, self.run.team[robot].camera
         planes = plausible_planes(stance_plane(run, stance, robot), run.team[robot].mount)
         tracks: list[Track] = []

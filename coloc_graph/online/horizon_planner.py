@@ -171,7 +171,7 @@ class HorizonPlanner:
         return self._belief.poses
 
     def _believed(self) -> Belief:
-        """What is known of the team, about where its robots are now."""
+        """Belief of the team at the current poses of its robots."""
         poses = self._registry.poses()
         if self._belief is None:
             self._belief = Belief.start(self._team, poses)

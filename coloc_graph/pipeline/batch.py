@@ -42,7 +42,7 @@ __all__ = ["METHODS", "EnteredStance", "Progress", "Solution", "SolveOptions", "
 
 NOISE_ROUNDS = 2  # of learning the noise and measuring again: which points are inliers depends on it
 
-LEAST_SHARED = 0.02  # part of homographies' covariance by shared errors below which their size is not looked for
+MIN_SHARED = 0.02  # part of homographies' covariance by shared errors below which their size is not looked for
 
 BATCH = {"chain": chain, "smooth": smooth, "joint": joint}
 
@@ -200,7 +200,7 @@ def _shared_noise(estimate: Estimate, noise: NoiseBelief) -> SharedNoise | None:
     """The size of shared errors relative to that of an estimate's measurements; None where they hardly count."""
     factor = float(np.median(noise.bias_factor))
     used = estimate.graph.without(one.measurement for one in estimate.rejected)
-    if estimate.dof <= 0 or shared_part(used) < LEAST_SHARED:
+    if estimate.dof <= 0 or shared_part(used) < MIN_SHARED:
         return None
     # the measurements were made with what is expected of the prior, which is more than its median
     expected = math.exp(math.log(factor) ** 2)

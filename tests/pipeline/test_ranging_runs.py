@@ -340,7 +340,7 @@ def test_a_run_without_odometry_says_so(tmp_path):
 def test_ranges_of_who_is_not_in_the_team_cannot_be_written(tmp_path):
     with pytest.raises(RunError, match="name `X`, which is neither another robot nor a landmark"):
         write(tmp_path / "run.mcap", target="X")
-    with pytest.raises(RunError, match="name `A`, which is no other"):
+    with pytest.raises(RunError, match="name `A`, which is neither"):
         write(tmp_path / "run.mcap", target="A")
     assert not list(tmp_path.iterdir())
 

@@ -423,7 +423,7 @@ def _between(live: _Live) -> Array:
 
 
 def _key(sample: Candidate | int) -> int:
-    """What tells a sample from all others of its tracker."""
+    """Identity of a sample among all of its tracker."""
     return sample if isinstance(sample, int) else id(sample)
 
 
