@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from coloc_graph.backend.planar import Latest
     from coloc_graph.evaluation import Accuracy
+    from coloc_graph.frontend import TrackerOptions
     from coloc_graph.pipeline.batch import EnteredStance, Solution, SolveOptions
     from coloc_graph.run import Run
 
@@ -31,6 +32,13 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     )
     command.add_argument("--out", required=True, metavar="DIR", help="folder for the result, or for those of all runs")
     command.add_argument("--incremental", action="store_true", help="solve stance by stance, as online")
+    command.add_argument(
+        "--tracking",
+        nargs="+",
+        metavar="NAME=VALUE",
+        help="of runs with stances: options of the tracking of markers, as speed=400 (see [tracking] in docs/team.md; "
+        "default: as the team states, or as usual)",
+    )
     command.add_argument("--json", action="store_true", help="print the summary as JSON")
     viewer = command.add_argument_group("viewer")
     viewer.add_argument(
@@ -100,6 +108,10 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
         frontend = options.resolved().frontend
         assert frontend is not None  # resolved
         options = replace(options, frontend=replace(frontend, scale=args.scale))
+    if args.tracking:
+        frontend = options.resolved().frontend
+        assert frontend is not None  # resolved
+        options = replace(options, frontend=replace(frontend, tracker=_tracker(args.tracking)))
     if args.lenient:
         raise InputError(f"{args.run_path} is not a pose graph (.g2o): --lenient applies to pose graphs only")
     if Path(args.run_path).is_dir():
@@ -135,6 +147,24 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
             viewer.publish(scene_of_solution(solution))
             viewer.wait_closed()
     return 0
+
+
+def _tracker(given: list[str]) -> "TrackerOptions":
+    """Options of the tracker, of NAME=VALUE each."""
+    import msgspec
+
+    from coloc_graph.errors import InputError
+    from coloc_graph.frontend import TrackerOptions
+    from coloc_graph.team import Tracking
+
+    fields = dict(one.partition("=")[::2] for one in given)
+    try:
+        stated = msgspec.convert(fields, Tracking, strict=False)
+    except msgspec.ValidationError as error:
+        known = ", ".join(one.name for one in msgspec.structs.fields(Tracking))
+        raise InputError(f"--tracking: {error}; give NAME=VALUE of {known}") from error
+    chosen = {name: value for name, value in msgspec.structs.asdict(stated).items() if value is not None}
+    return TrackerOptions(**chosen)
 
 
 @contextmanager

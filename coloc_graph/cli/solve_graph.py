@@ -19,7 +19,7 @@ def solve_graph(args: argparse.Namespace) -> int:
 
     given = [
         name
-        for name in ("method", "scale", "incremental", "without_odometry", "without_robots", "processes")
+        for name in ("method", "scale", "incremental", "without_odometry", "without_robots", "processes", "tracking")
         if getattr(args, name)
     ]
     if given:

@@ -243,7 +243,7 @@ def measure_pair(
 
 
 def _measure(seen: _Seen, tracks: StanceTracks, alone: bool) -> PairMeasurement:
-    """What some tracks of two observers measure."""
+    """Measure with some tracks of two observers."""
     stance, robot_i, robot_j = seen.stance, seen.robot_i, seen.robot_j
     found: Correspondences | None = None
     try:

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +20,7 @@ from coloc_graph.frontend.tracks.rigid_path import RigidPath
 from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
 from coloc_graph.measurements import Plane
 from coloc_graph.run import Detections, Flag, Recorded, Stance
-from coloc_graph.team import Markers
+from coloc_graph.team import Markers, Tracking
 
 Array = NDArray[np.float64]
 
@@ -91,7 +92,7 @@ class StanceTracks:
     def __init__(self, run: Recorded, stance: Stance, options: TrackerOptions | None = None) -> None:
         self.run, self.stance = run, stance
         stance_markers(run, stance)  # refuses movers whose markers share no plane
-        self._options = options or TrackerOptions()
+        self._options = _with_stated(options or TrackerOptions(), run.team.tracking)
         self._by_hue: dict[float | None, list[str]] = {}  # movers by the colour of their markers
         for name in stance.movers:
             markers = run.team[name].markers
@@ -129,7 +130,7 @@ class StanceTracks:
         return made[1]
 
     def checked(self, robot: str) -> list[Track]:
-        """Those of an observer up to where `of` was last asked for, cut where both directions of time disagree."""
+        """Tracks of an observer up to where `of` was last asked for, cut where both directions of time disagree."""
         trackers = self._trackers.get(robot, {})
         return self._bound(robot, {hue: tracker.checked_tracks() for hue, tracker in trackers.items()})
 
@@ -258,6 +259,19 @@ class StanceTracks:
         return MarkerTracker(
             robot, detector_for(markers[0] if markers else None, camera), options, (camera.width, camera.height)
         )
+
+
+def _with_stated(options: TrackerOptions, stated: Tracking | None) -> TrackerOptions:
+    """Options with those that a team states, but for those that are chosen already."""
+    if stated is None:
+        return options
+    usual = TrackerOptions()
+    fields = {
+        name: value
+        for name, value in msgspec.structs.asdict(stated).items()
+        if value is not None and getattr(options, name) == getattr(usual, name)
+    }
+    return replace(options, **fields)
 
 
 def _name(track: Track) -> str:

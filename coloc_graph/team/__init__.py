@@ -13,6 +13,7 @@ from coloc_graph.team.file import parse_team, read_team, team_of_fields, without
 from coloc_graph.team.landmark import Landmark, Tag
 from coloc_graph.team.sensors import Ranging, Wheels
 from coloc_graph.team.team import Floor, Robot, Team
+from coloc_graph.team.tracking import Tracking
 
 __all__ = [
     "MIN_IMAGES_PER_BIT",
@@ -31,6 +32,7 @@ __all__ = [
     "Slip",
     "Tag",
     "Team",
+    "Tracking",
     "Wheels",
     "parse_team",
     "read_team",

@@ -11,6 +11,7 @@ from coloc_graph.team.camera import Camera
 from coloc_graph.team.checks import require_finite, require_not_negative
 from coloc_graph.team.landmark import Landmark, require_name
 from coloc_graph.team.sensors import Ranging, Wheels
+from coloc_graph.team.tracking import Tracking
 
 
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -101,6 +102,8 @@ class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         estimated.
     landmarks : tuple of Landmark
         Landmarks, by which robots recognise places.
+    tracking : Tracking or None
+        Options of the tracking of markers; None: as usual.
     """
 
     reference: str
@@ -108,6 +111,7 @@ class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     floor: Floor | None = None
     clock_sigma: float = 0.0
     landmarks: tuple[Landmark, ...] = ()
+    tracking: Tracking | None = None
 
     def __post_init__(self) -> None:
         require_finite(self)

@@ -8,9 +8,9 @@ import pytest
 from coloc_graph.frontend import Detector, MarkerTracker, TrackerOptions
 from coloc_graph.frontend.images.detection import Blobs
 from coloc_graph.geometry.lie import floor_pose
-from coloc_graph.run import Image
+from coloc_graph.run import Detections, Image
 from coloc_graph.simulation import Sensor, reference_team, render, spots
-from coloc_graph.simulation.crowd import Faults, crowd
+from coloc_graph.simulation.crowd import Faults, Seen, crowd
 from coloc_graph.team.shared_view import View
 
 T0 = 1_700_000_000.0
@@ -237,3 +237,24 @@ def test_tracks_that_are_checked_backward_are_cut_where_lights_were_swapped(seed
     assert sum(light_changes(track, seen) for track in causal) > 0
     assert sum(map(len, checked)) > 0.9 * sum(map(len, causal))
     assert all((np.diff(track.times) > 0).all() for track in checked)
+
+
+def followed(seen, width):
+    tracker = MarkerTracker("A", Detector(), size=(width, width * 3 // 4))
+    for one in seen.images:
+        tracker.take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
+    return [len(track) for track in tracker.tracks()]
+
+
+@pytest.mark.parametrize("width", [320, 1280])
+def test_the_tracker_adapts_to_the_size_of_the_images_and_to_the_motion_that_it_sees(width):
+    """A light that turns sharply and fast, at the same pace of any image's width, is one track or few."""
+    times = np.arange(120) / 20.0
+    angle = 2.5 * times
+    uv = width * (0.5 + 0.2 * np.stack([np.cos(angle), np.sin(2 * angle) / 2], axis=1)) * (1, 0.75)
+    images = [
+        Detections("A", T0 + t, np.array([p]), 0.09 * np.eye(2)[None], ("",), *np.zeros((3, 1), np.uint8))
+        for t, p in zip(times.tolist(), uv, strict=True)
+    ]
+    lengths = followed(Seen(images, []), width)
+    assert sum(lengths) > 110 and len(lengths) <= 2

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from coloc_graph.errors import TeamError
 from coloc_graph.simulation import reference_team
-from coloc_graph.team import Blink, Camera, Floor, Markers, Mount, Robot, Slip, Team, read_team, write_team
+from coloc_graph.team import Blink, Camera, Floor, Markers, Mount, Robot, Slip, Team, Tracking, read_team, write_team
 
 LENSES = [
     (),
@@ -339,3 +339,14 @@ def test_a_lens_that_folds_within_the_image_is_found_where_it_folds(k1):
     assert camera.fold_radius() == pytest.approx(600 * r * (1 + k1 * r**2), rel=1e-3)
     mild = Camera(width=1280, height=800, fx=600.0, fy=600.0, cx=640.0, cy=400.0, distortion=(-0.1, 0.01, 0.0, 0.0))
     assert mild.fold_radius() is None
+
+
+def test_tracking_options_are_stated_and_refused_in_words(tmp_path, capsys):
+    stated = replace(reference_team(), tracking=Tracking(speed=400.0, clutter=1e-4))
+    write_team(stated, tmp_path / "team.toml")
+    assert read_team(tmp_path / "team.toml") == stated
+    for wrong, words in (("speed = 0.0", "`speed` is 0.0; give a positive"), ("detected = 1.0", "probability below 1")):
+        text = (tmp_path / "team.toml").read_text().replace("speed = 400.0", wrong)
+        (tmp_path / "wrong.toml").write_text(text)
+        with pytest.raises(TeamError, match=words):
+            read_team(tmp_path / "wrong.toml")

@@ -27,12 +27,21 @@ class PointFilters:
     """
 
     def __init__(self, acceleration: float, jerk: float, velocity_sigma: float) -> None:
-        self._q, self._jerk, self._velocity_sigma = acceleration, jerk, velocity_sigma
+        self.set_motion(acceleration, jerk, velocity_sigma)
         self.time: float | None = None
         self.position, self.velocity = np.zeros((0, 2)), np.zeros((0, 2))
         self.position_covariance = np.zeros((0, 2, 2))
         self._cross, self._velocity_covariance = np.zeros((0, 2, 2)), np.zeros((0, 2, 2))
         self._unseen = np.zeros(0)  # for how long [s]
+
+    def set_motion(self, acceleration: float, jerk: float, velocity_sigma: float) -> None:
+        """Set how points move from now on; see the parameters of the class."""
+        self._q, self._jerk, self._velocity_sigma = acceleration, jerk, velocity_sigma
+
+    def reach(self, dt: float) -> Array:
+        """Standard deviation of where each point is (n,) [px], had its velocity changed at once `dt` [s] ago."""
+        variance = np.trace(self.position_covariance, axis1=1, axis2=2) / 2
+        return np.asarray(np.sqrt(variance + (self._jerk * dt) ** 2))
 
     def __len__(self) -> int:
         return len(self.position)

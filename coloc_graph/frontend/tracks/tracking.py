@@ -32,6 +32,11 @@ CONFIRMED = 22.0  # log likelihood ratio of a light against false detections, ab
 AMBIGUOUS = 3.0  # log likelihood ratio of two assignments below which neither is trusted
 OVERLAP_PX = 6.0  # px between two lights that may be seen as one
 RIM = 3.0  # px from the border of the image, within which a missed light has left it
+WIDTH = 320.0  # px, width of images that the options are of
+ADAPTATION = 0.05  # of the logarithm of the acceleration, an image, by the mean normalised innovation less 1
+MAX_FACTOR = 100.0  # by which the acceleration may grow
+FASTER = 2.0  # a new light's velocity is up to this times those of the lights that are tracked
+REACH_SIGMAS = 3.0  # standard deviations of a light's position that the patch holds
 MIN_PIECE = 4  # samples of a piece on which both directions of time agree
 ROUGH_SIGMA = 0.5  # px, of a candidate's approximate centre
 
@@ -90,9 +95,13 @@ class Track:
 
 @dataclass(frozen=True)
 class TrackerOptions:
-    """Parameters of `MarkerTracker`."""
+    """Parameters of `MarkerTracker`.
 
-    patch: int = 40  # px, side of the search patch
+    Those in pixels are of images 320 px wide, and grow with the width. `acceleration` and `speed` are where the tracker
+    begins: it takes what the lights do for more, and the patch is as large as the time between images asks for.
+    """
+
+    patch: int = 40  # px, side of the search patch, at least
     patience: int = 3  # frames; a track ends that is not seen for longer, and for `patience_s`
     reacquire_every: float = 0.25  # s between searches of the full frame for markers that came into view
     markers: int = 2  # expected number of markers; with fewer live tracks the full frame is searched
@@ -159,6 +168,8 @@ class MarkerTracker:
         self._detector = detector
         self._options = options or TrackerOptions()
         self._filters = PointFilters(self._options.acceleration, self._options.jerk, self._options.speed)
+        self._growth = 0.0  # logarithm of the factor of the acceleration that was seen
+        self._moved(np.zeros(0), np.zeros(0))
         self._blink = BlinkFilter(self._options.off, self._options.off_rate)
         self._live: list[_Live] = []  # in the order of the filters
         self._ended: list[_Live] = []
@@ -169,10 +180,11 @@ class MarkerTracker:
 
     def step(self, image: Image) -> None:
         """Take in the next image."""
+        dt = 0.0 if self._filters.time is None else image.time - self._filters.time
         self._filters.predict(image.time)
         self._size = image.pixels.shape[1], image.pixels.shape[0]
         full = self._search_all(image.time)
-        found = self._detector.find(image.pixels) if full else self._in_patches(image.pixels)
+        found = self._detector.find(image.pixels) if full else self._in_patches(image.pixels, dt)
         found = [one for one in found if not one.clipped]
         uv = np.array([one.uv for one in found]).reshape(-1, 2)
         self._advance(image.time, uv, np.broadcast_to(ROUGH_SIGMA**2 * np.eye(2), (len(uv), 2, 2)), found, births=full)
@@ -238,6 +250,24 @@ class MarkerTracker:
         fields = np.array(live.times), np.array(uv), np.array(covariance), np.array(peak)
         return Track(self.robot, "", *fields, missed=_between(live), saturated=np.array(saturated))
 
+    @property
+    def _scale(self) -> float:
+        """Width of the images, by that which the options are of."""
+        return 1.0 if self._size is None else self._size[0] / WIDTH
+
+    def _moved(self, squared: Array, speeds: Array) -> None:
+        """Adapt to the motion of confirmed tracks: squared normalised innovations (k,), and speeds (k,) [px/s]."""
+        options, scale = self._options, self._scale
+        if len(squared):
+            innovation = float(np.minimum(squared, GATE).mean()) / 2
+            self._growth = float(np.clip(self._growth + ADAPTATION * (innovation - 1), 0.0, math.log(MAX_FACTOR)))
+        faster = FASTER * float(np.sqrt(np.mean(np.square(speeds)))) if len(speeds) else 0.0
+        self._filters.set_motion(
+            options.acceleration * scale**2 * math.exp(self._growth),
+            options.jerk * scale * math.exp(self._growth / 2),
+            max(options.speed * scale, faster),
+        )
+
     def _search_all(self, time: float) -> bool:
         return (
             not self._searched <= time < self._searched + self._options.reacquire_every
@@ -245,12 +275,12 @@ class MarkerTracker:
             or any(track.misses for track in self._live)
         )
 
-    def _in_patches(self, pixels: Pixels) -> list[Candidate]:
+    def _in_patches(self, pixels: Pixels, dt: float) -> list[Candidate]:
         height, width = pixels.shape[:2]
-        half = self._options.patch // 2
+        halves = np.maximum(self._scale * self._options.patch / 2, REACH_SIGMAS * self._filters.reach(dt))
         found: list[Candidate] = []
-        for centre in self._filters.position.tolist():
-            u, v = round(centre[0]), round(centre[1])
+        for centre, reach in zip(self._filters.position.tolist(), halves.tolist(), strict=True):
+            u, v, half = round(centre[0]), round(centre[1]), round(reach)
             box = (max(u - half, 0), max(v - half, 0), min(u + half, width), min(v + half, height))
             if box[2] - box[0] >= 3 and box[3] - box[1] >= 3:
                 # overlapping patches see a blob twice
@@ -305,7 +335,7 @@ class MarkerTracker:
         squared, density, jerked = self._filters.distances(uv, covariance)
         off = np.minimum(squared, jerked + JERK_PENALTY)
         near = jerked < GATE
-        gain = np.log(seen / options.clutter)[:, None] + density + 0.5 * (squared - off)
+        gain = np.log(seen / options.clutter * self._scale**2)[:, None] + density + 0.5 * (squared - off)
         worth = np.where(near, gain - missed[:, None], 0.0)  # log ratio to a missed marker and a false detection
         tracks, found = linear_sum_assignment(worth, maximize=True)
         good = near[tracks, found] & (worth[tracks, found] > AMBIGUOUS)
@@ -326,6 +356,9 @@ class MarkerTracker:
             track.score = min(track.score + one, 2 * CONFIRMED)
             track.confirmed |= track.score > CONFIRMED
         self._filters.jerk(tracks[off[tracks, found] < squared[tracks, found]])
+        sure = np.array([self._live[row].confirmed for row in tracks.tolist()], bool)
+        speeds = np.linalg.norm(self._filters.velocity[tracks[sure]], axis=1)
+        self._moved(squared[tracks[sure], found[sure]], speeds)
         return tracks, found, doubtful
 
     def _miss(self, time: float, tracks: NDArray[np.int64]) -> None:
