@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, innovation
-from coloc_graph.backend.estimate import Bump, Estimate, Rejection, contradicted, make_estimate
+from coloc_graph.backend.estimate import Bump, Estimate, Rejection, make_estimate, rejection_of
 from coloc_graph.backend.factors import Method, calibrations_in, require_robot_models
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.landmarks import ALWAYS, OnMap
@@ -173,7 +173,7 @@ def _find_outliers(method: Method, graph: PoseGraph, warm: WarmStart | None) -> 
             if _price(other, other_fit) < _price(offs, fit):
                 offs, fit = other, other_fit
     links = (*graph.measurements, *graph.on_map)
-    return tuple(contradicted(link, offs[id(link)]) for link in links if id(link) in offs), fit
+    return tuple(rejection_of(link, offs[id(link)]) for link in links if id(link) in offs), fit
 
 
 def _price(rejected: Mapping[int, Agreement], fit: Fit) -> float:

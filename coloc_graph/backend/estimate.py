@@ -34,7 +34,7 @@ class Rejection:
     reason : str
         Reason in words.
     sigmas : float
-        Distance from what all others say; NaN of a ranging run, whose weights are robust.
+        Distance from all other measurements in standard deviations; NaN of a ranging run, whose weights are robust.
     """
 
     measurement: Measurement | RangeBearing | OnMap
@@ -42,9 +42,9 @@ class Rejection:
     sigmas: float = float("nan")
 
 
-def contradicted(measurement: Measurement | OnMap, off: Agreement) -> Rejection:
-    """The rejection of a measurement that is so far `off` from what all others say."""
-    return Rejection(measurement, f"contradicted by the other measurements ({off.sigmas:.0f} sigmas)", off.sigmas)
+def rejection_of(measurement: Measurement | OnMap, off: Agreement) -> Rejection:
+    """Return the rejection of an outlier, by its test statistic."""
+    return Rejection(measurement, f"an outlier: {off.sigmas:.0f} sigmas from the other measurements", off.sigmas)
 
 
 @dataclass(frozen=True, eq=False)

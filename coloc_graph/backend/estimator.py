@@ -14,7 +14,7 @@ from coloc_graph.backend.batch import find_bumps, joint, smooth
 from coloc_graph.backend.calibration import Variables
 from coloc_graph.backend.checkpoint import Base, Entry, WaitingStance
 from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
-from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate, contradicted
+from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate, rejection_of
 from coloc_graph.backend.factors import Factors, Method, require_robot_models
 from coloc_graph.backend.graph import (
     Link,
@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 def _rejection(link: Link, off: Agreement) -> Rejection:
     assert isinstance(link, RelativePose | Sighting)
-    return contradicted(link, off)
+    return rejection_of(link, off)
 
 
 def _base(

@@ -25,7 +25,7 @@ Sensor = tuple[str, Literal["camera", "wheels"]]
 #: Tracks in both cameras of a pair.
 Seen = tuple[list[Track], list[Track]]
 
-LONGEST_TRACKS = 2  # tracks without names that are tried in each camera, the longest
+MAX_TRACKS_DURATION = 2  # tracks without names that are tried in each camera, the longest
 MOVED_PX = 20.0  # a track that keeps within this tells nothing [px]
 SYNCHRONOUS = 2e-3  # samples of two cameras that are taken at once lie this close [s]
 FEWEST_AT_ONCE = 10  # samples that tell that two cameras take them at once
@@ -138,7 +138,7 @@ def _pairings(seen_i: list[Track], seen_j: list[Track]) -> Iterator[list[tuple[i
         yield named
         return
     long_i, long_j = (
-        sorted(numbers, key=lambda n: -len(seen[n].times))[:LONGEST_TRACKS]
+        sorted(numbers, key=lambda n: -len(seen[n].times))[:MAX_TRACKS_DURATION]
         for seen, numbers in zip((seen_i, seen_j), moving, strict=True)
     )
     for a in long_i:

@@ -16,7 +16,7 @@ from coloc_graph.team import Team
 Array = NDArray[np.float64]
 
 SIGNIFICANT = 5.0  # an offset that is corrected exceeds its sigma by this factor
-LEAST_OFFSET = 3e-3  # and this [s]
+MIN_OFFSET = 3e-3  # and this [s]
 LEAST_OFFSET_OF_WHEELS = 0.06  # and of odometry, which may be filtered [s]
 LEAST_STEP = 0.05  # smallest step of a clock within a run [s]
 STEP_CHI2 = 50.0  # chi2 that a step must explain
@@ -119,7 +119,7 @@ def estimated_clocks(
                 continue
             offset, drift, sigma = known
             origin = float(np.mean([one.time for one in part]))
-            least = LEAST_OFFSET if sensor[1] == "camera" else LEAST_OFFSET_OF_WHEELS
+            least = MIN_OFFSET if sensor[1] == "camera" else LEAST_OFFSET_OF_WHEELS
             significant = abs(offset) > max(SIGNIFICANT * sigma, least)
             found = Segment(start, offset if significant else 0.0, offset, sigma, drift, origin)
             segments.append(found if segments else replace(found, start=-np.inf))

@@ -13,7 +13,7 @@ from coloc_graph.backend import Estimate
 from coloc_graph.frontend import PairMeasurement
 from coloc_graph.frontend.clock_evidence import ClockEvidence, Sensor, clock_evidence
 from coloc_graph.pipeline.clock_model import (
-    LEAST_OFFSET,
+    MIN_OFFSET,
     LEAST_STEP,
     SIGNIFICANT,
     SensorClock,
@@ -79,7 +79,7 @@ def _told(name: str, clock: SensorClock, usual: float) -> Iterator[str]:
     remedy = "the stamps were corrected; synchronise the robots' computers"
     first = clock.segments[0]
     offset = first.offset - usual
-    if abs(offset) > max(SIGNIFICANT * first.sigma, LEAST_OFFSET):
+    if abs(offset) > max(SIGNIFICANT * first.sigma, MIN_OFFSET):
         way = "ahead of" if offset > 0 else "behind"
         yield (
             f"{name} is {abs(offset):.3f} s {way} the other robots' ({known}, "

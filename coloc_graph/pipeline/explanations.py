@@ -125,7 +125,7 @@ def warnings_of_graph(
     warnings += [f"{part} (left out of the result)" for part in disconnected[:MAX_REASONS]]
     if len(disconnected) > MAX_REASONS:
         warnings.append(f"{len(disconnected) - MAX_REASONS} more groups of poses are not tied to the reference")
-    warnings += [f"the {one.measurement} is not used: it is {one.reason}" for one in estimate.rejected]
+    warnings += [f"the {one.measurement} was rejected: it is {one.reason}" for one in estimate.rejected]
     warnings += [str(bump) for bump in estimate.bumped]
     warnings += _far(estimate)
     p_value = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0

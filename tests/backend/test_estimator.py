@@ -237,7 +237,7 @@ def test_wrong_homographies_are_refused_before_they_enter_and_leave_no_trace():
     assert {id(r.measurement) for r in estimator.rejected} == set(map(id, made.wrong)) and len(made.wrong) >= 8
     right = smooth(graph_of_team(made, [m for m in made.measurements if m not in made.wrong]))
     assert largest_difference(estimator.estimate(), right, right.graph.nodes) < 1e-6
-    assert all("contradicted by the other measurements" in r.reason for r in estimator.rejected)
+    assert all("sigmas from the other measurements" in r.reason for r in estimator.rejected)
 
 
 @pytest.mark.parametrize("off", [0.03, 0.045])

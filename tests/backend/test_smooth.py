@@ -64,7 +64,7 @@ def test_wrong_homographies_in_a_loopy_team_are_all_found_and_no_right_one_is_re
     team, estimate = six
     assert len(team.wrong) >= 8
     assert {id(r.measurement) for r in estimate.rejected} == set(map(id, team.wrong))
-    assert all("contradicted" in r.reason and "sigmas" in r.reason for r in estimate.rejected)
+    assert all("outlier" in r.reason and "sigmas" in r.reason for r in estimate.rejected)
     # what remains is a fit as good as any
     low, high = chi2.ppf([1e-4, 1 - 1e-4], estimate.dof)
     assert low < estimate.chi2 < high
