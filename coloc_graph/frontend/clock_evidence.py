@@ -25,10 +25,10 @@ Sensor = tuple[str, Literal["camera", "wheels"]]
 #: Tracks in both cameras of a pair.
 Seen = tuple[list[Track], list[Track]]
 
-MAX_TRACKS_DURATION = 2  # tracks without names that are tried in each camera, the longest
+MAX_UNNAMED_TRACKS = 2  # tracks without names that are tried in each camera, the longest
 MOVED_PX = 20.0  # a track that keeps within this tells nothing [px]
 SYNCHRONOUS = 2e-3  # samples of two cameras that are taken at once lie this close [s]
-FEWEST_AT_ONCE = 10  # samples that tell that two cameras take them at once
+MIN_AT_ONCE = 10  # samples that tell that two cameras take them at once
 ROUGH_SIGMA = 20e-3  # standard deviation of a searched offset before it is refined [s]
 SIGMA_FLOORS = {"camera": 5e-3, "wheels": 20e-3}  # a searched offset is known no better: samples are few, wheels slip
 
@@ -116,7 +116,7 @@ def _at_once(
     apart = times_j[None] - times_i[:, None] - rough.value
     nearest = apart[np.arange(len(apart)), np.abs(apart).argmin(axis=1)]
     nearest = nearest[np.abs(nearest) < 4 * rough.sigma]
-    if len(nearest) < FEWEST_AT_ONCE:
+    if len(nearest) < MIN_AT_ONCE:
         return None
     lag = float(np.median(nearest))
     spread = 1.4826 * float(np.median(np.abs(nearest - lag)))
@@ -138,7 +138,7 @@ def _pairings(seen_i: list[Track], seen_j: list[Track]) -> Iterator[list[tuple[i
         yield named
         return
     long_i, long_j = (
-        sorted(numbers, key=lambda n: -len(seen[n].times))[:MAX_TRACKS_DURATION]
+        sorted(numbers, key=lambda n: -len(seen[n].times))[:MAX_UNNAMED_TRACKS]
         for seen, numbers in zip((seen_i, seen_j), moving, strict=True)
     )
     for a in long_i:

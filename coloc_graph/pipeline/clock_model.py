@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 
 SIGNIFICANT = 5.0  # an offset that is corrected exceeds its sigma by this factor
 MIN_OFFSET = 3e-3  # and this [s]
-LEAST_OFFSET_OF_WHEELS = 0.06  # and of odometry, which may be filtered [s]
-LEAST_STEP = 0.05  # smallest step of a clock within a run [s]
+MIN_WHEEL_OFFSET = 0.06  # and of odometry, which may be filtered [s]
+MIN_STEP = 0.05  # smallest step of a clock within a run [s]
 STEP_CHI2 = 50.0  # chi2 that a step must explain
 DRIFT_CHI2 = 25.0  # chi2 that drifts must explain
-LEAST_DRIFT = 2e-3  # change of an offset over the run that a drift makes at least [s]
-FEWEST_FOR_DRIFT = 4  # stances that tell a drift
+MIN_DRIFT = 2e-3  # change of an offset over the run that a drift makes at least [s]
+MIN_FOR_DRIFT = 4  # stances that tell a drift
 SAME_SIGMA = 5e-3  # camera and wheels of one robot share a clock to this [s]
 SAME_RATE = 1e-6  # and drift alike to this [s/s]
 UNKNOWN = 100.0  # standard deviation of an offset of which nothing is known [s]
@@ -70,7 +70,7 @@ class SensorClock:
         """True if another sensor's clock is wrong in the same way."""
         ours, theirs = self.segments[0], other.segments[0]
         sigma = float(np.hypot(ours.sigma, theirs.sigma))
-        return abs(ours.offset - theirs.offset) < max(SIGNIFICANT * sigma, LEAST_STEP)
+        return abs(ours.offset - theirs.offset) < max(SIGNIFICANT * sigma, MIN_STEP)
 
     def spans(self, start: float | None, end: float | None) -> Iterator[tuple[Segment, float | None, float | None]]:
         """Segments within a right time, each with the stamps of its begin and end."""
@@ -93,11 +93,11 @@ def usual_offset(clocks: Mapping[Sensor, SensorClock]) -> float:
     first = {sensor: clock.segments[0].measured for sensor, clock in clocks.items()}
 
     def shared(offset: float) -> int:
-        return len({robot for (robot, _), one in first.items() if abs(one - offset) < LEAST_STEP})
+        return len({robot for (robot, _), one in first.items() if abs(one - offset) < MIN_STEP})
 
     usual = max([0.0, *first.values()], key=lambda one: (shared(one), -abs(one)))
-    alike = [one for one in first.values() if abs(one - usual) < LEAST_STEP]
-    return float(np.median(alike)) if abs(usual) >= LEAST_STEP else 0.0
+    alike = [one for one in first.values() if abs(one - usual) < MIN_STEP]
+    return float(np.median(alike)) if abs(usual) >= MIN_STEP else 0.0
 
 
 def estimated_clocks(
@@ -119,7 +119,7 @@ def estimated_clocks(
                 continue
             offset, drift, sigma = known
             origin = float(np.mean([one.time for one in part]))
-            least = MIN_OFFSET if sensor[1] == "camera" else LEAST_OFFSET_OF_WHEELS
+            least = MIN_OFFSET if sensor[1] == "camera" else MIN_WHEEL_OFFSET
             significant = abs(offset) > max(SIGNIFICANT * sigma, least)
             found = Segment(start, offset if significant else 0.0, offset, sigma, drift, origin)
             segments.append(found if segments else replace(found, start=-np.inf))
@@ -147,7 +147,7 @@ def _split(evidence: list[ClockEvidence]) -> list[list[ClockEvidence]]:
         gain = whole - _chi2(before) - _chi2(after)
         if best is None or gain > best[0]:
             best = gain, before, after
-    if best is None or best[0] < STEP_CHI2 or _largest_step(best[1], best[2]) < LEAST_STEP:
+    if best is None or best[0] < STEP_CHI2 or _largest_step(best[1], best[2]) < MIN_STEP:
         return [evidence]
     return [*_split(best[1]), *_split(best[2])]
 
@@ -169,7 +169,7 @@ def _by_pair(evidence: Sequence[ClockEvidence]) -> dict[tuple[Sensor, Sensor], l
 
 def _chi2(evidence: Sequence[ClockEvidence]) -> float:
     """Squared error of constant or drifting offsets; errors beyond `ROBUST` sigmas count linearly."""
-    _, _, residuals = _fit(evidence, drifting=len({one.stance for one in evidence}) >= FEWEST_FOR_DRIFT)
+    _, _, residuals = _fit(evidence, drifting=len({one.stance for one in evidence}) >= MIN_FOR_DRIFT)
     size = np.abs(residuals)
     return float(np.where(size < ROBUST, size**2, 2 * ROBUST * size - ROBUST**2).sum())
 
@@ -179,7 +179,7 @@ def _solve(team: Team, evidence: Sequence[ClockEvidence]) -> dict[Sensor, tuple[
     values, covariance, residuals = _fit(evidence, drifting=False)
     drifting, more, rest = _fit(evidence, drifting=True)
     times = [one.time for one in evidence]
-    enough = len({one.stance for one in evidence}) >= FEWEST_FOR_DRIFT
+    enough = len({one.stance for one in evidence}) >= MIN_FOR_DRIFT
     sensors = list(values)
     rates = dict.fromkeys(sensors, 0.0)
     if enough and float((residuals**2).sum() - (rest**2).sum()) > DRIFT_CHI2:
@@ -188,7 +188,7 @@ def _solve(team: Team, evidence: Sequence[ClockEvidence]) -> dict[Sensor, tuple[
         for k, sensor in enumerate(sensors):
             slope = float(slopes[k] - slopes[right])
             sigma = float(np.sqrt(max(_difference(more, n + k, n + right), 0.0)))
-            if abs(slope) * (max(times) - min(times)) > LEAST_DRIFT and abs(slope) > SIGNIFICANT * sigma:
+            if abs(slope) * (max(times) - min(times)) > MIN_DRIFT and abs(slope) > SIGNIFICANT * sigma:
                 rates[sensor] = slope
         if any(rates.values()):
             values, covariance = drifting, more
@@ -210,7 +210,7 @@ def _difference(covariance: Array, i: int, j: int) -> float:
 def _right(team: Team, sensors: Sequence[Sensor], offsets: Array) -> int:
     """Number of the sensor whose time is the run's: the reference's camera, or one whose clock most robots share."""
     robots = np.array([sensor[0] for sensor in sensors])
-    shared = [len(set(robots[np.abs(offsets - one) < LEAST_STEP])) for one in offsets]
+    shared = [len(set(robots[np.abs(offsets - one) < MIN_STEP])) for one in offsets]
 
     def order(k: int) -> tuple[bool, int, bool]:
         robot, kind = sensors[k]

@@ -14,7 +14,7 @@ from coloc_graph.frontend import PairMeasurement
 from coloc_graph.frontend.clock_evidence import ClockEvidence, Sensor, clock_evidence
 from coloc_graph.pipeline.clock_model import (
     MIN_OFFSET,
-    LEAST_STEP,
+    MIN_STEP,
     SIGNIFICANT,
     SensorClock,
     beside,
@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 FIRST_CHECKED = 6  # stances that are compared first, of those in which clocks are doubted
 UNFIT_P_VALUE = 1e-6  # probability of a fit as bad as this by noise below which clocks are doubted
-LEAST_INLIERS = 0.8  # share of inliers below which they are doubted, too
+MIN_INLIERS = 0.8  # share of inliers below which they are doubted, too
 LEFT_SIGMA = 5e-3  # corrected clocks agree to this at least; the homographies tell the rest [s]
 
 
@@ -87,7 +87,7 @@ def _told(name: str, clock: SensorClock, usual: float) -> Iterator[str]:
         )
     for before, after in itertools.pairwise(clock.segments):
         jump = after.error(after.start) - before.error(after.start)
-        if abs(jump) > LEAST_STEP:
+        if abs(jump) > MIN_STEP:
             way = "ahead" if jump > 0 else "back"
             yield f"{name} was set {way} by {abs(jump):.3f} s at about {after.start:.0f} s ({known}): {remedy}"
     if first.drift:
@@ -100,7 +100,7 @@ def suspicious(measured: Iterable[PairMeasurement]) -> Iterator[PairMeasurement]
         h = one.homography
         if one.seen is not None and all(one.seen):
             unfit = h.dof > 0 and float(chdtrc(h.dof, h.chi2)) < UNFIT_P_VALUE
-            if h.unusable or unfit or h.inliers < LEAST_INLIERS * h.points:
+            if h.unusable or unfit or h.inliers < MIN_INLIERS * h.points:
                 yield one
 
 

@@ -101,7 +101,7 @@ def test_a_wrong_measurement_is_a_refused_edge_with_its_reason():
     estimate = smooth(graph_of_team(team))
     drawn = scene_of_estimate(estimate)
     wrong = {one for one in drawn.edges.reason if one}
-    assert len(estimate.rejected) == (~drawn.edges.used).sum() > 0 and all("contradicted" in why for why in wrong)
+    assert len(estimate.rejected) == (~drawn.edges.used).sum() > 0 and all("outlier" in why for why in wrong)
     frame = shown(drawn)
     assert len(frame.rejected.points) > (~drawn.edges.used).sum()  # dashes
 

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 REACH = 5.0  # offsets are searched up to this [s]
 COARSE_STEP = 0.08  # in steps of this [s]
 FINE_STEP = 0.004  # then about the best in steps of this [s]
-LONGEST_GAP = 0.5  # samples further apart are not interpolated [s]
+MAX_GAP = 0.5  # samples further apart are not interpolated [s]
 MAX_POINTS = 160  # points of a path that are compared, at most
 MAX_COARSE_POINTS = 60  # and in the first search
 MIN_POINTS = 20  # points that tell an offset
@@ -30,7 +30,7 @@ BASIN = 0.2  # half width of the neighbourhood of the best offset [s]
 INDEPENDENT = 0.25  # share of the points that count: neighbours err alike
 ROUNDS = 3  # rounds of robust weights
 OUTLIER = 3.0  # residuals beyond this, in robust sigmas, count no more
-LEAST_SIGMA = 2e-3  # an offset is known no better [s]
+MIN_SIGMA = 2e-3  # an offset is known no better [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class TimedPath:
     def at(self, times: Array) -> Array:
         """Interpolated positions (..., 2); NaN where no samples are near."""
         found = np.full((*times.shape, 2), np.nan)
-        cuts = np.flatnonzero(np.diff(self.times) > LONGEST_GAP) + 1
+        cuts = np.flatnonzero(np.diff(self.times) > MAX_GAP) + 1
         for t, xy in zip(np.split(self.times, cuts), np.split(self.xy, cuts), strict=True):
             if len(t) >= 4:
                 inside = (times >= t[0]) & (times <= t[-1])
@@ -99,7 +99,7 @@ def search_offset(pairs: Sequence[tuple[TimedPath, TimedPath]], reach: float = R
     if curvature <= 0:
         return None
     value = float(near[k] + FINE_STEP * 0.5 * (low - high) / curvature)
-    return ClockOffset(value, max(float(FINE_STEP * np.sqrt(2 / curvature)), LEAST_SIGMA))
+    return ClockOffset(value, max(float(FINE_STEP * np.sqrt(2 / curvature)), MIN_SIGMA))
 
 
 def _scaled(x: Array) -> Array:
