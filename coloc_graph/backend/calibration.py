@@ -125,6 +125,11 @@ def is_calibration(key: int) -> bool:
     return gtsam.mrsymbolChr(key) in SIZES
 
 
+def size_of(key: int) -> int:
+    """Return the dimension of a variable: 6 of a pose."""
+    return SIZES.get(key >> 56, 6)
+
+
 @dataclass(frozen=True, eq=False)
 class CalibratedMount:
     """A calibrated mount.

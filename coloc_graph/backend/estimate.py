@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.calibration import Calibration, Variables
+from coloc_graph.backend.calibration import Calibration, Variables, size_of
 from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.graph import PoseGraph, StayPut
@@ -248,7 +248,7 @@ class Estimate:
         factors_of = Factors(self.graph.floor, self.calibration.variables)
         factors, _, batched = factors_of.of_graph(used, poses_in(self.values))
         with batched:
-            return Marginals(factors, self.values)
+            return Marginals(factors.linearize(self.values), size_of)
 
     @cached_property
     def _index(self) -> dict[Node, int]:

@@ -6,7 +6,7 @@ robots' poses and mounts are in every clique. Sources: J. Liu, "The Multifrontal
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import gtsam
@@ -14,21 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack, solve_triangular
 
-from coloc_graph.backend.calibration import SIZES
 from coloc_graph.errors import EstimationError
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 SINGULAR_TOLERANCE = 1e-14  # pivot relative to the largest below which a variable is undetermined
+MERGED_WIDTH = 100  # columns up to which a clique is merged into its parent: numpy takes as long for fewer
 
 
 @dataclass(eq=False)
 class _Clique:
     """Frontal variables `first`, eliminated together, and separator variables `rest`, by their indices in the order.
 
-    Columns of each start at `begin`; `own` (f) is the number of frontal columns, `width` (f + s) of all. `R` (f, f) and
-    `T` (f, s) are the rows that elimination leaves; `covariance` (f, f + s) is that of the frontal variables with all.
+    Columns of each start at `begin`, and are `columns` among those of all; `own` (f) is the number of frontal columns,
+    `width` (f + s) of all. `R` (f, f) and `T` (f, s) are the rows that elimination leaves; `covariance` (f, f + s) is
+    that of the frontal variables with all.
     """
 
     first: list[int]
@@ -36,6 +37,7 @@ class _Clique:
     parent: "_Clique | None"
     children: "list[_Clique]" = field(default_factory=list)
     begin: dict[int, int] = field(default_factory=dict)
+    columns: Index = field(default_factory=lambda: np.empty(0, int))
     own: int = 0
     width: int = 0
     R: Array | None = None
@@ -44,28 +46,58 @@ class _Clique:
 
 
 class Marginals:
-    """Marginal covariances of the variables of a graph at its optimum.
+    """Marginal covariances of the variables of a linear graph.
+
+    Parameters
+    ----------
+    linear
+        Graph, linearised at its optimum.
+    size
+        Dimension of a variable, by its key.
+    ordering
+        Order of elimination; COLAMD's by default.
 
     Raises
     ------
     EstimationError
-        The factors leave a variable undetermined.
+        Factors leave a variable open.
     """
 
-    def __init__(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        linear = factors.linearize(values)
-        ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+    def __init__(
+        self, linear: gtsam.GaussianFactorGraph, size: Callable[[int], int], ordering: gtsam.Ordering | None = None
+    ) -> None:
+        ordering = ordering or gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         keys = [int(ordering.at(n)) for n in range(ordering.size())]
         self._place = {key: n for n, key in enumerate(keys)}
-        self._sizes = [SIZES.get(key >> 56, 6) for key in keys]
-        rows: dict[int, list[tuple[list[int], Array]]] = defaultdict(list)
-        for n in range(linear.size()):
-            factor = linear.at(n)
-            at = [self._place[int(key)] for key in factor.keys()]  # noqa: SIM118  GTSAM's own
-            rows[min(at)].append((at, factor.jacobian()[0]))
-        self._cliques = self._grown(rows)
+        self._sizes = list(map(size, keys))
+        self._begin: Index = np.cumsum([0, *self._sizes])  # first scalar column of each variable
+        self._at = np.zeros(int(self._begin[-1]), int)  # scratch: where the columns of one clique are in it
+        factors = [linear.at(n) for n in range(linear.size())]
+        at = [[self._place[int(key)] for key in factor.keys()] for factor in factors]  # noqa: SIM118  GTSAM's own
+        columns = np.split(self._columns([n for some in at for n in some]), self._ends(at))
+        rows: dict[int, list[tuple[Index, Array]]] = defaultdict(list)
+        for some, of_factor, factor in zip(at, columns, factors, strict=False):
+            rows[min(some)].append((of_factor, factor.jacobian()[0]))
+        self._cliques = self._grown(at)
         self._eliminate(rows)
-        self._spread()
+        for clique, whole in self._spread():
+            clique.covariance = whole[: clique.own]
+
+    def _columns(self, variables: Sequence[int]) -> Index:
+        """The scalar columns of variables, one after the other."""
+        sizes = np.array([self._sizes[n] for n in variables], int)
+        ends = np.cumsum(sizes)
+        first: Index = np.repeat(self._begin[np.array(variables, int)] - (ends - sizes), sizes)
+        return first + np.arange(len(first))
+
+    def _ends(self, groups: Sequence[Sequence[int]]) -> Index:
+        """Where the columns of each group of variables end among those of all."""
+        ends: Index = np.cumsum([sum(self._sizes[n] for n in group) for group in groups])
+        return ends
+
+    def has(self, key: int) -> bool:
+        """Return whether a variable is in the graph."""
+        return key in self._place
 
     def covariance(self, key: int) -> Array:
         """Return the covariance of one variable: of a pose (6, 6), rotation first, body frame."""
@@ -81,13 +113,41 @@ class Marginals:
         known = self._known(at)
         return self._swept(at) if known is None else known
 
-    def _grown(self, rows: dict[int, list[tuple[list[int], Array]]]) -> "list[_Clique]":
+    def variances(self, keys: Sequence[Index], jacobians: Sequence[Array]) -> Array:
+        """Return the variances (n, rows) of n linear functions of variables that share a factor.
+
+        Parameters
+        ----------
+        keys : sequence of (n,) int
+            Keys of the variables, by slot.
+        jacobians : sequence of (n, rows, size) float
+            Jacobians by the variables of each slot.
+        """
+        place = np.array([[self._place[key] for key in slot.tolist()] for slot in keys])
+        by_clique: dict[int, list[int]] = defaultdict(list)
+        for n, first in enumerate(place.min(axis=0).tolist()):
+            by_clique[id(self._cliques[first])].append(n)
+        A = np.concatenate(jacobians, axis=2)
+        out = np.empty(A.shape[:2])
+        columns = np.concatenate(
+            [self._begin[one][:, None] + np.arange(J.shape[2]) for one, J in zip(place, jacobians, strict=True)], axis=1
+        )
+        for clique, whole in self._spread():
+            some = by_clique.get(id(clique))
+            if some:
+                self._at[clique.columns] = np.arange(clique.width)
+                at = self._at[columns[some]]
+                C = whole[at[:, :, None], at[:, None, :]]
+                out[some] = np.einsum("nij,njk,nik->ni", A[some], C, A[some])
+        return out
+
+    def _grown(self, factors: Sequence[Sequence[int]]) -> "list[_Clique]":
         """Return the clique of each variable."""
         count = len(self._sizes)
         later: list[set[int]] = [set() for _ in range(count)]
+        for at in factors:
+            later[min(at)].update(at)
         for n in range(count):
-            for at, _ in rows.get(n, ()):
-                later[n].update(at)
             later[n].discard(n)
             if later[n]:
                 parent = min(later[n])
@@ -101,57 +161,74 @@ class Marginals:
                 cliques[n].first.insert(0, n)
                 continue
             cliques[n] = _Clique([n], sorted(later[n]), cliques[parent] if parent >= 0 else None)
-            if parent >= 0:
-                cliques[parent].children.append(cliques[n])
+        # children before their parents, which are then as they were
+        for clique in reversed(list({id(one): one for one in cliques.values()}.values())):
+            self._merge(clique, cliques)
         for clique in {id(one): one for one in cliques.values()}.values():
-            for n in (*clique.first, *clique.rest):
-                clique.begin[n] = clique.width
-                clique.width += self._sizes[n]
-            clique.own = sum(self._sizes[n] for n in clique.first)
+            if clique.parent is not None:
+                clique.parent = cliques[clique.parent.first[-1]]
+                clique.parent.children.append(clique)
+            variables = (*clique.first, *clique.rest)
+            clique.columns = self._columns(variables)
+            clique.begin = dict(zip(variables, [0, *self._ends([[n] for n in variables]).tolist()], strict=False))
+            clique.width, clique.own = len(clique.columns), sum(self._sizes[n] for n in clique.first)
         return [cliques[n] for n in range(count)]
 
-    def _span(self, clique: _Clique, variables: Sequence[int]) -> Index:
-        """Return the columns of variables, one after the other."""
-        return np.concatenate([clique.begin[n] + np.arange(self._sizes[n]) for n in variables])
+    def _merge(self, clique: _Clique, cliques: dict[int, _Clique]) -> None:
+        """Merge a clique into its parent where both together are small."""
+        parent = clique.parent
+        if parent is None:
+            return
+        width = sum(self._sizes[n] for n in (*clique.first, *parent.first, *parent.rest))
+        if width <= MERGED_WIDTH:
+            parent.first = sorted((*clique.first, *parent.first))
+            cliques.update(dict.fromkeys(clique.first, parent))
 
     def _each(self) -> Iterator[_Clique]:
         """Iterate over the cliques, each before its parent."""
         return (clique for n, clique in enumerate(self._cliques) if clique.first[-1] == n)
 
-    def _eliminate(self, rows: dict[int, list[tuple[list[int], Array]]]) -> None:
+    def _eliminate(self, rows: dict[int, list[tuple[Index, Array]]]) -> None:
         left: dict[int, Array] = {}
         for clique in self._each():
             own = clique.own
-            parts = [(self._span(clique, at), A) for n in clique.first for at, A in rows.get(n, ())]
-            parts += [(self._span(clique, child.rest), left.pop(id(child))) for child in clique.children]
+            parts = [part for n in clique.first for part in rows.get(n, ())]
+            parts += [(child.columns[child.own :], left.pop(id(child))) for child in clique.children]
+            self._at[clique.columns] = np.arange(clique.width)
             stacked = np.zeros((sum(len(A) for _, A in parts), clique.width), order="F")
             top = 0
             for columns, A in parts:
-                stacked[top : top + len(A), columns] = A
+                stacked[top : top + len(A), self._at[columns]] = A
                 top += len(A)
-            R = np.triu(lapack.dgeqrf(stacked, overwrite_a=1)[0])[: clique.width]
+            R = np.triu(lapack.dgeqrf(stacked, overwrite_a=1)[0][: clique.width])
             sizes = np.abs(np.diagonal(R)[:own])
             if len(R) < own or sizes.min(initial=np.inf) <= SINGULAR_TOLERANCE * sizes.max(initial=0.0):
                 raise EstimationError("a variable of the graph is undetermined: it has neither measurement nor prior")
             clique.R, clique.T, left[id(clique)] = R[:own, :own], R[:own, own:], R[own:, own:]
 
-    def _spread(self) -> None:
-        """Compute the covariances, from the roots down."""
+    def _spread(self) -> Iterator[tuple[_Clique, Array]]:
+        """Iterate over the cliques with the joint covariance of their variables, from the roots down."""
         # each clique with the covariance of its parent, kept until it is used
         ready: list[tuple[_Clique, Array]] = [(one, np.empty((0, 0))) for one in self._each() if one.parent is None]
         while ready:
             clique, above = ready.pop()
             assert clique.R is not None and clique.T is not None
-            at = self._span(clique.parent, clique.rest) if clique.parent else np.empty(0, int)
-            rest = above[np.ix_(at, at)]
+            rest = above
+            if clique.parent is not None:
+                self._at[clique.parent.columns] = np.arange(clique.parent.width)
+                at = self._at[clique.columns[clique.own :]]
+                rest = above[at[:, None], at]
             back = solve_triangular(clique.R, np.eye(clique.own), check_finite=False)
             gain = -back @ clique.T
             across = gain @ rest
             own = back @ back.T + across @ gain.T
-            clique.covariance = np.concatenate([(own + own.T) / 2, across], axis=1)
-            if clique.children:
-                whole = np.concatenate([clique.covariance, np.concatenate([across.T, rest], axis=1)])
-                ready += [(child, whole) for child in clique.children]
+            whole = np.empty((clique.width, clique.width))
+            whole[: clique.own, : clique.own] = (own + own.T) / 2
+            whole[: clique.own, clique.own :] = across
+            whole[clique.own :, : clique.own] = across.T
+            whole[clique.own :, clique.own :] = rest
+            yield clique, whole
+            ready += [(child, whole) for child in clique.children]
 
     def _known(self, at: Sequence[int]) -> Array | None:
         """Return the joint covariance of variables of which any two share a clique; None where two do not."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from coloc_graph.backend.batched_factors import BatchedFactors
+from coloc_graph.backend.calibration import size_of
 from coloc_graph.backend.chain import compose, spanning_tree
 from coloc_graph.backend.chi2_test import Agreement, agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
@@ -52,7 +53,7 @@ class Fit:
     def marginals(self) -> Marginals:
         """Marginal covariances."""
         with self.batched:
-            return Marginals(self.factors, self.values)
+            return Marginals(self.factors.linearize(self.values), size_of)
 
     @cached_property
     def dof(self) -> int:

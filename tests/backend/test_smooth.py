@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from teams import FLOOR, ate, graph_of_team, planar_nees, team_of
 
 from coloc_graph.backend import PoseGraph, chain, diagnose, smooth
+from coloc_graph.backend.calibration import size_of
 from coloc_graph.backend.chi2_test import Agreement
 from coloc_graph.backend.factors import Factors
 from coloc_graph.backend.marginals import Marginals
@@ -240,7 +241,7 @@ def test_covariances_are_those_of_the_dense_inverse():
         ordering.push_back(key)
     A = linear.jacobian(ordering)[0]
     dense = np.linalg.inv(A.T @ A).reshape(len(keys), 6, len(keys), 6)
-    posterior = Marginals(fit.factors, fit.values)
+    posterior = Marginals(fit.factors.linearize(fit.values), size_of)
     scale = np.abs(dense).max()
     for n, key in enumerate(keys):
         np.testing.assert_allclose(posterior.covariance(key), dense[n, :, n], atol=1e-9 * scale)
@@ -262,7 +263,7 @@ def test_a_variable_that_nothing_measures_has_no_covariance():
     for key in keys:
         values.insert(key, gtsam.Pose3())
     with pytest.raises(EstimationError, match="is undetermined"):
-        Marginals(factors, values)
+        Marginals(factors.linearize(values), size_of)
 
 
 def straight(count, sigmas):

@@ -6,13 +6,13 @@ import pytest
 from mrclam_folder import DELAY, DEPTH, LANDMARKS, ROBOT_OFFSET, SCALE, TURN_SCALE, make
 from msgspec.structs import replace as with_fields
 
+from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar import IncrementalKeyframes, optimise_keyframes
 from coloc_graph.backend.planar.factors import DriveFactors, State
 from coloc_graph.backend.planar.filter import Models, filter_forward
 from coloc_graph.backend.planar.initial_pose import RigidAlignmentRansac
-from coloc_graph.backend.planar.slices import Slices, Summary, slices_of
 from coloc_graph.cli import main
-from coloc_graph.errors import InputError, RunError
+from coloc_graph.errors import EstimationError, InputError, RunError
 from coloc_graph.exchange.mrclam import import_mrclam
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.pipeline.batch import SolveOptions, solve
@@ -195,7 +195,7 @@ def test_derivatives_are_those_of_the_residuals(somewhere):
     index = np.concatenate([of_robots, of_landmarks])
     steps = np.array([3, factors.first[1] + 7])
     for rows_at in (lambda at: factors.steps(at, steps), lambda at: factors.measured(at, index)):
-        J, columns = rows_at(state)
+        J, columns, _ = rows_at(state)
         for n, k in np.ndindex(columns.shape):
             ends = []
             for step in (1e-6, -1e-6):
@@ -206,72 +206,73 @@ def test_derivatives_are_those_of_the_residuals(somewhere):
             assert np.allclose((ends[0] - ends[1]) / 2e-6, J[n, :, k], atol=1e-5 * np.abs(J[n]).max())
 
 
-def dense(factors, slices, rows):
-    """The matrix and gradient of a problem over its own poses and what is shared, by the book."""
-    variables = np.concatenate(
-        [(3 * slices.poses[:, None] + np.arange(3)).ravel(), 3 * len(factors) + np.flatnonzero(factors.free)]
-    )
-    number = np.full(3 * len(factors) + len(factors.free), -1)
-    number[variables] = np.arange(len(variables))
+def dense(factors, rows):
+    """The normal equations of factors over all variables, by the book."""
+    free = factors.keys.free
     A, b = [], []
-    for J, columns in rows:
-        for n in range(len(J)):
-            row = np.zeros((J.shape[1], len(variables) + 1))
-            row[:, number[columns[n]]] = J[n, :, :-1]
-            A.append(row[:, :-1])
-            b.append(J[n, :, -1])
+    for one in rows:
+        for J, columns in zip(one.jacobians, one.columns, strict=True):
+            row = np.zeros((len(J), len(free)))
+            row[:, columns] = J[:, :-1]
+            A.append(row * free)
+            b.append(J[:, -1])
     A, b = np.concatenate(A), np.concatenate(b)
     return A.T @ A, A.T @ b
 
 
-def test_second_by_second_it_is_the_same_as_all_at_once(somewhere):
+def test_a_linear_system_is_solved_and_summed_up_as_by_the_book(somewhere):
     factors, state = somewhere
-    slices_all = slices_of(factors)
-    poses = np.flatnonzero(slices_all < 12)
-    slices = Slices(factors, slices_all, poses)
-    inside = np.isin(np.arange(len(factors)), poses)
+    inside = factors.times < factors.times.min() + 12.0
     steps = np.flatnonzero(inside[:-1] & inside[1:] & (factors.robot[:-1] == factors.robot[1:]))
     measured = np.flatnonzero(inside[factors.observer] & (inside[factors.seen] | ~factors.of_robot))
-    gauge = factors.gauge(state, int(poses[0]), state.poses[poses[0]] + 0.1)
+    first = int(np.flatnonzero(inside)[0])
+    gauge = factors.gauge(state, first, state.poses[first] + 0.1)
     rows = [factors.steps(state, steps), factors.measured(state, measured), gauge]
-    H, g = dense(factors, slices, rows)
-    weights, off = factors.before(state)
-    n = 3 * len(poses)
-    H[np.arange(n, len(H)), np.arange(n, len(H))] += weights
-    g[n:] += weights * off
-    C = np.linalg.inv(H)
-
-    flat = slices.problem(rows)
-    slices.add_known(flat, weights, off)
-    eliminated = slices.eliminate(flat)
-    shared, of_shared = slices.shared(flat)
+    H, g = dense(factors, rows)
+    shared = 3 * len(factors) + np.flatnonzero(factors.free)
+    off = np.concatenate([np.zeros(3 * len(factors)), state.shared - factors.start()])[shared]
+    H[shared, shared] += factors.sigmas[factors.free] ** -2
+    g[shared] += factors.sigmas[factors.free] ** -2 * off
+    there = np.flatnonzero(H.any(axis=0))
+    C = np.zeros_like(H)
+    C[np.ix_(there, there)] = np.linalg.inv(H[np.ix_(there, there)])
     expected = -C @ g
-    assert np.allclose(shared, expected[n:], rtol=1e-5, atol=1e-7)
-    assert np.allclose(slices.steps(eliminated, shared).ravel(), expected[:n], rtol=1e-5, atol=1e-6)
-    assert np.allclose(of_shared, C[n:, n:], rtol=1e-5, atol=1e-9)
-    for k, joint in slices.covariances(eliminated, of_shared):
-        at = np.r_[3 * slices.first[k] : 3 * slices.first[min(k + 2, slices.count)], n : len(C)]
-        assert np.allclose(joint, C[np.ix_(at, at)], rtol=1e-4, atol=1e-9)
 
-    # in two goes: what the first slices say of the rest is all they have to say
-    gone = slices_all < 5
-    near = Slices(factors, slices_all, np.flatnonzero(slices_all < 6))
-    is_early = [gone[steps] | gone[steps + 1], gone[factors.observer[measured]]]
-    is_early[1] |= gone[factors.seen[measured]] & factors.of_robot[measured]
-    flat = near.problem(
-        [factors.steps(state, steps[is_early[0]]), factors.measured(state, measured[is_early[1]]), gauge]
+    system = factors.system(state, rows)
+    ordering = system.ordering()
+    assert np.allclose(system.solve(ordering), expected, rtol=1e-5, atol=1e-6)
+    marginals = Marginals(system.graph, factors.keys.size, ordering)
+    at = slice(3 * first, 3 * first + 3)
+    assert np.allclose(marginals.covariance(first), C[at, at], rtol=1e-4, atol=1e-12)
+    assert np.allclose(system.eliminated(ordering).marginalCovariance(first), C[at, at], rtol=1e-4, atol=1e-12)
+    of_shared = C[3 * len(factors) :, 3 * len(factors) :]
+    assert np.allclose(factors.shared_covariance(marginals), of_shared, rtol=1e-4, atol=1e-9)
+    for index, parts in factors.keys.blocks(rows[1]):
+        keys, jacobians = zip(*parts, strict=True)
+        A, columns = rows[1].jacobians[index, :, :-1], rows[1].columns[index]
+        taken = np.einsum("nij,njk,nik->ni", A, C[columns[:, :, None], columns[:, None, :]], A)
+        assert np.allclose(marginals.variances(keys, jacobians), taken, rtol=1e-4, atol=1e-9)
+
+    # in two goes: what the first poses say of the rest is all they have to say
+    gone = factors.times < factors.times.min() + 5.0
+    early = [gone[steps] | gone[steps + 1], gone[factors.observer[measured]]]
+    early[1] |= gone[factors.seen[measured]] & factors.of_robot[measured]
+    system = factors.system(state, [rows[0].of(np.flatnonzero(early[0])), rows[1].of(np.flatnonzero(early[1])), gauge])
+    before = system.summed_up(np.flatnonzero(gone & inside))
+    system = factors.system(
+        state, [rows[0].of(np.flatnonzero(~early[0])), rows[1].of(np.flatnonzero(~early[1]))], priors=False
     )
-    near.add_known(flat, weights, off)
-    near.eliminate(flat, near.count - 1)
-    left, information, gradient = near.remaining(flat)
-    at = np.concatenate([state.poses[left].ravel(), state.shared[factors.free]])
-    rest = Slices(factors, slices_all, poses[~gone[poses]])
-    flat = rest.problem([factors.steps(state, steps[~is_early[0]]), factors.measured(state, measured[~is_early[1]])])
-    rest.add_summary(flat, Summary(left, information, gradient + 0.0, at), at)
-    eliminated = rest.eliminate(flat)
-    again, _ = rest.shared(flat)
-    assert np.allclose(again, shared, rtol=1e-4, atol=1e-6)
-    assert np.allclose(rest.steps(eliminated, again), expected[3 * slices.first[5] : n].reshape(-1, 3), atol=1e-5)
+    system.add_summary(before, np.zeros(len(before.columns)))
+    again = system.solve(system.ordering())
+    kept = np.setdiff1d(there, (3 * np.flatnonzero(gone)[:, None] + np.arange(3)).ravel())
+    assert np.allclose(again[kept], expected[kept], rtol=1e-4, atol=1e-5)
+
+
+def test_factors_that_leave_a_variable_open_are_one_sentence(somewhere):
+    factors, state = somewhere
+    system = factors.system(state, [factors.steps(state, np.array([3]))])
+    with pytest.raises(EstimationError, match="does not determine"):
+        system.solve(system.ordering())
 
 
 def test_what_has_left_the_window_is_not_forgotten(run, batch):

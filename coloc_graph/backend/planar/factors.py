@@ -4,12 +4,15 @@ Variables are numbered: x, y and heading of all poses, robot after robot, then w
 of sensors, positions of landmarks. Poses change in the world's axes.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.linear_system import Keys, LinearSystem, Rows
+from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.filter import Models
 from coloc_graph.backend.planar.model import RANGING, WHEELS
 from coloc_graph.backend.sensor_calibration import SensorErrors
@@ -37,19 +40,6 @@ class State:
     shared: Array
 
 
-class Rows(NamedTuple):
-    """Linearised factors of one kind: `jacobians` (n, rows, k + 1), whitened, whose last column are the residuals, and
-    the variables of the others, `columns` (n, k)."""
-
-    jacobians: Array
-    columns: Index
-
-    @property
-    def residuals(self) -> Array:
-        """Whitened residuals (n, rows)."""
-        return self.jacobians[:, :, -1]
-
-
 class DriveFactors:
     """The factors of a drive. `noise` (robots, 2) multiplies the standard deviations of ranges and bearings.
 
@@ -74,8 +64,8 @@ class DriveFactors:
         self._ranging, self._marks = WHEELS * robots, (WHEELS + RANGING) * robots
         sigmas = [models.wheels_sigmas.ravel(), models.ranging_sigmas.ravel()]
         sigmas.append(np.repeat(np.where(known, models.map_sigmas, ANYWHERE), 2))
-        self._sigmas = np.concatenate(sigmas)
-        self.free: NDArray[np.bool_] = self._sigmas > 0
+        self.sigmas = np.concatenate(sigmas)
+        self.free: NDArray[np.bool_] = self.sigmas > 0
         self.free[self._marks :] = ~np.repeat(self._exact, 2)
         self._known_before = np.zeros(len(self.free))
         self._known_before[self._marks :] = np.where(known[:, None], models.map, 0.0).ravel()
@@ -143,7 +133,7 @@ class DriveFactors:
             [3 * poses[:, None] + np.arange(6), self._shared(WHEELS * robots[:, None] + np.arange(WHEELS))], axis=1
         )
         whiten = self._whiten[self._step_first[robots] + poses - self.first[robots]]
-        return Rows(whiten @ J, columns)
+        return Rows(whiten @ J, columns, (0, 3, 6))
 
     def measured(self, state: State, index: Index) -> Rows:
         """Some ranges and bearings (n,), with what of them is new."""
@@ -169,17 +159,52 @@ class DriveFactors:
         target = np.where(of_robot, 3 * seen, self._shared(self._marks + 2 * landmark))
         errors = self._shared(self._ranging + RANGING * robots[:, None] + np.arange(RANGING))
         columns = [3 * observer[:, None] + np.arange(3), target[:, None] + np.arange(2), errors]
-        return Rows(J, np.concatenate(columns, axis=1))
+        return Rows(J, np.concatenate(columns, axis=1), (0, 3, 5))
 
-    def before(self, state: State) -> tuple[Array, Array]:
-        """What is known before of what is shared and free: weights (m,) and how far it is off (m,)."""
-        return self._sigmas[self.free] ** -2.0, (state.shared - self._known_before)[self.free]
+    @cached_property
+    def keys(self) -> Keys:
+        """Keys of all variables: poses by their number, then wheels and sensors by robot, then landmarks."""
+        robots, landmarks = len(self.drive.robots), len(self.drive.landmarks)
+        sizes = np.repeat([3, WHEELS, RANGING, 2], [len(self), robots, robots, landmarks])
+        return Keys(sizes, np.concatenate([np.ones(3 * len(self), bool), self.free]))
+
+    def system(self, state: State, rows: Iterable[Rows], *, priors: bool = True) -> LinearSystem:
+        """Return the linear system of some factors, with what is known before of what is shared."""
+        system = LinearSystem(self.keys)
+        for one in rows:
+            system.add(one)
+        if priors:
+            for key in range(len(self), len(self.keys.sizes)):
+                at = self.keys.span(key)
+                own = slice(at.start - 3 * len(self), at.stop - 3 * len(self))
+                system.add_prior(key, self.sigmas[own], (state.shared - self._known_before)[own])
+        return system
+
+    def moved(self, state: State, step: Array) -> State:
+        """Return the state after a step of all variables."""
+        poses = 3 * len(self)
+        return State(state.poses + step[:poses].reshape(-1, 3), state.shared + step[poses:])
+
+    def shared_covariance(self, marginals: Marginals) -> Array:
+        """Return the covariance (m, m) of what is shared; 0 of what is exact."""
+        there = [key for key in range(len(self), len(self.keys.sizes)) if marginals.has(key)]
+        C = np.zeros((len(self.free),) * 2)
+        if there:
+            at = np.concatenate([np.arange(self.keys.first[key], self.keys.first[key + 1]) for key in there])
+            at -= 3 * len(self)
+            C[np.ix_(at, at)] = marginals.joint(there)
+        return C * self.free * self.free[:, None]
+
+    def cost_before(self, state: State) -> float:
+        """Return half chi2 of what is known before of what is shared."""
+        off = (state.shared - self._known_before)[self.free] / self.sigmas[self.free]
+        return 0.5 * float(off @ off)
 
     def gauge(self, state: State, pose: int, at: Array) -> Rows:
         """What fixes the world's frame where no landmark does: a pose (3,) that stays where it is."""
         J = np.zeros((1, 3, 4))
         J[0, :, :3], J[0, :, 3] = np.eye(3), state.poses[pose] - at
-        return Rows(J / GAUGE_SIGMA, 3 * np.array([[pose]]) + np.arange(3))
+        return Rows(J / GAUGE_SIGMA, 3 * np.array([[pose]]) + np.arange(3), (0,))
 
     def errors_in(self, robot: int, shared: Array, covariance: Array) -> SensorErrors:
         """What is off of a robot's wheels and sensor, of the covariance (m, m) of all that is shared."""
@@ -206,4 +231,4 @@ def robust(rows: Rows) -> tuple[Rows, float]:
     """Measurements as they weigh at their residuals, and what they cost together (half chi2)."""
     squared = (rows.residuals**2).sum(axis=1) / CAUCHY**2
     weighed = rows.jacobians / np.sqrt(1 + squared)[:, None, None]
-    return Rows(weighed, rows.columns), float(CAUCHY**2 / 2 * np.log1p(squared).sum())
+    return rows._replace(jacobians=weighed), float(CAUCHY**2 / 2 * np.log1p(squared).sum())

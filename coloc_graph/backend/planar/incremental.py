@@ -6,14 +6,16 @@ time, and as it leaves the window, by when what came after it has had its say.
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.estimate import Estimate
-from coloc_graph.backend.planar.batch import found_landmarks, pose_covariances, whole_covariance
+from coloc_graph.backend.linear_system import LinearSystem, Summary
+from coloc_graph.backend.marginals import Marginals
+from coloc_graph.backend.planar.batch import found_landmarks, in_body
 from coloc_graph.backend.planar.factors import DriveFactors, State, robust
 from coloc_graph.backend.planar.filter import Filter
-from coloc_graph.backend.planar.slices import Slices, Summary, slices_of
 from coloc_graph.backend.planar.summary import Found, ranging_estimate
 from coloc_graph.backend.planar.trajectory import trajectory
 from coloc_graph.backend.sensor_calibration import SensorErrors
@@ -28,8 +30,7 @@ Index = NDArray[np.int64]
 #: Poses this far back are still corrected [s], and what came in meanwhile is taken in so often [s].
 LAG = 40.0
 EVERY = 1.0
-#: Slices leave so many at a time: each time, covariances of all are worked out.
-LEAVING = 4
+LEAVING = 4.0  # poses leave together, this often [s]
 #: Until so long after the first keyframe none leaves [s]: wheels and sensors are being calibrated, and what has left
 #: would stay as it was thought before.
 CALIBRATING = 300.0
@@ -45,11 +46,16 @@ class Latest:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """A window at its newest step: what is in it, eliminated, and the covariance of what is shared."""
+    """A window at its newest step: the poses in it, their linear system, and its Bayes tree."""
 
-    slices: Slices
-    eliminated: list[tuple[Array, Array]]
-    shared: Array
+    poses: Index
+    system: LinearSystem
+    ordering: gtsam.Ordering
+    tree: gtsam.GaussianBayesTree
+
+    def covariances(self, poses: Index) -> Array:
+        """Covariances (n, 3, 3) of some poses, in the world's axes."""
+        return np.array([self.tree.marginalCovariance(pose) for pose in poses.tolist()]).reshape(-1, 3, 3)
 
 
 class IncrementalKeyframes:
@@ -62,12 +68,11 @@ class IncrementalKeyframes:
         self.drive, self._lag, self._calibrating = drive, lag, calibrating
         self._filter = Filter(team, drive)
         self._factors = factors = DriveFactors(drive, self._filter.models)
-        self._slice = slices_of(factors)
         self._state = State(np.full((len(factors), 3), np.nan), factors.start())
         self._entered = [0] * len(drive.robots)  # how many keyframes of each are in, or have been
         self._inside = np.zeros(len(factors), bool)
-        self._window = 0  # the first slice that has not left
-        self._before: Summary | None = None
+        self._left = -np.inf  # the time before which all poses have left [UTC s]
+        self._before: tuple[Summary, Array] | None = None  # what those that have left say, and where it was linearised
         self._gauge: tuple[int, Array] | None = None
         self._landmarks: set[int] = set()
         self._next = 0
@@ -118,7 +123,7 @@ class IncrementalKeyframes:
                     a, b, c = poses[k - 1].tolist()
                     poses[k] = compose((a, b, c), (x, y, yaw))
             new = np.arange(first + self._entered[robot], first + max(until, entered))
-            self._inside[new] = self._slice[new] >= self._window
+            self._inside[new] = factors.times[new] >= self._left
             self._entered[robot] = max(until, entered)
 
     def _enter_landmarks(self) -> None:
@@ -149,92 +154,68 @@ class IncrementalKeyframes:
         found: Index = index[inside[factors.observer[index]] & there]
         return found
 
-    def _problem(self, slices: Slices, steps: Index, measured: Index) -> Array:
-        """Some factors in the window, and what is summed up of those before it, at what is estimated."""
+    def _system(self, steps: Index, measured: Index) -> LinearSystem:
+        """Some factors in the window, and what those before it say, at what is estimated."""
         factors, state = self._factors, self._state
         rows = [factors.steps(state, steps), robust(factors.measured(state, measured))[0]]
         if self._before is None and self._gauge is not None:
             rows.append(factors.gauge(state, *self._gauge))
-        problem = slices.problem(rows)
-        if self._before is None:
-            slices.add_known(problem, *factors.before(state))
-        else:
-            slices.add_summary(problem, self._before, self._at(self._before.poses))
-        return problem
+        system = factors.system(state, rows, priors=self._before is None)
+        if self._before is not None:
+            before, at = self._before
+            system.add_summary(before, self._vector()[before.columns] - at)
+        return system
 
-    def _at(self, poses: Index) -> Array:
-        """What is estimated of some poses and of what is shared, as one vector."""
-        return np.concatenate([self._state.poses[poses].ravel(), self._state.shared[self._factors.free]])
+    def _vector(self) -> Array:
+        """Everything that is estimated, by the numbers of the variables."""
+        return np.concatenate([self._state.poses.ravel(), self._state.shared])
 
     def _step(self) -> _Solved:
         """One step of Gauss-Newton in the window: it was at its optimum a moment ago."""
-        slices = Slices(self._factors, self._slice, np.flatnonzero(self._inside))
         measured = self._measured(self._inside)
         self._taken[measured] = True
-        problem = self._problem(slices, self._steps(self._inside), measured)
-        eliminated = slices.eliminate(problem)
-        shared, C = slices.shared(problem)
-        self._state.poses[slices.poses] += slices.steps(eliminated, shared)
-        self._state.shared[self._factors.free] += shared
-        return _Solved(slices, eliminated, C)
+        system = self._system(self._steps(self._inside), measured)
+        ordering = system.ordering()
+        tree = system.eliminated(ordering)
+        moved = self._factors.moved(self._state, system.step(tree, ordering))
+        self._state.poses[:], self._state.shared[:] = moved.poses, moved.shared
+        return _Solved(np.flatnonzero(self._inside), system, ordering, tree)
 
     def _leave(self, time: float) -> None:
-        """Keep what is estimated of slices that are over for longer than the lag, and sum up what they say."""
+        """Keep what is estimated of poses that are over for longer than the lag, and sum up what they say."""
         solved, factors, times = self._solved, self._factors, self._factors.times
-        if solved is None or time < times.min() + self._calibrating:
+        if solved is None or time < times.min() + self._calibrating or time - self._lag < self._left + LEAVING:
             return
-        ending = np.flatnonzero(self._inside & (times < time - self._lag))
-        if not len(ending):
+        self._left = time - self._lag
+        gone = self._inside & (times < self._left)
+        if not gone.any():
             return
-        until = int(self._slice[ending].max())  # which may not be over
-        leaving = min(until - solved.slices.base, solved.slices.count - 1)
-        if leaving < LEAVING:
-            return
-        self._note_leaving(leaving)
-        # the first slice that stays: there is none where nothing was measured for a while
-        window = int(self._slice[self._inside & (self._slice >= solved.slices.base + leaving)].min())
-        near = self._inside & (self._slice <= window)
-        gone = near & (self._slice < window)
-        slices = Slices(factors, self._slice, np.flatnonzero(near))
-        steps, measured = self._steps(near), self._measured(near)
+        self._keep(np.flatnonzero(gone))
+        steps, measured = self._steps(self._inside), self._measured(self._inside)
         seen = gone[factors.seen[measured]] & factors.of_robot[measured]
-        problem = self._problem(
-            slices, steps[gone[steps] | gone[steps + 1]], measured[gone[factors.observer[measured]] | seen]
-        )
-        slices.eliminate(problem, slices.count - 1)
-        poses, information, gradient = slices.remaining(problem)
-        self._before = Summary(poses, information, gradient, self._at(poses))
+        system = self._system(steps[gone[steps] | gone[steps + 1]], measured[gone[factors.observer[measured]] | seen])
+        before = system.summed_up(np.flatnonzero(gone))
+        self._before = before, self._vector()[before.columns]
         self._inside &= ~gone
-        self._window = window
 
-    def _note_leaving(self, leaving: int) -> None:
-        """Keep poses of the first so many slices, as they are."""
-        solved = self._solved
-        assert solved is not None
-        slices = solved.slices
-        for n, joint in slices.covariances(solved.eliminated, solved.shared):
-            if n < leaving:
-                poses = slices.poses[slices.first[n] : slices.first[n + 1]]
-                self._smoothed[poses] = self._state.poses[poses]
-                self._smoothed_C[poses] = pose_covariances(self._state.poses[poses], joint)
+    def _keep(self, poses: Index) -> None:
+        """Keep poses as they are."""
+        assert self._solved is not None
+        self._smoothed[poses] = self._state.poses[poses]
+        self._smoothed_C[poses] = in_body(self._state.poses[poses], self._solved.covariances(poses))
 
     def _note_latest(self, before: list[int]) -> None:
         """Keep what is thought of each robot's newest keyframe at its time."""
         solved = self._solved
         assert solved is not None
-        wanted = {
+        newest = [
             int(self._factors.first[robot]) + count - 1
             for robot, (count, had) in enumerate(zip(self._entered, before, strict=True))
             if count > had
-        }
-        for n, joint in solved.slices.covariances(solved.eliminated, solved.shared):
-            poses = solved.slices.poses[solved.slices.first[n] : solved.slices.first[n + 1]]
-            some = np.isin(poses, list(wanted))
-            self._online[poses[some]] = self._state.poses[poses[some]]
-            self._online_C[poses[some]] = pose_covariances(self._state.poses[poses], joint)[some]
-            wanted -= set(poses.tolist())
-            if not wanted:
-                return
+        ]
+        poses = np.array([one for one in newest if self._inside[one]], int)
+        self._online[poses] = self._state.poses[poses]
+        self._online_C[poses] = in_body(self._state.poses[poses], solved.covariances(poses))
 
     def finish(self) -> tuple[Estimate, dict[str, Trajectory]]:
         """The estimate of all keyframes as they left, and, by robot, what was thought of each at its time."""
@@ -242,8 +223,12 @@ class IncrementalKeyframes:
         C = np.zeros((len(factors.free),) * 2)
         if self._solved is not None:
             self._solved = self._step()
-            self._note_leaving(self._solved.slices.count)
-            C = whole_covariance(factors, self._solved.shared)
+            solved = self._solved
+            marginals = Marginals(solved.system.graph, factors.keys.size, solved.ordering)
+            self._smoothed[solved.poses] = state.poses[solved.poses]
+            inside = np.array([marginals.covariance(pose) for pose in solved.poses.tolist()])
+            self._smoothed_C[solved.poses] = in_body(state.poses[solved.poses], inside)
+            C = factors.shared_covariance(marginals)
         errors = [
             factors.errors_in(robot, state.shared, C) if count else SensorErrors(None, None)
             for robot, count in enumerate(self._entered)
