@@ -158,6 +158,13 @@ class LeapFrog:
         for robot in self._registry.robots.values():
             robot.arrived, robot.drive = True, None
         self._leap = self._plan.leap
+        self._log.note(
+            "planned",
+            stance=self._index,
+            leap=self._leap,
+            patrol=np.round(self._plan.patrol, 3).tolist(),
+            duration=self._plan.duration,
+        )
         if not self._plan.mover_first:
             self._send_leaper()
         self._commander.drive(self.mover, self._plan.patrol[:1])
