@@ -1,4 +1,4 @@
-"""Other people's formats, in and out: TUM, g2o, ROS camera_info and bags, MR.CLAM, a user's own marker tracks.
+"""Convert other formats: TUM, g2o, ROS camera_info and bags, MR.CLAM, and a user's own images and marker tracks.
 
-One module a format, imported where it is used; what comes in becomes an ordinary run.
+One module for each format, imported where it is used; imported data becomes an ordinary run.
 """

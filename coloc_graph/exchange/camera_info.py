@@ -1,7 +1,7 @@
-"""A camera as ROS has it: the YAML of `camera_info`, as calibrators write it and as topics print it.
+"""Read and write cameras as ROS `camera_info` YAML, as calibrators write it and as topics print it.
 
-What of it our `Camera` cannot say is refused, or is a warning; nothing is dropped without a word. Numbers are read back
-to the bit. Source: ROS `sensor_msgs/CameraInfo`, and the files of `camera_calibration_parsers`.
+Anything in it that `Camera` cannot express is refused, or reported in a warning. Numbers are read back bit for bit.
+Source: ROS `sensor_msgs/CameraInfo`, and the files of `camera_calibration_parsers`.
 """
 
 import math
@@ -23,11 +23,9 @@ from coloc_graph.team.camera import MAX_SIDE
 
 Array = NDArray[np.float64]
 
-#: Distortion models of ROS that are OpenCV's, and how many coefficients they have, without zeros behind the last; "" is
-#: no distortion.
+#: Distortion models of ROS that are OpenCV's, with their numbers of coefficients; "" is no distortion.
 MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "": (0,)}
-#: Largest text of one camera_info [bytes]; PyYAML takes a second for some hundred kilobytes.
-MAX_SIZE = 64 * 1024
+MAX_SIZE = 64 * 1024  # bytes of one camera_info; PyYAML takes a second for some hundred kilobytes
 #: Names of the fields: those of a calibrator's file, of a message in ROS 2, and in ROS 1.
 NAMES = {
     "width": ("image_width", "width"),
@@ -41,15 +39,12 @@ NAMES = {
 
 
 def write_camera_info(camera: Camera, name: str, path: Path) -> None:
-    """Write a camera's size, intrinsics and distortion as `camera_info` YAML.
-
-    Nothing is rectified: R is the identity and P is [K 0].
-    """
+    """Write a camera's size, intrinsics and distortion as `camera_info` YAML, with R the identity and P = [K 0]."""
     write_atomically(path, camera_info_text(camera, name))
 
 
 def camera_info_text(camera: Camera, name: str) -> str:
-    """The YAML of a camera."""
+    """Format a camera as `camera_info` YAML."""
     K = camera.K
     fields = {
         "image_width": camera.width,
@@ -65,10 +60,24 @@ def camera_info_text(camera: Camera, name: str) -> str:
 
 
 def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Camera, tuple[str, ...]]:
-    """The camera in a `camera_info` YAML, and warnings on what of it was left out.
+    """Read a camera from a `camera_info` YAML.
 
-    What such a file does not say (fps, noise) is as in `base`. Raises `InputError` where it is not one, and where it
-    describes what `Camera` cannot: a fisheye, skewed pixels, binned images, a region of interest.
+    Parameters
+    ----------
+    path
+        File.
+    base
+        Camera that provides what such a file does not contain (fps, noise).
+
+    Returns
+    -------
+    tuple
+        The camera, and warnings on ignored fields.
+
+    Raises
+    ------
+    InputError
+        The file is not a `camera_info`, or describes a fisheye, skewed pixels, binned images or a region of interest.
     """
     path = Path(path)
     fields = _fields(path)
@@ -114,8 +123,8 @@ def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Came
         raise InputError(f"{path}: {error}") from error
     if (radius := camera.fold_radius()) is not None:
         raise InputError(
-            f"{path}: its lens model folds {radius:.0f} px from the middle of the image, so that pixels beyond have no "
-            "ray; calibrate the camera anew, with corners out to the image's border"
+            f"{path}: its lens model folds {radius:.0f} px from the middle of the image, beyond which pixels have no "
+            "ray; calibrate the camera again, with corners out to the image's border"
         )
     return camera, _left_out(path, fields, K)
 
@@ -126,7 +135,7 @@ def _matrix(values: Any) -> dict[str, Any]:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML without aliases, which a few lines repeat a billion times, and without dates."""
+    """YAML loader without dates, and without aliases, which can expand a few lines a billion times."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -142,7 +151,7 @@ _Loader.yaml_implicit_resolvers = {
 
 
 def _text(path: Path) -> str:
-    """Text of the first document: a topic that is printed ends each message with ---; the first is as good as any."""
+    """Text of the first document of a file, since a printed topic separates messages by `---`."""
     remedy = "give the path of a camera_info YAML"
     data = read_bytes(path, remedy)
     if len(data) > MAX_SIZE:
@@ -207,7 +216,7 @@ def _numbers(path: Path, fields: Mapping[str, Any], name: str, shape: tuple[int,
 
 
 def _require_whole_image(path: Path, fields: Mapping[str, Any], width: int, height: int) -> None:
-    """Binned images and parts of images have other pixels than those that K is in."""
+    """Raise `InputError` for binned images and regions of interest, whose pixels are not those of K."""
     for name in ("binning_x", "binning_y"):
         if fields.get(name, 0) not in (0, 1):
             raise InputError(
@@ -233,14 +242,14 @@ def _left_out(path: Path, fields: Mapping[str, Any], K: Any) -> tuple[str, ...]:
         # the identity, or zeros where nobody filled it in
         if not np.array_equal(R, np.eye(3)) and R.any():
             said.append(
-                f"{path}: `rectification_matrix` was left out: it turns the images of a stereo pair, and ours are as "
+                f"{path}: `rectification_matrix` is ignored: it rotates the images of a stereo pair, and these are as "
                 "the camera takes them"
             )
     if any(name in fields for name in NAMES["P"]):
         P = _numbers(path, fields, "P", (3, 4))
         if P.any() and not np.array_equal(P, np.hstack([K, np.zeros((3, 1))])):
             said.append(
-                f"{path}: `projection_matrix` was left out: it is of rectified images, and ours are as the camera "
+                f"{path}: `projection_matrix` is ignored: it is of rectified images, and these are as the camera "
                 "takes them"
             )
     return tuple(said)

@@ -1,4 +1,4 @@
-"""A CSV file as columns of text that remember their lines, so that what is wrong can be named by file and line."""
+"""Read CSV files into columns of text with line numbers, so that errors name file and line."""
 
 import csv
 import io
@@ -15,15 +15,14 @@ from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
 
-#: Stance numbers above this are no numbers of stances, but something else in the wrong column.
-MAX_STANCE = 10**9
+MAX_STANCE = 10**9  # larger numbers are of another column
 
 
 @dataclass(frozen=True)
 class Table:
-    """The rows of a CSV: `columns` by name, and the `lines` of the file they are from, counted from 1.
+    """Rows of a CSV file: `columns` by name, and the `lines` of the file that they are from, counted from 1.
 
-    The methods that convert a column raise `TracksError` at the first row that is wrong.
+    Methods that convert a column raise `TracksError` at the first wrong row.
     """
 
     path: Path
@@ -34,11 +33,11 @@ class Table:
         return len(self.lines)
 
     def error(self, row: int, what: str) -> TracksError:
-        """The sentence for a row that is wrong."""
+        """Return the error for a wrong row."""
         return TracksError(f"{self.path}, line {self.lines[row]}: {what}")
 
     def numbers(self, name: str) -> Array:
-        """A column of finite numbers, (n,)."""
+        """Convert a column to finite numbers, (n,)."""
         texts = self.columns[name]
         values = np.empty(len(texts))
         for row, text in enumerate(texts):
@@ -48,11 +47,11 @@ class Table:
                 raise self.error(row, f"`{name}` is {_quoted(text)}, not a number; {_remedy(text)}") from None
         unbounded = first(~np.isfinite(values))
         if unbounded is not None:
-            raise self.error(unbounded, f"`{name}` is `{texts[unbounded]}`; leave out the rows that were not measured")
+            raise self.error(unbounded, f"`{name}` is `{texts[unbounded]}`; remove rows that were not measured")
         return values
 
     def stances(self) -> NDArray[np.int64]:
-        """The column `stance`, (n,): whole numbers from 0 on."""
+        """Convert the column `stance` to whole numbers from 0 on, (n,)."""
         texts = self.columns["stance"]
         values = []
         for row, text in enumerate(texts):
@@ -66,7 +65,7 @@ class Table:
         return np.array(values, np.int64)
 
     def robots(self, team: Team) -> NDArray[np.int64]:
-        """The column `robot` as places in the team, (n,)."""
+        """Convert the column `robot` to indices in the team, (n,)."""
         place = {name: index for index, name in enumerate(team.names)}
         names = self.columns["robot"]
         row = next((row for row, name in enumerate(names) if name not in place), None)
@@ -80,16 +79,30 @@ class Table:
 
 
 def first(wrong: NDArray[np.bool_]) -> int | None:
-    """Index of the first True; None where there is none."""
+    """Index of the first True, None if there is none."""
     return int(wrong.argmax()) if wrong.any() else None
 
 
 def read_table(path: Path, what: str, header: Sequence[str], *, optional: Sequence[str] = ()) -> Table:
-    """The table in a UTF-8 CSV file with exactly this header, and perhaps the `optional` columns after it.
+    """Read a UTF-8 CSV file with a given header.
 
-    Blank lines, spaces around cells, a byte order mark and Windows line ends are accepted. Raises `TracksError`
-    for a file that cannot be read or decoded, is empty, or whose header or a row has other columns; `what`
-    names the kind of file in the sentence.
+    Blank lines, spaces around cells, a byte order mark and Windows line ends are accepted.
+
+    Parameters
+    ----------
+    path
+        File.
+    what
+        Kind of file, for messages.
+    header
+        Names of the columns.
+    optional
+        Names of columns that may follow.
+
+    Raises
+    ------
+    TracksError
+        The file cannot be read or decoded, is empty, or its header or a row has other columns.
     """
     expected = ",".join(header) + (f"[,{','.join(optional)}]" if optional else "")
     rows, lines = _rows(path, _text(path, what))
@@ -103,7 +116,7 @@ def read_table(path: Path, what: str, header: Sequence[str], *, optional: Sequen
         if len(row) != len(found):
             raise TracksError(
                 f"{path}, line {at}: {len(row)} columns, where the header has {len(found)} ({','.join(found)}); "
-                f"{'complete the row' if len(row) < len(found) else 'remove what is too much (decimals take a point)'}"
+                f"{'complete the row' if len(row) < len(found) else 'remove the surplus (decimals take a point)'}"
             )
     columns = zip(*rows, strict=True) if rows else ((),) * len(found)
     return Table(path, {name: list(column) for name, column in zip(found, columns, strict=True)}, lines)
@@ -115,7 +128,7 @@ def _text(path: Path, what: str) -> str:
 
 
 def _rows(path: Path, text: str) -> tuple[list[list[str]], list[int]]:
-    """The rows that are not blank, and their lines."""
+    """Non-blank rows, and their line numbers."""
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows, lines = [], []
     try:
@@ -130,9 +143,9 @@ def _rows(path: Path, text: str) -> tuple[list[list[str]], list[int]]:
 
 
 def _quoted(text: str) -> str:
-    """The text as it is shown in a sentence, cut where it is long."""
+    """Quote a text for a message, shortened if it is long."""
     return f"`{text}`" if len(text) <= 80 else f"`{text[:80]}...`"
 
 
 def _remedy(text: str) -> str:
-    return "write it like 12.5" if text else "leave out the rows that were not measured"
+    return "write it like 12.5" if text else "remove rows that were not measured"

@@ -1,4 +1,4 @@
-"""Tables of numbers in columns of text, with comments after #, that remember their lines."""
+"""Read text tables of numbers with comments after #, with line numbers for errors."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class DatTable:
-    """`values` (n, columns), and the `lines` (n,) of the file they are from, counted from 1."""
+    """Table of numbers: `values` (n, columns), and the `lines` (n,) of the file that they are from, counted from 1."""
 
     path: Path
     values: Array
@@ -22,7 +22,7 @@ class DatTable:
 
 
 def read_dat(path: Path, columns: int) -> DatTable:
-    """The rows of a file; `InputError`, with its line, for one that is not so many finite numbers, or where none is."""
+    """Read a table with a given number of columns; `InputError` names the line of a wrong row."""
     text = read_text(path, "give the folder of a whole dataset, with the files as they were published")
     rows, lines = [], []
     for line, content in enumerate(text.split("\n"), start=1):

@@ -1,4 +1,4 @@
-"""A pose graph as a drawing: Graphviz's dot, one box a place, stay-put constraints visible as such."""
+"""Draw pose graphs as Graphviz dot: one box for each pose variable, with visible stay-put constraints."""
 
 from collections import defaultdict
 
@@ -11,11 +11,11 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
 def to_dot(graph: PoseGraph) -> str:
-    """The graph in the dot language; draw it with `dot -Tsvg`, or `neato` for large ones.
+    """Format a graph in the dot language; draw it with `dot -Tsvg`, or `neato` for large graphs.
 
-    A box is one variable, named by all stances at which it holds; a double border is a robot that stayed put
+    A box is one variable, labelled with all stances that share it; a double border marks a robot that stayed put
     exactly. Dashed edges are stay-put constraints with a slip, dotted ones odometry, thin ones sightings. Landmarks are
-    hexagons, and so is the map, with dashed edges to those that are on it.
+    hexagons, and so is the map, with dashed edges to the landmarks on it.
     """
     places: dict[int, list[Node]] = defaultdict(list)
     for node in graph.nodes:

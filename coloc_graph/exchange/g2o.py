@@ -24,8 +24,7 @@ from coloc_graph.measurements import Node
 
 Array = NDArray[np.float64]
 
-#: Order of ours, rotation first, in g2o's, translation first.
-TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]
+TRANSLATION_FIRST = [3, 4, 5, 0, 1, 2]  # our order, rotation first, in g2o's
 MAX_NORM_ERROR = 1e-3  # of a quaternion, which is then normalised
 MIN_EIGENVALUE = 1e-12  # of an information matrix of unit diagonal that is positive definite
 MIN_PROJECTED = 1e-9  # least eigenvalue that projection leaves, relative to the largest

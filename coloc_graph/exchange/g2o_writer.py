@@ -1,10 +1,10 @@
-"""Pose graphs in the g2o format, written; `g2o` reads them.
+"""Write pose graphs in the g2o format; `g2o` reads them.
 
 VERTEX_SE3:QUAT and EDGE_SE3:QUAT with the information's upper triangle, translation first. Ids are plain integers;
-numbers read back to the bit. g2o has no word for a stay-put constraint: stances that share a pose share a vertex, and a
-comment says so, which `read_g2o` understands. Landmarks, and the map,
-are vertices like any other, named in comments. Nor has g2o a word for a floor: its priors are left out. What a planar
-measurement does not know has the information `UNKNOWN`.
+numbers are read back bit for bit. g2o cannot express a stay-put constraint: stances that share a pose share a vertex,
+and a comment says so, which `read_g2o` understands. Landmarks and the map are ordinary vertices, named in comments.
+Floor priors cannot be expressed and are omitted. Components that a planar measurement leaves unknown get the
+information `UNKNOWN`.
 
 Source: g2o's file format, https://github.com/RainerKuemmerle/g2o/wiki/File-Format
 """
@@ -22,12 +22,11 @@ from coloc_graph.geometry.lie import quaternion
 
 Array = NDArray[np.float64]
 
-#: The information of what a measurement does not know, on paper: a deviation of 1 km, or of 1000 rad.
-UNKNOWN = 1e-6
+UNKNOWN = 1e-6  # information of an unknown component: a standard deviation of 1 km, or of 1000 rad
 
 
 def write_g2o(estimate: Estimate, path: Path) -> None:
-    """Write what was estimated, and what was measured between it and not refused."""
+    """Write the poses of an estimate and its measurements that were not rejected."""
     graph = estimate.graph
     poses: dict[int, Array] = {}
     names: dict[int, list[str]] = {}
@@ -62,7 +61,7 @@ def write_g2o(estimate: Estimate, path: Path) -> None:
 
 
 def _information(C: Array) -> Array:
-    """g2o's (6, 6), translation first, of a covariance (6, 6), or (3, 3) of heading, x, y."""
+    """Information (6, 6), translation first, of a covariance (6, 6), or (3, 3) of heading, x, y."""
     information = UNKNOWN * np.eye(6)
     known = slice(0, 6) if len(C) == 6 else slice(2, 5)
     information[known, known] = np.linalg.inv(C)

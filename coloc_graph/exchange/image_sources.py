@@ -1,4 +1,4 @@
-"""Sources of a robot's images: a folder, a glob that may span folders, or a video; and the time of each image."""
+"""Open sources of a robot's images (a folder, a glob across folders, or a video), and find the time of each image."""
 
 import glob
 import re
@@ -38,11 +38,11 @@ class ImageSource:
         return len(self.times)
 
     def shifted(self, seconds: float) -> "ImageSource":
-        """The same, later by some seconds."""
+        """Return the source with all times shifted [s]."""
         return replace(self, times=self.times + seconds)
 
     def pixels(self) -> Iterator[NDArray[np.uint8]]:
-        """All images of 8 bits, grey or BGR."""
+        """Yield all images with 8 bits, grey or BGR."""
         for record in self.records():
             if isinstance(record, Image):
                 yield record.pixels
@@ -51,7 +51,7 @@ class ImageSource:
                 yield np.asarray(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), np.uint8)
 
     def records(self) -> Iterator[Image | EncodedImage]:
-        """All images as a run has them: JPEG and PNG as they are, where any decoder makes the same of them."""
+        """Yield all images as records of a run; JPEG and PNG are kept if every decoder agrees on them."""
         times = self.times.tolist()
         if self.video is not None:
             for time, frame in zip(times, _frames(self.video), strict=False):
@@ -77,9 +77,12 @@ def open_sources(
     fps: float | None = None,
     pattern: str | None = None,
 ) -> list[ImageSource]:
-    """Sources of images by `ROBOT=SOURCE`, with times from a CSV, a rate, the files' names, or a video's container.
+    """Open sources of images `ROBOT=SOURCE`, with times from a CSV, a rate, file names, or a video's container.
 
-    Raises `InputError` where a source has no images, or its times are not known or do not ascend.
+    Raises
+    ------
+    InputError
+        A source has no images, or its times are unknown or do not ascend.
     """
     if sum(one is not None for one in (times, fps, pattern)) > 1:
         raise InputError("times come from --times, --fps or --time-pattern; give one of them")
@@ -90,7 +93,7 @@ def open_sources(
     for one in given:
         robot, equals, where = one.partition("=")
         if not equals or not where:
-            raise InputError(f"`{one}` is no ROBOT=SOURCE; give a folder, a glob or a video, as A=images/A")
+            raise InputError(f"`{one}` is not ROBOT=SOURCE: give a folder, a glob or a video, such as A=images/A")
         if team[robot].camera_if_any is None:
             raise InputError(f"robot {robot} has no camera in the team; give it one under [robots.camera]")
         if robot in [source.robot for source in found]:
@@ -110,9 +113,7 @@ def open_sources(
         elif fps is not None:
             own = START + np.arange(len(files)) / fps
         else:
-            raise InputError(
-                f"when the images of {robot} were taken is not said: give --times, --fps or --time-pattern"
-            )
+            raise InputError(f"the times of the images of {robot} are not known: give --times, --fps or --time-pattern")
         late = np.flatnonzero(np.diff(own) <= 0)
         if len(late) and video is None:
             order = np.argsort(own, kind="stable")
@@ -128,7 +129,7 @@ def open_sources(
 
 
 def _files(where: str) -> tuple[tuple[Path, ...], Path | None]:
-    """Image files of a folder or a glob, or a video."""
+    """List the image files of a folder or a glob, or a video."""
     path = Path(where)
     if path.is_dir():
         return tuple(images_in(path)), None
@@ -155,7 +156,7 @@ def _read_times(path: Path, team: Team) -> dict[str, list[tuple[tuple[str, ...],
 def _times_of(
     files: Sequence[Path], robot: str, table: dict[str, list[tuple[tuple[str, ...], float]]], path: Path
 ) -> Array:
-    """Time of each file: of the row whose `file` is the end of its path."""
+    """Time of each file, from the row whose `file` is the end of its path."""
     by_end: dict[tuple[str, ...], float] = {}
     for parts, time in table.get(robot, []):
         if parts in by_end:
@@ -178,7 +179,7 @@ def _times_of(
 
 
 def _times_by_name(files: Sequence[Path], pattern: str) -> Array:
-    """Times in the files' names, by a pattern as `frame_{ms}`."""
+    """Times in file names, by a pattern such as `frame_{ms}`."""
     unit = re.search(r"\{(s|ms|us|ns)\}", pattern)
     if unit is None:
         raise InputError(f"--time-pattern is `{pattern}`; write {{s}}, {{ms}}, {{us}} or {{ns}} where the time is")
@@ -206,7 +207,7 @@ def _frames(path: Path) -> Iterator[NDArray[np.uint8]]:
 
 
 def _video_times(path: Path, fps: float | None) -> Array:
-    """Times of a video's frames: by a rate, else as its container has them."""
+    """Times of a video's frames, by a rate or from its container."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     stamps: list[float] = []
     try:

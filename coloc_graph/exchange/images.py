@@ -1,4 +1,4 @@
-"""Import a team's own recording: one folder, glob or video of images a robot."""
+"""Import a team's own recording: one folder, glob or video of images for each robot."""
 
 import heapq
 from collections.abc import Callable, Iterator, Sequence
@@ -21,16 +21,23 @@ from coloc_graph.team import Team, read_team
 Array = NDArray[np.float64]
 
 STANCES_HEADER = ("stance", "start", "end", "observers", "movers", "anchors")
-#: Images tell when a camera stands; there is nothing to settle as with wheels.
-BY_IMAGES = MotionThresholds(settle=0.0)
+BY_IMAGES = MotionThresholds(settle=0.0)  # by images a camera stands at once, unlike by odometry
 
 
 @dataclass(frozen=True)
 class ImagesSummary:
-    """What was imported: `images` by robot, the `stances`, and for how long each robot stood [s], of how long.
+    """Summary of an import.
 
-    `stood` is empty where the stances were stated. `offsets` are by how much the recordings of robots were moved in
-    time [s].
+    Attributes
+    ----------
+    images
+        Number of images by robot.
+    stances
+        The stances.
+    stood
+        For each robot the duration at rest and the recorded duration [s]; empty if stances were given.
+    offsets
+        Time offsets that were applied to the robots' recordings [s].
     """
 
     images: dict[str, int]
@@ -81,9 +88,7 @@ def import_images(
     team = read_team(team_path)
     found = open_sources(team, sources, times=Path(times) if times is not None else None, fps=fps, pattern=time_pattern)
     if len(found) < 2:
-        raise InputError(
-            "a stance needs two robots that watch; give the images of two robots, as A=images/A B=images/B"
-        )
+        raise InputError("a stance needs two observers: give the images of two robots, such as A=images/A B=images/B")
     if stances is not None:
         made, moves = _read_stances(Path(stances), team, found), []
     else:
@@ -111,7 +116,7 @@ def _begin(record: Stance | Motion) -> float:
 
 
 def _sized(source: ImageSource, team: Team) -> Iterator[Image | EncodedImage]:
-    """Images of a source, each of the size that the team says."""
+    """Yield the images of a source and check their size against the team."""
     camera = team[source.robot].camera
     for number, record in enumerate(source.records()):
         if isinstance(record, Image):
@@ -130,7 +135,7 @@ def _sized(source: ImageSource, team: Team) -> Iterator[Image | EncodedImage]:
 
 
 def _find_stances(team: Team, sources: Sequence[ImageSource], moves: Sequence[Movements]) -> list[Stance]:
-    """Stances by who stands; robots without images, and those whose camera never stands, are the movers."""
+    """Find stances by cameras at rest; robots without images, and those whose camera never rests, are the movers."""
     begin = min(float(one.times[0]) for one in sources)
     end = max(float(one.times[-1]) for one in sources)
     seen = {one.robot for one in sources}
@@ -144,14 +149,14 @@ def _find_stances(team: Team, sources: Sequence[ImageSource], moves: Sequence[Mo
             for one in moves
         )
         raise InputError(
-            f"never do two cameras stand while a robot with markers moves, so that there is no stance: {stood}; state "
-            "the stances with --stances, and give a robot that only moves no images"
+            f"there is no stance: never do two cameras stand while a robot with markers moves ({stood}); state the "
+            "stances with --stances, and give no images of a robot that only moves"
         )
     return found
 
 
 def _with_images(stance: Stance, cameras: dict[str, Array]) -> Stance:
-    """A stance from its first to its last image."""
+    """Shorten a stance to its first and last image."""
     own = [cameras[robot] for robot in stance.observers]
     inside = [one[(one >= stance.start) & (one <= stance.end)] for one in own]
     return replace(stance, start=float(min(one[0] for one in inside)), end=float(max(one[-1] for one in inside)))

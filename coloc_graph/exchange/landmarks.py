@@ -1,4 +1,4 @@
-"""landmarks.csv: where landmarks, and the map that some are on, came out in the world."""
+"""Read and write landmarks.csv: estimated poses of landmarks, and of the map that some are on, in the world frame."""
 
 import csv
 import io
@@ -19,10 +19,10 @@ REMEDY = "solve the run again"  # of a file that is damaged
 
 @dataclass(frozen=True)
 class LandmarkRow:
-    """A landmark's pose in the world, x, y [m] and yaw [deg], with standard deviations and the correlation of x and y.
+    """Pose of a landmark in the world frame, x, y [m] and yaw [deg], with sigmas and the correlation of x and y.
 
-    The yaw of a point, as a landmark that was ranged, is NaN, and empty in the file. `stated` says whether the team
-    states its position, `measurements` how many of it are in the estimate.
+    The yaw of a landmark that is a point (in ranging runs) is NaN, and empty in the file. `stated` is True if the team
+    states its position; `measurements` is the number of its measurements in the estimate.
     """
 
     name: str
@@ -51,7 +51,7 @@ def landmark_rows(estimate: Estimate) -> list[LandmarkRow]:
 
 
 def map_row(estimate: Estimate) -> LandmarkRow | None:
-    """Pose T_world_map of the map in the world; its `measurements` are of all landmarks on it."""
+    """Return the pose T_world_map of the map; its `measurements` are those of all landmarks on it."""
     if estimate.map is None:
         return None
     on_it = _on_map(estimate)
@@ -64,7 +64,7 @@ def _on_map(estimate: Estimate) -> set[str]:
 
 
 def row_of(name: str, placed: StaticPose, stated: bool, measurements: int) -> LandmarkRow:
-    """A row of the file."""
+    """Make a row of the file."""
     x, y, yaw = placed.planar
     C = placed.covariance_xy_yaw
     sx, sy, turn = np.sqrt(C.diagonal()).tolist()
@@ -75,7 +75,7 @@ def row_of(name: str, placed: StaticPose, stated: bool, measurements: int) -> La
 
 
 def landmarks_csv(rows: list[LandmarkRow]) -> str:
-    """The text of the file; numbers read back to the bit."""
+    """Format rows as CSV; numbers are read back bit for bit."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [one.name for one in fields(LandmarkRow)], lineterminator="\n")
     writer.writeheader()
@@ -86,7 +86,7 @@ def landmarks_csv(rows: list[LandmarkRow]) -> str:
 
 
 def read_landmarks(path: Path) -> tuple[LandmarkRow, ...]:
-    """The rows of a file, () where there is none; `InputError` naming the line where it is damaged."""
+    """Read the rows of a file, () if there is none; `InputError` names the line if it is damaged."""
     if not path.exists():
         return ()
     reader = csv.DictReader(io.StringIO(read_text(path, REMEDY), newline=""))

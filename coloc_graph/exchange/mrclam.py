@@ -1,8 +1,8 @@
-"""The UTIAS Multi-Robot Cooperative Localization and Mapping datasets as ordinary runs: `import_mrclam`.
+"""Import UTIAS Multi-Robot Cooperative Localization and Mapping (MR.CLAM) datasets: `import_mrclam`.
 
-Source: Leung, Halpern, Barfoot, Liu, "The UTIAS multi-robot cooperative localization and mapping dataset", IJRR 30(8),
-2011. Five iRobot Creates with a camera each, which gives range and bearing to
-barcodes on robots and landmarks; wheels' commands; truth by motion capture.
+Five iRobot Creates, each with a camera that gives range and bearing to barcodes on robots and landmarks; wheel
+commands; ground truth by motion capture. Source: Leung, Halpern, Barfoot, Liu, "The UTIAS multi-robot cooperative
+localization and mapping dataset", IJRR 30(8), 2011.
 """
 
 import heapq
@@ -22,8 +22,8 @@ from coloc_graph.team import Floor, Landmark, Ranging, Robot, Team, Wheels
 
 Array = NDArray[np.float64]
 
-#: What is known of the camera of these robots: a range is made of a barcode's height in the image, so that it is how
-#: far in front of the camera the barcode is; its error grows with its square, and lasts while the view stays the same.
+#: Sensor of these robots: a range follows from a barcode's height in the image and is a depth along the optical axis;
+#: its error grows with its square, and persists while the view stays the same.
 RANGING = Ranging(
     range_sigma=0.012,
     range_sigma_per_m2=0.0012,
@@ -39,17 +39,15 @@ RANGING = Ranging(
     robot_offset_sigma=0.05,
     place_sigma=0.05,
 )
-#: Their odometry is what the wheels were told, which they do a moment later, and not to the full.
+#: Their odometry is made of commands, which the wheels carry out a moment later and not fully.
 WHEELS = Wheels(delay=0.1, scale_sigma=0.1, turn_scale_sigma=0.1, delay_sigma=0.1)
-#: Noise of the way: along and across it [m per root of a metre, of a second], and of the heading [rad per root of a
-#: radian, of a metre, of a second]. It is what errors add up to in ten seconds: they last, and a step alone has less.
-ALONG = (0.08, 0.004)
-ACROSS = (0.012, 0.002)
-TURN = (0.1, 0.08, 0.006)
+# accumulated errors of ten seconds; those of a single step are smaller, since errors are correlated
+ALONG = (0.08, 0.004)  # m per root of a metre, of a second: odometry noise along the path
+ACROSS = (0.012, 0.002)  # m per root of a metre, of a second: across the path
+TURN = (0.1, 0.08, 0.006)  # rad per root of a radian, of a metre, of a second: of the heading
 KEPT_EVERY = 0.2  # s, period at which commands that stay the same are kept
 TRUTH_EVERY = 0.045  # s, period at which truth is kept: all 100 a second would be most of the run
-#: The way of one command is followed to so much [s]; one that is older was no command any more.
-LONGEST_COMMAND = 2.0
+MAX_COMMAND = 2.0  # s, for which a command is followed
 
 
 @dataclass(frozen=True)
@@ -79,13 +77,25 @@ def import_mrclam(
     map_known: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> MrclamSummary:
-    """Write the run `out` from a folder of .dat files of one MR.CLAM dataset.
+    """Write a run from the .dat files of one MR.CLAM dataset.
 
-    Robots are called R1, R2, ..., landmarks by their subject's number, L6, L7, ... With `map_known` the team states
-    where the landmarks are; else nothing does but the truth. Commands are made into odometry by following them.
-    `progress` is called with the measurements written and their number.
+    Robots are called R1, R2, ..., landmarks by their subject's number, L6, L7, ... Commands are integrated to odometry.
 
-    Raises `InputError` with one sentence that names file and line; nothing is written then.
+    Parameters
+    ----------
+    folder
+        Folder of the dataset.
+    out
+        Run to write.
+    map_known
+        False to leave the landmarks' positions out of the team; they are then in the truth only.
+    progress
+        Called with (measurements written, their number).
+
+    Raises
+    ------
+    InputError
+        A file is missing or wrong, in one sentence that names file and line; nothing is written then.
     """
     folder = Path(folder)
     subjects = _robots(folder)
@@ -133,7 +143,7 @@ def _robots(folder: Path) -> list[int]:
 
 
 def _table(folder: Path, name: str, columns: int, warnings: list[str]) -> DatTable:
-    """A table whose first column is time, in the order of time."""
+    """Read a table whose first column is time, and sort it by time."""
     table = read_dat(folder / name, columns)
     order = np.argsort(table.values[:, 0], kind="stable")
     out_of_order = int((np.diff(table.values[:, 0]) < 0).sum())
@@ -144,7 +154,7 @@ def _table(folder: Path, name: str, columns: int, warnings: list[str]) -> DatTab
 
 
 def _barcodes(folder: Path, robots: list[int]) -> tuple[dict[int, int], list[str]]:
-    """{barcode: subject}; a code that two subjects have is nobody's."""
+    """Map barcodes to subjects; a code that two subjects share is ignored, with a warning."""
     table = read_dat(folder / "Barcodes.dat", 2)
     codes: dict[int, int] = {}
     shared: dict[int, list[int]] = {}
@@ -158,13 +168,13 @@ def _barcodes(folder: Path, robots: list[int]) -> tuple[dict[int, int], list[str
     if missing:
         raise InputError(f"{table.path}: has no barcode of robot {missing[0]}, whose files are there; add its row")
     return codes, [
-        f"{table.path}: barcode {code} is that of subjects {', '.join(map(str, of))}; its measurements are left out"
+        f"{table.path}: barcode {code} belongs to subjects {', '.join(map(str, of))}; its measurements are not used"
         for code, of in shared.items()
     ]
 
 
 def _landmarks(folder: Path, codes: dict[int, int], robots: list[int]) -> dict[int, Array]:
-    """{subject: (x, y, sigma)} of the landmarks [m]."""
+    """Map subjects to (x, y, sigma) of the landmarks [m]."""
     table = read_dat(folder / "Landmark_Groundtruth.dat", 5)
     positions = {}
     for row, line in zip(table.values, table.lines.tolist(), strict=True):
@@ -192,14 +202,14 @@ def _without_map(team: Team) -> Team:
 def _ranges(
     table: DatTable, subject: int, codes: dict[int, int], names: dict[int, str], warnings: list[str]
 ) -> list[Ranges]:
-    """Measurements of a robot, instant by instant; unknown barcodes, and its own, are left out."""
+    """Measurements of a robot, one record for each time; unknown barcodes and its own are ignored, with a warning."""
     seen = np.array([codes.get(code, -1) for code in table.values[:, 1].astype(int).tolist()], int)
     known = np.array([one in names and one != subject for one in seen.tolist()], bool)
     if not known.all():
         of = sorted(set(table.values[~known, 1].astype(int).tolist()))
         warnings.append(
-            f"{table.path}: {int((~known).sum())} measurements are of barcodes that are nobody's "
-            f"({', '.join(map(str, of))}) and are left out"
+            f"{table.path}: {int((~known).sum())} measurements are of unknown barcodes ({', '.join(map(str, of))}) and "
+            "are not used"
         )
     bad = known & ~(table.values[:, 2] > 0)
     if bad.any():
@@ -217,12 +227,12 @@ def _ranges(
 
 
 def _odometry(table: DatTable) -> _Odometry:
-    """Dead reckoning of the commands: each holds until the next one; equal ones are merged."""
+    """Dead reckoning of the commands, each of which holds until the next; equal ones are merged."""
     times, commands = table.values[:, 0], table.values[:, 1:]
     # a row that changes nothing is kept so that time goes on
     keep = np.r_[True, (np.diff(commands, axis=0) != 0).any(axis=1)] | _every(times, KEPT_EVERY)
     times, commands = times[keep], commands[keep]
-    dt = np.minimum(np.diff(times), LONGEST_COMMAND)
+    dt = np.minimum(np.diff(times), MAX_COMMAND)
     way, turn = commands[:-1].T * dt
     yaw = np.r_[0.0, np.cumsum(turn)]
     # an arc's chord, in the direction half way
@@ -252,7 +262,7 @@ def _write(
     truth: dict[int, DatTable],
     progress: Callable[[int], None],
 ) -> None:
-    """All records in the order of time."""
+    """Write all records in order of time."""
 
     def of_truth(robot: str, table: DatTable) -> Iterator[tuple[float, str, Array]]:
         kept = table.values[_every(table.values[:, 0], TRUTH_EVERY)]

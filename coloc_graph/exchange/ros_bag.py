@@ -1,7 +1,7 @@
-"""A ROS bag, without ROS: what topics it has, and their messages. ROS 1 `.bag`; ROS 2 folders, `.mcap`, `.db3`.
+"""Read ROS bags without ROS: ROS 1 `.bag`; ROS 2 folders, `.mcap`, `.db3`.
 
-The messages that are read are standard ones, whose definitions are the same in every distribution: definitions that a
-bag brings are not needed, and those of messages that nobody asks for do no harm.
+Only standard messages are read, whose definitions are the same in every distribution: definitions in the bag are not
+needed, and those of other messages do no harm.
 """
 
 import struct
@@ -35,7 +35,7 @@ REMEDIES = {".bag": "`rosbag reindex`", ".mcap": "`mcap recover`"}
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag: its types (one, unless it is odd) as `package/msg/Type`, and how many messages."""
+    """Topic of a bag: its types (normally one) as `package/msg/Type`, and its number of messages."""
 
     name: str
     types: tuple[str, ...]
@@ -44,7 +44,7 @@ class Topic:
 
 @dataclass(frozen=True, eq=False)
 class BagMessage:
-    """A message as it is in the bag, and when the bag received it [ns]."""
+    """Message as it is in the bag, with its time of reception [ns]."""
 
     topic: str
     type: str
@@ -53,12 +53,12 @@ class BagMessage:
 
 
 def full_name(topic: str) -> str:
-    """Name of a topic with one slash before it, as ROS resolves one without a namespace."""
+    """Name of a topic with one leading slash, as ROS resolves it without a namespace."""
     return "/" + topic.lstrip("/")
 
 
 class Bag:
-    """A bag that is open; `open_bag` gives one."""
+    """Open bag, made by `open_bag`."""
 
     def __init__(self, path: Path, reader: Any, store: "Typestore", *, ros2: bool, notes: Sequence[str] = ()) -> None:
         self.path, self.ros2, self.notes = path, ros2, tuple(notes)
@@ -72,7 +72,7 @@ class Bag:
         }
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        """The messages of some topics, in the order in which the bag received them."""
+        """Yield messages of some topics in order of reception."""
         wanted = [one for one in self._reader.connections if full_name(one.topic) in topics]
         for one in wanted:
             self._require_standard(one)
@@ -90,7 +90,7 @@ class Bag:
             yield last
 
     def decode(self, message: BagMessage) -> Any:
-        """The message as an object with the fields of its type, ROS 1 as ROS 2."""
+        """Decode a message to an object with the fields of its type, the same for ROS 1 and ROS 2."""
         kind = TF if message.type == OLD_TF else message.type
         read = self._store.deserialize_cdr if self.ros2 else self._store.deserialize_ros1
         try:
@@ -99,7 +99,7 @@ class Bag:
             raise self.error(message, f"is not a {message.type} ({shortened(error)}); record the bag again") from error
 
     def stamp(self, message: BagMessage) -> int:
-        """The header's stamp of a message that begins with one [ns]; 0 where it is not set."""
+        """Header stamp of a message that begins with a header [ns]; 0 if it is not set."""
         try:
             if not self.ros2:  # after a sequence number
                 seconds, rest = struct.unpack_from("<II", message.data, 4)
@@ -110,13 +110,13 @@ class Bag:
         return int(seconds) * 1_000_000_000 + int(rest)
 
     def error(self, message: BagMessage, what: str) -> BagError:
-        """The sentence for a message that is wrong."""
+        """Return the error for a wrong message."""
         return BagError(
             f"{self.path}: the message of {message.topic} received at {to_seconds(message.received)} s {what}"
         )
 
     def _require_standard(self, connection: Any) -> None:
-        """`BagError` where a bag defines a standard message otherwise than everybody else."""
+        """Raise `BagError` if a bag defines a standard message differently."""
         kind = connection.msgtype
         if kind == OLD_TF or not connection.digest or kind not in self._store.fielddefs:
             return
@@ -130,7 +130,7 @@ class Bag:
 
 @contextmanager
 def open_bag(path: str | Path) -> Iterator[Bag]:
-    """A bag to read from; `BagError` where there is none, or it was cut off, or rosbags is not installed."""
+    """Open a bag for reading; `BagError` if there is none, it was cut off, or rosbags is not installed."""
     path = Path(path)
     try:
         import rosbags  # noqa: F401
@@ -158,7 +158,7 @@ def _standard_types(*, ros2: bool) -> "Typestore":
 
 @contextmanager
 def _understood(path: Path, where: str = "") -> Iterator[None]:
-    """Whatever rosbags stumbles over in a damaged bag is one sentence."""
+    """Convert any exception of rosbags on a damaged bag to one sentence."""
     try:
         yield
     except ColocError:

@@ -17,18 +17,18 @@ from coloc_graph.run.schemas import to_seconds
 Array = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 
-STEP = 0.1  # smallest step of a clock that is corrected [s]; latency varies by less
-STEP_SIGMAS = 8.0  # a step also exceeds the jitter of the stamps by this factor
-FAR = 0.1  # smallest offset between topics of one kind that is corrected [s]; their latencies differ by less
-APART = 1.0  # smallest offset between topics of different kinds that is corrected [s]
-SIGMAS = {"odometry": 5e-3, "image": 30e-3}  # what latency leaves of a corrected offset, by kind of topic [s]
+STEP = 0.1  # s, smallest step of a clock that is corrected; latency varies by less
+STEP_SIGMAS = 8.0  # ratio of a step to the jitter of the stamps that it must exceed too
+FAR = 0.1  # s, smallest offset between topics of one kind that is corrected; their latencies differ by less
+APART = 1.0  # s, smallest offset between topics of different kinds that is corrected
+SIGMAS = {"odometry": 5e-3, "image": 30e-3}  # s, uncertainty of a corrected offset due to latency, by kind of topic
 WINDOW = 7  # messages on either side of a candidate step
-FEWEST = 5  # messages of a topic that tell anything of its clock
-DRIFT_SIGMAS = 5.0  # a drift exceeds its own uncertainty by this factor
-DRIFT_EFFECT = 5e-3  # and changes the offset by this much over the recording [s]
-BIN = 1.0  # the message of least latency in each bin of this length tells the drift [s]
-PACE = 1.5  # reception that is faster or slower than the stamps by this factor is not of the recording itself
-QUIET = 0.9  # quantile of stamp minus reception: messages of low latency
+MIN_MESSAGES = 5  # messages of a topic that are needed to judge its clock
+DRIFT_SIGMAS = 5.0  # standard deviations that a drift must exceed
+DRIFT_EFFECT = 5e-3  # s, change of the offset over the recording that it must exceed too
+BIN = 1.0  # s, bins from each of which the message of least latency is taken for the drift
+PACE = 1.5  # ratio of the paces of reception and stamps above which the bag was converted, not recorded live
+QUIET = 0.9  # quantile of stamp minus reception, for messages of low latency
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class StampedTopic:
     @property
     def is_live(self) -> bool:
         """True if the messages were received at the pace of their stamps, and not when a bag was converted."""
-        if len(self.stamps) < FEWEST:
+        if len(self.stamps) < MIN_MESSAGES:
             return False
         stamped, came = (float(np.median(np.diff(one))) for one in (self.stamps, self.received))
         return stamped > 0 and 1 / PACE < came / stamped < PACE
@@ -56,10 +56,18 @@ class StampedTopic:
 
 @dataclass(frozen=True, eq=False)
 class RobotClock:
-    """The clock of one robot against the other robots' clocks.
+    """Clock of one robot against the other robots' clocks.
 
-    `offsets` (m,) [s] hold in the m segments between the `steps` (m - 1,) [ns, reception]; `drift` [s/s] is within each
-    segment, about `origin` [ns]. `jitter` [s] is the scatter of the stamps. Offsets are 0 where nothing is corrected.
+    Attributes
+    ----------
+    offsets
+        Offsets of the m segments between the steps, (m,) [s]; 0 if nothing is corrected.
+    steps
+        Reception times of steps, (m - 1,) [ns].
+    drift, origin
+        Drift within each segment [s/s], about a reception time [ns].
+    jitter
+        Scatter of the stamps [s].
     """
 
     robot: str
@@ -112,7 +120,7 @@ class RobotClock:
 
 @dataclass(frozen=True, eq=False)
 class BagClocks:
-    """The clock of each topic, and how well those of the observers agree once corrected: `sigma` [s]."""
+    """Clock of each topic, and the standard deviation `sigma` [s] of the observers' clocks after correction."""
 
     clocks: Mapping[str, RobotClock]
     sigma: float
@@ -179,8 +187,7 @@ def bag_clocks(topics: Mapping[str, StampedTopic]) -> BagClocks:
 
 
 def _relative(topics: Mapping[str, StampedTopic], offsets: Mapping[str, Array]) -> dict[str, tuple[Array, float]]:
-    """Offsets (m,) [s] of each topic against the other robots' topics of its kind, and how large they must be to be a
-    clock's and not latency."""
+    """Offsets (m,) [s] of each topic against other robots' topics of its kind, and bounds of what latency explains."""
     found = {}
     for name, topic in topics.items():
         kin = [other for other, one in topics.items() if one.kind == topic.kind]
@@ -192,7 +199,7 @@ def _relative(topics: Mapping[str, StampedTopic], offsets: Mapping[str, Array]) 
 
 
 def _steps(topics: Sequence[StampedTopic]) -> Nanoseconds:
-    """Reception times [ns] of the steps of a clock, as its topics agree on them."""
+    """Reception times [ns] of a clock's steps on which its topics agree."""
     found: list[int] = []
     for topic in topics:
         d = topic.offsets
@@ -224,7 +231,7 @@ def _steps(topics: Sequence[StampedTopic]) -> Nanoseconds:
 
 
 def _segment_offsets(topic: StampedTopic, steps: Nanoseconds) -> Array:
-    """Offset (m,) [s] of a clock in each segment: stamp minus reception of the topic's messages of low latency."""
+    """Offset (m,) [s] of a clock in each segment: stamp minus reception of messages with low latency."""
     segment, d = np.searchsorted(steps, topic.received, side="right"), topic.offsets
     found = np.full(len(steps) + 1, np.nan)
     for k in np.unique(segment):
@@ -233,12 +240,12 @@ def _segment_offsets(topic: StampedTopic, steps: Nanoseconds) -> Array:
 
 
 def _jitter(topic: StampedTopic) -> float:
-    """Scatter [s] of stamp minus reception, from one message to the next."""
+    """Scatter [s] of stamp minus reception from message to message."""
     return float(1.4826 * np.median(np.abs(np.diff(topic.offsets))) / np.sqrt(2))
 
 
 def _majority(offsets: Sequence[float]) -> float:
-    """Offset [s] that most segments share; of two equally frequent ones the one nearest to the recorder's clock."""
+    """Offset [s] that most segments share; of two equally frequent ones that nearest to the recorder's clock."""
     near = [sum(abs(other - one) < FAR for other in offsets) for one in offsets]
     among = [one for one, count in zip(offsets, near, strict=True) if count == max(near)]
     centre = min(among, key=abs)
@@ -246,7 +253,7 @@ def _majority(offsets: Sequence[float]) -> float:
 
 
 def _drift(topics: Sequence[StampedTopic], steps: Nanoseconds) -> tuple[float, float]:
-    """Drift of a clock against the recorder's [s/s] with its sigma, from the messages of least latency a second."""
+    """Drift of a clock against the recorder's [s/s] with its sigma, from messages of least latency in each second."""
     times, values, sets = [], [], []
     for number, topic in enumerate(topics):
         t, d = topic.received / 1e9, topic.offsets
@@ -274,7 +281,7 @@ def _drift(topics: Sequence[StampedTopic], steps: Nanoseconds) -> tuple[float, f
 
 
 def _disagreement(topics: Mapping[str, StampedTopic], clocks: Mapping[str, RobotClock]) -> float:
-    """Standard deviation [s] of what latency leaves of the observers' corrected offsets; 0 where none is corrected."""
+    """Standard deviation [s] of the observers' corrected offsets due to latency; 0 if none is corrected."""
     if all(clock.is_right for clock in clocks.values()):
         return 0.0
     watching = {one.robot for one in topics.values() if one.kind == "image"}

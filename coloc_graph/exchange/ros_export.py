@@ -1,6 +1,6 @@
-"""A result as a ROS 2 bag: one MCAP file with tf and each robot's poses with covariances, for RViz and Foxglove.
+"""Write a result as a ROS 2 bag for RViz and Foxglove: one MCAP file with tf and each robot's poses with covariances.
 
-Profile `ros2`, messages in CDR, schemas as ros2msg: what `ros2 bag` records into MCAP.
+Profile `ros2`, messages in CDR, schemas as ros2msg, like `ros2 bag` records.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,13 +35,34 @@ FOREVER = divmod(2**63 - 1, 1_000_000_000)
 
 
 def write_ros2(trajectories: Mapping[str, Trajectory], team: Team, path: str | Path) -> int:
-    """Write the poses T_world_body of a team as the ROS 2 bag `path` (.mcap); gives the number of poses.
+    """Write the poses T_world_body of a team as a ROS 2 bag.
 
-    /tf_static has <robot>/camera (optical axes) in <robot>/base_link, /tf has <robot>/base_link in `world` at each
-    pose; /<robot>/pose is a PoseWithCovarianceStamped, its covariance that of x, y, z and of rotations about the
-    world's axes; /<robot>/path is a nav_msgs/Path of all poses, at the time of the first. The same input gives the same
-    bytes. Raises `InputError` where there is no pose, `BagError` where rosbags is not installed; the file is there
-    whole or not at all.
+    Parameters
+    ----------
+    trajectories
+        Trajectory of each robot.
+    team
+        The team.
+    path
+        Bag to write (.mcap); it appears complete or not at all, and the same input gives the same bytes.
+
+    Returns
+    -------
+    int
+        Number of poses.
+
+    Raises
+    ------
+    InputError
+        There is no pose.
+    BagError
+        rosbags is not installed.
+
+    Notes
+    -----
+    /tf_static has <robot>/camera (optical axes) in <robot>/base_link; /tf has <robot>/base_link in `world` at each
+    pose; /<robot>/pose is a PoseWithCovarianceStamped with the covariance of x, y, z and of rotations about the world's
+    axes; /<robot>/path is a nav_msgs/Path of all poses at the time of the first.
     """
     path = Path(path)
     trajectories = {robot: one for robot, one in trajectories.items() if len(one)}
@@ -58,7 +79,7 @@ def write_ros2(trajectories: Mapping[str, Trajectory], team: Team, path: str | P
 
 
 class _Message(NamedTuple):
-    """A message for a topic at a time [ns]."""
+    """Message for a topic at a time [ns]."""
 
     topic: str
     ns: int
@@ -67,7 +88,7 @@ class _Message(NamedTuple):
 
 
 class _Messages:
-    """Makes messages of ROS's types."""
+    """Factory of ROS messages."""
 
     def __init__(self) -> None:
         try:
@@ -87,7 +108,7 @@ class _Messages:
         return _Message(TF_STATIC, ns, TF, self._new(TF, transforms=mounts))
 
     def of_robot(self, robot: str, trajectory: Trajectory) -> Iterator[_Message]:
-        """A robot's path, its poses with covariances, and its tf."""
+        """Path of a robot, its poses with covariances, and its tf."""
         times, poses = [to_ns(time) for time in trajectory.times.tolist()], trajectory.T_world_body
         stamped = [self._stamped(ns, T) for ns, T in zip(times, poses, strict=True)]
         path = self._new(PATH, header=self._header(times[0], WORLD), poses=stamped)
@@ -130,7 +151,7 @@ class _Messages:
 
 
 def _write(folder: Path, store: "Typestore", messages: Sequence[_Message]) -> None:
-    """The ROS 2 bag `folder` of messages."""
+    """Write messages as a ROS 2 bag in a folder."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
     writer = Writer(folder, version=VERSION, storage_plugin=StoragePlugin.MCAP)
@@ -148,7 +169,7 @@ def _write(folder: Path, store: "Typestore", messages: Sequence[_Message]) -> No
 
 
 def _latched() -> Any:
-    """ROS 2's quality of service of what is told once and holds."""
+    """ROS 2 quality of service of latched topics."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     forever = QosTime(*FOREVER)

@@ -1,4 +1,4 @@
-"""Files of a ROS bag, and the reader for them: what a path means, checked before a library reads it."""
+"""Locate the files of a ROS bag and open a reader for them, with checks before a library reads them."""
 
 import bz2
 import re
@@ -19,12 +19,17 @@ MAX_METADATA = 1024 * 1024
 
 
 def open_reader(path: Path) -> tuple[Any, bool, list[str]]:
-    """Reader of a bag, open; whether it is of ROS 2; and sentences on what was assumed.
+    """Open a reader of a bag.
+
+    Returns
+    -------
+    tuple
+        The reader, True for ROS 2, and sentences on assumptions.
 
     Raises
     ------
     BagError
-        If there is no bag at `path`.
+        There is no bag at `path`.
     """
     if not path.exists():
         raise BagError(f"{path}: there is no such bag; give a ROS 1 .bag, a ROS 2 folder, or an .mcap")
@@ -59,7 +64,7 @@ def open_reader(path: Path) -> tuple[Any, bool, list[str]]:
 
 
 def _storage_files(folder: Path) -> list[Path]:
-    """Files of messages in a folder, all .mcap or all .db3, in the order of their numbers."""
+    """Message files in a folder, all .mcap or all .db3, in order of their numbers."""
     for suffix in (".mcap", ".db3"):
         if found := sorted((one for one in folder.glob(f"*{suffix}") if one.is_file()), key=_number):
             return found
@@ -94,7 +99,7 @@ def _mcap(files: list[Path], path: Path, notes: list[str]) -> tuple[Any, bool, l
 
 
 def _require_tables(path: Path) -> None:
-    """A database has tables of messages and topics; a view may take forever."""
+    """Raise `BagError` unless a database has tables of messages and topics; a view could take forever."""
     try:
         database = sqlite3.connect(f"file:{path.absolute().as_posix().replace('?', '%3f')}?mode=ro", uri=True)
         try:

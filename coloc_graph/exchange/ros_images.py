@@ -1,4 +1,4 @@
-"""Images and cameras of ROS messages, as a run has them."""
+"""Convert images and cameras of ROS messages."""
 
 import math
 from typing import Any, Literal
@@ -43,9 +43,12 @@ LENSES = ("plumb_bob", "rational_polynomial", "")
 
 
 def image_of(bag: Bag, message: BagMessage, robot: str, time: float, camera: Camera) -> Image | EncodedImage:
-    """The image of a message; JPEG and PNG stay as they are.
+    """Convert the image of a message; JPEG and PNG are kept.
 
-    Raises `BagError`, naming topic and time, for an encoding that is not read, and for a size that is not the camera's.
+    Raises
+    ------
+    BagError
+        The encoding is not supported, or the size is not the camera's; the message names topic and time.
     """
     found = bag.decode(message)
     if message.type == COMPRESSED_IMAGE:
@@ -105,10 +108,12 @@ def _require_size(bag: Bag, message: BagMessage, shape: tuple[int, ...], camera:
 
 
 def camera_of(bag: Bag, message: BagMessage, stated: Camera, *, rectified: bool) -> Camera:
-    """The camera of a sensor_msgs/CameraInfo, with what that does not say as `stated`.
+    """Convert a sensor_msgs/CameraInfo, with missing fields from `stated`; rectified images have camera P, undistorted.
 
-    Rectified images have the camera P and no distortion. Raises `BagError` for a lens model, a region of interest or
-    a binning that is not read, and for a camera that is not calibrated.
+    Raises
+    ------
+    BagError
+        The lens model, region of interest or binning is not supported, or the camera is not calibrated.
     """
     found = bag.decode(message)
     K, D = _numbers(found, "k"), _numbers(found, "d")
@@ -154,13 +159,13 @@ def camera_of(bag: Bag, message: BagMessage, stated: Camera, *, rectified: bool)
 
 
 def _numbers(found: Any, name: str) -> list[float]:
-    """A field whose name ROS 1 writes with a capital letter."""
+    """Field whose name ROS 1 writes with a capital letter."""
     values = getattr(found, name) if hasattr(found, name) else getattr(found, name.upper())
     return [float(one) for one in values]
 
 
 def differences(found: Camera, stated: Camera) -> list[str]:
-    """Differences between a camera_info and the camera in the team, in words."""
+    """Describe the differences between a camera_info and the camera in the team."""
     said = []
     for name in ("width", "height", "fx", "fy", "cx", "cy"):
         a, b = getattr(found, name), getattr(stated, name)

@@ -1,4 +1,4 @@
-"""A ROS bag becomes an ordinary run: `import_ros`. docs/ros.md says how."""
+"""Import a ROS bag as a run: `import_ros`, explained in docs/ros.md."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from coloc_graph.errors import BagError
 from coloc_graph.exchange.ros_bag import Bag, open_bag
 from coloc_graph.exchange.ros_images import image_of
 from coloc_graph.exchange.ros_map import RosMap, read_map
-from coloc_graph.exchange.ros_order import MOST_HELD, InOrder
+from coloc_graph.exchange.ros_order import MAX_HELD, InOrder
 from coloc_graph.exchange.ros_read import Recording, read_recording, require_topics
 from coloc_graph.exchange.ros_robots import (
     movements_of,
@@ -35,9 +35,19 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class RosSummary:
-    """What was imported: `counts` of images, odometry, true poses, and how long each robot stood of the time in which
-    that is known [s]. `observers` are the robots that observe in any stance; `warnings` are sentences on what was
-    assumed, or was odd."""
+    """Summary of an import.
+
+    Attributes
+    ----------
+    counts
+        Numbers of images, odometry samples and true poses.
+    stances, observers
+        Number of stances, and robots that observe in any of them.
+    stood
+        For each robot the duration at rest, and the duration in which that is known [s].
+    warnings
+        Sentences on assumptions and oddities.
+    """
 
     stances: int
     counts: dict[str, int]
@@ -54,13 +64,27 @@ def import_ros(
     image_format: ImageFormat = "jpeg",
     progress: Progress | None = None,
 ) -> RosSummary:
-    """Write the run `out` from a ROS bag and a map of its topics.
+    """Write a run from a ROS bag and a map of its topics.
 
-    `bag_path` is a ROS 1 .bag, a ROS 2 folder, or an .mcap. JPEG and PNG stay as they are; other images are written in
-    `image_format`. `progress` is called with how many messages were read, and of how many.
+    Parameters
+    ----------
+    bag_path
+        ROS 1 .bag, ROS 2 folder, or .mcap.
+    map_path
+        MAP.toml with the topics of each robot.
+    out
+        Run to write.
+    image_format
+        Format for images that are neither JPEG nor PNG, which are kept.
+    progress
+        Called with (messages read, their number).
 
-    Raises `BagError` (`TeamError` for the team) with one sentence that names file, topic and time; `RunError` where
-    `out` cannot be written. Nothing is written then, and a file that was at `out` stays as it was.
+    Raises
+    ------
+    BagError, TeamError
+        In one sentence that names file, topic and time. Nothing is written, and an existing file is kept.
+    RunError
+        The run cannot be written.
     """
     bag_path, map_path, out = Path(bag_path), Path(map_path), Path(out)
     for path in (bag_path, map_path):
@@ -120,7 +144,7 @@ def import_ros(
 def _stances(
     bag: Bag, map_path: Path, the_map: RosMap, team: Team, recording: Recording, moves: list[Movements]
 ) -> list[Stance]:
-    """The stances, of which there is one at least."""
+    """Return the stances, at least one."""
     cameras = {robot.name: seconds(recording.orders[robot.image].ns) for robot in the_map.robots if robot.image}
     marked = {robot.name for robot in team.robots if robot.markers is not None}
     found = derive_stances(moves, cameras, marked, the_map.motion)
@@ -141,7 +165,7 @@ def _stances(
 
 
 class _Events:
-    """All that is written but images, in the order of time."""
+    """All records except images, in order of time."""
 
     def __init__(
         self,
@@ -161,7 +185,7 @@ class _Events:
         self._rest = sorted(records, key=lambda one: one[0], reverse=True)
 
     def write_until(self, time: float) -> None:
-        """Write what is not after a time [UTC s]."""
+        """Write the records up to a time [UTC s]."""
         while self._rest and self._rest[-1][0] <= time:
             at, record = self._rest.pop()
             if isinstance(record, tuple):
@@ -170,7 +194,7 @@ class _Events:
                 self._writer.write(record)
 
     def write_image(self, image: Image | EncodedImage) -> None:
-        """Write an image, after all that is not after it."""
+        """Write an image after all records up to its time."""
         self.write_until(image.time)
         self._writer.write(image)
 
@@ -187,6 +211,6 @@ def _write_images(
                 events.write_image(due)
         except OverflowError:
             raise bag.error(
-                message, f"comes more than {MOST_HELD} images before one that is earlier; record the topic in order"
+                message, f"comes more than {MAX_HELD} images before one that is earlier; record the topic in order"
             ) from None
         told(number)

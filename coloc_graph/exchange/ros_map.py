@@ -1,4 +1,4 @@
-"""MAP.toml: which topics of a ROS bag are whose, and what of it. docs/ros.md shows one."""
+"""Read MAP.toml, which assigns the topics of a ROS bag to robots; docs/ros.md shows one."""
 
 import math
 from pathlib import Path
@@ -19,8 +19,8 @@ MotionSource = Literal["odometry", "stands", "moves"]
 class OdometrySigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Standard deviations of odometry, which grow with the root of the distance.
 
-    `along` and `across` [m] are of the way after one metre, ahead and sideways; `turned` [rad] is of the heading after
-    turning by one radian, `veer` [rad] after driving one metre.
+    `along` and `across` [m] are of the position after one metre, ahead and sideways; `turned` [rad] is of the heading
+    after a rotation by one radian, `veer` [rad] after one metre.
     """
 
     along: float
@@ -35,11 +35,16 @@ class OdometrySigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One robot's topics, None where the bag has none.
+    """Topics of one robot, None if the bag has none.
 
-    `rectified` says that the images are rectified, so that the camera is P of its camera_info, without distortion.
-    `truth_tf` are the two frames of tf whose transform is T_world_body: world, body. `motion` is from what it is known
-    when the robot moves: by its `odometry`, or it always `stands`, or always `moves`.
+    Attributes
+    ----------
+    rectified
+        True if the images are rectified, so that the camera is P of its camera_info without distortion.
+    truth_tf
+        Two frames of tf whose transform is T_world_body: world, body.
+    motion
+        Source of the robot's motion: its `odometry`, or it always `stands` or always `moves`.
     """
 
     name: str
@@ -67,16 +72,22 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     @property
     def topics(self) -> dict[str, str]:
-        """Its topics by what they are: image, camera_info, odometry, truth."""
+        """Topics by kind: image, camera_info, odometry, truth."""
         every = {kind: getattr(self, kind) for kind in ("image", "camera_info", "odometry", "truth")}
         return {kind: topic for kind, topic in every.items() if topic is not None}
 
 
 class RosMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Map of the topics of a ROS bag. `team` is the path of a team.toml, from where the map lies.
+    """Map of the topics of a ROS bag.
 
-    `time` is where a message's time is from: its header's stamp, or when the bag received it. `motion` is when a robot
-    counts as moving, and what makes a stance.
+    Attributes
+    ----------
+    team
+        Path of a team.toml, relative to the map.
+    time
+        Source of a message's time: its header stamp, or its reception.
+    motion
+        Thresholds of motion and of stances.
     """
 
     team: str
@@ -104,7 +115,7 @@ def _with_full_names(robot: RobotTopics) -> RobotTopics:
 
 
 def read_map(path: str | Path) -> tuple[RosMap, Team]:
-    """The map in a TOML file, and its team; `BagError` (`TeamError` for the team) names the file and the path in it."""
+    """Read a map and its team; `BagError` (`TeamError` for the team) names the file and the path in it."""
     path = Path(path)
     fields = read_toml(path, "give the path of a map, see docs/ros.md", error=BagError)
     found = convert(path, fields, RosMap, "see docs/ros.md for the fields", error=BagError)

@@ -1,4 +1,4 @@
-"""MCAP files of a ROS 2 bag, read by the bounded reader of runs: of any profile, and up to where they were cut off."""
+"""Read the MCAP files of a ROS 2 bag of any profile, up to where they were cut off, within bounds of memory."""
 
 import heapq
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,7 @@ CDR = "cdr"
 
 @dataclass(frozen=True)
 class McapTopic:
-    """One topic, in the words of rosbags' connections."""
+    """Topic with the attributes of rosbags' connections."""
 
     topic: str
     msgtype: str
@@ -72,7 +72,7 @@ class McapBag:
         ]
 
     def messages(self, connections: Sequence[McapTopic]) -> Iterator[tuple[McapTopic, int, memoryview]]:
-        """Messages of some topics: topic, time of reception [ns], and data, in the order of that time in each file."""
+        """Yield messages of some topics: topic, time of reception [ns], and data, in that order in each file."""
         wanted = {(one.topic, one.msgtype): one for one in connections}
         for index in self._indexes:
             channels = {
@@ -83,11 +83,11 @@ class McapBag:
             yield from _in_order(index, channels)
 
     def close(self) -> None:
-        """Files are open only while messages are read."""
+        """Do nothing: files are open only while messages are read."""
 
 
 def _in_order(index: Index, channels: dict[int, McapTopic]) -> Iterator[tuple[McapTopic, int, memoryview]]:
-    """Messages of some channels by time: chunks may overlap in time, and what is due waits for those before it."""
+    """Messages of some channels by time, across chunks that overlap in time."""
     waiting: list[tuple[int, int, McapTopic, memoryview]] = []
     number = 0
     with index.path.open("rb") as file:

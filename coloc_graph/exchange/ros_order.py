@@ -1,4 +1,4 @@
-"""Messages of one topic by their own time: sorted, those that are there twice dropped, and counted."""
+"""Sort the messages of one topic by time, and drop and count duplicates."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 
 T = TypeVar("T")
 
-#: A message is held back until those before it have come, at most so many of a topic at once.
-MOST_HELD = 200
+MAX_HELD = 200  # messages of a topic that are held back until earlier ones arrive
 
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """In which order the messages of a topic are, n of them as they came: `kept` (m,) are their numbers by time, the
-    first of each instant; `ns` (m,) are the times [ns].
+    """Order of n messages of a topic: indices `kept` (m,) by time, the first of each time, and times `ns` (m,) [ns].
 
-    `late` came after one of a later time, `repeated` are of an instant that was there already.
+    `late` is the number of messages that came after one of a later time, `repeated` that of messages with a repeated
+    time.
     """
 
     ns: NDArray[np.int64]
@@ -29,7 +28,7 @@ class Order:
 
 
 def order_of(times: list[int]) -> Order:
-    """The order of messages with these times [ns], as they came."""
+    """Order of messages with these times [ns]."""
     came = np.array(times, np.int64)
     ns, kept = np.unique(came, return_index=True)
     late = int((came[1:] < np.maximum.accumulate(came)[:-1]).sum()) if len(came) else 0
@@ -37,19 +36,19 @@ def order_of(times: list[int]) -> Order:
 
 
 class InOrder(Generic[T]):
-    """Gives messages by time while they come: one that came early is held back. `due` are their times, in order."""
+    """Reorder messages by time while they arrive; early ones are held back. `due` are their times, in order."""
 
     def __init__(self, due: NDArray[np.int64]) -> None:
         self._due, self._held = deque(due.tolist()), dict[int, T]()
 
     def take(self, ns: int, message: T) -> Iterator[tuple[int, T]]:
-        """Yield the messages that are due with a message, none or several; one that is there already is dropped.
+        """Yield the messages that are due with a message, none or several; duplicates are dropped.
 
-        `OverflowError` where more are held back than are held.
+        `OverflowError` if too many are held back.
         """
         if self._due and ns >= self._due[0]:
             self._held.setdefault(ns, message)
-        if len(self._held) > MOST_HELD:
+        if len(self._held) > MAX_HELD:
             raise OverflowError
         while self._due and self._due[0] in self._held:
             due = self._due.popleft()

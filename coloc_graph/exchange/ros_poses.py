@@ -1,7 +1,7 @@
-"""Poses of ROS messages, the covariances of odometry's increments, and ROS's own covariances.
+"""Convert poses of ROS messages, covariances of odometry increments, and ROS covariances.
 
-ROS orders a covariance x, y, z, then rotations about the fixed axes of the frame that the pose is in; we order rotation
-first, then translation, both in the body (docs/conventions.md).
+ROS orders a covariance x, y, z, then rotations about the fixed axes of the pose's frame; here rotation comes first,
+then translation, both in the body frame (docs/conventions.md).
 """
 
 import math
@@ -17,18 +17,14 @@ from coloc_graph.geometry.se2 import wrap
 
 Array = NDArray[np.float64]
 
-#: x, y and the rotation about z of ROS's six.
-PLANAR = [0, 1, 5]
-#: A covariance that shrinks by no more than this share of itself has not shrunk.
-ROUNDING = 1e-6
-#: A quaternion may be this far from unit length.
-UNIT = 1e-3
-#: Where the statement belongs that a covariance does not make.
-STATE_SIGMAS = "state `odometry_sigmas` in the map: how far it errs after a metre, and after a turn"
+PLANAR = [0, 1, 5]  # x, y and the rotation about z of ROS's six
+ROUNDING = 1e-6  # relative decrease of a covariance that is rounding
+UNIT = 1e-3  # tolerance of a quaternion's length
+STATE_SIGMAS = "state `odometry_sigmas` in the map: its errors after a metre, and after a turn"  # remedy
 
 
 def T_of(position: Any, orientation: Any) -> Array | None:
-    """The pose (4, 4) of a geometry_msgs position and quaternion, or a translation and rotation; None if it is none."""
+    """Pose (4, 4) of a geometry_msgs position and quaternion, or translation and rotation; None if it is invalid."""
     x, y, z, w = q = (orientation.x, orientation.y, orientation.z, orientation.w)
     p = (position.x, position.y, position.z)
     norm = math.hypot(*q)
@@ -44,15 +40,14 @@ def T_of(position: Any, orientation: Any) -> Array | None:
 
 
 def planar_covariance(message: Any) -> Array:
-    """The covariance (3, 3) of x, y, yaw in the odometry frame, of a nav_msgs/Odometry."""
+    """Covariance (3, 3) of x, y, yaw in the odometry frame of a nav_msgs/Odometry."""
     return np.asarray(message.pose.covariance, float).reshape(6, 6)[np.ix_(PLANAR, PLANAR)]
 
 
 def stated_increments(poses: ArrayLike, sigmas: OdometrySigmas) -> Array:
-    """The covariances (n, 3, 3) of the increments to poses (n, 3) of x, y [m], yaw [rad] of an odometer that errs so.
+    """Covariances (n, 3, 3) of the increments to poses (n, 3) of x, y [m], yaw [rad] from stated standard deviations.
 
-    Each is of x, y, yaw in the body at the sample before, and grows with the way and the turn; that of the first
-    sample is zero.
+    Each is of x, y, yaw in the body frame at the sample before and grows with distance and rotation; the first is zero.
     """
     steps = np.diff(np.asarray(poses, float), axis=0, prepend=np.asarray(poses, float)[:1])
     way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(wrap(steps[:, 2]))
@@ -63,10 +58,10 @@ def stated_increments(poses: ArrayLike, sigmas: OdometrySigmas) -> Array:
 
 
 def grown_increments(poses: ArrayLike, covariances: ArrayLike, where: str) -> Array:
-    """The covariances (n, 3, 3) of increments by which those of the poses (n, 3), themselves (n, 3, 3), have grown.
+    """Covariances (n, 3, 3) of increments from the growth of the covariances (n, 3, 3) of poses (n, 3).
 
-    With errors added up to first order, C_k = J C_(k-1) J' + R Q R', R the heading at sample k - 1 and Q what is asked
-    for. Raises `BagError` where they do not grow so: many drivers fill in the same numbers every time.
+    To first order, C_k = J C_(k-1) J' + R Q R' with R the heading at sample k - 1; Q is returned. Raises `BagError` if
+    they do not grow that way: many drivers fill in the same numbers every time.
     """
     p, C = np.asarray(poses, float), np.asarray(covariances, float)
     if not np.isfinite(C).all():
@@ -84,18 +79,16 @@ def grown_increments(poses: ArrayLike, covariances: ArrayLike, where: str) -> Ar
     values, vectors = np.linalg.eigh(Q)
     size = np.abs(C[1:]).max(axis=(1, 2))
     if (values[:, 0] < -ROUNDING * size).any() or (values[moved, 2] <= ROUNDING * size[moved]).all():
-        raise BagError(
-            f"{where} has covariances that do not grow with its way, so that they say nothing; {STATE_SIGMAS}"
-        )
+        raise BagError(f"{where} has covariances that do not grow with distance and are meaningless; {STATE_SIGMAS}")
     Q = vectors @ (np.maximum(values, 0)[:, :, None] * vectors.mT)
     return np.concatenate([np.zeros((1, 3, 3)), (Q + Q.mT) / 2])
 
 
 def ros_covariance(covariance: ArrayLike, R_world_body: ArrayLike) -> Array:
-    """ROS's covariance (..., 6, 6) in the world of a pose with GTSAM's (..., 6, 6) and the rotation (..., 3, 3).
+    """Convert GTSAM covariances (..., 6, 6) of poses with rotation (..., 3, 3) to ROS's in the world frame.
 
-    An error xi = (w, v) in the body, T_true = T exp(xi), turns the pose about the world's axes by R w and moves it
-    by R v, to first order.
+    An error xi = (w, v) in the body frame, T_true = T exp(xi), rotates the pose about the world's axes by R w and moves
+    it by R v, to first order.
     """
     C, R = np.asarray(covariance, float), np.asarray(R_world_body, float)
     to_ros = np.zeros_like(C)

@@ -1,4 +1,4 @@
-"""All that a map asks of a bag but the images: read once, sorted by time, and what was odd about it."""
+"""Read everything that a map asks of a bag, except images, once and in order of time."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -41,8 +41,17 @@ TELL_EVERY = 100  # messages between two reports of progress
 
 
 class Moment(NamedTuple):
-    """One sample of odometry: x, y [m], yaw [rad] of the frame `frame` with their covariance (3, 3); `T_odom_frame`
-    (4, 4) is the same in space, `tilt` how far it is from upright [rad]."""
+    """Sample of odometry.
+
+    Attributes
+    ----------
+    pose, covariance
+        x, y [m], yaw [rad] of the frame `frame`, and their covariance, (3, 3).
+    T_odom_frame
+        The same in space, (4, 4).
+    tilt
+        Deviation from upright [rad].
+    """
 
     pose: tuple[float, float, float]
     covariance: Array
@@ -52,7 +61,7 @@ class Moment(NamedTuple):
 
 
 class TruePose(NamedTuple):
-    """One true pose (4, 4), and the frame it is in."""
+    """True pose (4, 4), and its frame."""
 
     T_world_body: Array
     frame: str
@@ -60,10 +69,16 @@ class TruePose(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Content of a bag that a map asks for: the order of each topic's messages and, but for images, their values in it.
+    """Content of a bag that a map asks for: the order of each topic's messages and, except for images, their values.
 
-    `by_bag` are the topics whose time is when the bag received them. `frames` are of tf, empty where no robot asks for
-    them. `notes` are sentences on what was odd.
+    Attributes
+    ----------
+    by_bag
+        Topics whose times are those of reception.
+    frames
+        Frames of tf, empty if no robot needs them.
+    notes
+        Sentences on oddities.
     """
 
     orders: dict[str, Order]
@@ -74,7 +89,7 @@ class Recording:
     clocks: BagClocks
 
     def time(self, bag: Bag, message: BagMessage) -> int:
-        """Time of a message [ns], with the error of its robot's clock removed."""
+        """Time of a message [ns], corrected by the error of its robot's clock."""
         if message.topic in self.by_bag:
             return message.received
         clock = self.clocks.clocks.get(message.topic)
@@ -82,7 +97,7 @@ class Recording:
 
 
 def require_topics(bag: Bag, the_map: RosMap) -> None:
-    """`BagError` for a topic of the map that the bag lacks, or has of another type; it lists those that it could be."""
+    """Raise `BagError` for a topic of the map that the bag lacks or has with another type; it lists candidates."""
     for robot in the_map.robots:
         for kind, name in robot.topics.items():
             fitting = [topic for topic in bag.topics.values() if {*topic.types} & {*TYPES[kind]}]
@@ -107,9 +122,9 @@ def _is_tf(bag: Bag, name: str) -> bool:
 
 
 def read_recording(bag: Bag, the_map: RosMap, told: Callable[[int], None]) -> Recording:
-    """All that the map asks for but the images; `told` hears how many messages were read.
+    """Read everything that the map asks for except images, after `require_topics`.
 
-    `require_topics` has been asked before. Raises `BagError`, naming topic and time, for a message that is wrong.
+    Raises `BagError`, naming topic and time, for a wrong message.
     """
     kinds = {topic: kind for robot in the_map.robots for kind, topic in robot.topics.items()}
     wanted = set(kinds)
@@ -191,7 +206,7 @@ def _unstamped(bag: Bag, by_bag: set[str]) -> Iterator[str]:
     if by_bag:
         yield (
             f"{bag.path}: no message of {', '.join(sorted(by_bag))} has a time in its header; "
-            "they are taken to be of when the bag received them"
+            "their times of reception are used"
         )
 
 

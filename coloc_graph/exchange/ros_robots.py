@@ -1,4 +1,4 @@
-"""Robots of a ROS bag as a run has them: camera, odometry, true poses, movements; and warnings."""
+"""Convert the robots of a ROS bag: camera, odometry, true poses, movements; and warnings."""
 
 import itertools
 import re
@@ -23,17 +23,15 @@ from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
 
-#: A message's bytes up to here are another's, if only their times differ.
-STAMPED = 12
-#: Odometry on a floor is not tilted by more than this [deg].
-LEVEL = 5.0
+STAMPED = 12  # bytes at the start of a message that hold its time
+LEVEL = 5.0  # deg, largest tilt of odometry on a floor
 BREAKS_NAMED = 3  # jumps of one topic that are described one by one
 BODY_FRAME = re.compile(r"(^|[/_])(base(_link|_footprint)?|body|chassis|footprint)$")  # frames of the body itself
 UNKNOWN = 1.0  # s, images further before or after all odometry are warned of
 
 
 def with_cameras(bag: Bag, the_map: RosMap, recording: Recording, team: Team) -> tuple[Team, list[str]]:
-    """The team with the cameras that the bag knows, and where these are others than were stated."""
+    """Return the team with the cameras in the bag, and warnings if they differ from stated ones."""
     cameras, warnings = {}, []
     for robot in the_map.robots:
         if robot.camera_info is None:
@@ -57,16 +55,16 @@ def with_cameras(bag: Bag, the_map: RosMap, recording: Recording, team: Team) ->
 
 
 def seconds(ns: NDArray[np.int64]) -> Array:
-    """UTC seconds (n,) of nanoseconds."""
+    """Convert nanoseconds to UTC seconds, (n,)."""
     return np.array([to_seconds(one) for one in ns.tolist()])
 
 
 def odometry_of(bag: Bag, robot: RobotTopics, recording: Recording) -> tuple[list[OdometrySample], list[str]]:
-    """Odometry of a robot's body, and sentences on what was mended in it.
+    """Odometry of a robot's body, and sentences on corrections.
 
-    The covariances of its increments are as the map states them, or as those of its poses grow. A jump that no wheel
-    can make is cut out: poses go on from before it, and the increment across it says next to nothing. Raises
-    `BagError` where neither map nor messages say how far odometry errs.
+    Covariances of increments are those stated in the map, or follow from the growth of those of the poses. A jump that
+    no wheel can make is removed: poses continue from before it, and the increment across it has a very large
+    covariance. Raises `BagError` if neither map nor messages give the errors of odometry.
     """
     assert robot.odometry is not None
     values = recording.values[robot.odometry]
@@ -95,7 +93,7 @@ def odometry_of(bag: Bag, robot: RobotTopics, recording: Recording) -> tuple[lis
 
 
 def _of_body(bag: Bag, robot: RobotTopics, recording: Recording) -> tuple[Array, list[str]]:
-    """Poses (n, 3) x, y, yaw of the body by odometry, whose own frame may be another's, and what is said of that."""
+    """Poses (n, 3) x, y, yaw of the body by odometry, which may be of another frame, and sentences on that."""
     assert robot.odometry is not None
     values = recording.values[robot.odometry]
     frame = values[0].frame
@@ -121,7 +119,7 @@ def _of_body(bag: Bag, robot: RobotTopics, recording: Recording) -> tuple[Array,
 
 
 def truth_of(bag: Bag, robot: RobotTopics, recording: Recording) -> list[tuple[float, Array]]:
-    """The true poses of a robot's body, with their times [UTC s]."""
+    """True poses of a robot's body, with their times [UTC s]."""
     if robot.truth is not None:
         times = seconds(recording.orders[robot.truth].ns).tolist()
         return [(time, one.T_world_body) for time, one in zip(times, recording.values[robot.truth], strict=True)]
@@ -147,7 +145,7 @@ def truth_of(bag: Bag, robot: RobotTopics, recording: Recording) -> list[tuple[f
 def movements_of(
     the_map: RosMap, recording: Recording, odometry: Mapping[str, list[OdometrySample]]
 ) -> list[Movements]:
-    """When each robot moved: by its odometry, or as the map says for all of the time."""
+    """Movements of each robot, by its odometry or as the map states."""
     begin, end = _extent(recording)
     found = []
     for robot in the_map.robots:
@@ -172,8 +170,8 @@ def of_motion(bag: Bag, the_map: RosMap, recording: Recording, moves: list[Movem
         if one.crept:
             first = one.crept[0]
             said.append(
-                f"{bag.path}: {robot.name} got somewhere without ever being as fast as [motion] says, "
-                f"{len(one.crept)} times (the first from {first[0]:.3f} to {first[1]:.3f} s): it counts as moving then"
+                f"{bag.path}: {robot.name} changed its position {len(one.crept)} times slower than the thresholds of "
+                f"[motion] (first from {first[0]:.3f} to {first[1]:.3f} s): it counts as moving then"
             )
         if robot.odometry is not None:
             tilt = float(np.rad2deg(max(moment.tilt for moment in recording.values[robot.odometry])))
@@ -187,14 +185,14 @@ def of_motion(bag: Bag, the_map: RosMap, recording: Recording, moves: list[Movem
             out = max(one.start - to_seconds(int(ns[0])), to_seconds(int(ns[-1])) - one.end)
             if out > UNKNOWN:
                 said.append(
-                    f"{bag.path}: images of {robot.name} are up to {out:.1f} s before or after its odometry, and "
-                    "whether it stands then is not known: no stance is made of them"
+                    f"{bag.path}: images of {robot.name} are up to {out:.1f} s before or after its odometry: no stance "
+                    "is made of them, since its motion is unknown then"
                 )
     return said
 
 
 def of_team(bag: Bag, the_map: RosMap, team: Team, recording: Recording) -> list[str]:
-    """Warnings on robots that are left out, and on truths in different frames."""
+    """Warnings on robots that are not imported, and on truths in different frames."""
     said = []
     absent = [name for name in team.names if name not in {robot.name for robot in the_map.robots}]
     if absent:

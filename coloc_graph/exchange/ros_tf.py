@@ -1,4 +1,4 @@
-"""ROS's tf: the pose of one frame in another, along the tree of frames, at the times when it was told."""
+"""Resolve ROS tf: the pose of one frame in another, along the tree of frames, at the times of its transforms."""
 
 from dataclasses import dataclass, field
 
@@ -12,8 +12,7 @@ Array = NDArray[np.float64]
 
 @dataclass(eq=False)
 class Edge:
-    """The poses of a frame in its `parent`, as they came: `times` [ns], `poses` (4, 4). One that is `static` has the
-    same pose always, the last one told."""
+    """Poses of a frame in its `parent`: `times` [ns], `poses` (4, 4). A `static` one always has the last pose."""
 
     parent: str
     static: bool
@@ -21,7 +20,7 @@ class Edge:
     poses: list[Array] = field(default_factory=list)
 
     def at(self, ns: NDArray[np.int64]) -> Array:
-        """T_parent_frame (n, 4, 4) at times within those that were told, between two of them as tf does it."""
+        """Interpolate T_parent_frame (n, 4, 4) at times within the known ones, as tf does."""
         if self.static:
             return np.broadcast_to(self.poses[-1], (len(ns), 4, 4))
         times, first = np.unique(np.array(self.times, np.int64), return_index=True)
@@ -36,7 +35,7 @@ class Edge:
 
 
 class Frames:
-    """The tree of frames; `add` takes what is told."""
+    """Tree of frames."""
 
     def __init__(self) -> None:
         self._edges: dict[str, Edge] = {}
@@ -46,11 +45,11 @@ class Frames:
 
     @property
     def names(self) -> list[str]:
-        """All frames."""
+        """Names of all frames."""
         return sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
 
     def add(self, parent: str, child: str, ns: int, T_parent_child: Array, *, static: bool) -> None:
-        """The pose of a frame in its parent at a time [ns]; a frame that changes its parent begins anew."""
+        """Add the pose of a frame in its parent at a time [ns]; a frame that changes its parent starts anew."""
         edge = self._edges.get(child)
         if edge is None or (edge.parent, edge.static) != (parent, static):
             edge = self._edges[child] = Edge(parent, static)
@@ -58,9 +57,9 @@ class Frames:
         edge.poses.append(T_parent_child)
 
     def poses(self, a: str, b: str) -> tuple[NDArray[np.int64], Array] | None:
-        """Times [ns] (n,) and T_a_b (n, 4, 4): all when one on the way from a to b was told, and all are known.
+        """Times [ns] (n,) and T_a_b (n, 4, 4) whenever a transform between a and b was sent and all are known.
 
-        None where the two are not in one tree; times are () where nothing on the way ever moves.
+        None if the two are not in one tree; times are () if nothing between them ever moves.
         """
         up_a, up_b = self._up(a), self._up(b)
         common = next((frame for frame in up_b if frame in up_a), None)
@@ -74,7 +73,7 @@ class Frames:
         return ns, se3_inverse(self._down(from_a, ns)) @ self._down(from_b, ns)
 
     def fixed(self, a: str, b: str) -> Array | None:
-        """T_a_b (4, 4) of two frames that static transforms tie to each other; None where they do not."""
+        """T_a_b (4, 4) of two frames tied by static transforms, None if they are not."""
         up_a, up_b = self._up(a), self._up(b)
         common = next((frame for frame in up_b if frame in up_a), None)
         if common is None:
@@ -87,7 +86,7 @@ class Frames:
         return found
 
     def _down(self, frames: list[str], ns: NDArray[np.int64]) -> Array:
-        """The pose of the first of some frames in the parent of the last."""
+        """Pose of the first of some frames in the parent of the last."""
         T = np.tile(np.eye(4), (len(ns), 1, 1))
         for frame in frames:
             T = self._edges[frame].at(ns) @ T

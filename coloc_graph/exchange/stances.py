@@ -1,7 +1,7 @@
-"""Stances of a run that was recorded without any: from when each robot moved, by its odometry.
+"""Find stances in a run that was recorded without any, from each robot's movements by its odometry.
 
-What wheels do not feel is not seen: a robot that is pushed or carried while its odometry stands still counts as
-standing. The estimate finds an anchor that was pushed, by its `slip` or by what all else says.
+A robot that is pushed or carried while its odometry is constant counts as standing; the estimate finds a pushed anchor
+by its `slip`, or by measurements that contradict it.
 """
 
 import bisect
@@ -16,17 +16,27 @@ from numpy.typing import ArrayLike, NDArray
 from coloc_graph.run import Motion, Stance
 
 Array = NDArray[np.float64]
-#: Begin and end of a stretch of time [UTC s].
+#: Begin and end of an interval [UTC s].
 Span = tuple[float, float]
 
-LEAST_IMAGES = 2  # images of an observer in a stance, at least
+MIN_IMAGES = 2  # of an observer in a stance
 
 
 class MotionThresholds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """When a robot counts as moving: faster than `speed` [m/s] or `turn_deg` [deg/s] over `window` [s].
+    """Thresholds of motion.
 
-    It counts as standing from `settle` [s] after a movement on. Stances of the same robots that are no further apart
-    than `pause` [s] are one, and what is shorter than `shortest` [s] is none.
+    Attributes
+    ----------
+    speed, turn_deg
+        Speed [m/s] and turn rate [deg/s] above which a robot moves.
+    window
+        Duration over which they are measured [s].
+    settle
+        Time after a movement from which the robot counts as standing [s].
+    pause
+        Stances of the same robots with a shorter gap are merged [s].
+    shortest
+        Shorter stances are dropped [s].
     """
 
     speed: float = 0.01
@@ -45,21 +55,21 @@ class MotionThresholds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     @property
     def step(self) -> float:
-        """The way in one window from which on a robot moves [m]."""
+        """Distance within one window above which a robot moves [m]."""
         return self.speed * self.window
 
     @property
     def turned(self) -> float:
-        """The turn in one window from which on a robot moves [rad]."""
+        """Rotation within one window above which a robot moves [rad]."""
         return float(np.deg2rad(self.turn_deg)) * self.window
 
 
 @dataclass(frozen=True)
 class Movements:
-    """When a robot `moved`: stretches of time that are apart, in their order; it stood otherwise.
+    """Intervals in which a robot `moved`, disjoint and in order; it stood otherwise.
 
-    Known from `start` to `end` [UTC s]. `crept` are those of them in which it was never as fast as a movement, and yet
-    got somewhere.
+    Known from `start` to `end` [UTC s]. `crept` are those in which it was always slower than a movement, yet changed
+    its position.
     """
 
     robot: str
@@ -69,7 +79,7 @@ class Movements:
     crept: tuple[Span, ...] = ()
 
     def motions(self) -> list[Motion]:
-        """Their beginnings and ends, as a run has them."""
+        """Starts and ends of the movements, as records of a run."""
         return [
             motion
             for begin, end in self.moved
@@ -77,16 +87,25 @@ class Movements:
         ]
 
     def standing(self, settle: float = 0.0) -> list[Span]:
-        """The stretches in which it stands, each from `settle` [s] after a movement on."""
+        """Intervals in which the robot stands, each from `settle` [s] after a movement on."""
         begins = [self.start, *(end + settle for _, end in self.moved)]
         ends = [*(begin for begin, _ in self.moved), self.end]
         return [(begin, end) for begin, end in zip(begins, ends, strict=True) if end > begin]
 
 
 def movements(robot: str, times: ArrayLike, poses: ArrayLike, thresholds: MotionThresholds) -> Movements:
-    """When a robot moved, by its odometry: `poses` (n, 3) of x, y [m], yaw [rad] at ascending `times` (n,) [UTC s].
+    """Find the movements of a robot by its odometry.
 
-    Between two samples that are far apart it moved if they differ. n is at least 1.
+    Parameters
+    ----------
+    robot
+        Name of the robot.
+    times
+        Ascending times, (n,) [UTC s], n >= 1.
+    poses
+        x, y [m], yaw [rad], (n, 3). Between two samples with a large gap it moved if they differ.
+    thresholds
+        Thresholds of motion.
     """
     t, p = np.asarray(times, float), np.array(poses, float)
     p[:, 2] = np.unwrap(p[:, 2])
@@ -106,20 +125,20 @@ def _at(t: Array, p: Array, times: Array) -> Array:
 
 
 def _differ(a: Array, b: Array, thresholds: MotionThresholds) -> NDArray[np.bool_]:
-    """True for pairs of poses (n, 3) and (n, 3) that are a movement apart."""
+    """True for pairs of poses (n, 3) and (n, 3) that a movement separates."""
     off = np.atleast_2d(a - b)
     return np.asarray((np.hypot(off[:, 0], off[:, 1]) > thresholds.step) | (np.abs(off[:, 2]) > thresholds.turned))
 
 
 def _creeps(t: Array, p: Array, span: Span, thresholds: MotionThresholds) -> bool:
-    """True if a robot that seems to stand creeps; at both ends it may still brake and set off."""
+    """True if a robot that seems to stand creeps; at both ends it may still brake or set off."""
     half = thresholds.window / 2
     inside = p[(t >= span[0] + half) & (t <= span[1] - half)]
     return bool(len(inside)) and bool(_differ(inside, inside[:1], thresholds).any())
 
 
 def _union(spans: Sequence[Sequence[float]]) -> tuple[Span, ...]:
-    """Stretches of time, those that touch joined."""
+    """Merge intervals that touch."""
     joined: list[list[float]] = []
     for begin, end in sorted((span[0], span[1]) for span in spans):
         if joined and begin <= joined[-1][1]:
@@ -135,11 +154,24 @@ def derive_stances(
     marked: Collection[str],
     thresholds: MotionThresholds,
 ) -> list[Stance]:
-    """The stretches in which at least two robots stand and watch, and another one that carries markers moves.
+    """Find intervals in which at least two robots stand and observe while another one with markers moves.
 
-    `cameras` are the times of the images that each robot took, ascending [UTC s]; who took none observes nothing.
-    `marked` are the robots with markers. Who stood from one stance to the next, and observes in both, is its anchor.
-    A stance ends where a robot that takes part begins or ends to move, pauses of the movers left aside.
+    Parameters
+    ----------
+    team
+        Movements of each robot.
+    cameras
+        Ascending times of the images that each robot took [UTC s]; a robot without images observes nothing.
+    marked
+        Robots with markers.
+    thresholds
+        Thresholds of motion.
+
+    Returns
+    -------
+    list of Stance
+        A stance ends when a robot that takes part starts or stops moving, except for pauses of the movers. A robot that
+        observes in two stances and stood in between is an anchor.
     """
     at_rest = {one.robot: one.standing() for one in team}
     settled = {one.robot: one.standing(thresholds.settle) for one in team}
@@ -148,7 +180,7 @@ def derive_stances(
     found: list[Stance] = []
     for begin, end in itertools.pairwise(sorted(instants)):
         observers = tuple(
-            robot for robot in _throughout(settled, begin, end) if _images(cameras, robot, begin, end) >= LEAST_IMAGES
+            robot for robot in _throughout(settled, begin, end) if _images(cameras, robot, begin, end) >= MIN_IMAGES
         )
         movers = _throughout(moved, begin, end)
         if len(observers) < 2 or not movers:
@@ -169,7 +201,7 @@ def derive_stances(
 
 
 def _throughout(spans: Mapping[str, Sequence[Span]], begin: float, end: float) -> tuple[str, ...]:
-    """The robots of which one of the stretches, which are in order and apart, holds another stretch."""
+    """Robots with an interval that contains the given one; intervals are disjoint and in order."""
     found = []
     for robot, every in spans.items():
         k = bisect.bisect_right(every, (begin, np.inf)) - 1

@@ -1,9 +1,9 @@
-"""When a robot moved, by its own images: the background of a camera that stands is still.
+"""Find the movements of a robot by its own images: the background of a camera at rest is still.
 
-At each instant the median of the images just before is compared with the median of those just after: that leaves out
-noise, and robots that pass. Slow changes of the light are filtered out in space. Across a pause in the recording the
-same tells whether the camera was carried on meanwhile. A camera that shakes for a moment shorter than half a window is
-not noticed, nor is one that sees nothing but an even surface.
+The median of the images just before a time is compared with the median of those just after, which suppresses noise and
+passing robots; slow changes of the light are filtered out in space. The same comparison across a pause in the recording
+tells whether the camera was carried meanwhile. A camera that shakes for less than half a window is not noticed, nor is
+one that sees only an even surface.
 """
 
 from collections.abc import Iterable
@@ -20,19 +20,19 @@ Small = NDArray[np.float32]
 
 WIDTH = 160  # px, width at which images are compared
 BLUR = 1.2  # px
-HIGH_PASS = 5.0  # px, scale above which a difference is one of the light
-CLIP = 6.0  # grey levels, beyond which a pixel counts no more: a light, a reflection
+HIGH_PASS = 5.0  # px, scale above which differences are changes of the light
+CLIP = 6.0  # grey levels at which a pixel's difference saturates, such as of a light or a reflection
 WINDOW = 15  # images before and after
-STRIDE = 3  # images between the instants that are looked at
-QUANTILE = 0.8  # share of the pixels that a still background leaves unchanged
-USUAL = 0.3  # quantile of the changes that noise alone makes
-RATIO = 1.8  # times the usual change from which on the camera moved
-LEAST_CHANGE = 1.0  # grey levels times the root of the images, no change below which is a movement
-PAUSE = 3.0  # median intervals between images from which on the recording paused
+STRIDE = 3  # images between the times that are tested
+QUANTILE = 0.8  # share of the pixels that are unchanged with a still background
+USUAL = 0.3  # quantile of the changes that is taken for noise
+RATIO = 1.8  # ratio to the usual change above which the camera moved
+MIN_CHANGE = 1.0  # grey levels times the root of the number of images, of a movement
+PAUSE = 3.0  # median intervals between images above which the recording paused
 
 
 def movements_by_images(robot: str, times: Array, images: Iterable[NDArray[np.uint8]]) -> Movements:
-    """Stretches of time in which a robot moved, by its images at ascending `times` (n,) [UTC s]."""
+    """Find the intervals in which a robot moved, by its images at ascending `times` (n,) [UTC s]."""
     small = [_small(image) for image in images]
     gaps = np.diff(times)
     part = np.concatenate([[0], np.cumsum(gaps > PAUSE * np.median(gaps))]) if len(gaps) else np.zeros(1, np.int64)
@@ -40,7 +40,7 @@ def movements_by_images(robot: str, times: Array, images: Iterable[NDArray[np.ui
     changes = np.array([_change(_window(small, part, k, -1), _window(small, part, k + 1, 1)) for k in looked])
     moved: list[tuple[float, float]] = []
     if len(changes):
-        moving = changes > max(LEAST_CHANGE, RATIO * float(np.quantile(changes, USUAL)))
+        moving = changes > max(MIN_CHANGE, RATIO * float(np.quantile(changes, USUAL)))
         for n in np.flatnonzero(moving).tolist():
             k = looked[n]
             end = k + 1 if part[k] != part[k + 1] else min(k + STRIDE, len(small) - 1)
@@ -52,7 +52,7 @@ def movements_by_images(robot: str, times: Array, images: Iterable[NDArray[np.ui
 
 
 def _window(small: list[Small], part: NDArray[np.int64], k: int, step: int) -> list[Small]:
-    """Images from k on, forward or backward, without a pause."""
+    """Images from k on, forward or backward, up to a pause."""
     return [small[n] for n in range(k, k + step * WINDOW, step) if 0 <= n < len(small) and part[n] == part[k]]
 
 
@@ -64,7 +64,7 @@ def _small(image: NDArray[np.uint8]) -> Small:
 
 
 def _change(before: list[Small], after: list[Small]) -> float:
-    """Difference of the medians of some images [grey levels], in units that do not depend on how many they are."""
+    """Difference of the medians of two groups of images [grey levels], normalised for their numbers."""
     a, b = (np.median(np.stack(one), axis=0) for one in (before, after))
     gain = (float(np.median(a)) + 1) / (float(np.median(b)) + 1)
     a, b = (np.clip(one - cv2.GaussianBlur(one, (0, 0), HIGH_PASS), -CLIP, CLIP) for one in (a, gain * b))

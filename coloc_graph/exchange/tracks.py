@@ -1,4 +1,4 @@
-"""A user's own marker tracks, from CSV files to an ordinary run: `import_tracks`. docs/import-tracks.md shows one."""
+"""Import a user's own marker tracks from CSV files: `import_tracks`, explained in docs/import-tracks.md."""
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping
@@ -21,20 +21,14 @@ PLANES_HEADER = ("stance", "robot", "nx", "ny", "nz", "d")
 PLANES_SIGMAS = ("normal_sigma_deg", "d_sigma")
 MOVES_HEADER = ("stance", "robot")
 
-#: A run counts nanoseconds in 63 bits; later times are milliseconds or nanoseconds given as seconds [s].
-LATEST = 9e9
-#: A normal's length may be off by this much, which is what three decimals leave.
-UNIT_TOLERANCE = 1e-3
-#: A centre found this far outside of the image is still the work of a sub-pixel fit [px].
-IMAGE_MARGIN = 1.0
+LATEST = 9e9  # s; later times are milliseconds or nanoseconds (a run counts nanoseconds in 63 bits)
+UNIT_TOLERANCE = 1e-3  # error of a normal's length, as three decimals leave it
+IMAGE_MARGIN = 1.0  # px outside of the image where a sub-pixel fit may still put a centre
 
 
 @dataclass(frozen=True)
 class ImportSummary:
-    """Summary of an import: numbers of stances and rows, the robots that observe in any stance (in the team's order).
-
-    `warnings` are sentences on what was assumed or looks wrong.
-    """
+    """Summary of an import: numbers of stances and rows, observers in the team's order, and `warnings`."""
 
     stances: int
     rows: int
@@ -44,7 +38,7 @@ class ImportSummary:
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """The rows, as they are in the file: `robot` is the place in the team, `uv` and `sigma` are pixels."""
+    """Rows in the order of the file: `robot` is the index in the team, `uv` and `sigma` are pixels."""
 
     table: Table
     stance: NDArray[np.int64]
@@ -64,21 +58,36 @@ def import_tracks(
     moves_path: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ImportSummary:
-    """Write the run `out` from a team.toml and marker tracks in a CSV file.
+    """Write a run from a team.toml and marker tracks in a CSV file.
 
-    `tracks_path` has the columns stance, time [UTC s], robot (whose camera saw it), marker (any name; the same
-    name in two cameras is the same marker), u, v [px], and perhaps sigma [px], one standard deviation an axis
-    (`Camera.noise_px` where there is none). `planes_path` has stance, robot, nx, ny, nz, d: the marker plane
-    N . X = d in that robot's camera frame, N a unit normal from the camera to the plane, d > 0 [m]; and perhaps
-    normal_sigma_deg, d_sigma [m]: how well that is known, from which the joint estimate goes on.
-    `moves_path` has stance, robot: this robot moved since the stance before; observers that are not listed
-    stayed put. Without it all observers are taken to have stayed put, with a warning.
+    A stance's observers are the robots with rows in it, its movers the other robots with markers. A mover has moved.
 
-    A stance's observers are the robots with rows in it, its movers the other robots that carry markers. A robot
-    that was a mover has moved. `progress` is called with the rows written and their number.
+    Parameters
+    ----------
+    team_path
+        Description of the team.
+    tracks_path
+        CSV with stance, time [UTC s], robot (whose camera saw the marker), marker (any name; the same name in two
+        cameras is the same marker), u, v [px], and optionally sigma [px], the standard deviation along each axis
+        (default: `Camera.noise_px`).
+    out
+        Run to write.
+    planes_path
+        CSV with stance, robot, nx, ny, nz, d: the marker plane N . X = d in the robot's camera frame, N a unit normal
+        from the camera to the plane, d > 0 [m]; and optionally normal_sigma_deg, d_sigma [m], with which the joint
+        estimate corrects it.
+    moves_path
+        CSV with stance, robot: the robot moved since the stance before; other observers stayed put. By default all
+        observers are taken to have stayed put, with a warning.
+    progress
+        Called with (rows written, their number).
 
-    Raises `TracksError`, or `TeamError` for the team, with one sentence that names file and line; `RunError`
-    where `out` cannot be written. Nothing is written then, and a file that was at `out` stays as it was.
+    Raises
+    ------
+    TracksError, TeamError
+        In one sentence that names file and line. Nothing is written, and an existing file is kept.
+    RunError
+        The run cannot be written.
     """
     tracks_path, out = Path(tracks_path), Path(out)
     _require_other_file(out, team_path, tracks_path, planes_path, moves_path)
@@ -103,7 +112,7 @@ def import_tracks(
 def _require_other_file(out: Path, *inputs: str | Path | None) -> None:
     for path in inputs:
         if path is not None and out.resolve() == Path(path).resolve():
-            raise TracksError(f"{out}: is to be read and to be replaced by the run; give the run a name of its own")
+            raise TracksError(f"{out}: is an input and the run to write; give the run a name of its own")
 
 
 def _read_tracks(path: Path, team: Team) -> _Tracks:
@@ -149,7 +158,7 @@ def _sigma(table: Table, robot: NDArray[np.int64], team: Team) -> Array:
 
 
 def _require_ascending(tracks: _Tracks, team: Team) -> None:
-    """The times of a marker in a camera and stance ascend, in the order of the rows."""
+    """Raise `TracksError` unless the times of a marker in a camera and stance ascend in the order of the rows."""
     _, marker = np.unique(np.array(tracks.marker), return_inverse=True)
     keys = np.stack([tracks.stance, tracks.robot, marker])
     order = np.lexsort(keys)  # stable: the rows of one track stay in their order
@@ -198,14 +207,14 @@ def _observers(tracks: _Tracks, team: Team) -> dict[int, tuple[str, ...]]:
     if max(map(len, observers.values())) < 2:
         stance, (robot,) = next(iter(observers.items()))
         raise TracksError(
-            f"{tracks.table.path}: every stance has one observer only (stance {stance} has `{robot}`); "
-            "at least two robots must watch the same markers in one stance"
+            f"{tracks.table.path}: every stance has only one observer (stance {stance} has `{robot}`); "
+            "at least two robots must observe the same markers in one stance"
         )
     return observers
 
 
 def _read_moves(path: Path, team: Team, tracks: _Tracks) -> dict[int, tuple[str, ...]]:
-    """Robots that moved since the stance before, by stance; no rows mean that none ever did."""
+    """Robots that moved since the stance before, by stance; no rows mean that none ever moved."""
     table = read_table(path, "moves", MOVES_HEADER)
     places, stances = table.robots(team), table.stances()
     known = set(tracks.stance.tolist())
@@ -230,14 +239,14 @@ def _no_stance(stance: int, tracks: _Tracks) -> str:
 
 @dataclass(frozen=True)
 class _Plane:
-    """N . X = d, and its standard deviations: of the normal [rad] and of d [m], None where none are given."""
+    """Plane N . X = d, and its standard deviations of the normal [rad] and of d [m], None if none are given."""
 
     plane: tuple[float, float, float, float]
     sigmas: tuple[float, float] | None
 
 
 def _read_planes(path: Path, team: Team, tracks: _Tracks) -> dict[int, dict[str, _Plane]]:
-    """The planes by stance and robot; normals are made exactly unit."""
+    """Read planes by stance and robot; normals are normalised."""
     table = read_table(path, "planes", PLANES_HEADER, optional=PLANES_SIGMAS)
     if not len(table):
         raise TracksError(
@@ -285,7 +294,7 @@ def _plane_sigmas(table: Table) -> list[tuple[float, float]] | None:
 def _require_seen_in_front(
     table: Table, row: int, tracks: _Tracks, stance: int, place: int, N: Array, team: Team
 ) -> None:
-    """A plane belongs to a robot and stance with rows, and what the camera saw is where its normal points."""
+    """Raise `TracksError` unless a plane's robot and stance have rows, most of them where its normal points."""
     in_stance = tracks.stance == stance
     if not in_stance.any():
         raise table.error(row, f"{_no_stance(stance, tracks)}; correct the number or remove the row")
@@ -308,7 +317,7 @@ def _require_seen_in_front(
 def _stances(
     tracks: _Tracks, team: Team, observers: Mapping[int, tuple[str, ...]], moved: Mapping[int, tuple[str, ...]]
 ) -> list[Stance]:
-    """The stances in the order of time. Anchors are the robots that still stand where they observed before."""
+    """Stances in order of time; anchors are robots that still stand where they observed before."""
     stances: list[Stance] = []
     standing: set[str] = set()
     for index, watching in observers.items():
@@ -322,12 +331,12 @@ def _stances(
 
 
 def _require_planes(path: Path, stances: list[Stance], planes: Mapping[int, dict[str, _Plane]]) -> None:
-    """`TracksError` where no stance has a marker plane: no mover of the team carries markers, and none is stated."""
+    """Raise `TracksError` if no stance has a marker plane: no mover carries markers, and no plane is stated."""
     if planes or any(stance.movers for stance in stances):
         return
     raise TracksError(
-        f"{path}: no robot of the team moves that carries markers, and no plane is stated, so that there is no marker "
-        "plane: add the robot whose markers these are to the team (with its markers), or state the planes with --planes"
+        f"{path}: there is no marker plane, since no robot with markers moves and no plane is stated: "
+        "add the robot that carries the markers to the team, or state the planes with --planes"
     )
 
 
@@ -358,7 +367,7 @@ def _write(
 
 
 def _detections(tracks: _Tracks, stance: int, team: Team) -> Iterator[Detections]:
-    """All rows of one robot at one time, for each robot and time of a stance, in the order of time."""
+    """Yield the rows of each robot and time of a stance together, in order of time."""
     rows = np.flatnonzero(tracks.stance == stance)
     rows = rows[np.lexsort((tracks.robot[rows], tracks.ns[rows]))]
     begins = np.flatnonzero(np.diff(tracks.ns[rows]) | np.diff(tracks.robot[rows])) + 1
@@ -380,14 +389,14 @@ def _warnings(tracks: _Tracks, team: Team, stances: list[Stance], *, moves_known
     path = tracks.table.path
     if len(stances) > 1 and not moves_known:
         yield (
-            f"{path}: {len(stances)} stances and no moves, so that the observers are taken to have stayed put "
-            "throughout; list who moved in a CSV and give it with --moves"
+            f"{path}: {len(stances)} stances and no moves: the observers are taken to have stayed put throughout; "
+            "list the robots that moved in a CSV and give it with --moves"
         )
     alone = [stance for stance in stances if len(stance.observers) < 2]
     if alone:
         yield (
-            f"{path}: in {len(alone)} of {len(stances)} stances there is one observer only (the first is stance "
-            f"{alone[0].index}, with `{alone[0].observers[0]}`), so that they give no measurement"
+            f"{path}: {len(alone)} of {len(stances)} stances have only one observer and give no measurement (the first "
+            f"is stance {alone[0].index}, with `{alone[0].observers[0]}`)"
         )
     cameras = [robot.camera_if_any for robot in team.robots]
     size = np.array([(one.width, one.height) if one else (0, 0) for one in cameras])[tracks.robot]

@@ -1,4 +1,4 @@
-"""Trajectories in the TUM format: `timestamp tx ty tz qx qy qz qw`, and their covariances beside them.
+"""Read and write trajectories in the TUM format, `timestamp tx ty tz qx qy qz qw`, with covariances in a second file.
 
 Source of the format: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", 2012; evo reads it.
 """
@@ -24,8 +24,8 @@ COVARIANCE_HEADER = ",".join(["stance", "time", *(f"{_AXES[i]}_{_AXES[j]}" for i
 def write_tum(trajectory: Trajectory, path: Path) -> None:
     """Write poses as `path` (.tum), and covariances with stance numbers as `path` with .cov.csv.
 
-    Covariances are the upper triangle in GTSAM's tangent: rotation [rad] first, then translation [m], in the
-    body frame; the stance is empty where poses belong to none. Numbers are written so that they read back to the bit.
+    Covariances are the upper triangle in GTSAM's tangent space: rotation [rad] first, then translation [m], body frame;
+    the stance is empty for poses without one. Numbers are read back bit for bit.
     """
     lines = []
     for time, T in zip(trajectory.times, trajectory.T_world_body, strict=True):
@@ -43,9 +43,9 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
 
 
 def read_tum(path: Path) -> Trajectory:
-    """The trajectory in a .tum file, with covariances where the .cov.csv lies beside it; the robot is its name.
+    """Read the trajectory in a .tum file, with covariances if the .cov.csv is beside it; the robot is the file's name.
 
-    Raises `InputError` naming file and line, also where times do not increase.
+    Raises `InputError` naming file and line, also if times do not ascend.
     """
     poses: list[Array] = []
     times: list[float] = []

@@ -131,7 +131,7 @@ def test_a_team_that_is_not_there(refused, tmp_path):
         ("", r"tracks.csv: is empty; begin it with the header"),
         (
             "".join(GOOD.splitlines(keepends=True)[:9]),
-            r"tracks.csv: every stance has one observer only.*two robots",
+            r"tracks.csv: every stance has only one observer.*two robots",
         ),
     ],
 )

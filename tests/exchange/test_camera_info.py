@@ -69,9 +69,9 @@ def test_a_calibrators_file_and_a_printed_topic_are_the_same_camera(read):
 
 def test_what_is_of_rectified_images_is_left_out_with_a_warning(read):
     _, (said,) = read(FILE.replace("data: [1, 0, 0, 0, 1, 0", "data: [1, 0, 0.001, 0, 1, 0"))
-    assert "`rectification_matrix` was left out" in said
+    assert "`rectification_matrix` is ignored" in said
     _, (said,) = read(MESSAGE.replace("p: [430.2, 0.0, 306.7, 0.0,", "p: [430.2, 0.0, 306.7, -38.7,"))
-    assert "`projection_matrix` was left out" in said
+    assert "`projection_matrix` is ignored" in said
     assert read(MESSAGE.replace("p: [430.2, 0.0, 306.7, 0.0, 0.0, 430.5, 227.2, 0.0, 0.0, 0.0, 1.0, 0.0]",
                                 "p: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]"))[1] == ()  # fmt: skip
 

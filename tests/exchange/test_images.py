@@ -135,7 +135,7 @@ def test_times_are_in_names_or_in_a_video(tmp_path):
 @pytest.mark.parametrize(
     ("sources", "options", "words"),
     [
-        (["A"], {"fps": 10}, "`A` is no ROBOT=SOURCE"),
+        (["A"], {"fps": 10}, "`A` is not ROBOT=SOURCE"),
         (["A=A", "A=A"], {"fps": 10}, "robot A has two sources"),
         (["X=A"], {"fps": 10}, "robot `X` is not in the team"),
         (["A=A"], {}, "give --times, --fps or --time-pattern"),

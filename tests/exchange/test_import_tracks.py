@@ -263,11 +263,11 @@ BAD = {
     "missing column": ({"tracks": HEADER + "0,1,A,x,9\n"}, "line 2: 5 columns, where the header has 6"),
     "extra column": ({"tracks": HEADER + "0,1,A,x,9,5,9,5\n"}, "line 2: 8 columns.*decimals take a point"),
     "no number": ({"tracks": HEADER + "0,1,A,x,9,9\n0,2,A,x,9,nine\n"}, "line 3: `v` is `nine`, not a number"),
-    "empty cell": ({"tracks": HEADER + "0,1,A,x,,9\n"}, "line 2: `u` is ``, not a number; leave out"),
+    "empty cell": ({"tracks": HEADER + "0,1,A,x,,9\n"}, "line 2: `u` is ``, not a number; remove"),
     "blank lines count": ({"tracks": HEADER + "\n\n0,1,A,x,,9\n"}, "line 4: `u` is"),
     "no time": ({"tracks": HEADER + "0,noon,A,x,9,9\n"}, "line 2: `time` is `noon`, not a number"),
-    "NaN pixel": ({"tracks": HEADER + "0,1,A,x,nan,9\n"}, "line 2: `u` is `nan`; leave out"),
-    "infinite pixel": ({"tracks": HEADER + "0,1,A,x,9,-inf\n"}, "line 2: `v` is `-inf`; leave out"),
+    "NaN pixel": ({"tracks": HEADER + "0,1,A,x,nan,9\n"}, "line 2: `u` is `nan`; remove"),
+    "infinite pixel": ({"tracks": HEADER + "0,1,A,x,9,-inf\n"}, "line 2: `v` is `-inf`; remove"),
     "sigma zero": ({"tracks": HEADER[:-1] + ",sigma\n0,1,A,x,9,9,0\n"}, "line 2: `sigma` is 0; give the standard"),
     "sigma negative": ({"tracks": HEADER[:-1] + ",sigma\n0,1,A,x,9,9,-2\n"}, "line 2: `sigma` is -2"),
     "time backwards": (
@@ -283,7 +283,7 @@ BAD = {
     "unknown robot": ({"tracks": HEADER + "0,1,A,x,9,9\n0,1,Z,x,9,9\n"}, r"line 3: robot `Z` .* team \(A, B, C\)"),
     "empty file": ({"tracks": ""}, "tracks.csv: is empty; begin it with the header stance,time"),
     "only a header": ({"tracks": HEADER}, "tracks.csv: has a header and no rows"),
-    "one observer": ({"tracks": stances("A", "B")}, r"every stance has one observer only \(stance 0 has `A`\)"),
+    "one observer": ({"tracks": stances("A", "B")}, r"every stance has only one observer \(stance 0 has `A`\)"),
     "nameless marker": ({"tracks": HEADER + "0,1,A,,9,9\n"}, "line 2: `marker` is empty"),
     "stance negative": ({"tracks": HEADER + "-1,1,A,x,9,9\n"}, "line 2: `stance` is -1; number"),
     "stance fractional": ({"tracks": HEADER + "0.5,1,A,x,9,9\n"}, "line 2: `stance` is `0.5`, not a whole number"),
@@ -423,7 +423,7 @@ def test_the_examples_of_the_documentation_come_in_and_are_enough_to_solve(tmp_p
 
 
 def test_a_mover_that_is_not_in_the_team_is_named_at_the_import_where_no_plane_is_stated(files):
-    with pytest.raises(TracksError, match=r"tracks.csv: no robot of the team moves .*add the robot .*--planes"):
+    with pytest.raises(TracksError, match=r"tracks.csv: there is no marker plane.*add the robot .*--planes"):
         files.bring_in(stances("AB", "AB"), of=team(markers_on=()))
     assert not files.out.exists()
 

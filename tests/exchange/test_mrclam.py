@@ -63,14 +63,14 @@ def test_what_is_nobodys_or_out_of_order_is_counted_and_said(copy, tmp_path):
     first = path.read_text().splitlines()[1].split()
     add(path, f"{first[0]} 99 2.0 0.1", f"{first[0]} 5 2.0 0.1")  # nobody's, and its own
     summary = import_mrclam(copy, tmp_path / "run.mcap")
-    assert any("2 measurements are of barcodes that are nobody's (5, 99)" in one for one in summary.warnings)
+    assert any("2 measurements are of unknown barcodes (5, 99)" in one for one in summary.warnings)
     assert any("time runs backwards 1 times" in one for one in summary.warnings)
 
 
 def test_a_barcode_of_two_is_nobodys(copy, tmp_path):
     add(copy / "Barcodes.dat", "7 63")
     summary = import_mrclam(copy, tmp_path / "run.mcap")
-    assert any("barcode 63 is that of subjects 6, 7" in one for one in summary.warnings)
+    assert any("barcode 63 belongs to subjects 6, 7" in one for one in summary.warnings)
     ranges = [one for name in ("R1", "R2", "R3") for one in open_run(tmp_path / "run.mcap").ranges(name)]
     targets = [target for one in ranges for target in one.targets]
     of_7 = sum((np.loadtxt(copy / f"Robot{n}_Measurement.dat")[:, 1] == 81).sum() for n in (1, 2, 3))
