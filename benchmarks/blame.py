@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from monte_carlo import MemoryRun, over_seeds, simulated
 
+from coloc_graph.backend import joint
+from coloc_graph.errors import ColocError
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.geometry.se2 import compose
 from coloc_graph.measurements import Odometry, RelativePose
@@ -67,8 +69,7 @@ class Faulty:
         late = fault.size if mine and fault.kind == "clock" else 0.0
         last = self._run.stances[fault.stance].end
         for one in self._run.detections(robot, start - late, end - late):
-            displaced = fault.kind == "bump" or (fault.kind == "homography" and one.time <= last)
-            if mine and displaced and one.time >= self._since:
+            if mine and fault.kind == "homography" and self._since <= one.time <= last:
                 one = self._moved(one)
             yield replace(one, time=one.time + late) if late else one
 
@@ -99,6 +100,36 @@ class Faulty:
         p_body = T_bc[:3, 3] + rays * ((height - T_bc[2, 3]) / rays[:, 2])[:, None]
         T = self.fault.T_before_after @ T_bc
         return replace(one, uv=camera.project((p_body - T[:3, 3]) @ T[:3, :3])[0])
+
+
+def bumped(run: MemoryRun, fault: Fault) -> MemoryRun:
+    """The same run where a robot is displaced right before a stance, and drives on from there by its wheels."""
+    world, at = run._world, run.stances[fault.stance].start - 1e-3
+    path = world.paths[fault.robot]
+    T_world_body = path.pose_at([at])[0]
+    T = T_world_body @ fault.T_before_after @ np.linalg.inv(T_world_body)
+    knots, c, s = path.knots.copy(), T[:2, :2], np.arctan2(T[1, 0], T[0, 0])
+    later = path.times >= at
+    here = path.planar_at([at, at])
+    times = np.concatenate([path.times[~later], [at, at + 1e-6], path.times[later]])
+    knots = np.concatenate([path.knots[~later], here, path.knots[later]])
+    after = np.arange(len(knots)) > int((~later).sum())
+    knots[after, :2] = knots[after, :2] @ c.T + T[:2, 3]
+    knots[after, 2] += s
+    captures = tuple(
+        tuple(
+            replace(one, view=replace(one.view, T_world_camera=T @ one.view.T_world_camera))
+            if k >= fault.stance and one.robot == fault.robot
+            else one
+            for one in every
+        )
+        for k, every in enumerate(world.captures)
+    )
+    moved = replace(path, times=times, knots=knots)
+    made = MemoryRun(replace(world, paths={**world.paths, fault.robot: moved}, captures=captures))
+    for robot in run.team.names:  # no wheel feels it
+        made._odometry[robot] = list(run.odometry(robot))
+    return made
 
 
 def drawn(run: MemoryRun, kind: str, rng: np.random.Generator) -> Fault:
@@ -155,6 +186,20 @@ def verdict(solution: Solution, fault: Fault) -> tuple[bool, bool]:
     return any(right in one for one in said), any(all(robot != fault.robot for _, robot in one) for one in said)
 
 
+def effect(solution: Solution, world: MemoryRun) -> float:
+    """Largest distance of a pose from the one estimated without the fault, in its sigmas, if nothing is rejected."""
+    healthy = solve(world, SolveOptions()).estimate  # type: ignore[arg-type]
+    naive = joint(solution.estimate.graph, reject=False)
+    far = 0.0
+    for robot, stance in healthy.graph.nodes:
+        try:
+            off = healthy.pose(robot, stance).localCoordinates(naive.pose(robot, stance))[2:5]
+            far = max(far, float(off @ np.linalg.solve(healthy.covariance(robot, stance)[2:5, 2:5], off)))
+        except ColocError:
+            continue
+    return round(float(np.sqrt(far)), 1)
+
+
 def world_of(seed: int) -> MemoryRun:
     """A hallway, or a team of four."""
     imperfections = Imperfections(mount_sigma_deg=0.3, height_sigma=0.002, floor_sigma_deg=0.1)
@@ -177,10 +222,12 @@ def one_seed(seed: int) -> dict[str, Any]:
     row: dict[str, Any] = {"kind": kind, "seed": seed, "robot": fault.robot, "stance": fault.stance}
     row["size"] = round(fault.size, 3)
     try:
-        solution = solve(Faulty(world, fault), SolveOptions())  # type: ignore[arg-type]
+        faulty = bumped(world, fault) if fault.kind == "bump" else Faulty(world, fault)
+        solution = solve(faulty, SolveOptions())  # type: ignore[arg-type]
     except Exception as error:  # one failure must not end the others
         return {**row, "error": f"{type(error).__name__}: {error}"}
     right, innocent = verdict(solution, fault)
+    row["effect"] = effect(solution, world)
     said = [sorted(one) for one in accusations(solution)]
     row["kind"] = fault.kind
     return {**row, "right": right, "innocent": innocent, "said": said, "seconds": time.process_time() - began,

@@ -32,6 +32,8 @@ from coloc_graph.pipeline.incremental import (
     StanceSolver,
     measure_stance,
 )
+from coloc_graph.pipeline.lever_arm import LeverArm, find_lever_arms, with_lever_arms
+from coloc_graph.pipeline.odometry_checks import CheckedRun
 from coloc_graph.pipeline.options import METHODS, SolveOptions
 from coloc_graph.pipeline.solution import Solution
 from coloc_graph.run import Run, Stance
@@ -103,9 +105,11 @@ def solve(
     EstimationError
         No measurement ties any robot to the world frame.
     """
-    options = options or SolveOptions()
+    options, recorded = options or SolveOptions(), run
     kind = require_applicable(run, options)
     unused = unused_in(run, options)
+    if options.odometry:
+        run = CheckedRun(run)  # type: ignore[assignment]
     started = time.perf_counter()
     if kind == "ranges":
         solved = _by_ranges(run, options, progress, on_update)
@@ -116,7 +120,7 @@ def solve(
             _by_stance(run, options, measure, on_update) if options.incremental else _in_batch(run, options, measure)
         )
     return Solution(
-        run=run,
+        run=recorded,
         options=options,
         estimate=solved.estimate,
         measurements=solved.measured,
@@ -166,16 +170,20 @@ def _in_batch(
     if clocks is None and contradicts(estimate) and (clocks := clocks_of_run(run, measured, any_pair=True)) is not None:
         run = clocks.corrected(run)
         return _in_batch(run, options, measure.of(run), clocks, made - started)
+    arms = dict[str, LeverArm]()
+    if options.method != "chain":
+        arms, estimate = find_lever_arms(estimate, BATCH[options.method])
     if options.method == "joint":
         shared = _shared_noise(estimate, noise)
         if shared is not None:
             noise = noise.with_bias(shared.size, shared.factor)
             measured = measured_again(measured, noise.used(run.team))
             graph, sources = _graph_of(run, options, measured, noise.used(run.team))
+            graph = with_lever_arms(graph, arms)
             _require_ties(run, graph, measured)
             estimate = joint(graph, start=estimate.values)
     measured = tuple(replace(one, with_team=None) for one in measured)
-    of_clocks = [*(clocks.sentences() if clocks else ()), *clock_warnings]
+    of_clocks = [*(clocks.sentences() if clocks else ()), *clock_warnings, *map(str, arms.values())]
     warnings = _warnings(run, options, estimate, measured, of_clocks, sources.unused)
     missing = without_poses(run, options, estimate, measured, sources.unused)
     return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise)

@@ -1,0 +1,132 @@
+"""Odometry that cannot be right: jumps, drivers that hang, covariances that say nothing; mended, and told.
+
+A recording whose odometry is right is passed on as it is.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.geometry.se2 import wrap
+from coloc_graph.run import OdometrySample, Stance
+from coloc_graph.run.odometry_breaks import find_breaks, join_breaks
+
+Array = NDArray[np.float64]
+
+ALONG = 0.02  # standard deviation of odometry whose covariances are not believed, after one metre [m]
+TURNED = 0.02  # the same after turning by one radian [rad]
+VEER = 0.01  # its heading after one metre [rad]
+LEAST_SIGMA = 1e-4  # and of each increment at least [m, rad]
+ABSURD_SIGMA = 10.0  # standard deviation of one increment that says nothing [m, rad]
+HUNG_SIGMA = 1.0  # standard deviation of a way on which the odometry hung [m, rad]
+FEWEST_HUNG = 5  # samples of a stance that do not change where its driver hangs
+BREAKS_NAMED = 3  # jumps of one robot that are told one by one
+
+
+class CheckedRun:
+    """A recording whose odometry was checked; all else is as it is recorded. `warnings` tell what was mended."""
+
+    def __init__(self, run: Any) -> None:
+        self._run = run
+        self._mended: dict[str, list[OdometrySample]] = {}
+        said: list[str] = []
+        for robot in run.team.names:
+            samples = list(run.odometry(robot))
+            mended, sentences = checked(robot, samples, run.stances)
+            if sentences:
+                self._mended[robot] = mended
+                said += sentences
+        self.warnings = (*run.warnings, *said)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._run, name)
+
+    def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
+        """Odometry, as `Recorded`."""
+        if robot not in self._mended:
+            yield from self._run.odometry(robot, start, end)
+            return
+        for one in self._mended[robot]:
+            if (start is None or one.time >= start) and (end is None or one.time <= end):
+                yield one
+
+
+def checked(
+    robot: str, samples: Sequence[OdometrySample], stances: Sequence[Stance]
+) -> tuple[list[OdometrySample], list[str]]:
+    """Mend one robot's odometry.
+
+    Parameters
+    ----------
+    robot : str
+        Its name.
+    samples : sequence of OdometrySample
+        All of them, in the order of time.
+    stances : sequence of Stance
+        Those in which it is a mover tell whether its odometry hangs.
+
+    Returns
+    -------
+    list of OdometrySample, list of str
+        The samples, and a sentence on each fault; none where nothing is wrong.
+    """
+    if len(samples) < 2:
+        return list(samples), []
+    times, poses = np.array([one.time for one in samples]), np.array([one.pose for one in samples])
+    covariances = np.array([one.covariance for one in samples])
+    breaks = find_breaks(times, poses)
+    said = [
+        f"the odometry of {robot} {one}; the jump is cut out, and what it may hide is in the uncertainty"
+        for one in breaks[:BREAKS_NAMED]
+    ]
+    if len(breaks) > BREAKS_NAMED:
+        said.append(f"the odometry of {robot} jumped {len(breaks) - BREAKS_NAMED} more times")
+    mended = join_breaks(poses, breaks)
+    moved = np.diff(mended, axis=0, prepend=mended[:1])
+    wrong = _says_nothing(covariances) & (np.abs(moved).max(axis=1) > 0)
+    if wrong.any():
+        said.append(
+            f"the odometry of {robot} states {_fault(covariances[wrong])} in {wrong.sum()} of {len(wrong)} samples: "
+            f"it is taken to err by {100 * ALONG:.0f} cm after one metre; state the covariance of each increment"
+        )
+        covariances[wrong] = _usual(moved[wrong])
+    for one in breaks:
+        covariances[one.index] = np.diag(np.square(one.sigmas))
+    for stance in stances:
+        inside = np.flatnonzero((times >= stance.start) & (times <= stance.end))
+        if robot in stance.movers and len(inside) >= FEWEST_HUNG and not np.ptp(poses[inside], axis=0).any():
+            covariances[inside[-1]] = np.diag([HUNG_SIGMA**2] * 3)
+            said.append(
+                f"the odometry of {robot} does not change in stance {stance.index}, in which it moves: it is not used "
+                "there; check its driver"
+            )
+    if not said:
+        return list(samples), []
+    columns = zip(samples, mended, covariances, strict=True)
+    return [replace(one, pose=pose, covariance=covariance) for one, pose, covariance in columns], said
+
+
+def _says_nothing(covariances: Array) -> NDArray[np.bool_]:
+    """True of covariances (n, 3, 3) that are zero, no covariances, or so large that they say nothing."""
+    finite = np.asarray(np.isfinite(covariances).all(axis=(1, 2)), bool)
+    variances = np.diagonal(np.where(finite[:, None, None], covariances, -1.0), axis1=1, axis2=2)
+    least = np.linalg.eigvalsh(np.where(finite[:, None, None], covariances, 0.0))[:, 0]
+    none = ~variances.any(axis=1) | (variances < 0).any(axis=1) | (least < -1e-9 * variances.max(axis=1))
+    return np.asarray(none | (variances > ABSURD_SIGMA**2).any(axis=1))
+
+
+def _fault(covariances: Array) -> str:
+    if not covariances.any():
+        return "a covariance of zero"
+    return "a covariance that is none, or that says nothing,"
+
+
+def _usual(moved: Array) -> Array:
+    """Covariances (n, 3, 3) of increments (n, 3) of ordinary wheels."""
+    way, turn = np.hypot(moved[:, 0], moved[:, 1]), np.abs(wrap(moved[:, 2]))
+    xy = ALONG**2 * way + LEAST_SIGMA**2
+    yaw = TURNED**2 * turn + VEER**2 * way + LEAST_SIGMA**2
+    return np.asarray(np.stack([xy, xy, yaw], axis=1)[:, :, None] * np.eye(3))
