@@ -15,10 +15,10 @@ from coloc_graph.measurements import Odometry, Sighting
 
 Array = NDArray[np.float64]
 
-FEWEST_REJECTED = 2  # odometry and sightings that are rejected before a lever arm is looked for
+MIN_REJECTED = 2  # odometry and sightings that are rejected before a lever arm is looked for
 DOUBTED_P_VALUE = 1e-4  # or an estimate that noise explains less probably than this
-FEWEST_WAYS = 4  # ways that tell a lever arm
-LEAST_ARM = 0.02  # shorter lever arms do no harm [m]
+MIN_WAYS = 4  # ways that tell a lever arm
+MIN_ARM = 0.02  # shorter lever arms do no harm [m]
 SIGNIFICANT = 6.0  # a lever arm exceeds its sigma by this factor
 POSE_SIGMA = 5e-3  # standard deviation of estimated positions, added to that of odometry [m]
 ROBUST = 4.0  # ways that are off by more sigmas count less
@@ -61,12 +61,12 @@ def find_lever_arms(estimate: Estimate, solve: Callable[[PoseGraph], Estimate]) 
     """
     doubted = [one.measurement for one in estimate.rejected if isinstance(one.measurement, Odometry | Sighting)]
     p_value = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
-    if len(doubted) < FEWEST_REJECTED and not estimate.bumped and p_value > DOUBTED_P_VALUE:
+    if len(doubted) < MIN_REJECTED and not estimate.bumped and p_value > DOUBTED_P_VALUE:
         return {}, estimate
     best: tuple[float, LeverArm, Estimate] | None = None
     for robot in estimate.graph.robots:
         ways = [one for one in estimate.graph.measurements if isinstance(one, Odometry) and one.robot == robot]
-        if len(ways) < FEWEST_WAYS:
+        if len(ways) < MIN_WAYS:
             continue
         try:
             without = solve(estimate.graph.without(ways))
@@ -99,7 +99,7 @@ def _arm(estimate: Estimate, robot: str, ways: Sequence[Odometry]) -> LeverArm |
         # P^-1 T P has the translation t + (R - 1) p
         rows.append((one.T_before_after[:2, :2] - np.eye(2)) / sigma)
         right.append((one.T_before_after[:2, 3] - T[:2, 3]) / sigma)
-    if len(rows) < FEWEST_WAYS:
+    if len(rows) < MIN_WAYS:
         return None
     A, b = np.array(rows), np.array(right)
     weights = np.ones(len(A))
@@ -109,13 +109,13 @@ def _arm(estimate: Estimate, robot: str, ways: Sequence[Odometry]) -> LeverArm |
         off = np.linalg.norm(b - A @ p, axis=1)
         weights = np.minimum(1.0, ROBUST / np.maximum(off, 1e-9)) ** 2
     kept = weights > 0.5
-    if kept.sum() < max(FEWEST_WAYS, len(A) / 2):
+    if kept.sum() < max(MIN_WAYS, len(A) / 2):
         return None
     after = float(((b - A @ p)[kept] ** 2).sum())
     scale = max(1.0, after / max(2 * int(kept.sum()) - 2, 1))
     covariance = scale * np.linalg.pinv(normal)
     far, sigma = float(np.linalg.norm(p)), float(np.sqrt(np.trace(covariance) / 2))
-    if far < max(LEAST_ARM, SIGNIFICANT * sigma):
+    if far < max(MIN_ARM, SIGNIFICANT * sigma):
         return None
     return LeverArm(robot, float(p[0]), float(p[1]), sigma)
 

@@ -19,10 +19,10 @@ Array = NDArray[np.float64]
 ALONG = 0.02  # standard deviation of odometry whose covariances are not believed, after one metre [m]
 TURNED = 0.02  # the same after turning by one radian [rad]
 VEER = 0.01  # its heading after one metre [rad]
-LEAST_SIGMA = 1e-4  # and of each increment at least [m, rad]
+MIN_SIGMA = 1e-4  # and of each increment at least [m, rad]
 ABSURD_SIGMA = 10.0  # standard deviation of one increment that says nothing [m, rad]
 HUNG_SIGMA = 1.0  # standard deviation of a way on which the odometry hung [m, rad]
-FEWEST_HUNG = 5  # samples of a stance that do not change where its driver hangs
+MIN_HUNG = 5  # samples of a stance that do not change where its driver hangs
 BREAKS_NAMED = 3  # jumps of one robot that are told one by one
 
 
@@ -97,7 +97,7 @@ def checked(
         covariances[one.index] = np.diag(np.square(one.sigmas))
     for stance in stances:
         inside = np.flatnonzero((times >= stance.start) & (times <= stance.end))
-        if robot in stance.movers and len(inside) >= FEWEST_HUNG and not np.ptp(poses[inside], axis=0).any():
+        if robot in stance.movers and len(inside) >= MIN_HUNG and not np.ptp(poses[inside], axis=0).any():
             covariances[inside[-1]] = np.diag([HUNG_SIGMA**2] * 3)
             said.append(
                 f"the odometry of {robot} does not change in stance {stance.index}, in which it moves: it is not used "
@@ -127,6 +127,6 @@ def _fault(covariances: Array) -> str:
 def _usual(moved: Array) -> Array:
     """Covariances (n, 3, 3) of increments (n, 3) of ordinary wheels."""
     way, turn = np.hypot(moved[:, 0], moved[:, 1]), np.abs(wrap(moved[:, 2]))
-    xy = ALONG**2 * way + LEAST_SIGMA**2
-    yaw = TURNED**2 * turn + VEER**2 * way + LEAST_SIGMA**2
+    xy = ALONG**2 * way + MIN_SIGMA**2
+    yaw = TURNED**2 * turn + VEER**2 * way + MIN_SIGMA**2
     return np.asarray(np.stack([xy, xy, yaw], axis=1)[:, :, None] * np.eye(3))
