@@ -1,7 +1,7 @@
 """Pose graphs in the g2o format, read: those of other people and ours.
 
 Ids are integers of 64 bits, as GTSAM's symbols are. Comments, in lines of their own or behind a record, blank lines,
-Windows line ends and a byte order mark are accepted.
+Windows line ends and a byte order mark are accepted. A file without any vertex begins at its edges, compounded.
 
 Source: g2o's file format, https://github.com/RainerKuemmerle/g2o/wiki/File-Format
 """
@@ -96,10 +96,14 @@ def read_g2o(path: str | Path, *, lenient: bool = False) -> G2oGraph:
     planar = _is_planar(path, text)
     kind = "SE2" if planar else "SE3:QUAT"
     vertices, edges = text.blocks[f"VERTEX_{kind}"], text.blocks[f"EDGE_{kind}"]
-    keys = [one for (one,) in vertices.ids]
     _require_ends(path, text, vertices, edges)
+    measured = _poses(path, edges, planar=planar)
+    if vertices.ids:
+        initial = dict(zip((key for (key,) in vertices.ids), _poses(path, vertices, planar=planar), strict=True))
+    else:
+        initial = _compounded(edges.ids, measured)
     values = gtsam.Values()
-    for key, pose in zip(keys, _poses(path, vertices, planar=planar), strict=True):
+    for key, pose in initial.items():
         values.insert(key, pose)
     roots, indefinite = _information_roots(edges.numbers[:, 3:] if planar else edges.numbers[:, 7:])
     if len(indefinite) and not lenient:
@@ -110,7 +114,7 @@ def read_g2o(path: str | Path, *, lenient: bool = False) -> G2oGraph:
             f"the information matrix is not positive definite, as in {count} of {len(edges.ids)} edges; correct {them},"
             f" or read the graph with --lenient, which projects {them}",
         )
-    fixed = tuple(dict.fromkeys(key for key, _ in text.fixed)) or (min(keys),)
+    fixed = tuple(dict.fromkeys(key for key, _ in text.fixed)) or (min(initial),)
     between = gtsam.BetweenFactorPose2 if planar else gtsam.BetweenFactorPose3
     factors, links, ends = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph(), []
     for key in fixed:
@@ -121,7 +125,7 @@ def read_g2o(path: str | Path, *, lenient: bool = False) -> G2oGraph:
             held = gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA)
             factors.add(gtsam.PriorFactorPose3(key, values.atPose3(key), held))
     noises: dict[bytes, gtsam.noiseModel.Base] = {}  # most files have few
-    for (i, j), pose, root in zip(edges.ids, _poses(path, edges, planar=planar), roots, strict=True):
+    for (i, j), pose, root in zip(edges.ids, measured, roots, strict=True):
         if root is not None:
             if (noise := noises.get(which := root.tobytes())) is None:
                 noise = noises[which] = gtsam.noiseModel.Gaussian.SqrtInformation(root)
@@ -149,11 +153,11 @@ def _is_planar(path: Path, text: G2oText) -> bool:
     """Return whether a file is a graph in 2D; raise where it is of both kinds or of none."""
     planar = [bool(text.blocks[f"{one}_SE2"].ids) for one in ("VERTEX", "EDGE")]
     solid = [bool(text.blocks[f"{one}_SE3:QUAT"].ids) for one in ("VERTEX", "EDGE")]
-    if not planar[0] and not solid[0]:
-        raise InputError(f"{path}: holds no vertex; give a pose graph in the g2o format")
+    if not any(planar) and not any(solid):
+        raise InputError(f"{path}: holds no vertex and no edge; give a pose graph in the g2o format")
     if any(planar) and any(solid):
         raise InputError(f"{path}: mixes SE2 and SE3; give a graph of one of them")
-    return planar[0]
+    return any(planar)
 
 
 def _require_ends(path: Path, text: G2oText, vertices: Block, edges: Block) -> None:
@@ -163,12 +167,31 @@ def _require_ends(path: Path, text: G2oText, vertices: Block, edges: Block) -> N
         if key in keys:
             raise bad_line(path, line, f"vertex {key} is there twice; give each an id of its own")
         keys.add(key)
+    keys |= set() if keys else {key for ids in edges.ids for key in ids}
     for ids, line in (*zip(edges.ids, edges.lines, strict=True), *(((key,), line) for key, line in text.fixed)):
         for key in ids:
             if key not in keys:
                 raise bad_line(path, line, f"vertex {key} is not there; give it a VERTEX line")
         if len(ids) == 2 and ids[0] == ids[1]:
             raise bad_line(path, line, f"the edge is from vertex {ids[0]} to itself; remove it")
+
+
+def _compounded(ends: list[tuple[int, ...]], measured: list[Any]) -> dict[int, Any]:
+    """Poses of a file without vertices: edges compounded from the lowest id of each connected part, breadth first."""
+    steps: dict[int, list[tuple[int, Any]]] = {}
+    for (i, j), pose in zip(ends, measured, strict=True):
+        steps.setdefault(i, []).append((j, pose))
+        steps.setdefault(j, []).append((i, pose.inverse()))
+    found: dict[int, Any] = {}
+    for root in sorted(steps):
+        queue = [] if root in found else [root]
+        found.setdefault(root, type(measured[0])())
+        for at in queue:
+            for to, pose in steps[at]:
+                if to not in found:
+                    found[to] = found[at].compose(pose)
+                    queue.append(to)
+    return found
 
 
 def _poses(path: Path, block: Block, *, planar: bool) -> list[Any]:

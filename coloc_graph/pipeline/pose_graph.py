@@ -143,7 +143,7 @@ def linear_start(graph: G2oGraph) -> gtsam.Values | None:
         key = graph.fixed[0]
         diagonal.add(gtsam.PriorFactorPose2(key, graph.values.atPose2(key), gtsam.noiseModel.Unit.Create(3)))
         return gtsam.lago.initialize(diagonal)
-    except (RuntimeError, IndexError):  # a singular system; a vertex that its spanning tree does not reach
+    except (RuntimeError, IndexError, ValueError):  # a singular system, an unreached vertex, or noise that it refuses
         return None
 
 

@@ -55,14 +55,14 @@ def summarise_pose_graph(solution: PoseGraphSolution) -> dict[str, Any]:
 
 
 def _solved_text(solution: PoseGraphSolution) -> str:
+    values, planar = solution.values, solution.graph.planar
+    tag = "VERTEX_SE2" if planar else "VERTEX_SE3:QUAT"
+    vertices = {key: f"{tag} {key} {_pose(values, key, planar=planar)}" for key in values.keys()}  # noqa: SIM118
     lines = []
     for line in read_text(solution.path, "solve it again").split("\n"):
         words = line.split()
-        if words and words[0].startswith("VERTEX"):
-            key = int(words[1])
-            line = f"{words[0]} {key} {_pose(solution.values, key, planar=solution.graph.planar)}"
-        lines.append(line.rstrip("\r"))
-    return "\n".join(lines).rstrip("\n") + "\n"
+        lines.append(vertices.pop(int(words[1])) if words and words[0] == tag else line.rstrip("\r"))
+    return "\n".join([*vertices.values(), *lines]).rstrip("\n") + "\n"
 
 
 def _pose(values: gtsam.Values, key: int, *, planar: bool) -> str:

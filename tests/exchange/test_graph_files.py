@@ -88,7 +88,7 @@ E3 = "EDGE_SE3:QUAT {} {} 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 
             "3: .*not positive definite, as in 1 of 1",
         ),
         ([V2.format(0), V2.format(1), "EDGE_SE2 0 1 1 0 0 1 1 0 1 0 1"], "line 3: .*as in 1 of 1 edges.*--lenient"),
-        ([], "holds no vertex"),
+        ([], "holds no vertex and no edge"),
     ],
 )
 def test_a_bad_g2o_is_named_by_its_line(tmp_path, lines, words):
@@ -262,6 +262,20 @@ def test_a_loop_is_closed_from_poses_that_are_far_off(tmp_path, planar):
         lines.append(f"{kind} {k} {(k + 1) % count} {edge} {information}")
     path.write_text("\n".join(lines))
     assert solve_pose_graph(path).chi2 < 1e-6
+
+
+def test_a_graph_without_vertices_begins_at_its_edges(tmp_path):
+    path, out = tmp_path / "square.g2o", tmp_path / "result"
+    whole = square(4, [(0, 1), (3, 2), (1, 2), (3, 0)]).split("\n")
+    path.write_text("\n".join(line for line in whole if line.startswith("EDGE")))
+    assert main(["solve", str(path), "--out", str(out)]) == 0
+    solved = read_g2o(out / "graph.g2o")
+    assert solved.values.size() == 4 and len(solved.ends) == 4
+    path.write_text("\n".join(whole))
+    np.testing.assert_allclose(solve_pose_graph(path).chi2, solve_pose_graph(out / "graph.g2o").chi2, rtol=1e-6)
+    path.write_text("\n".join([*whole[4:], "FIX 3"]))
+    with pytest.raises(InputError, match="vertex 3 is not there"):
+        read_g2o(path)
 
 
 def test_a_disconnected_graph_and_options_of_runs_are_refused(tmp_path, capsys):
