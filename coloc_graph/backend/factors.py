@@ -80,7 +80,8 @@ class Factors:
             height = max(floor.height_sigma, tilt * BODY_LENGTH, MIN_FLOOR_SIGMA)
         self.gauge_sigmas = np.array([tilt, tilt, GAUGE_SIGMA, GAUGE_SIGMA, GAUGE_SIGMA, height])
         self._level = gtsam.noiseModel.Isotropic.Sigma(2, tilt)
-        self._on_floor = gtsam.noiseModel.Diagonal.Precisions(np.array([0.0, 0.0, height**-2]))
+        # not Diagonal.Precisions: a sigma that is infinite cannot be read back from a serialised graph
+        self._on_floor = gtsam.noiseModel.Gaussian.SqrtInformation(np.diag([0.0, 0.0, 1 / height]), False)
 
     def dof(self, values: gtsam.Values, links: Iterable[tuple[Link, gtsam.NonlinearFactor]]) -> int:
         """Return the degrees of freedom of links and their factors: rows of weight less unknowns.
@@ -218,4 +219,4 @@ def _noise(link: Link) -> gtsam.noiseModel.Gaussian:
     # heading, x and y alone are measured; the rows of roll, pitch and height are zero
     R = np.zeros((6, 6))
     R[2:5, 2:5] = np.linalg.cholesky(np.linalg.inv(C)).T
-    return gtsam.noiseModel.Gaussian.SqrtInformation(R)
+    return gtsam.noiseModel.Gaussian.SqrtInformation(R, False)  # not diagonal, which would have infinite sigmas

@@ -1,7 +1,7 @@
 """The folder of a result: atomic writing, and reading.
 
 A folder holds summary.json, trajectories/<robot>.tum (and .cov.csv), measurements.csv, config.toml and report.html;
-of a run with stances also graph.g2o and graph.dot; of an incremental estimate of a ranging run also
+of a run with stances also graph.g2o, graph.dot and factors.zip; of an incremental estimate of a ranging run also
 online/<robot>.tum; where landmarks were measured, landmarks.csv; and team.toml, the calibrated team, where anything
 was calibrated.
 """
@@ -37,6 +37,7 @@ SUMMARY = "summary.json"
 CONFIG = "config.toml"
 LANDMARKS = "landmarks.csv"
 MEASUREMENTS = "measurements.csv"
+GTSAM_FACTORS = "factors.zip"
 CALIBRATED_TEAM = "team.toml"
 REMEDY = "solve the run again"
 

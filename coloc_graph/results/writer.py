@@ -17,12 +17,14 @@ from coloc_graph.errors import ColocError
 from coloc_graph.evaluation import Accuracy, accuracy_json, align, evaluate, usual_alignment
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o_writer import write_g2o
+from coloc_graph.exchange.gtsam_files import write_gtsam
 from coloc_graph.exchange.landmarks import landmark_rows, landmarks_csv, map_row
 from coloc_graph.exchange.tum import write_tum
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.solution import Solution
 from coloc_graph.results.folder import (
     CALIBRATED_TEAM,
+    GTSAM_FACTORS,
     LANDMARKS,
     MEASUREMENTS,
     atomic_result,
@@ -124,6 +126,7 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
                 write_tum(trajectory, part / "online" / f"{robot}.tum")
         if not estimate.is_ranging:
             write_g2o(estimate, part / "graph.g2o")
+            write_gtsam(estimate, part / GTSAM_FACTORS)
             (part / "graph.dot").write_text(to_dot(estimate.graph), encoding="utf-8")
         (part / MEASUREMENTS).write_text(measurement_table(solution), encoding="utf-8")
         if estimate.landmarks:

@@ -30,6 +30,7 @@ FILES = {
     "trajectories/C.cov.csv",
     "graph.dot",
     "graph.g2o",
+    "factors.zip",
     "measurements.csv",
     "config.toml",
     "report.html",
