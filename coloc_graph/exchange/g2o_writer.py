@@ -1,9 +1,9 @@
 """Write pose graphs in the g2o format; `g2o` reads them.
 
-VERTEX_SE3:QUAT and EDGE_SE3:QUAT with the information's upper triangle, translation first. Ids are plain integers, 0 the
-reference's first pose; numbers are read back bit for bit. g2o cannot express a stay-put constraint: stances that share a
-pose share a vertex, and a comment says so, which `read_g2o` understands. Landmarks and the map are ordinary vertices,
-named in comments. Nor can it express floors and mounts: see `relative_edges`.
+VERTEX_SE3:QUAT and EDGE_SE3:QUAT with the information's upper triangle, translation first. Ids are plain integers, 0
+for the reference's first pose; numbers are read back bit for bit. g2o cannot express a stay-put constraint: stances that
+share a pose share a vertex, and a comment says so, which `read_g2o` understands. Landmarks and the map are ordinary
+vertices, named in comments. Nor can it express floors and mounts: see `relative_edges`.
 
 Source: g2o's file format, https://github.com/RainerKuemmerle/g2o/wiki/File-Format
 """
