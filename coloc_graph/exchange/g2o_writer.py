@@ -1,7 +1,7 @@
 """Write pose graphs in the g2o format; `g2o` reads them.
 
-VERTEX_SE3:QUAT and EDGE_SE3:QUAT with the information's upper triangle, translation first. Ids are plain integers, 0
-for the reference's first pose; numbers are read back bit for bit. g2o cannot express a stay-put constraint: stances that
+VERTEX_SE3:QUAT and EDGE_SE3:QUAT with the upper triangle of the information, translation first. Ids are plain integers,
+0 for the first pose of the reference; numbers are read back bit for bit. g2o cannot express stay-puts: stances that
 share a pose share a vertex, and a comment says so, which `read_g2o` understands. Landmarks and the map are ordinary
 vertices, named in comments. Nor can it express floors and mounts: see `relative_edges`.
 
