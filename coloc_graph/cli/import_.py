@@ -49,6 +49,14 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         help="stance,start,end,observers,movers,anchors (default: detected from cameras at rest)",
     )
     images.add_argument(
+        "--offset",
+        nargs="+",
+        default=[],
+        metavar="ROBOT=SECONDS",
+        help="by how much a recording began later than its times say (default: 0; of videos with their own times as "
+        "the motion tells that both show)",
+    )
+    images.add_argument(
         "--image-format",
         choices=("jpeg", "png", "raw"),
         default="png",
@@ -127,11 +135,14 @@ def run_images(args: argparse.Namespace) -> int:
             fps=args.fps,
             time_pattern=args.time_pattern,
             stances=args.stances,
+            offsets=_offsets(args.offset),
             image_format=args.image_format,
             progress=report,
         )
     images = ", ".join(f"{count} of {robot}" for robot, count in summary.images.items())
     print(f"{args.out}: images {images}; {counted(len(summary.stances), 'stance')}")
+    for robot, offset in summary.offsets.items():
+        print(f"{robot} was moved by {offset:+.2f} s in time")
     for robot, (stood, known) in summary.stood.items():
         print(f"{robot} stood {stood:.1f} of {known:.1f} s")
     for one in summary.stances:
@@ -141,3 +152,19 @@ def run_images(args: argparse.Namespace) -> int:
             f"{' '.join(one.movers)}{anchors}"
         )
     return 0
+
+
+def _offsets(given: list[str]) -> dict[str, float]:
+    """Seconds by robot, of ROBOT=SECONDS each."""
+    from coloc_graph.errors import InputError
+
+    found = {}
+    for one in given:
+        robot, _, text = one.partition("=")
+        try:
+            found[robot] = float(text)
+        except ValueError:
+            found[robot] = float("nan")
+        if not abs(found[robot]) < 1e9:
+            raise InputError(f"--offset: `{one}` is no ROBOT=SECONDS; give it as B=1.25")
+    return found

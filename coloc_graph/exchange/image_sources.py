@@ -27,12 +27,16 @@ TIMES_HEADER = ("robot", "file", "time")
 
 @dataclass(frozen=True, eq=False)
 class ImageSource:
-    """Images of one robot at ascending `times` (n,) [UTC s]: `files`, or the frames of a `video`."""
+    """Images of one robot at ascending `times` (n,) [UTC s]: `files`, or the frames of a `video`.
+
+    `has_start` is False of a video whose own times are taken: nothing says when it began.
+    """
 
     robot: str
     times: Array
     files: tuple[Path, ...] = ()
     video: Path | None = None
+    has_start: bool = True
 
     def __len__(self) -> int:
         return len(self.times)
@@ -124,7 +128,7 @@ def open_sources(
                     f"{files[twice[0]]} and {files[twice[0] + 1]} of {robot} have the same time {own[twice[0]]:.6f} s; "
                     "correct the times"
                 )
-        found.append(ImageSource(robot, own, files, video))
+        found.append(ImageSource(robot, own, files, video, has_start=video is None or fps is not None))
     return found
 
 

@@ -1,16 +1,18 @@
 """Import a team's own recording: one folder, glob or video of images for each robot."""
 
 import heapq
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.exchange.csv_table import Table, read_table
 from coloc_graph.exchange.image_sources import ImageSource, open_sources
+from coloc_graph.exchange.recording_offsets import OFFSET_SIGMA, recorded_tracks, recording_offset
 from coloc_graph.exchange.stances import MotionThresholds, Movements, derive_stances
 from coloc_graph.exchange.still_cameras import movements_by_images
 from coloc_graph.run import EncodedImage, Image, Motion, Stance, atomic_run
@@ -37,7 +39,7 @@ class ImagesSummary:
     stood
         For each robot the duration at rest and the recorded duration [s]; empty if stances were given.
     offsets
-        Time offsets that were applied to the robots' recordings [s].
+        Time offsets that were applied to the robots' recordings, as stated or found [s].
     """
 
     images: dict[str, int]
@@ -55,6 +57,7 @@ def import_images(
     fps: float | None = None,
     time_pattern: str | None = None,
     stances: str | Path | None = None,
+    offsets: Mapping[str, float] | None = None,
     image_format: ImageFormat = "png",
     progress: Callable[[int, int], None] | None = None,
 ) -> ImagesSummary:
@@ -77,6 +80,9 @@ def import_images(
     stances
         CSV `stance,start,end,observers,movers,anchors`, names separated by spaces. Without it stances are found: a
         robot stands while the background of its images is still, and robots without images move all the time.
+    offsets
+        By how much a robot's recording is later than its times say, by robot [s]. Of videos with their own times, which
+        do not say when they began, others are found by the motion that they show.
     image_format
         Of images that are neither JPEG nor PNG, or that need a change: EXIF orientation, alpha, 16 bits.
 
@@ -89,6 +95,9 @@ def import_images(
     found = open_sources(team, sources, times=Path(times) if times is not None else None, fps=fps, pattern=time_pattern)
     if len(found) < 2:
         raise InputError("a stance needs two observers: give the images of two robots, such as A=images/A B=images/B")
+    found, moved = _together(team, found, dict(offsets or {}))
+    if any(robot not in (offsets or {}) for robot in moved):
+        team = msgspec.structs.replace(team, clock_sigma=max(team.clock_sigma, OFFSET_SIGMA))
     if stances is not None:
         made, moves = _read_stances(Path(stances), team, found), []
     else:
@@ -108,7 +117,26 @@ def import_images(
         for one in reversed(rest):
             writer.write(one)
     stood = {one.robot: (sum(end - begin for begin, end in one.standing()), one.end - one.start) for one in moves}
-    return ImagesSummary({one.robot: len(one) for one in found}, tuple(made), stood, {})
+    return ImagesSummary({one.robot: len(one) for one in found}, tuple(made), stood, moved)
+
+
+def _together(
+    team: Team, sources: Sequence[ImageSource], stated: dict[str, float]
+) -> tuple[list[ImageSource], dict[str, float]]:
+    """Sources moved in time, and by how much each was, by robot [s]: as stated, or as the motion that they show."""
+    unknown = [robot for robot in stated if robot not in [one.robot for one in sources]]
+    if unknown:
+        raise InputError(f"--offset names robot {unknown[0]}, of which no images are given; leave it out")
+    offsets, first = dict(stated), sources[0]
+    open_yet = [one for one in sources[1:] if not (first.has_start and one.has_start) and one.robot not in stated]
+    if open_yet:
+        seen = {}
+        for one in (first.shifted(offsets.get(first.robot, 0.0)), *open_yet):
+            standing = movements_by_images(one.robot, one.times, one.pixels()).standing()
+            seen[one.robot] = recorded_tracks(team, one.robot, one.times, one.pixels(), standing)
+        for one in open_yet:
+            offsets[one.robot] = recording_offset(team, seen[first.robot], seen[one.robot])
+    return [one.shifted(offsets.get(one.robot, 0.0)) for one in sources], offsets
 
 
 def _begin(record: Stance | Motion) -> float:
