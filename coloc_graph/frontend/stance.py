@@ -243,7 +243,7 @@ def measure_pair(
 
 
 def _measure(seen: _Seen, tracks: StanceTracks, alone: bool) -> PairMeasurement:
-    """Measure with some tracks of two observers."""
+    """Measure a pair of observers from one choice of tracks."""
     stance, robot_i, robot_j = seen.stance, seen.robot_i, seen.robot_j
     found: Correspondences | None = None
     try:

@@ -1,7 +1,7 @@
-"""Tracks of a stance that is whole: as they came, and with hindsight where that is better.
+"""Track a complete stance in a batch if causal tracks broke.
 
-One robot with two like markers that moves alone is found as a rigid body in each image, and the order of its lights by
-both cameras. Tracks of several movers are kept as far as both directions of time agree.
+A lone mover with two equal lights is found as a rigid body in each image, its lights are ordered with both cameras.
+Tracks of several movers are kept where tracking forward and backward in time agree.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,16 +12,16 @@ from coloc_graph.frontend.stance_tracks import StanceTracks, stance_plane
 from coloc_graph.frontend.tracks.rigid_path import RigidPath, rigid_path
 from coloc_graph.frontend.tracks.tracking import Track
 
-MIN_SAMPLES = 25  # mean samples of a causal track below which it broke often
+MIN_SAMPLES = 25  # mean length of causal tracks below which they broke often
 MIN_SEEN = 0.5  # share of the images with both lights below which the mover was out of view
-FAST = 0.35  # share of the distance between two lights that is a large step from one image to the next
+FAST = 0.35  # step of a light from image to image, as a share of the distance between both, that is large
 
 #: Tracks of two observers.
 Both = tuple[list[Track], list[Track]]
 
 
 def track_choices(tracks: StanceTracks, robot_i: str, robot_j: str, end: float, window: float) -> Iterator[Both]:
-    """Yield the tracks of two observers up to an instant, as they may have to be taken, the likeliest first.
+    """Yield alternative tracks of two observers up to a time, the most probable first.
 
     Parameters
     ----------
