@@ -146,7 +146,9 @@ def findings(team: "Team") -> tuple[list[str], list[str]]:
     watching = [robot for robot in team.robots if robot.camera_if_any is not None]
     marked = [robot for robot in team.robots if robot.markers is not None]
     problems, implausible = [], []
-    if len(watching) < 2 and not any(robot.ranging for robot in team.robots):
+    if len(team.robots) == 1:
+        implausible.append("one robot is enough to calibrate: add those that observe and move to solve a run")
+    elif len(watching) < 2 and not any(robot.ranging for robot in team.robots):
         problems.append("fewer than two robots have a camera, but a stance needs two observers")
     if watching and not marked:
         problems.append("no robot carries markers to observe: give one [robots.markers]")

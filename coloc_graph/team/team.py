@@ -94,7 +94,7 @@ class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     reference : str
         Robot whose body at stance 0 is the world frame.
     robots : tuple of Robot
-        The robots, at least two.
+        The robots: one is enough to calibrate, two and more to solve.
     floor : Floor or None
         Floor that they stand on; None: no common one.
     clock_sigma : float
@@ -135,8 +135,8 @@ class Team(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
                         f"landmarks {other} and {landmark.name} have the same tag {landmark.tag.id}; "
                         "give each a number of its own"
                     )
-        if len(names) < 2:
-            raise ValueError("a team has at least two robots; add another under [[robots]]")
+        if not names:
+            raise ValueError("a team has at least one robot; add one under [[robots]]")
         if self.reference not in names:
             raise ValueError(f"`reference` is `{self.reference}`, which is not one of the robots {', '.join(names)}")
 

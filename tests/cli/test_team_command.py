@@ -35,3 +35,20 @@ def test_a_team_that_cannot_be_solved_is_not_written(tmp_path, capsys, arguments
     assert main(["team", "new", *arguments, "--out", str(path)]) == 2
     assert words in capsys.readouterr().err
     assert not path.exists()
+
+
+def test_one_robot_is_enough_to_calibrate(tmp_path, capsys):
+    team, info = tmp_path / "team.toml", tmp_path / "info.yaml"
+    assert main(["team", "new", "A", "--out", str(team)]) == 0
+    assert main(["team", "check", str(team)]) == 0
+    assert "one robot is enough to calibrate: add those that observe and move" in capsys.readouterr().out
+    K, P = "[600, 0, 320, 0, 600, 240, 0, 0, 1]", "[600, 0, 320, 0, 0, 600, 240, 0, 0, 0, 1, 0]"
+    info.write_text(
+        f"image_width: 640\nimage_height: 480\ncamera_name: a\ncamera_matrix: {{rows: 3, cols: 3, data: {K}}}\n"
+        "distortion_model: plumb_bob\ndistortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n"
+        "rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\n"
+        f"projection_matrix: {{rows: 3, cols: 4, data: {P}}}\n"
+    )
+    words = ["calibrate", "camera", "--from-camera-info", str(info), "--team", str(team), "--robot", "A"]
+    assert main(words) == 0, capsys.readouterr().err
+    assert "fx = 600.0" in team.read_text()

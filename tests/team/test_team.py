@@ -128,7 +128,7 @@ WRONG = {
     "a robot twice": ('name = "C"', 'name = "A"', ["two robots are called `A`"]),
     "a name with a slash": ('name = "C"', 'name = "a/b"', ["`a/b`", "$.robots[1]"]),
     "an unknown reference": ('reference = "A"', 'reference = "D"', ["`reference` is `D`", "A, C"]),
-    "no robots": (TOML, 'reference = "A"\nrobots = []', ["at least two"]),
+    "no robots": (TOML, 'reference = "A"\nrobots = []', ["at least one robot"]),
     "not TOML": ("[[robots]]", "[[robots]", ["line"]),
     "nothing": (TOML, "", ["`reference`"]),
 }
