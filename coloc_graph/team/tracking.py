@@ -1,4 +1,4 @@
-"""How the movers' markers may move and are seen, where that is not as usual: `Tracking`."""
+"""Options of the tracking of markers, for unusual motion or detection: `Tracking`."""
 
 import msgspec
 
@@ -6,14 +6,14 @@ from coloc_graph.team.checks import require_finite
 
 
 class Tracking(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the tracking of markers; None: as usual. Pixels are those of images 320 px wide.
+    """Options of the tracking of markers; None: the default. Pixels are those of images 320 px wide.
 
     Parameters
     ----------
     speed : float or None
         Standard deviation of a new track's velocity [px/s].
     acceleration : float or None
-        Spectral density of the acceleration to begin with [px^2/s^3]; the tracker adapts it.
+        Spectral density of the acceleration at the beginning [px^2/s^3]; the tracker adapts it.
     jerk : float or None
         Standard deviation of sudden changes of velocity [px/s].
     detected : float or None
