@@ -91,7 +91,7 @@ class Marginals:
         return first + np.arange(len(first))
 
     def _ends(self, groups: Sequence[Sequence[int]]) -> Index:
-        """Where the columns of each group of variables end among those of all."""
+        """Return the index of the column after the last of each group of variables."""
         ends: Index = np.cumsum([sum(self._sizes[n] for n in group) for group in groups])
         return ends
 

@@ -11,7 +11,7 @@ from coloc_graph.backend import Estimate, Estimator, StanceEstimate
 from coloc_graph.backend.graph import PoseKeys, slips_of
 from coloc_graph.backend.landmarks import landmarks_of
 from coloc_graph.backend.planar import IncrementalKeyframes, Latest
-from coloc_graph.backend.planar.incremental import EVERY
+from coloc_graph.backend.planar.incremental import UPDATE_PERIOD
 from coloc_graph.errors import ColocError
 from coloc_graph.frontend import (
     PairMeasurement,
@@ -295,7 +295,7 @@ class RangingSolver:
         begin = min(float(times[0]) for times in keyframes.times if len(times))
         end = max(float(times[-1]) for times in keyframes.times if len(times))
         #: Times of the updates that take in all measurements [UTC s].
-        self.times = tuple(begin + n * EVERY for n in range(1, math.ceil((end - begin) / EVERY) + 2))
+        self.times = tuple(begin + n * UPDATE_PERIOD for n in range(1, math.ceil((end - begin) / UPDATE_PERIOD) + 2))
         #: Poses as they were estimated at their times, by robot; filled by `estimate`.
         self.online: Mapping[str, Trajectory] = {}
         #: Duration of each step [s].

@@ -22,24 +22,33 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 COST_TOLERANCE_PER_POSE = 1e-4  # half chi2; its expected value is about 3
-#: Where the fit has left less than this of residuals, they say nothing of noise.
-LEAST_LEFT = 0.3
-#: Noise is not taken for less, or more, than so many times what is stated.
-NOISE_RANGE = (0.2, 5.0)
+MIN_REDUNDANCY = 0.3  # share of squared residuals that the fit leaves, for an estimate of noise
+NOISE_RANGE = (0.2, 5.0)  # estimated noise relative to that stated
 
 
 def optimise_keyframes(team: Team, drive: Drive, *, calibrate_noise: bool = True) -> Estimate:
-    """Estimate everything together, given all steps and measurements; a filter gives the initial values.
+    """Estimate everything together, given all odometry and measurements; a filter gives the initial values.
 
-    Noise of measurements is what the team states, times what makes it that of the residuals (`calibrate_noise`), by
-    robot and kind. That of steps is as stated: errors of wheels last, and one step says nothing of them.
-    Raises `EstimationError` where no robot can be placed, or the search leads nowhere.
+    Parameters
+    ----------
+    team : Team
+        The team.
+    drive : Drive
+        Keyframes, odometry and measurements.
+    calibrate_noise : bool
+        Scale the stated noise of ranges and bearings to the residuals, by robot and kind. That of odometry is as
+        stated.
+
+    Raises
+    ------
+    EstimationError
+        No robot can be localised, or the optimisation does not converge.
     """
     filtered = filter_forward(team, drive)
     models = Models(team, drive)
     if not filtered.placed_at:
         raise EstimationError(
-            "no robot can be placed: a robot must observe at least two landmarks with known positions, several times"
+            "no robot can be localised: a robot must observe at least two landmarks with known positions, several times"
         )
     factors = DriveFactors(drive, models)
     fit = _fitted(factors, _start(filtered, factors))
@@ -56,8 +65,10 @@ def optimise_keyframes(team: Team, drive: Drive, *, calibrate_noise: bool = True
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Everything of the robots that have a pose: `steps` from which poses, and which are `measured`; `gauge` is the
-    pose that the world hangs on, with where it is, if no landmark fixes it."""
+    """Factors of the robots that have a pose: `steps` from some poses, and `measured` ones by index.
+
+    `gauge` is the pose that defines the world, with its value, if no landmark does.
+    """
 
     factors: DriveFactors
     poses: Index
@@ -66,7 +77,7 @@ class _Problem:
     gauge: tuple[int, Array] | None
 
     def rows(self, state: State) -> tuple[list[Rows], float]:
-        """All factors linearised, but for what is known before, and the cost of everything (half chi2)."""
+        """Linearise all factors without the priors, and return them with the whole cost (half chi2)."""
         steps = self.factors.steps(state, self.steps)
         measured, cost = robust(self.factors.measured(state, self.measured))
         cost += 0.5 * float((steps.residuals**2).sum()) + self.factors.cost_before(state)
@@ -93,7 +104,7 @@ class _Fit:
 
 
 def _start(filtered: Filtered, factors: DriveFactors) -> State:
-    """Where the search starts: as the filter has it."""
+    """Return the initial values, by the filter."""
     poses = np.concatenate(filtered.whole(factors.drive, factors.models))
     shared = factors.start()
     factors.wheels(shared)[:] = filtered.wheels
@@ -115,7 +126,7 @@ def _posed(factors: DriveFactors, state: State) -> _Problem:
 
 
 def _fitted(factors: DriveFactors, state: State) -> _Fit:
-    """The optimum near a state; Levenberg-Marquardt gains nothing here."""
+    """Find the optimum near a state; Levenberg-Marquardt is no better here."""
     problem = _posed(factors, state)
     tolerance = COST_TOLERANCE_PER_POSE * len(factors)
     return _Fit(problem, gauss_newton(state, problem.rows, factors.system, factors.moved, tolerance))
@@ -132,7 +143,7 @@ def in_body(poses: Array, covariances: Array) -> Array:
 def found_landmarks(
     factors: DriveFactors, shared: Array, C: Array, there: Sequence[int]
 ) -> dict[int, tuple[Array, Array]]:
-    """Positions and covariances of the landmarks that are there, and of those that are exact."""
+    """Return positions and covariances of the landmarks `there`, and of exact ones."""
     return {
         n: (factors.landmarks(shared)[n], factors.landmark_covariance(n, C))
         for n in range(len(factors.drive.landmarks))
@@ -154,11 +165,10 @@ def _found(factors: DriveFactors, filtered: Filtered, fit: _Fit) -> Found:
 
 
 def _noise(factors: DriveFactors, fit: _Fit) -> tuple[Array, float]:
-    """What standard deviations of ranges and bearings are to be multiplied with, (robots, 2).
+    """Return factors (robots, 2) on the sigmas of ranges and bearings, and the absorbed degrees of freedom.
 
-    Of a squared residual the fit has taken away a part. And how many degrees of freedom the fit has left more than
-    shares say: of a measurement with a share s, of which it has taken h, it has left s (1 - h), and not s - h, since
-    errors that last are not fitted as new ones would be.
+    The fit absorbs a part of each squared residual. Of a measurement with a share s, of which it absorbs h, it leaves
+    s (1 - h) degrees of freedom, and not s - h, since correlated errors are not fitted as independent ones would be.
     """
     m, index = factors.drive.measured, fit.problem.measured
     taken = _taken(fit)
@@ -169,12 +179,12 @@ def _noise(factors: DriveFactors, fit: _Fit) -> tuple[Array, float]:
     for robot in np.unique(robots[good]).tolist():
         own = good & (robots == robot)
         mean = (share[own] * off[own] ** 2).sum(axis=0) / share[own].sum(axis=0)
-        noise[robot] *= np.sqrt(mean / np.maximum(1 - taken[own].mean(axis=0), LEAST_LEFT))
+        noise[robot] *= np.sqrt(mean / np.maximum(1 - taken[own].mean(axis=0), MIN_REDUNDANCY))
     return np.clip(noise, *NOISE_RANGE), float(((1 - share) * taken)[good].sum())
 
 
 def _taken(fit: _Fit) -> Array:
-    """How much of each measurement's squared residuals (n, 2) the fit has taken away, in units of their noise."""
+    """Return the part of each measurement's squared residuals (n, 2) that the fit absorbs, in units of their noise."""
     factors = fit.problem.factors
     rows, _ = robust(factors.measured(fit.state, fit.problem.measured))
     taken = np.zeros((len(fit.problem.measured), 2))

@@ -1,7 +1,7 @@
-"""The factors of a drive, linearised many at once: steps by the wheels, ranges and bearings, what is known before.
+"""Factors of a ranging run, linearised in batches: odometry, ranges and bearings, priors.
 
-Variables are numbered: x, y and heading of all poses, robot after robot, then what all share: errors of wheels, errors
-of sensors, positions of landmarks. Poses change in the world's axes.
+Variables are numbered: x, y and heading of all poses, robot after robot, then the shared ones: errors of wheels, errors
+of sensors, positions of landmarks. Poses change along the world's axes.
 """
 
 from collections.abc import Iterable
@@ -22,30 +22,26 @@ from coloc_graph.measurements import Drive
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-#: A landmark that is known better than this is where it is said to be [m].
-EXACT = 1e-3
-#: And one of which nothing is said is this near the origin [m].
-ANYWHERE = 1e4
-#: The world's frame is fixed this firmly where no landmark fixes it [m, rad].
-GAUGE_SIGMA = 1e-4
-#: Beyond so many sigmas a measurement weighs less and less: a barcode that was read wrong is tens of sigmas off.
-CAUCHY = 3.0
+EXACT_SIGMA = 1e-3  # m: tolerance of a landmark's position below which it is not estimated
+UNKNOWN_SIGMA = 1e4  # m: prior of a landmark without a stated position, about the origin
+GAUGE_SIGMA = 1e-4  # m, rad: prior that fixes the world frame where no landmark does
+CAUCHY = 3.0  # sigmas: scale of the robust loss; a misread barcode is tens of sigmas off
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is estimated: `poses` (n, 3) of all keyframes, NaN where there is none yet, and what is `shared` (m,)."""
+    """Estimated variables: `poses` (n, 3) of all keyframes, NaN where there is none yet, and the `shared` ones (m,)."""
 
     poses: Array
     shared: Array
 
 
 class DriveFactors:
-    """The factors of a drive. `noise` (robots, 2) multiplies the standard deviations of ranges and bearings.
+    """Factors of a ranging run. `noise` (robots, 2) multiplies the standard deviations of ranges and bearings.
 
-    `first` (robots + 1,) says which pose is each robot's first, `times` (n,) when all were. `observer` (m,), `seen`
-    (m,) are the poses of who measured and of who was measured, -1 for landmarks. `free` says what of the shared is
-    estimated, and not exact.
+    `first` (robots + 1,) is each robot's first pose, `times` (n,) are the times of all. `observer` (m,) and `seen` (m,)
+    are the poses of the observer and of the measured robot, -1 for landmarks. `free` is True of the shared variables
+    that are estimated.
     """
 
     def __init__(self, drive: Drive, models: Models, noise: Array | None = None) -> None:
@@ -60,10 +56,10 @@ class DriveFactors:
         self.observer: Index = self.first[m.robot] + m.keyframe
         self.seen: Index = np.where(self.of_robot, self.first[np.minimum(m.target, robots)] + m.target_keyframe, -1)
         known = np.isfinite(models.map[:, 0])
-        self._exact: NDArray[np.bool_] = known & (models.map_sigmas < EXACT)
+        self._exact: NDArray[np.bool_] = known & (models.map_sigmas < EXACT_SIGMA)
         self._ranging, self._marks = WHEELS * robots, (WHEELS + RANGING) * robots
         sigmas = [models.wheels_sigmas.ravel(), models.ranging_sigmas.ravel()]
-        sigmas.append(np.repeat(np.where(known, models.map_sigmas, ANYWHERE), 2))
+        sigmas.append(np.repeat(np.where(known, models.map_sigmas, UNKNOWN_SIGMA), 2))
         self.sigmas = np.concatenate(sigmas)
         self.free: NDArray[np.bool_] = self.sigmas > 0
         self.free[self._marks :] = ~np.repeat(self._exact, 2)
@@ -81,27 +77,27 @@ class DriveFactors:
         return len(self.times)
 
     def start(self) -> Array:
-        """What is shared, as it is known before; landmarks of unknown positions at the origin."""
+        """Return the prior means of the shared variables; landmarks of unknown positions at the origin."""
         return self._known_before.copy()
 
     def wheels(self, shared: Array) -> Array:
-        """Errors of all wheels (robots, 3) among what is shared."""
+        """Return the errors of all wheels (robots, 3), a view of the shared variables."""
         return shared[: self._ranging].reshape(-1, WHEELS)
 
     def ranging(self, shared: Array) -> Array:
-        """Errors of all sensors (robots, 7) among what is shared."""
+        """Return the errors of all sensors (robots, 7), a view of the shared variables."""
         return shared[self._ranging : self._marks].reshape(-1, RANGING)
 
     def landmarks(self, shared: Array) -> Array:
-        """Positions of all landmarks (m, 2) [m] among what is shared."""
+        """Return the positions of all landmarks (m, 2) [m], a view of the shared variables."""
         return shared[self._marks :].reshape(-1, 2)
 
     def is_exact(self, landmark: int) -> bool:
-        """Whether a landmark is where it is said to be, and so not estimated."""
+        """Return whether a landmark's position is exact, and not estimated."""
         return bool(self._exact[landmark])
 
     def steps(self, state: State, poses: Index) -> Rows:
-        """The wheels' word on the ways from some poses (n,), ascending, each to its robot's next."""
+        """Linearise the odometry from some poses (n,), ascending, each to its robot's next."""
         a, b = state.poses[poses], state.poses[poses + 1]
         c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
         dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
@@ -113,7 +109,7 @@ class DriveFactors:
             own = robots == robot
             model = self.models.wheels[robot]
             said[own], by_errors[own] = model.steps(poses[own] - self.first[robot], errors[robot])
-            # in units of what the wheels say: with the noise fixed in metres, a smaller world would have less of it
+            # in units of the odometry: with noise fixed in metres, a smaller world would fit better
             p, q = 1 / (model.wheels.scale + errors[robot, 0]), 1 / (model.wheels.turn_scale + errors[robot, 1])
             units[own] = p, p, q
         off = units * np.stack([x - said[:, 0], y - said[:, 1], wrap(b[:, 2] - a[:, 2] - said[:, 2])], axis=-1)
@@ -136,7 +132,7 @@ class DriveFactors:
         return Rows(whiten @ J, columns, (0, 3, 6))
 
     def measured(self, state: State, index: Index) -> Rows:
-        """Some ranges and bearings (n,), with what of them is new."""
+        """Linearise some ranges and bearings (n,), weighted by their shares of new information."""
         m = self.drive.measured
         robots, observer, of_robot = m.robot[index], self.observer[index], self.of_robot[index]
         seen, landmark = np.maximum(self.seen[index], 0), self._landmark[index]
@@ -169,7 +165,7 @@ class DriveFactors:
         return Keys(sizes, np.concatenate([np.ones(3 * len(self), bool), self.free]))
 
     def system(self, state: State, rows: Iterable[Rows], *, priors: bool = True) -> LinearSystem:
-        """Return the linear system of some factors, with what is known before of what is shared."""
+        """Return the linear system of some factors, with the priors of the shared variables."""
         system = LinearSystem(self.keys)
         for one in rows:
             system.add(one)
@@ -186,7 +182,7 @@ class DriveFactors:
         return State(state.poses + step[:poses].reshape(-1, 3), state.shared + step[poses:])
 
     def shared_covariance(self, marginals: Marginals) -> Array:
-        """Return the covariance (m, m) of what is shared; 0 of what is exact."""
+        """Return the covariance (m, m) of the shared variables; 0 of exact ones."""
         there = [key for key in range(len(self), len(self.keys.sizes)) if marginals.has(key)]
         C = np.zeros((len(self.free),) * 2)
         if there:
@@ -196,18 +192,18 @@ class DriveFactors:
         return C * self.free * self.free[:, None]
 
     def cost_before(self, state: State) -> float:
-        """Return half chi2 of what is known before of what is shared."""
+        """Return half chi2 of the priors of the shared variables."""
         off = (state.shared - self._known_before)[self.free] / self.sigmas[self.free]
         return 0.5 * float(off @ off)
 
     def gauge(self, state: State, pose: int, at: Array) -> Rows:
-        """What fixes the world's frame where no landmark does: a pose (3,) that stays where it is."""
+        """Return the prior of a pose (3,) that fixes the world frame where no landmark does."""
         J = np.zeros((1, 3, 4))
         J[0, :, :3], J[0, :, 3] = np.eye(3), state.poses[pose] - at
         return Rows(J / GAUGE_SIGMA, 3 * np.array([[pose]]) + np.arange(3), (0,))
 
     def errors_in(self, robot: int, shared: Array, covariance: Array) -> SensorErrors:
-        """What is off of a robot's wheels and sensor, of the covariance (m, m) of all that is shared."""
+        """Return the errors of a robot's wheels and sensor, with the covariance (m, m) of the shared variables."""
         found = []
         for start, size, sigmas in (
             (WHEELS * robot, WHEELS, self.models.wheels_sigmas[robot]),
@@ -218,7 +214,7 @@ class DriveFactors:
         return SensorErrors(*found)
 
     def landmark_covariance(self, landmark: int, covariance: Array) -> Array:
-        """That of a landmark (2, 2), of the covariance (m, m) of all that is shared."""
+        """Return the covariance (2, 2) of a landmark, from that of the shared variables (m, m)."""
         at = slice(self._marks + 2 * landmark, self._marks + 2 * landmark + 2)
         exact = np.eye(2) * self.models.map_sigmas[landmark] ** 2
         return exact if self._exact[landmark] else covariance[at, at]
@@ -228,7 +224,7 @@ class DriveFactors:
 
 
 def robust(rows: Rows) -> tuple[Rows, float]:
-    """Measurements as they weigh at their residuals, and what they cost together (half chi2)."""
+    """Return measurements with robust weights at their residuals (Cauchy), and their cost (half chi2)."""
     squared = (rows.residuals**2).sum(axis=1) / CAUCHY**2
     weighed = rows.jacobians / np.sqrt(1 + squared)[:, None, None]
     return rows._replace(jacobians=weighed), float(CAUCHY**2 / 2 * np.log1p(squared).sum())

@@ -1,7 +1,7 @@
-"""A drive as it happens: the most likely of the last while, and what came before summed up: `IncrementalKeyframes`.
+"""Fixed-lag smoother of a ranging run, with earlier poses marginalised: `IncrementalKeyframes`.
 
-A filter goes along for where robots and landmarks first appear. What is estimated of a keyframe is kept twice: at its
-time, and as it leaves the window, by when what came after it has had its say.
+A filter gives initial values of robots and landmarks. The estimate of a keyframe is kept twice: at its time, and when
+it leaves the window, corrected by later measurements.
 """
 
 from dataclasses import dataclass
@@ -27,18 +27,15 @@ from coloc_graph.team import Team
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-#: Poses this far back are still corrected [s], and what came in meanwhile is taken in so often [s].
-LAG = 40.0
-EVERY = 1.0
-LEAVING = 4.0  # poses leave together, this often [s]
-#: Until so long after the first keyframe none leaves [s]: wheels and sensors are being calibrated, and what has left
-#: would stay as it was thought before.
-CALIBRATING = 300.0
+LAG = 40.0  # s for which poses are corrected
+UPDATE_PERIOD = 1.0  # s between updates
+LEAVING_PERIOD = 4.0  # s between marginalisations
+CALIBRATION_TIME = 300.0  # s at the beginning in which no pose leaves: wheels and sensors are not calibrated yet
 
 
 @dataclass(frozen=True, eq=False)
 class Latest:
-    """Where the robots are at a time [UTC s]: by name, (x, y, heading), and its covariance (3, 3) in the body frame."""
+    """Poses of robots at a time [UTC s]: by name, (x, y, heading) and its covariance (3, 3) in the body frame."""
 
     time: float
     poses: dict[str, tuple[Array, Array]]
@@ -46,7 +43,7 @@ class Latest:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """A window at its newest step: the poses in it, their linear system, and its Bayes tree."""
+    """Window after its last step: its poses, their linear system, and its Bayes tree."""
 
     poses: Index
     system: LinearSystem
@@ -54,25 +51,34 @@ class _Solved:
     tree: gtsam.GaussianBayesTree
 
     def covariances(self, poses: Index) -> Array:
-        """Covariances (n, 3, 3) of some poses, in the world's axes."""
+        """Return covariances (n, 3, 3) of some poses, along the world's axes."""
         return np.array([self.tree.marginalCovariance(pose) for pose in poses.tolist()]).reshape(-1, 3, 3)
 
 
 class IncrementalKeyframes:
-    """Estimates a drive in the order of time: `advance` takes in what was measured until a time.
+    """Fixed-lag smoother of a ranging run, in the order of time.
 
-    Poses are corrected for `lag` [s] after their time, and all of them until `calibrating` [s] after the first.
+    Parameters
+    ----------
+    team : Team
+        The team.
+    drive : Drive
+        Keyframes, odometry and measurements.
+    lag : float
+        Time for which poses are corrected [s].
+    calibrating : float
+        Time at the beginning in which all poses are [s].
     """
 
-    def __init__(self, team: Team, drive: Drive, *, lag: float = LAG, calibrating: float = CALIBRATING) -> None:
+    def __init__(self, team: Team, drive: Drive, *, lag: float = LAG, calibrating: float = CALIBRATION_TIME) -> None:
         self.drive, self._lag, self._calibrating = drive, lag, calibrating
         self._filter = Filter(team, drive)
         self._factors = factors = DriveFactors(drive, self._filter.models)
         self._state = State(np.full((len(factors), 3), np.nan), factors.start())
-        self._entered = [0] * len(drive.robots)  # how many keyframes of each are in, or have been
+        self._entered = [0] * len(drive.robots)  # number of keyframes of each that were added
         self._inside = np.zeros(len(factors), bool)
-        self._left = -np.inf  # the time before which all poses have left [UTC s]
-        self._before: tuple[Summary, Array] | None = None  # what those that have left say, and where it was linearised
+        self._left = -np.inf  # time before which all poses were marginalised [UTC s]
+        self._before: tuple[Summary, Array] | None = None  # their marginal, and its linearisation point
         self._gauge: tuple[int, Array] | None = None
         self._landmarks: set[int] = set()
         self._next = 0
@@ -82,7 +88,7 @@ class IncrementalKeyframes:
         self._smoothed_C, self._online_C = (np.full((len(factors), 3, 3), np.nan) for _ in range(2))
 
     def advance(self, time: float) -> Latest:
-        """Take in all that was measured before a time [UTC s]; where the robots are then."""
+        """Process all measurements before a time [UTC s], and return the newest poses."""
         m = self.drive.measured
         while self._next < len(m) and m.time[self._next] < time:
             self._filter.take(self._next)
@@ -102,7 +108,7 @@ class IncrementalKeyframes:
         return Latest(time, latest)
 
     def _enter_robots(self, time: float) -> None:
-        """New keyframes of the robots that have a place: as the filter has the first ones, then by their wheels."""
+        """Add new keyframes of the robots that have poses: the first ones by the filter, then by odometry."""
         factors, poses = self._factors, self._state.poses
         for robot, times in enumerate(self.drive.times):
             if robot not in self._filter.out.placed_at:
@@ -127,22 +133,22 @@ class IncrementalKeyframes:
             self._entered[robot] = max(until, entered)
 
     def _enter_landmarks(self) -> None:
-        """Landmarks that the filter has a place for since the last time."""
+        """Add landmarks that the filter knows since the last time."""
         for number in range(len(self.drive.landmarks)):
-            place = self._filter.landmark(number)
-            if place is not None and number not in self._landmarks and not self._factors.is_exact(number):
-                self._factors.landmarks(self._state.shared)[number] = place
+            position = self._filter.landmark(number)
+            if position is not None and number not in self._landmarks and not self._factors.is_exact(number):
+                self._factors.landmarks(self._state.shared)[number] = position
                 self._landmarks.add(number)
 
     def _steps(self, inside: NDArray[np.bool_]) -> Index:
-        """The steps between poses, from which they are."""
+        """Return the poses from which there are steps to others inside."""
         factors = self._factors
         ends: Index = np.flatnonzero(inside[:-1] & inside[1:])
         steps: Index = ends[factors.robot[ends] == factors.robot[ends + 1]]
         return steps
 
     def _measured(self, inside: NDArray[np.bool_]) -> Index:
-        """The measurements so far between poses, or of landmarks that have a place."""
+        """Return the processed measurements between poses inside, or of known landmarks."""
         factors, m = self._factors, self.drive.measured
         earliest = factors.times[inside].min() - 1.0
         index = np.arange(np.searchsorted(m.time, earliest), self._next)
@@ -155,7 +161,7 @@ class IncrementalKeyframes:
         return found
 
     def _system(self, steps: Index, measured: Index) -> LinearSystem:
-        """Some factors in the window, and what those before it say, at what is estimated."""
+        """Linearise some factors in the window, with the marginal of those before it."""
         factors, state = self._factors, self._state
         rows = [factors.steps(state, steps), robust(factors.measured(state, measured))[0]]
         if self._before is None and self._gauge is not None:
@@ -167,11 +173,11 @@ class IncrementalKeyframes:
         return system
 
     def _vector(self) -> Array:
-        """Everything that is estimated, by the numbers of the variables."""
+        """Return all variables by their numbers."""
         return np.concatenate([self._state.poses.ravel(), self._state.shared])
 
     def _step(self) -> _Solved:
-        """One step of Gauss-Newton in the window: it was at its optimum a moment ago."""
+        """Take one Gauss-Newton step in the window, which was at its optimum before."""
         measured = self._measured(self._inside)
         self._taken[measured] = True
         system = self._system(self._steps(self._inside), measured)
@@ -182,9 +188,9 @@ class IncrementalKeyframes:
         return _Solved(np.flatnonzero(self._inside), system, ordering, tree)
 
     def _leave(self, time: float) -> None:
-        """Keep what is estimated of poses that are over for longer than the lag, and sum up what they say."""
+        """Keep the estimates of poses older than the lag, and marginalise them."""
         solved, factors, times = self._solved, self._factors, self._factors.times
-        if solved is None or time < times.min() + self._calibrating or time - self._lag < self._left + LEAVING:
+        if solved is None or time < times.min() + self._calibrating or time - self._lag < self._left + LEAVING_PERIOD:
             return
         self._left = time - self._lag
         gone = self._inside & (times < self._left)
@@ -199,13 +205,13 @@ class IncrementalKeyframes:
         self._inside &= ~gone
 
     def _keep(self, poses: Index) -> None:
-        """Keep poses as they are."""
+        """Keep the smoothed estimates of poses."""
         assert self._solved is not None
         self._smoothed[poses] = self._state.poses[poses]
         self._smoothed_C[poses] = in_body(self._state.poses[poses], self._solved.covariances(poses))
 
     def _note_latest(self, before: list[int]) -> None:
-        """Keep what is thought of each robot's newest keyframe at its time."""
+        """Keep the estimate of each robot's newest keyframe at its time."""
         solved = self._solved
         assert solved is not None
         newest = [
@@ -218,7 +224,7 @@ class IncrementalKeyframes:
         self._online_C[poses] = in_body(self._state.poses[poses], solved.covariances(poses))
 
     def finish(self) -> tuple[Estimate, dict[str, Trajectory]]:
-        """The estimate of all keyframes as they left, and, by robot, what was thought of each at its time."""
+        """Return the smoothed estimate of all keyframes, and, by robot, the estimates at their times."""
         factors, state = self._factors, self._state
         C = np.zeros((len(factors.free),) * 2)
         if self._solved is not None:
