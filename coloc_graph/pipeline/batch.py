@@ -17,6 +17,7 @@ from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.clocks import RunClocks, clocks_of_run, contradicts
 from coloc_graph.pipeline.contents import require_applicable, unused_in
+from coloc_graph.pipeline.disagreement import moves_unstated
 from coloc_graph.pipeline.explanations import (
     implausible_planes,
     reasons,
@@ -277,7 +278,7 @@ def _warnings(
         *of_clocks,
         *describe_unused(unused),
         *implausible_planes(run, options, measured),
-        *warnings_of_graph(estimate, diagnose(estimate.graph), measured),
+        *warnings_of_graph(estimate, diagnose(estimate.graph), measured, moves_stated=not moves_unstated(run)),
     ]
 
 

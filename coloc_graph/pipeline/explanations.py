@@ -10,6 +10,7 @@ from coloc_graph.backend import DisconnectedComponent, Estimate
 from coloc_graph.backend.ranging import RangingProblem
 from coloc_graph.frontend import PairMeasurement, UnusedSighting, little_in_common
 from coloc_graph.frontend.pairing.plane_check import implausible
+from coloc_graph.pipeline.disagreement import unstated_moves, worst_kinds
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
 
@@ -106,9 +107,16 @@ def why_disconnected(disconnected: tuple[DisconnectedComponent, ...], measuremen
 
 
 def warnings_of_graph(
-    estimate: Estimate, disconnected: Sequence[DisconnectedComponent], measurements: Sequence[PairMeasurement]
+    estimate: Estimate,
+    disconnected: Sequence[DisconnectedComponent],
+    measurements: Sequence[PairMeasurement],
+    *,
+    moves_stated: bool = True,
 ) -> list[str]:
-    """Warnings of an estimate of stances: unusable and rejected measurements, bumps, unlikely calibrations, chi2."""
+    """Warnings of an estimate of stances: unusable and rejected measurements, bumps, unlikely calibrations, chi2.
+
+    Where nobody stated who moved (not `moves_stated`) and somebody did, neither robots nor measurements are blamed.
+    """
     stances = estimate.graph.by_index
     warnings = [
         f"stance {m.homography.stance}: {m.homography.robot_i} and {m.homography.robot_j} not used: "
@@ -125,15 +133,18 @@ def warnings_of_graph(
     warnings += [f"{part} (left out of the result)" for part in disconnected[:MAX_REASONS]]
     if len(disconnected) > MAX_REASONS:
         warnings.append(f"{len(disconnected) - MAX_REASONS} more groups of poses are not tied to the reference")
-    warnings += [f"the {one.measurement} was rejected: it is {one.reason}" for one in estimate.rejected]
-    warnings += [str(bump) for bump in estimate.bumped]
+    unstated = None if moves_stated else unstated_moves(estimate.graph)
+    if unstated is None:
+        warnings += [f"the {one.measurement} was rejected: it is {one.reason}" for one in estimate.rejected]
+        warnings += [str(bump) for bump in estimate.bumped]
+    else:
+        warnings.append(unstated)
     warnings += _far(estimate)
     p_value = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
     if p_value < WARNING_P_VALUE:
         warnings.append(
             f"the measurements disagree (chi2/dof {estimate.chi2 / estimate.dof:.1f} with {estimate.dof} degrees of "
-            f"freedom, expected 1; probability by noise alone {_p_value(p_value)}): an anchor moved, or mounts, "
-            "heights, the floor or the noise are not as stated"
+            f"freedom, expected 1; probability by noise alone {_p_value(p_value)}); {worst_kinds(estimate)}"
         )
     return warnings
 
