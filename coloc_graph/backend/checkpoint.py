@@ -56,7 +56,7 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """State of an estimator: its `base`, the `journal` of inputs since in their order, and `waiting` stances."""
+    """State of an estimator: its `base`, the `journal` of later inputs in order, and `waiting` stances."""
 
     reference: str
     robots: tuple[str, ...]

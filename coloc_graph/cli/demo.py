@@ -26,7 +26,9 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         help="run the online system instead: three robot programs with simulated wheels and cameras drive the hallway",
     )
     command.add_argument(
-        "--plan", action="store_true", help="with --online: plan the stances anew after each one, over the same way"
+        "--plan",
+        action="store_true",
+        help="with --online: replan the remaining stances after each one, over the same distance",
     )
     command.add_argument(
         "--formation", choices=("paper", "plan"), default="paper", help="with --online: `plan` is --plan"

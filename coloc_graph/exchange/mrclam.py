@@ -180,7 +180,7 @@ def _landmarks(folder: Path, codes: dict[int, int], robots: list[int]) -> dict[i
     for row, line in zip(table.values, table.lines.tolist(), strict=True):
         subject = int(row[0])
         if subject in positions or subject in robots:
-            raise InputError(f"{table.path}, line {line}: subject {subject} is there already; give each subject once")
+            raise InputError(f"{table.path}, line {line}: subject {subject} appears twice; give each subject once")
         positions[subject] = np.array([row[1], row[2], max(float(np.hypot(row[3], row[4])), 1e-4)])
     return positions
 

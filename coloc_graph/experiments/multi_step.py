@@ -67,7 +67,7 @@ class Outing:
 def measure_outing(seed: int, scenario: str, depth: Depth, stances: int | None) -> Outing:
     """Simulate a scenario and solve it by both methods.
 
-    Raises `EstimationError` where a method leaves out a pose: the two could then not be compared.
+    Raises `EstimationError` if a method does not estimate all poses, since the two could then not be compared.
     """
     with TemporaryDirectory(prefix="coloc-") as folder:
         path = Path(folder) / "run.mcap"

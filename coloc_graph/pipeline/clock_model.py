@@ -49,7 +49,7 @@ class Segment:
         return self.offset + self.drift * (time - self.origin)
 
     def right(self, stamp: float) -> float:
-        """Right time of a stamp [UTC s]."""
+        """Corrected time of a stamp [UTC s]."""
         return (stamp - self.offset + self.drift * self.origin) / (1 + self.drift)
 
 

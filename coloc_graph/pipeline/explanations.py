@@ -51,7 +51,7 @@ def without_poses(
     measurements: Iterable[PairMeasurement],
     unused: Iterable[UnusedSighting],
 ) -> dict[str, str]:
-    """Reason, by robot, for which robots of a team with stances have no pose."""
+    """Reasons, by robot, why robots of a team with stances have no pose."""
     team, stances = run.team, run.stances
     sighted = {one.landmark: one.why for one in unused if one.is_robot}
     disconnected = {robot for robot, _ in estimate.disconnected}

@@ -133,7 +133,7 @@ def detect(
 
 
 def _touching(uv: Array) -> NDArray[np.int64]:
-    """The group (n,) of each of n lights: those that touch, and those that these touch, are one."""
+    """Connected group (n,) of each of n lights that touch, directly or through others."""
     near = np.linalg.norm(uv[:, None] - uv[None], axis=2) < MERGING
     groups = np.arange(len(uv))
     for _ in range(len(uv)):

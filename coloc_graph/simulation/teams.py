@@ -30,10 +30,10 @@ def build_team_world(
     imperfections: Imperfections | None = None,
     team: Team | None = None,
 ) -> World:
-    """Let it happen once, at depth tracks: some `points` correspondences for a pair that sees two movers all the time.
+    """Simulate a team scenario at depth tracks, with `points` correspondences for a pair that always sees two movers.
 
-    Cameras detect the markers of all movers, and of the robots that stand before them. Robots drive through each other
-    where they change places. Raises `InputError` where robots blink and so few points are of too few images to see it.
+    Cameras detect the markers of all movers, and of the robots at rest before them. Robots pass through each other
+    when they change places. Raises `InputError` if robots blink and `points` means too few images to recognise a code.
     """
     imperfections = imperfections or Imperfections()
     bits = [one.blink.bit for one in team.robots if one.blink] if team else []

@@ -296,7 +296,7 @@ class Scene:
 
     @property
     def true(self) -> Layer | None:
-        """The true poses."""
+        """Ground-truth poses of the robots."""
         return next((layer for layer in self.layers if layer.name == TRUE), None)
 
     def errors(self, layer: Layer) -> Array:

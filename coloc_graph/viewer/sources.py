@@ -275,7 +275,7 @@ def _edges_on_disk(path: Path, robots: Sequence[str], stances: Sequence[Stance])
 
 
 def _ends_on_disk(path: Path, kind: str) -> list[tuple[Node, Node]]:
-    """Read the ends of the used measurements of a kind; a landmark gets the stance in which it was seen."""
+    """Read the nodes that used measurements of a kind connect; a landmark has the stance in which it was seen."""
     return [
         ((row["robot_i"], int(row["index_i"])), (row["robot_j"], int(row["index_j"] or row["index_i"])))
         for row in read_measurements(path, [kind])

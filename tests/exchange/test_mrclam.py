@@ -82,7 +82,7 @@ def test_a_barcode_of_two_is_nobodys(copy, tmp_path):
     ("Robot2_Measurement.dat", "1248444100.0 63 two 0.1", "`two` is not a number"),
     ("Robot2_Measurement.dat", "1248444100.0 63 -1.0 0.1", "the range is not above 0"),
     ("Robot3_Groundtruth.dat", "1248444100.0 nan 1.0 0.1", "not finite"),
-    ("Landmark_Groundtruth.dat", "6 1.0 1.0 0.1 0.1", "subject 6 is there already"),
+    ("Landmark_Groundtruth.dat", "6 1.0 1.0 0.1 0.1", "subject 6 appears twice"),
 ])  # fmt: skip
 def test_a_wrong_row_is_named_by_file_and_line_and_nothing_is_written(copy, tmp_path, capsys, name, line, words):
     path = copy / name

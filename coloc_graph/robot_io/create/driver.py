@@ -187,7 +187,7 @@ class Create:
         if not (math.isfinite(v) and math.isfinite(w)):
             raise InputError(f"drive({v}, {w}) is not a motion: give finite m/s and rad/s")
         if not 0 < lease <= MAX_LEASE:
-            raise InputError(f"a lease is above 0 and at most {MAX_LEASE} s, not {lease} s: renew it instead")
+            raise InputError(f"a lease must be above 0 and at most {MAX_LEASE} s, not {lease} s: renew it instead")
         halts, line = self._halts if self._line else None, self._may_drive()
         half = WHEELS[self.model].base / 2
         wheel = (abs(v) + abs(w) * half) * 1e3 / oi.MAX_WHEEL_SPEED
