@@ -31,7 +31,7 @@ OFFSET_SIGMA = 0.05  # s, standard deviation of an offset that was found so
 SEARCH_SIGMA = 0.12  # s, standard deviation with which each offset is tried
 STEP = 0.3  # s between offsets that are tried
 STRETCHES = 2  # longest stretches in which the first camera stands that are looked at
-LONGEST = 15.0  # s of such a stretch
+MAX_STRETCH = 15.0  # s of such a stretch
 MIN_OVERLAP = 5.0  # s that both cameras stand
 MIN_POINTS = 40  # that agree on one homography
 MIN_SHARE = 0.75  # of the points
@@ -71,7 +71,7 @@ def recording_offset(team: Team, first: RecordedTracks, other: RecordedTracks) -
     tried: dict[float, int] = {}
     longest = sorted(first.standing, key=lambda one: one[0] - one[1])[:STRETCHES]
     for begin, end in longest:
-        span = begin, min(end, begin + LONGEST)
+        span = begin, min(end, begin + MAX_STRETCH)
         for b, e in other.standing:
             # offsets, as clock of the other less that of the first, at which both stand for long enough
             for lag in np.arange(b - span[1] + MIN_OVERLAP, e - span[0] - MIN_OVERLAP, STEP).tolist():
@@ -120,7 +120,7 @@ def _shared(one: Span, two: Span, lag: float) -> Span:
 def _tried(
     team: Team, first: RecordedTracks, other: RecordedTracks, span: Span, prior: ClockOffset
 ) -> tuple[float, int]:
-    """The refined offset (clock of the other less that of the first) [s], and how many points agree there."""
+    """Refine the offset (clock of the other less that of the first) [s]; return it with the number of points."""
     cameras, lag = (team[first.robot].camera, team[other.robot].camera), prior.value
     i = _within(team, first, span)
     j = _within(team, other, (span[0] + lag, span[1] + lag))

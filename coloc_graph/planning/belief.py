@@ -17,13 +17,13 @@ POSE = 6  # roll, pitch, yaw [rad], x, y, z [m] in the body frame
 BLOCK = 11  # numbers of a robot: pose, mount (height, tilt, roll), markers (span, height)
 UNKNOWN = 1.0  # standard deviation of a pose that nothing is known of [m, rad]
 FIXED = 1e-6  # standard deviation of the pose that defines the world [m, rad]
-LEAST_TILT = 1e-5  # a floor that is stated as flat is taken to be flat to this [rad, m]
+MIN_TILT_SIGMA = 1e-5  # a floor that is stated as flat is taken to be flat to this [rad, m]
 BODY_LENGTH = 0.05  # a floor that tilts a body raises it by the tilt times this [m]
 
 ALONG = 0.01  # error of wheel odometry after one metre, growing with the root of the distance [m]
 TURNED = 0.01  # the same of the heading after turning by one radian [rad]
 VEER = 0.005  # the same of the heading after driving one metre [rad]
-LEAST = (1e-3, 5e-4, 5e-4)  # wheel odometry is not taken to be better: heading [rad], x, y [m]
+MIN_ODOMETRY_SIGMAS = (1e-3, 5e-4, 5e-4)  # wheel odometry is not taken to be better: heading [rad], x, y [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,8 @@ class Belief:
         if team.floor is None:
             raise InputError("plans are made for teams on a floor: give the team a [floor]")
         robots = tuple(poses)
-        tilt = max(math.radians(team.floor.tilt_sigma_deg), LEAST_TILT)
-        height = max(team.floor.height_sigma, tilt * BODY_LENGTH, LEAST_TILT)
+        tilt = max(math.radians(team.floor.tilt_sigma_deg), MIN_TILT_SIGMA)
+        height = max(team.floor.height_sigma, tilt * BODY_LENGTH, MIN_TILT_SIGMA)
         sigmas = np.zeros(BLOCK * len(robots))
         for n, name in enumerate(robots):
             robot, free = team[name], FIXED if name == team.reference else UNKNOWN
@@ -160,5 +160,5 @@ def leap_model(D: Planar, floor: tuple[float, float], *, odometry: bool = True) 
     line[0, 2] = line[2, 0] = (turned + veer / 2) * distance
     c, s = math.cos(second), math.sin(second)
     R = np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
-    Q[2:5, 2:5] = R @ line @ R.T + np.diag(np.square(LEAST))
+    Q[2:5, 2:5] = R @ line @ R.T + np.diag(np.square(MIN_ODOMETRY_SIGMAS))
     return F, Q

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 SPEED = 0.2  # speed of the mover [m/s]
 TURN_RATE = 1.0  # turn rate of a robot that turns on the spot [rad/s]
 COVERED = 0.84  # drive that brings half of what evenly spread images would bring in its time [m]
-SHORTEST = 1e-6  # waypoints closer to each other are one [m]
+MIN_WAYPOINT_DISTANCE = 1e-6  # waypoints closer to each other are one [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ def there_and_back(waypoints: ArrayLike, duration: float, speed: float = SPEED) 
     """Waypoints (n, 2) of a drive back and forth through `waypoints` that lasts at least `duration` [s]."""
     once = np.asarray(waypoints, float).reshape(-1, 2)
     length = float(np.hypot(*np.diff(once, axis=0).T).sum())
-    rounds = max(1, math.ceil(duration * speed / max(length, 1e-3))) if length > SHORTEST else 1
+    rounds = max(1, math.ceil(duration * speed / max(length, 1e-3))) if length > MIN_WAYPOINT_DISTANCE else 1
     legs = [once if n % 2 == 0 else once[::-1] for n in range(min(rounds, 1000))]
     return np.concatenate([legs[0], *(leg[1:] for leg in legs[1:])])
 
@@ -56,7 +56,7 @@ def drive_through(waypoints: ArrayLike, speed: float = SPEED, turn_rate: float =
     at = np.asarray(waypoints, float)
     step = np.diff(at, axis=0)
     distance = np.hypot(*step.T)
-    moved = distance > SHORTEST
+    moved = distance > MIN_WAYPOINT_DISTANCE
     at, step, distance = np.vstack([at[:1], at[1:][moved]]), step[moved], distance[moved]
     if not len(step):
         return Drive(np.zeros(1), np.array([[*at[0], 0.0]]))

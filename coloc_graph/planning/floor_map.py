@@ -16,8 +16,8 @@ from coloc_graph.input_file import read_text
 
 Array = NDArray[np.float64]
 
-LARGEST_FILE = 100_000  # size of a map's YAML above which it is none [bytes]
-MOST_CELLS = 50_000_000  # cells above which a map is refused
+MAX_FILE_SIZE = 100_000  # size of a map's YAML above which it is none [bytes]
+MAX_CELLS = 50_000_000  # cells above which a map is refused
 STEP = 0.03  # least step along a line of sight [m]
 REMEDY = "give the YAML file of a ROS map_server map"
 
@@ -89,7 +89,7 @@ def read_floor_map(path: str | Path) -> FloorMap:
     """
     path = Path(path)
     try:
-        fields = yaml.safe_load(read_text(path, REMEDY, limit=LARGEST_FILE))
+        fields = yaml.safe_load(read_text(path, REMEDY, limit=MAX_FILE_SIZE))
     except yaml.YAMLError as error:
         raise InputError(f"{path} is not a map: its YAML cannot be read; {REMEDY}") from error
     if not isinstance(fields, dict) or not isinstance(fields.get("image"), str):
@@ -102,8 +102,8 @@ def read_floor_map(path: str | Path) -> FloorMap:
         raise InputError(f"{path}: the map is turned by {origin[2]} rad; give one with an origin of yaw 0")
     free_below = _number(path, fields, "free_thresh", 0.0, 1.0)
     grey = to_grey(to_8_bits(read_image(path.parent / fields["image"]))).astype(float)
-    if grey.size > MOST_CELLS:
-        raise InputError(f"{path}: a map of {grey.size} cells is too large; give one of at most {MOST_CELLS}")
+    if grey.size > MAX_CELLS:
+        raise InputError(f"{path}: a map of {grey.size} cells is too large; give one of at most {MAX_CELLS}")
     occupied = grey / 255 if fields.get("negate") in (1, True) else 1 - grey / 255
     free = (occupied < free_below)[::-1]
     if not free.any():

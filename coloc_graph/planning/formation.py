@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar
 
-LONGEST_LEAP = 2.5  # advance of the pair a stance above which two cameras share no view of the floor [m]
+MAX_LEAP = 2.5  # advance of the pair a stance above which two cameras share no view of the floor [m]
 BODY_WIDTH = 0.34  # width of an iRobot Create, the least distance between the lanes of two that pass [m]
 
 
@@ -34,8 +34,8 @@ class Gait:
     toe_in_deg: float = 17.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.leap <= LONGEST_LEAP:
-            raise InputError(f"a leap of {self.leap} m is not possible: give a leap above 0 and up to {LONGEST_LEAP} m")
+        if not 0 < self.leap <= MAX_LEAP:
+            raise InputError(f"a leap of {self.leap} m is not possible: give a leap above 0 and up to {MAX_LEAP} m")
         if not BODY_WIDTH <= self.abreast <= 4:
             raise InputError(
                 f"robots {self.abreast} m abreast cannot pass each other and share a view: give {BODY_WIDTH} to 4 m"

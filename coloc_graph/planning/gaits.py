@@ -26,9 +26,9 @@ LEAPS = (0.185, 0.3, 0.45, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.5)  # [m]
 ABREAST = (0.45, 0.5, 0.6, 0.72, 0.9, 1.1)  # [m]
 TOE_INS = (-10.0, 0.0, 10.0, 17.0, 25.0, 35.0)  # [deg]
 REFINED = 5  # number of gaits whose drives are planned
-SHORTEST = 3.0  # least duration of a stance [s]
+MIN_STANCE_DURATION = 3.0  # least duration of a stance [s]
 PAPER_SECONDS = 5.0  # duration of a stance of the paper's gait, where nothing is asked for [s]
-LONGEST = 3600.0  # time of a mission above which a wanted sigma is given up [s]
+MAX_MISSION_DURATION = 3600.0  # time of a mission above which a wanted sigma is given up [s]
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class GaitSearch:
             else:
                 assert time is not None
                 seconds = self.seconds(one, time)
-            if seconds >= SHORTEST or capture is not None:
+            if seconds >= MIN_STANCE_DURATION or capture is not None:
                 found.append((self.end_sigma(one, seconds), one, seconds))
         found.sort(key=lambda each: each[0])
         return [(one, seconds) for _, one, seconds in found]
@@ -195,14 +195,14 @@ class GaitSearch:
         InputError
             If none does within an hour; the message says what the best one is, and what would help.
         """
-        self.candidates = [one for one, _ in self.ranked(time=LONGEST)][:40]
-        low, high = 10.0, LONGEST
+        self.candidates = [one for one, _ in self.ranked(time=MAX_MISSION_DURATION)][:40]
+        low, high = 10.0, MAX_MISSION_DURATION
         if not self._reaches(sigma, high):
             best, seconds = self.ranked(time=high)[0]
             reached = self.end_sigma(best, seconds)
             raise InputError(
                 f"no plan reaches {1e3 * sigma:g} mm at the end of {self.length:g} m: the best one promises "
-                f"{1e3 * reached:.1f} mm in {LONGEST / 60:.0f} min (leaps of {best.gait.leap:g} m); "
+                f"{1e3 * reached:.1f} mm in {MAX_MISSION_DURATION / 60:.0f} min (leaps of {best.gait.leap:g} m); "
                 f"{self._remedy(best, seconds)} would help most"
             )
         while high / low > 1.03:

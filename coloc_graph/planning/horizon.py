@@ -28,10 +28,10 @@ DIFFERENT = 0.15  # poses are compared one by one from this distance on, in whic
 BEAM = 6  # plans that are followed from one stance to the next
 SHARES = (0.6, 1.0, 1.7)  # durations of a stance that are compared, relative to the pace of the mission
 PREFERRED = 1.03  # the gait's own leap is left for one that promises a variance this much smaller
-SHORTEST = 5.0  # least duration of a stance [s]
-LONGEST = 60.0  # longest duration of a stance [s]
-FEWEST = 3  # cells of the common view without which a stance is not planned
-MOST_STANCES = 2000
+MIN_STANCE_DURATION = 5.0  # least duration of a stance [s]
+MAX_STANCE_DURATION = 60.0  # longest duration of a stance [s]
+MIN_CELLS = 3  # cells of the common view without which a stance is not planned
+MAX_STANCES = 2000
 ARRIVED = 0.1  # the goal is reached within this distance along the course [m]
 
 #: What decides between stances: the variance at the goal with the cost to go, the information gained, the size of the
@@ -155,8 +155,8 @@ class Horizon:
             belief, left = decision.promise.belief, left - stance.duration
             if self.arrived(stance.standing):
                 return Mission(Plan(tuple(stances)), tuple(promises), tuple(times))
-            if len(stances) > MOST_STANCES:
-                raise InputError(f"the goal is not reached in {MOST_STANCES} stances: give a nearer one, or more goals")
+            if len(stances) > MAX_STANCES:
+                raise InputError(f"the goal is not reached in {MAX_STANCES} stances: give a nearer one, or more goals")
             decision = self.next(belief, left)
 
     def remaining(self, standing: Mapping[str, Planar]) -> float:
@@ -177,7 +177,7 @@ class Horizon:
         """
         standing = {name: belief.poses[name] for name in self.observers}
         pace = self.seconds / max(self.course.length, ARRIVED)
-        seconds = min(max(1.5 * pace * 0.5, SHORTEST), LONGEST, self.seconds)
+        seconds = min(max(1.5 * pace * 0.5, MIN_STANCE_DURATION), MAX_STANCE_DURATION, self.seconds)
         stance, promise = best_stance(self.predictor, belief, standing, (), self.mover, seconds, self.goal)
         return Decision(stance, promise, ())
 
@@ -254,7 +254,7 @@ class Horizon:
         standing = np.concatenate([standing, leaps.targets[:, None]], axis=1)
         model = self.predictor.model(observers, self.mover)
         information, count = evenly_seen(model, standing, leaps.margins, self.predictor.free)
-        seen = np.flatnonzero(count >= FEWEST)
+        seen = np.flatnonzero(count >= MIN_CELLS)
         if not len(seen):
             return []
         if self.objective in ("view", "random"):
@@ -270,9 +270,9 @@ class Horizon:
         left = max(self.remaining(node.standing), ARRIVED)
         share = min(leaps.gains[n] / left, 1.0) * node.seconds
         if leaps.gains[n] > left - ARRIVED:
-            return np.full(len(SHARES), max(node.seconds, SHORTEST))
-        longest = min(LONGEST, max(node.seconds, SHORTEST))
-        return np.asarray(np.clip(share * np.array(SHARES), SHORTEST, longest))
+            return np.full(len(SHARES), max(node.seconds, MIN_STANCE_DURATION))
+        longest = min(MAX_STANCE_DURATION, max(node.seconds, MIN_STANCE_DURATION))
+        return np.asarray(np.clip(share * np.array(SHARES), MIN_STANCE_DURATION, longest))
 
     def _scored(
         self, node: _Node, leaps: Leaps, seen: NDArray[np.int64], observers: tuple[str, ...], information: Array

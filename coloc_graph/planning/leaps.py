@@ -23,7 +23,7 @@ TOE_INS = (0.0, 1.0, 1.5)  # of a target's heading against the course, in those 
 AHEAD = 0.8  # a robot may look along the course this far ahead of where it stands [m]
 TURNS = (0.0, 0.35, 0.7, 1.0)  # share of a corner by which a target is turned
 BEND = 0.1  # turn of the course that is a corner [rad]
-LONGEST_LEAP = 1.5  # advance of a target [m]
+MAX_LEAP = 1.5  # advance of a target [m]
 TO_WALL = 0.25  # least distance of a robot's middle from walls [m]
 TO_ROBOT = 0.42  # least distance between the middles of two robots, where they stand and on the way [m]
 STEP = 0.1  # distance between places of a leap that are checked [m]
@@ -92,7 +92,7 @@ def possible_leaps(
     before = course.at(front)[2]
     turning = any(abs(float(wrap(course.at(front + ahead)[2] - before))) > BEND for ahead in (AHEAD, 2 * AHEAD))
     for advance, side, width, toe, turned in product(ADVANCES, (-1.0, 1.0), WIDTHS, TOE_INS, TURNS):
-        way = front + min(advance * gait.leap, LONGEST_LEAP)
+        way = front + min(advance * gait.leap, MAX_LEAP)
         x, y, heading = course.at(way)
         # near a corner a robot may look into it
         bend = float(wrap(course.at(way + AHEAD)[2] - before))

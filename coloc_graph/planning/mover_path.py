@@ -20,7 +20,7 @@ YAWS = (0.0, np.pi / 2)  # headings at which each place is weighed [rad]
 CLEARANCE = 0.45  # distance of the mover's middle from robots that stand [m]
 ROUNDS = 12  # steps of the multiplicative algorithm
 MERGED = 0.35  # places nearer to each other are one waypoint [m]
-MOST = 5  # number of places with large shares through which drives are tried
+MAX_PLACES = 5  # number of places with large shares through which drives are tried
 WORTH = 0.5  # a share is large above this, relative to equal shares
 KNOTS = 8  # number of places through which drives are tried, with the outermost ones
 LONGER = 10  # number of drives through three places that are tried with a fourth
@@ -159,7 +159,7 @@ def _knots(places: Array, shares: Array) -> list[int]:
     """Places that matter: those with the largest shares, and the outermost ones."""
     left = shares.copy()
     chosen: list[int] = []
-    while len(chosen) < MOST and left.max() > WORTH / len(places):
+    while len(chosen) < MAX_PLACES and left.max() > WORTH / len(places):
         chosen.append(int(np.argmax(left)))
         left[np.hypot(*(places - places[chosen[-1]]).T) < MERGED] = 0.0
     apart = np.min([np.hypot(*(places - places[n]).T) for n in chosen], axis=0)

@@ -12,7 +12,7 @@ from coloc_graph.geometry.se2 import Planar
 
 COLUMNS = ("stance", "robot", "role", "order", "x", "y", "yaw_deg", "duration")
 ROLES = ("anchor", "observer", "mover")
-LARGEST = 20_000_000  # size of a plan above which it is no plan [bytes]
+MAX_PLAN_SIZE = 20_000_000  # size of a plan above which it is no plan [bytes]
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ def read_plan(path: str | Path) -> Plan:
         If the file is no plan; the message names the line.
     """
     try:
-        if Path(path).stat().st_size > LARGEST:
-            raise InputError(f"{path} is too large for a plan: give one of at most {LARGEST // 1_000_000} MB")
+        if Path(path).stat().st_size > MAX_PLAN_SIZE:
+            raise InputError(f"{path} is too large for a plan: give one of at most {MAX_PLAN_SIZE // 1_000_000} MB")
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"the plan {path} cannot be read: {error}") from error

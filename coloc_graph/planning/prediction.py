@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 INSTANTS = 48  # instants of a drive at which its pixels are linearised; each stands for several images
 NOTABLE = 0.1  # relative change of the noise for which models are made anew
 MOMENT = 0.01  # time over which the mover's velocity is taken [s]
-LEAST_POINTS = 6  # correspondences without which a stance has no homography
+MIN_POINTS = 6  # correspondences without which a stance has no homography
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class Predictor:
                 belief = belief.after_leap(name, target, odometry=self.odometry)
         observers = tuple(stance.standing)
         information, points = self.information(stance)
-        if points < LEAST_POINTS:
+        if points < MIN_POINTS:
             return Promise(points, belief)
         return Promise(points, belief.after_stance(observers, stance.mover, information))
 

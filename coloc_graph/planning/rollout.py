@@ -24,7 +24,7 @@ SECONDS = tuple(0.5 * 1.3**n for n in range(20))  # durations of a stance for wh
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """What some stances make of a covariance: P -> C + A P (I + B P)^-1 A^T, (..., d, d) each."""
+    """Covariance after some stances: P -> C + A P (I + B P)^-1 A^T, (..., d, d) each."""
 
     A: Array
     B: Array

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 STOP_SIGMA = 0.01  # standard deviation of where a robot stops, per axis [m]
 STOP_PER_METRE = 0.01  # the same for each metre that it has leapt [m]
 HEADING_SIGMA = math.radians(1.0)  # standard deviation of the heading with which it stops [rad]
-LEAST_MARGIN = 4.0  # distance of markers from the borders of images without any slip [px]
+MIN_MARGIN = 4.0  # distance of markers from the borders of images without any slip [px]
 SIGMAS = 2.0  # a view is kept clear by this number of standard deviations
 DISTANCE = 1.5  # distance of the mover at which a slip turns the view [m]
 
@@ -29,4 +29,4 @@ def view_margin(leapt: ArrayLike, focal_px: float) -> NDArray[np.float64]:
         Focal length of its camera [px].
     """
     turn = np.hypot(HEADING_SIGMA, stop_sigma(leapt) / DISTANCE)
-    return np.asarray(LEAST_MARGIN + SIGMAS * focal_px * turn)
+    return np.asarray(MIN_MARGIN + SIGMAS * focal_px * turn)
