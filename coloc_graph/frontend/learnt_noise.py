@@ -22,7 +22,7 @@ from coloc_graph.team.centre_noise import COMPONENTS
 Array = NDArray[np.float64]
 
 BIAS_PX = 0.002  # median of the shared error where a team states nothing
-PARTS = (("stated sigma times", "scale", ""), ("white floor", "floor", "px"), ("saturated spots", "saturated", "px"))
+PARTS = (("stated sigma times", "scale", ""), ("white floor", "floor", "px"), ("of saturated spots", "saturated", "px"))
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class NoiseBelief:
         """Return the standard deviation of a typical centre [px] and its factor of uncertainty."""
         mean, covariance = self._of(robot)
         stated, saturated = self.typical[self.robots.index(robot)]
-        parts = np.exp(mean) * (stated, 1.0, saturated)
+        parts = np.exp(mean) * (stated, 1 - saturated, saturated)
         relative = parts / parts.sum()
         return math.sqrt(parts.sum()), math.exp(math.sqrt(relative @ covariance @ relative) / 2)
 
@@ -148,7 +148,8 @@ class NoiseBelief:
                 continue
             stated, learnt = team[robot].camera.centre_noise or CentreNoise(), self.noise(robot)
             rows.append(NoiseRow(robot, "typical centre", "px", math.sqrt(variance), 1.0, *self.sigma(robot)))
-            for what, name, unit in PARTS[: 3 if saturated else 2]:
+            there = (True, saturated < 1, saturated > 0)
+            for what, name, unit in (part for part, seen in zip(PARTS, there, strict=True) if seen):
                 ends = f"_{unit}" * bool(unit), "_factor"
                 values = (getattr(one, f"{name}{end}") for one in (stated, learnt) for end in ends)
                 rows.append(NoiseRow(robot, what, unit, *values))

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtr, chdtrc
 
 from coloc_graph.backend import DisconnectedComponent, Estimate
 from coloc_graph.backend.ranging import RangingProblem
@@ -15,6 +15,7 @@ from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
 
 WARNING_P_VALUE = 1e-4  # probability of a chi2 by noise alone below which a warning says that measurements disagree
+MISFIT = 1.5  # chi2/dof from which on the prediction is off by half; below the inverse square it is too wide
 MAX_REASONS = 3  # kinds of reasons that are named where no measurement is usable
 
 
@@ -140,13 +141,27 @@ def warnings_of_graph(
     else:
         warnings.append(unstated)
     warnings += _far(estimate)
-    p_value = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
-    if p_value < WARNING_P_VALUE:
-        warnings.append(
-            f"the measurements disagree (chi2/dof {estimate.chi2 / estimate.dof:.1f} with {estimate.dof} degrees of "
+    return warnings + _misfit(estimate)
+
+
+def _misfit(estimate: Estimate) -> list[str]:
+    """Warn where chi2/dof says that predicted variances are off by half or more, beyond chance."""
+    if estimate.dof <= 0:
+        return []
+    per_dof = estimate.chi2 / estimate.dof
+    p_value = float(chdtrc(estimate.dof, estimate.chi2))
+    if per_dof > MISFIT and p_value < WARNING_P_VALUE:
+        return [
+            f"the measurements disagree (chi2/dof {per_dof:.1f} with {estimate.dof} degrees of "
             f"freedom, expected 1; probability by noise alone {_p_value(p_value)}); {worst_kinds(estimate)}"
-        )
-    return warnings
+        ]
+    if per_dof < 1 / MISFIT**2 and float(chdtr(estimate.dof, estimate.chi2)) < WARNING_P_VALUE:
+        return [
+            f"the measurements agree better than expected (chi2/dof {per_dof:.2f} with {estimate.dof} degrees of "
+            "freedom, expected 1): predicted uncertainties are too large; state smaller tolerances of mounts, floor, "
+            "odometry or noise"
+        ]
+    return []
 
 
 def _p_value(p_value: float) -> str:

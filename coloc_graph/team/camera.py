@@ -84,7 +84,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         stated
             Covariances that detections state, (n, 2, 2) [px^2].
         loads
-            Parts (n, 2) of the floor's and of saturation's variance that each centre has.
+            Parts (n, 2) of the white floors, of other and of saturated spots, in each centre.
         """
         if self.centre_noise is None:
             return stated

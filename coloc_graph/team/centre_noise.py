@@ -13,7 +13,7 @@ class CentreNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Standard deviations of marker centres beyond what each detection states; log-normal, as a prior and as learnt.
 
     The variance of a centre, per axis and without correlation between samples, is (scale * stated sigma)^2 +
-    floor_px^2, and saturated_px^2 more where the core of the spot is saturated. Each value is a median, known
+    floor_px^2, or + saturated_px^2 where the core of the spot is saturated. Each value is a median, known
     within its factor (one standard deviation of its logarithm): 0.03 with a factor of 3 is 0.01 to 0.09.
 
     Attributes
@@ -23,7 +23,7 @@ class CentreNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     floor_px, floor_factor
         White floor [px]: what pixels, lens and background do to a centre, whatever its light.
     saturated_px, saturated_factor
-        Additional part of saturated spots [px].
+        White floor of saturated spots [px], and its factor. They are brighter or longer exposed, and may have less.
     """
 
     scale: float = 1.0

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MAX_ITERATIONS = 50
+MIN_CLUSTERS = 5  # from which on their scatter is judged
 MAX_STEP = 1.5  # of the logarithm of a variance in one iteration
 CONVERGED = 1e-3  # step of the logarithms of variances, in posterior standard deviations, at which the search ends
 
@@ -37,6 +38,9 @@ class NoiseEvidence:
     weight
         Share of the evidence that counts: less than 1 where errors of neighbouring points are alike, or points are
         evidence elsewhere, too.
+    clusters
+        Numbers (n,), from 0 on, of what may have noise of its own, such as images that one fit is made to; None if that
+        is all of it.
     """
 
     residual: Array
@@ -44,10 +48,13 @@ class NoiseEvidence:
     parts: Array
     components: NDArray[np.int64]
     weight: float = 1.0
+    clusters: NDArray[np.int64] | None = None
 
 
 def learn_components(evidence: Sequence[NoiseEvidence], mean: Array, covariance: Array) -> tuple[Array, Array]:
     """Estimate the logarithms of variance components.
+
+    The covariance allows for clusters (fits, or their `clusters`) whose noise differs.
 
     Parameters
     ----------
@@ -71,14 +78,33 @@ def learn_components(evidence: Sequence[NoiseEvidence], mean: Array, covariance:
         logs = logs + step
         if step @ total @ step < CONVERGED**2 * len(step):
             break
-    _, information = _score(evidence, np.exp(logs))
-    return logs, np.linalg.inv(information + precision)
+    scores, information = _scores(evidence, np.exp(logs))
+    return logs, np.linalg.inv(information / _dispersion(scores, information) + precision)
+
+
+def _dispersion(scores: Array, information: Array) -> float:
+    """Factor (at least 1) by which scores (m, k) of m clusters scatter more than their information (k, k) says.
+
+    Clusters whose noise differs, as that of images which were shaken more or less, tell less of the next one than
+    their points would alone.
+
+    Source: Liang and Zeger, "Longitudinal Data Analysis Using Generalized Linear Models", 1986.
+    """
+    if len(scores) < MIN_CLUSTERS:
+        return 1.0
+    return max(1.0, float((scores**2).sum() / max(np.trace(information), 1e-300)))
 
 
 def _score(evidence: Sequence[NoiseEvidence], variances: Array) -> tuple[Array, Array]:
     """Derivative (k,) of the restricted log likelihood by the logarithms of variances, and its information (k, k)."""
+    scores, information = _scores(evidence, variances)
+    return scores.sum(axis=0), information
+
+
+def _scores(evidence: Sequence[NoiseEvidence], variances: Array) -> tuple[Array, Array]:
+    """Derivatives (m, k) of the restricted log likelihood of each cluster, and the information of all (k, k)."""
     k = len(variances)
-    score, information = np.zeros(k), np.zeros((k, k))
+    scores, information = [np.zeros((0, k))], np.zeros((k, k))
     for one in evidence:
         parts = variances[one.components, None, None, None] * one.parts
         inverse = np.linalg.inv(parts.sum(axis=0))
@@ -86,12 +112,16 @@ def _score(evidence: Sequence[NoiseEvidence], variances: Array) -> tuple[Array, 
         normal = np.linalg.inv(np.einsum("nap,naq->pq", one.design, weighted))
         h = normal @ np.einsum("nap,na->p", weighted, one.residual)
         left = (inverse @ (one.residual - one.design @ h)[..., None])[..., 0]
-        square = np.einsum("na,cnab,nb->c", left, parts, left)
-        used = np.einsum("nap,cnab,nbq,pq->c", weighted, parts, weighted, normal)
+        square = np.einsum("na,cnab,nb->nc", left, parts, left)
+        spread = weighted @ np.linalg.cholesky(normal)  # so that what the fit explains is a sum of squares
+        used = np.einsum("nap,cnab,nbp->nc", spread, parts, spread)
         relative = inverse @ parts  # (c, n, 2, 2)
-        trace = np.einsum("cnaa->c", relative) - used
+        trace = np.einsum("cnaa->nc", relative) - used
         n, p = len(one.residual), one.design.shape[2]
         by_pair = np.einsum("cnab,dnba->cd", relative, relative) * (1 - p / (2 * n))
-        np.add.at(score, one.components, 0.5 * one.weight * (square - trace))
+        clusters = np.zeros(n, np.int64) if one.clusters is None else one.clusters
+        own = np.zeros((int(clusters.max(initial=0)) + 1, k))
+        np.add.at(own, (clusters[:, None], one.components), 0.5 * one.weight * (square - trace))
+        scores.append(own)
         np.add.at(information, np.ix_(one.components, one.components), 0.5 * one.weight * by_pair)
-    return score, information
+    return np.concatenate(scores), information

@@ -49,8 +49,8 @@ class Correspondences:
     pairs
         Normalised coordinates with covariances.
     loads_i, loads_j
-        Parts of the white floor's and of saturation's variance in each point (`team.CentreNoise`), (n, 2); less than 1
-        for interpolated points.
+        Parts of the white floors, of other and of saturated spots, in each point (`team.CentreNoise`), (n, 2); less
+        than 1 for interpolated points.
     """
 
     uv_i: Array

@@ -83,9 +83,9 @@ class Track:
 
     @property
     def loads(self) -> Array:
-        """Parts of the white floor's and of saturation's variance in each sample (`team.CentreNoise`), (n, 2)."""
-        saturated = np.zeros(len(self)) if self.saturated is None else self.saturated
-        return np.stack([np.ones(len(self)), saturated], axis=1)
+        """Parts of the white floors, of other and of saturated spots, in each sample (n, 2): `team.CentreNoise`."""
+        saturated = np.zeros(len(self), bool) if self.saturated is None else self.saturated
+        return np.stack([~saturated, saturated], axis=1).astype(float)
 
     @property
     def extent(self) -> float:
