@@ -16,7 +16,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -290,7 +290,7 @@ def _variant(truth: dict[str, Any], images: dict[tuple[int, str], list[Pixels]],
         "nees_stated": stated / dof,
         "nees_learnt": chi2 / dof,
         "pose_nees": None if accuracy is None else accuracy.anees,
-        "pose_nees_intervals": None if accuracy is None else [row.nees_interval for row in accuracy.robots],
+        "pose_nees_by_robot": None if accuracy is None else [asdict(row.nees) for row in accuracy.robots if row.nees],
         "used": solution.count.used,
         "chi2_per_dof": solution.estimate.chi2 / max(solution.estimate.dof, 1),
         "warnings": list(solution.warnings),

@@ -21,7 +21,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from coloc_graph.backend import Method
@@ -162,14 +161,13 @@ def benchmark(stereo: Stereo) -> dict[str, object]:
     with tempfile.TemporaryDirectory() as folder:
         run = bring_in(stereo, FIRST_SIGMA, Path(folder))
         first = solve(run, "smooth", FrontendOptions())
-        sigma = FIRST_SIGMA * float(np.sqrt(chi2_per_dof(first.measurements)))
+        assert first.noise is not None
+        sigma = float(np.mean([first.noise.sigma(name)[0] for name in CAMERAS]))
         run = bring_in(stereo, sigma, Path(folder))
         chained = solve(run, "chain", FrontendOptions(criterion="transfer", pose="eq2"))
         reprojected = solve(run, "chain", FrontendOptions(pose="eq2"))
         smoothed = solve(run, "smooth", FrontendOptions())
-        # what the lens models leave, which no corner of an image can average away
-        bias = float(np.sqrt(max(stereo.rms**2 - sigma**2, 0.0)))
-        joint = solve(bring_in(stereo, sigma, Path(folder), bias), "joint", FrontendOptions())
+        joint = solve(bring_in(stereo, sigma, Path(folder), stereo.rms), "joint", FrontendOptions())
     rows = [
         _row("eq. (2), criterion transfer (the paper's)", stereo, _poses(chained)),
         _row("eq. (2), criterion reprojection", stereo, _poses(reprojected)),
@@ -201,10 +199,10 @@ def benchmark(stereo: Stereo) -> dict[str, object]:
 def bring_in(stereo: Stereo, sigma: float, folder: Path, bias: float | None = None) -> Run:
     """The corners as a user would bring them: TEAM.toml and three CSVs in `folder`, one stance a pair.
 
-    With a `bias` [px], which the corners of an image share, it is stated, and how well PnP knows each plane with it.
+    With a `bias` [px], what calibration leaves of the corners, planes have the tolerance that PnP has with it.
     """
     robots = [
-        Robot(name=name, camera_if_any=replace(camera, bias_px=bias or 0.0), mount_if_any=Mount(height=0.0))
+        Robot(name=name, camera_if_any=camera, mount_if_any=Mount(height=0.0))
         for name, camera in zip(CAMERAS, stereo.cameras, strict=True)
     ]
     write_team(Team(reference=CAMERAS[0], robots=tuple(robots)), folder / "TEAM.toml")

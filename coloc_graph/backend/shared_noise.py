@@ -5,11 +5,13 @@ variance component of the whole graph, by restricted maximum likelihood under a 
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from coloc_graph.backend.factors import factors_for, poses_in
 from coloc_graph.backend.graph import PoseGraph
@@ -19,8 +21,8 @@ from coloc_graph.measurements import RelativePose
 Array = NDArray[np.float64]
 
 MAX_STANCES = 60  # of a longer run, whose first part tells as much as is needed; the search takes their square
-REACH = 2.5  # of the search, in standard deviations of the prior
-STEPS = 9  # sizes that are tried
+COARSE = (-4.0, -2.0, 0.0, 2.0, 4.0)  # sizes that are tried, in standard deviations of the prior
+FINE = (-1.0, -0.5, 0.5, 1.0)  # and then about the likeliest of them
 
 
 @dataclass(frozen=True)
@@ -58,16 +60,27 @@ def learn_shared_noise(graph: PoseGraph, values: gtsam.Values, factor: float, me
     graph = graph.up_to(MAX_STANCES)
     sigma = math.log(factor)
     prior = math.log(median)
-    logs = prior + np.linspace(-REACH * sigma, REACH * sigma, STEPS)
-    likelihood = [restricted_log_likelihood(_at_size(graph, math.exp(one)), values) for one in logs.tolist()]
-    posterior = np.array(likelihood) - 0.5 * ((logs - prior) / sigma) ** 2
+    tried: dict[float, float] = {}
+
+    def posterior(steps: Iterable[float]) -> float:
+        """Try some sizes; return the likeliest so far."""
+        for step in steps:
+            if step not in tried:
+                likelihood = restricted_log_likelihood(_at_size(graph, math.exp(prior + sigma * step)), values)
+                tried[step] = likelihood - 0.5 * step**2
+        return max(tried, key=tried.__getitem__)
+
+    best = posterior(COARSE)
+    posterior(best + step for step in FINE)
+    steps = np.array(sorted(tried))
     # between the sizes that were tried it is smooth
-    fine = np.linspace(logs[0], logs[-1], 401)
-    smooth = np.polynomial.Polynomial.fit(logs, posterior, 6)(fine)
+    fine = np.linspace(steps[0], steps[-1], 801)
+    smooth = PchipInterpolator(steps, [tried[step] for step in steps.tolist()])(fine)
     weights = np.exp(smooth - smooth.max())
     weights /= weights.sum()
     mean = float(weights @ fine)
-    spread = math.sqrt(float(weights @ (fine - mean) ** 2))
+    spread = sigma * math.sqrt(float(weights @ (fine - mean) ** 2))
+    mean = prior + sigma * mean
     return SharedNoise(math.exp(mean), math.exp(max(spread, 1e-3)))
 
 

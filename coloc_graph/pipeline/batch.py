@@ -47,6 +47,8 @@ NOISE_ROUNDS = 2  # of learning the noise and measuring again: which points are 
 
 MIN_SHARED = 0.02  # part of homographies' covariance by shared errors below which their size is not looked for
 
+UNEXPLAINED = 2.0  # chi2/dof from which on a few wrong measurements are not the cause
+
 BATCH = {"chain": chain, "smooth": smooth, "joint": joint}
 
 #: Called with the number done and the total: of measured stances, or of seconds of a ranging run.
@@ -208,8 +210,12 @@ def _graph_of(
 def _shared_noise(estimate: Estimate, noise: NoiseBelief) -> SharedNoise | None:
     """The size of shared errors relative to that of an estimate's measurements; None where they hardly count."""
     factor = float(np.median(noise.bias_factor))
-    used = estimate.graph.without(one.measurement for one in estimate.rejected)
-    if estimate.dof <= 0 or shared_part(used) < MIN_SHARED:
+    explained = estimate.chi2 < UNEXPLAINED * estimate.dof
+    used = estimate.graph
+    if explained:
+        used = used.without(one.measurement for one in estimate.rejected)
+    # else the rejected ones do not explain it: noise is the likelier cause of all of it
+    if estimate.dof <= 0 or (explained and shared_part(used) < MIN_SHARED):
         return None
     # the measurements were made with what is expected of the prior, which is more than its median
     expected = math.exp(math.log(factor) ** 2)

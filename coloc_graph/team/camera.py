@@ -55,7 +55,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     noise_px: float = 0.3
     shot_gain: float = 0.1
     bias_px: float = 0.0
-    bias_factor: float = 2.0
+    bias_factor: float = 3.0
     centre_noise: CentreNoise | None = None
 
     def __post_init__(self) -> None:
