@@ -237,6 +237,8 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
     # the first observer is the same in all: what it does not see need not be asked of the others
     alone = model.in_view(standing[:1], points.reshape(1, -1, 3), 0.0)[0, 0].reshape(-1, 4).all(axis=1)
     xy, points = xy[alone], points[alone]
+    if not len(xy):  # it looks at a wall
+        return np.zeros((len(standing), model.variables, model.variables)), np.zeros(len(standing), int)
     everywhere = np.broadcast_to(points.reshape(-1, 3), (len(standing), 4 * len(xy), 3))
     seen = model.in_view(standing, everywhere, margins[:, None]).reshape(len(standing), -1, len(xy), 4)
     common = seen.all(axis=(1, 3))

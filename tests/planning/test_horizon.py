@@ -14,6 +14,7 @@ from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.horizon import Horizon
 from coloc_graph.planning.leaps import TO_ROBOT, TO_WALL
 from coloc_graph.planning.mission import leap_frog, stances_of
+from coloc_graph.planning.mover_path import evenly_seen
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.rollout import HEADING_ARM
 from coloc_graph.simulation import Imperfections, reference_team
@@ -141,3 +142,11 @@ def test_a_file_that_is_no_map_is_refused(tmp_path, text, sentence):
     cv2.imwrite(str(tmp_path / "map.pgm"), np.zeros((4, 4), np.uint8))
     with pytest.raises(InputError, match=sentence):
         read_floor_map(tmp_path / "map.yaml")
+
+
+def test_an_observer_that_looks_at_a_wall_shares_no_view():
+    predictor = Predictor(stated_team(reference_team(), FIELD), floor_map=corridor(1.2))
+    standing = np.array([[[0.0, 0.3, 1.6], [0.5, -0.3, 0.0]]])
+    information, count = evenly_seen(predictor.model(("A", "B"), "C"), standing, np.array([10.0]), predictor.free)
+    assert count.tolist() == [0]
+    assert not information.any()
