@@ -1,19 +1,27 @@
-"""coloc export g2o|gtsam|tum|dot|ros2 DIR --out PATH."""
+"""coloc export g2o|gtsam|tum|dot|ros2|foxglove DIR --out PATH."""
 
 import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coloc_graph.results.folder import Result
 
 FORMATS = (
     "g2o and dot: one file; gtsam: a folder with the serialised factors and a script; tum: a file for each robot; "
-    "ros2: a bag (.mcap) with tf, poses and paths"
+    "ros2: a bag (.mcap) with tf, poses and paths; foxglove: an .mcap with frames, cameras, poses, truth and a 3D scene"
 )
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command and its arguments."""
-    command = commands.add_parser("export", help="export a result as g2o, GTSAM, TUM, Graphviz or a ROS 2 bag")
-    command.add_argument("format", choices=("g2o", "gtsam", "tum", "dot", "ros2"), help=FORMATS)
+    command = commands.add_parser("export", help="export a result for g2o, GTSAM, TUM, Graphviz, ROS 2 or Foxglove")
+    command.add_argument("format", choices=("g2o", "gtsam", "tum", "dot", "ros2", "foxglove"), help=FORMATS)
     command.add_argument("result", metavar="DIR", help="result of `coloc solve`")
     command.add_argument("--out", required=True, metavar="PATH", help="file to write; for tum and gtsam a folder")
+    command.add_argument("--truth", action="store_true", help="tum: export the truth of the run, not the estimate")
+    command.add_argument("--layout", action="store_true", help="foxglove: write a layout (.json) beside the file, too")
+    command.add_argument("--run", dest="run_path", metavar="RUN", help="the result's run, if it has moved")
     command.set_defaults(run=run)
 
 
@@ -21,7 +29,6 @@ def run(args: argparse.Namespace) -> int:
     """Copy the files of a result, or write a bag of it, to a new path."""
     import os
     import shutil
-    from pathlib import Path
 
     from coloc_graph.errors import InputError
     from coloc_graph.exchange.gtsam_files import unpack_gtsam
@@ -31,6 +38,14 @@ def run(args: argparse.Namespace) -> int:
     result, out = read_result(args.result), Path(args.out)
     if os.path.lexists(out):
         raise InputError(f"{out} exists; give another path, or remove it")
+    if args.truth and args.format != "tum":
+        raise InputError(f"--truth applies to tum, not to {args.format}: leave it out")
+    if args.layout and args.format != "foxglove":
+        raise InputError(f"--layout applies to foxglove, not to {args.format}: leave it out")
+    if args.truth:
+        return _truth(result, args.run_path, out)
+    if args.format == "foxglove":
+        return _foxglove(result, args.run_path, out, layout=args.layout)
     if args.format == "ros2":
         from coloc_graph.exchange.ros_export import write_ros2
 
@@ -57,4 +72,45 @@ def run(args: argparse.Namespace) -> int:
     else:
         write_atomically(out, source.read_bytes())
     print(f"wrote {out}")
+    return 0
+
+
+def _truth(result: "Result", run_path: str | None, out: Path) -> int:
+    """Write the true trajectories of a result's run as TUM files, in the world of the run."""
+    from coloc_graph.errors import InputError
+    from coloc_graph.exchange.tum import write_tum
+    from coloc_graph.run import read_truth
+
+    path = Path(run_path or result.run_path)
+    result.require_run(path)
+    truth = read_truth(path)
+    if not truth:
+        raise InputError(f"{path}: the run holds no truth to export; leave --truth out")
+    out.mkdir(parents=True)
+    for robot, trajectory in truth.items():
+        write_tum(trajectory, out / f"{robot}.tum")
+    print(f"wrote {out}: true poses of {len(truth)} robots")
+    return 0
+
+
+def _foxglove(result: "Result", run_path: str | None, out: Path, *, layout: bool) -> int:
+    """Write a result for Foxglove, with a layout beside it."""
+    from coloc_graph.cli.printing import warn
+    from coloc_graph.errors import InputError
+    from coloc_graph.exchange.foxglove_export import LAYOUT
+    from coloc_graph.results.foxglove import export_foxglove
+    from coloc_graph.run.atomic_file import write_atomically
+
+    if out.suffix != ".mcap":
+        raise InputError(f"{out} is not the name of an MCAP file: give one that ends in .mcap")
+    beside = out.with_suffix(".json")
+    if layout and beside.exists():
+        raise InputError(f"{beside} exists; give another --out, or remove it")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    messages, warnings = export_foxglove(result, out, Path(run_path) if run_path else None)
+    warn(warnings)
+    print(f"wrote {out}: {messages} messages of {len(result.trajectories)} robots")
+    if layout:
+        write_atomically(beside, LAYOUT.read_bytes())
+        print(f"wrote {beside}: import it as a layout in Foxglove")
     return 0

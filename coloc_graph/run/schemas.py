@@ -160,7 +160,7 @@ def schema_of(name: str) -> tuple[str, str, bytes]:
     if name in JSON_TYPES:
         schema = msgspec.json.schema(JSON_TYPES[name])
         return "jsonschema", "json", msgspec.json.encode(schema, order="deterministic")
-    return "protobuf", "protobuf", _file_descriptors(protobuf_type(name))
+    return "protobuf", "protobuf", file_descriptors(protobuf_type(name))
 
 
 def protobuf_type(name: str) -> Any:
@@ -179,7 +179,7 @@ def protobuf_type(name: str) -> Any:
     return PoseInFrame
 
 
-def _file_descriptors(message: Any) -> bytes:
+def file_descriptors(message: Any) -> bytes:
     """Return a FileDescriptorSet, dependencies first, as MCAP requires for protobuf."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
