@@ -199,6 +199,16 @@ def test_whether_measurements_disagree_depends_on_the_degrees_of_freedom(solutio
         assert all(f"chi2/dof {chi2 / dof:.1f}" in one and "by noise alone" in one for one in warnings)
 
 
+def test_a_prediction_that_is_off_by_half_is_warned_of_and_a_tenth_is_not(solutions):
+    from coloc_graph.pipeline.explanations import warnings_of_graph
+
+    estimate = solutions["smooth"].estimate
+    for chi2, said in ((750.0, None), (950.0, "disagree"), (450.0, None), (200.0, "agree better than expected")):
+        warnings = warnings_of_graph(dataclasses.replace(estimate, chi2=chi2, dof=600), (), ())
+        assert len(warnings) == (said is not None), (chi2, warnings)
+        assert said is None or said in warnings[0]
+
+
 def with_camera_at(run, copied, to, **mount):
     team = run.team
     robots = tuple(
