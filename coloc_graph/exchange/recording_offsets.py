@@ -1,7 +1,7 @@
-"""Offsets between recordings that did not begin together, by the homography that explains what both saw at once.
+"""Find the time offset of recordings that did not begin together, by homographies between their cameras.
 
-Offsets are tried over the whole of both recordings, a part of a second apart; the front end refines each
-(`find_offset`), and the one at which most points agree on one homography is taken. The rest is found with the poses
+Offsets are tried over the whole of both recordings, a fraction of a second apart; the front end refines each
+(`find_offset`), and the one at which most points agree on one homography is chosen. The rest is estimated with the poses
 (`Team.clock_sigma`).
 """
 
@@ -27,15 +27,15 @@ from coloc_graph.team import Markers, Team
 Array = NDArray[np.float64]
 Span = tuple[float, float]
 
-OFFSET_SIGMA = 0.05  # s, standard deviation of an offset that was found so
+OFFSET_SIGMA = 0.05  # s, standard deviation of the result
 SEARCH_SIGMA = 0.12  # s, standard deviation with which each offset is tried
 STEP = 0.3  # s between offsets that are tried
-STRETCHES = 2  # longest stretches in which the first camera stands that are looked at
-MAX_STRETCH = 15.0  # s of such a stretch
+STRETCHES = 2  # number of intervals, longest first, in which the first camera stands, that are used
+MAX_STRETCH = 15.0  # s of such an interval
 MIN_OVERLAP = 5.0  # s that both cameras stand
 MIN_POINTS = 40  # that agree on one homography
 MIN_SHARE = 0.75  # of the points
-CANDIDATES = 4  # offsets that are looked at in all stretches
+CANDIDATES = 4  # offsets that are tested in all intervals
 MIN_CONTRAST = 1.3  # of the points that agree, to any other offset
 MIN_SHARED = 0.6  # of the time for which the camera stands that stands less, in which both stand at the offset
 APART = 1.0  # s
@@ -43,7 +43,7 @@ APART = 1.0  # s
 
 @dataclass(frozen=True, eq=False)
 class RecordedTracks:
-    """Tracks of lights in a robot's recording, and the stretches in which its camera stood, by its own times."""
+    """Tracks of lights in a robot's recording, and the intervals in which its camera stood, by its own clock."""
 
     robot: str
     tracks: list[Track]
@@ -53,7 +53,7 @@ class RecordedTracks:
 def recorded_tracks(
     team: Team, robot: str, times: Array, images: Iterable[NDArray[np.uint8]], standing: Sequence[Span]
 ) -> RecordedTracks:
-    """Follow the lights in a recording."""
+    """Track the lights in a recording."""
     tracker = MarkerTracker(robot, detector_for(_markers(team), team[robot].camera))
     for time, pixels in zip(times.tolist(), images, strict=False):
         tracker.step(Image(robot, time, pixels))
@@ -113,14 +113,14 @@ def recording_offset(team: Team, first: RecordedTracks, other: RecordedTracks) -
 
 
 def _shared(one: Span, two: Span, lag: float) -> Span:
-    """The stretch, by the first clock, in which both cameras stand at an offset."""
+    """Interval, by the first clock, in which both cameras stand at an offset."""
     return max(one[0], two[0] - lag), min(one[1], two[1] - lag)
 
 
 def _tried(
     team: Team, first: RecordedTracks, other: RecordedTracks, span: Span, prior: ClockOffset
 ) -> tuple[float, int]:
-    """Refine the offset (clock of the other less that of the first) [s]; return it with the number of points."""
+    """Refine an offset (other clock minus first) [s], and return it with the number of points that agree."""
     cameras, lag = (team[first.robot].camera, team[other.robot].camera), prior.value
     i = _within(team, first, span)
     j = _within(team, other, (span[0] + lag, span[1] + lag))
