@@ -1,7 +1,7 @@
 """Find the time offset of recordings that did not begin together, by homographies between their cameras.
 
 Offsets are tried over the whole of both recordings, a fraction of a second apart; the front end refines each
-(`find_offset`), and the one at which most points agree on one homography is chosen. The rest is estimated with the poses
+(`find_offset`), and the one at which most points agree on one homography is chosen. The rest is estimated with poses
 (`Team.clock_sigma`).
 """
 
