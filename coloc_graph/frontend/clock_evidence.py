@@ -29,6 +29,7 @@ MAX_UNNAMED_TRACKS = 2  # tracks without names that are tried in each camera, th
 MOVED_PX = 20.0  # a track that keeps within this tells nothing [px]
 SYNCHRONOUS = 2e-3  # samples of two cameras that are taken at once lie this close [s]
 MIN_AT_ONCE = 10  # samples that tell that two cameras take them at once
+MAX_WHEEL_ERROR = 0.03  # robust deviation of a path by wheels from the seen one that an offset explains [m]
 ROUGH_SIGMA = 20e-3  # standard deviation of a searched offset before it is refined [s]
 SIGMA_FLOORS = {"camera": 5e-3, "wheels": 20e-3}  # a searched offset is known no better: samples are few, wheels slip
 
@@ -180,7 +181,7 @@ def _camera_to_wheels(
     if not named and alone:
         long = sorted((one for one in seen if _moves(one) and not one.marker), key=lambda one: -len(one.times))
         choices = [[(_path(one), path)] for one in long[:1] for path in paths]
-    found = [one for pairs in choices if (one := search_offset(pairs)) is not None]
+    found = [one for pairs in choices if (one := search_offset(pairs, max_residual=MAX_WHEEL_ERROR))]
     if not found:
         return None
     best = min(found, key=lambda one: one.sigma)

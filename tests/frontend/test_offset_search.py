@@ -47,3 +47,10 @@ def test_an_offset_that_the_motion_does_not_tell_is_not_found():
     still = [TimedPath(times, 100 + 0.3 * rng.standard_normal(line.shape)) for _ in range(2)]
     assert search_offset([tuple(still)]) is None
     assert search_offset([]) is None
+
+
+def test_an_offset_that_leaves_the_paths_apart_is_none():
+    """As odometry of another point of the body than the one that carries the marker."""
+    pairs = seen(np.random.default_rng(1), 0.3)
+    assert search_offset(pairs, max_residual=1.0) is not None
+    assert search_offset(pairs, max_residual=0.1) is None

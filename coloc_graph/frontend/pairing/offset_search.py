@@ -51,7 +51,9 @@ class TimedPath:
         return found
 
 
-def search_offset(pairs: Sequence[tuple[TimedPath, TimedPath]], reach: float = REACH) -> ClockOffset | None:
+def search_offset(
+    pairs: Sequence[tuple[TimedPath, TimedPath]], reach: float = REACH, max_residual: float = np.inf
+) -> ClockOffset | None:
     """Search for the offset clock_j - clock_i at which one homography explains all pairs of paths.
 
     Parameters
@@ -60,11 +62,13 @@ def search_offset(pairs: Sequence[tuple[TimedPath, TimedPath]], reach: float = R
         The same markers' paths by clocks i and j.
     reach : float
         Largest offset that is looked for [s].
+    max_residual : float
+        Robust standard deviation of the second paths about the first that an offset may leave, in their coordinates.
 
     Returns
     -------
     ClockOffset or None
-        None where no offset is clearly better than all others.
+        None where no offset is clearly better than all others, or none explains the paths.
     """
     pairs = [(a, b) for a, b in pairs if len(a.times) >= 4 and len(b.times) >= 4]
     total = sum(len(a.times) for a, _ in pairs)
@@ -78,7 +82,8 @@ def search_offset(pairs: Sequence[tuple[TimedPath, TimedPath]], reach: float = R
         times = [a.times[::every] for a, _ in pairs]
         x = _scaled(np.concatenate([a.xy[::every] for a, _ in pairs]))
         y = np.concatenate([b.at(t[None] + offsets[:, None]) for t, (_, b) in zip(times, pairs, strict=True)], axis=1)
-        return _log_likelihood(x, (y - middle) / unit) * min(total, MAX_POINTS) / len(x)
+        # neighbours err alike, so that not all points count
+        return INDEPENDENT * (2 * min(total, MAX_POINTS) - 9) * _log_variance(x, (y - middle) / unit)
 
     count = round(reach / COARSE_STEP)
     offsets = np.asarray(COARSE_STEP * np.arange(-count, count + 1), float)
@@ -94,6 +99,8 @@ def search_offset(pairs: Sequence[tuple[TimedPath, TimedPath]], reach: float = R
         return None
     if float(np.nanmin(far)) - fine[k] < CLEAR:
         return None
+    if unit * np.exp(fine[k] / (2 * INDEPENDENT * (2 * min(total, MAX_POINTS) - 9))) > max_residual:
+        return None
     low, here, high = fine[k - 1 : k + 2]
     curvature = low + high - 2 * here
     if curvature <= 0:
@@ -106,10 +113,10 @@ def _scaled(x: Array) -> Array:
     return np.asarray((x - x.mean(axis=0)) / max(float(x.std()), 1e-12))
 
 
-def _log_likelihood(x: Array, y: Array) -> Array:
-    """-2 log-likelihood (m,) of the offsets, from points x (n, 2) and y (m, n, 2), NaN where they are unseen.
+def _log_variance(x: Array, y: Array) -> Array:
+    """Logarithm of the variance (m,) of y (m, n, 2) about the best homography of x (n, 2), by offset.
 
-    The homography and the noise are eliminated; NaN where too few points are seen.
+    NaN in y is unseen; NaN is returned where too few points are seen.
     """
     seen = np.asarray(np.isfinite(y).all(axis=-1), bool)
     counts = seen.sum(axis=1)
@@ -138,5 +145,5 @@ def _log_likelihood(x: Array, y: Array) -> Array:
     bounded = np.minimum(squared, OUTLIER**2 * scale[:, None])
     variance = (bounded * seen).sum(axis=1) / (2 * counts)
     # offsets with fewer points have less to explain: compared by the mean
-    found[enough] = INDEPENDENT * (2 * counts - 9).max() * np.log(variance + 1e-12)
+    found[enough] = np.log(variance + 1e-12)
     return found
