@@ -21,11 +21,14 @@ ANCHOR_TILT_SIGMA = float(np.deg2rad(0.25))  # rad, tilt sigma below which spans
 FAR_SIGMAS = 3.0  # sigmas from the stated value above which a calibration is warned of
 
 # characters of the variables' GTSAM keys
-MOUNT = ord("m")  # height [m], tilt, roll [rad]
+MOUNT = ord("m")  # height [m], tilt, roll, yaw [rad], x, y [m]
 MARKERS = ord("k")  # span (relative), height [m]
 CLOCKS = ord("o")  # offset of the clocks of a pair [s]
 PLANE = ord("p")  # normal in two directions [rad], distance (relative)
-SIZES = {MOUNT: 3, MARKERS: 2, CLOCKS: 1, PLANE: 3}  # dimension of each
+SIZES = {MOUNT: 6, MARKERS: 2, CLOCKS: 1, PLANE: 3}  # dimension of each
+TILTS = slice(1, 3)  # tilt and roll among the errors of a mount
+YAW = "camera yaw"
+UNOBSERVABLE = 0.8  # part of a stated tolerance that is left of what nothing measures
 
 
 class Variables:
@@ -51,7 +54,8 @@ class Variables:
     def mount(self, robot: str) -> int | None:
         """Return the key of a robot's mount; None where it is exact."""
         m = self.robot_models[robot].mount
-        return self._key(MOUNT, robot, 0, [m.height_sigma, *np.deg2rad([m.tilt_sigma_deg, m.roll_sigma_deg])])
+        angles = np.deg2rad([m.tilt_sigma_deg, m.roll_sigma_deg, m.yaw_sigma_deg])
+        return self._key(MOUNT, robot, 0, [m.height_sigma, *angles, m.position_sigma, m.position_sigma])
 
     def anchor(self, robot: str) -> tuple[Array, float]:
         """Return the mount error (3,) at which spans are linearised, and the sigma of its tilts there [rad].
@@ -62,12 +66,12 @@ class Variables:
         key = self.mount(robot)
         if key in self.anchors:
             return self.anchors[key], ANCHOR_TILT_SIGMA
-        return np.zeros(3), float(np.deg2rad(max(m.tilt_sigma_deg, m.roll_sigma_deg)))
+        return np.zeros(SIZES[MOUNT]), float(np.deg2rad(max(m.tilt_sigma_deg, m.roll_sigma_deg)))
 
     def is_anchored(self, values: Mapping[int, Array]) -> bool:
         """Return whether the mounts in `values` are close enough to those at which spans are linearised."""
         return all(
-            np.abs((found - self.anchors.get(key, np.zeros(3)))[1:]).max() < ANCHOR_TILT_SIGMA
+            np.abs((found - self.anchors.get(key, np.zeros(SIZES[MOUNT])))[TILTS]).max() < ANCHOR_TILT_SIGMA
             for key, found in values.items()
             if self.is_mount(key)
         )
@@ -142,9 +146,9 @@ class CalibratedMount:
         The robot.
     stated : Mount
         The mount as stated.
-    errors : (3,) float
-        Estimated errors of height [m], tilt and roll [rad].
-    covariance : (3, 3) float
+    errors : (6,) float
+        Estimated errors of height [m], tilt, roll, yaw [rad], x and y [m].
+    covariance : (6, 6) float
         Their covariance.
     """
 
@@ -158,7 +162,8 @@ class CalibratedMount:
     def mount(self) -> Mount:
         """The calibrated mount, with the remaining tolerances."""
         sigmas = np.sqrt(self.covariance.diagonal())
-        (height, tilt, roll), (d_height, d_tilt, d_roll) = self.errors.tolist(), sigmas.tolist()
+        height, tilt, roll, yaw, x, y = self.errors.tolist()
+        d_height, d_tilt, d_roll, d_yaw, d_x, d_y = sigmas.tolist()
         return with_fields(
             self.stated,
             height=self.stated.height + height,
@@ -167,13 +172,22 @@ class CalibratedMount:
             height_sigma=d_height,
             tilt_sigma_deg=float(np.rad2deg(d_tilt)),
             roll_sigma_deg=float(np.rad2deg(d_roll)),
+            yaw_deg=self.stated.yaw_deg + float(np.rad2deg(yaw)),
+            x=self.stated.x + x,
+            y=self.stated.y + y,
+            yaw_sigma_deg=float(np.rad2deg(d_yaw)) if self.stated.yaw_sigma_deg else 0.0,
+            position_sigma=max(d_x, d_y) if self.stated.position_sigma else 0.0,
         )
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Height, tilt and roll, one after the other."""
+        """Height, tilt, roll, yaw, x and y, one after the other."""
         stated, found = self.stated, self.mount
+        d_x, d_y = np.sqrt(self.covariance.diagonal())[4:].tolist()
         return (
+            Row(self.robot, YAW, "deg", stated.yaw_deg, stated.yaw_sigma_deg, found.yaw_deg, found.yaw_sigma_deg),
+            Row(self.robot, "camera x", "m", stated.x, stated.position_sigma, found.x, d_x),
+            Row(self.robot, "camera y", "m", stated.y, stated.position_sigma, found.y, d_y),
             Row(self.robot, "height", "m", stated.height, stated.height_sigma, found.height, found.height_sigma),
             Row(
                 self.robot, "tilt", "deg", stated.tilt_deg, stated.tilt_sigma_deg, found.tilt_deg, found.tilt_sigma_deg
@@ -304,6 +318,16 @@ class Calibration:
                 landmark = with_fields(landmark, markers=self.markers[landmark.name].markers)
             landmarks.append(self.landmarks.get(landmark.name, landmark))
         return with_fields(team, robots=tuple(robots), landmarks=tuple(landmarks))
+
+    @property
+    def unobservable(self) -> tuple[Row, ...]:
+        """Yaws and positions of mounts of which the measurements say next to nothing."""
+        return tuple(
+            row
+            for mount in self.mounts.values()
+            for row in mount.rows[:3]
+            if row.stated_sigma > 0 and row.found_sigma > UNOBSERVABLE * row.stated_sigma
+        )
 
     @property
     def far(self) -> tuple[Row, ...]:

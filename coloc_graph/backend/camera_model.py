@@ -57,18 +57,18 @@ class Model(Protocol):
 
 
 class Mounts:
-    """`T_body_camera` of n mounts as a function of their errors (n, 3): height, tilt, roll."""
+    """`T_body_camera` of n mounts as a function of their errors (n, 6): height, tilt, roll, yaw, x, y."""
 
     def __init__(self, mounts: Sequence[Mount]) -> None:
         self._yaw, self._tilt, self._roll = np.deg2rad([[m.yaw_deg, m.tilt_deg, m.roll_deg] for m in mounts]).T
         self._t: Array = np.array([(m.x, m.y, m.height) for m in mounts])
 
     def at(self, errors: Array) -> "MountedCameras":
-        """Return the cameras of mounts with `errors` (n, 3)."""
+        """Return the cameras of mounts with `errors` (n, 6)."""
         tilt, roll = self._tilt + errors[:, 1], self._roll + errors[:, 2]
         t = self._t.copy()
-        t[:, 2] += errors[:, 0]
-        return MountedCameras(camera_rotation(self._yaw, tilt, roll), t, tilt_axis(roll))
+        t += errors[:, [4, 5, 0]]
+        return MountedCameras(camera_rotation(self._yaw + errors[:, 3], tilt, roll), t, tilt_axis(roll))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +84,13 @@ class MountedCameras:
 
     @property
     def by_errors(self) -> Array:
-        """Derivatives (n, 6, 3) of the cameras' tangents by the mounts' errors."""
-        out = np.zeros((len(self.t), 6, 3))
+        """Derivatives (n, 6, 6) of the cameras' tangents by the mounts' errors."""
+        out = np.zeros((len(self.t), 6, 6))
         out[:, 3:, 0] = self.R[:, 2]
         out[:, :3, 1] = self.tilt_axis
         out[:, :3, 2] = roll_axis()
+        out[:, :3, 3] = self.R[:, 2]
+        out[:, 3:, 4], out[:, 3:, 5] = self.R[:, 0], self.R[:, 1]
         return out
 
     @property

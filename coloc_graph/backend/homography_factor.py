@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.batched_factors import BatchedFactor, FactorEvaluator
-from coloc_graph.backend.calibration import Variables, sigmas_of_plane
+from coloc_graph.backend.calibration import MOUNT, SIZES, Variables, sigmas_of_plane
 from coloc_graph.backend.camera_model import MarkersModel
 from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
 from coloc_graph.geometry.lie import floor_pose, yaw
@@ -19,6 +19,7 @@ from coloc_graph.measurements import RelativePose, Sighting
 
 Array = NDArray[np.float64]
 
+MOUNT_SIZE = SIZES[MOUNT]
 MAX_STEPS = 8  # Gauss-Newton steps to one pose; three are usual
 
 
@@ -39,7 +40,7 @@ def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, 
     clocks, sign = variables.clocks(link.robot_i, link.robot_j, measured.time_offset_sigma)
     model = HomographyModel(measured, link.spans, mount_i, mount_j, markers, on_floor, about, tilt_sigma, sign)
     keys = variables.mount(link.robot_i), variables.mount(link.robot_j), *map(variables.markers, model.movers), clocks
-    return BatchedFactor(FactorEvaluator(model, (i, j), keys, (3, 3, *[2] * len(model.movers), 1)))
+    return BatchedFactor(FactorEvaluator(model, (i, j), keys, (MOUNT_SIZE, MOUNT_SIZE, *[2] * len(model.movers), 1)))
 
 
 def homography_pose(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[[int], Array]) -> gtsam.Pose3:
@@ -70,13 +71,13 @@ def homography_pose(link: RelativePose, factor: gtsam.NonlinearFactor, errors: C
 def markers_factor(link: Sighting, i: int, j: int, variables: Variables) -> BatchedFactor:
     """Return the factor of sighted markers on the poses of observer and seen, the observer's mount and the markers."""
     keys = variables.mount(link.observer), variables.markers(link.seen)
-    return BatchedFactor(FactorEvaluator(_markers_model(link, variables), (i, j), keys, (3, 2)))
+    return BatchedFactor(FactorEvaluator(_markers_model(link, variables), (i, j), keys, (MOUNT_SIZE, 2)))
 
 
 def sighted_pose(link: Sighting, variables: Variables, errors: Callable[[int], Array]) -> gtsam.Pose3:
     """Return the pose of the seen robot in its observer, with mount and markers at `errors` of their keys."""
     keys = variables.mount(link.observer), variables.markers(link.seen)
-    mount, markers = (np.zeros(n) if key is None else errors(key) for key, n in zip(keys, (3, 2), strict=True))
+    mount, markers = (np.zeros(n) if key is None else errors(key) for key, n in zip(keys, (MOUNT_SIZE, 2), strict=True))
     planar = _markers_model(link, variables).planar_pose(mount, markers)
     return gtsam.Pose3(link.T_i_j) if planar is None else gtsam.Pose3(floor_pose(*planar))
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from coloc_graph.backend.calibration import ANCHOR_TILT_SIGMA, is_calibration
+from coloc_graph.backend.calibration import ANCHOR_TILT_SIGMA, TILTS, is_calibration
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, agreement, innovation, keys_of
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
@@ -120,7 +120,7 @@ class Isam2Graph:
             return
         for key in self._calibrated:
             if variables.is_mount(key) and (
-                key in variables.anchors or np.sqrt(self.covariance(key).diagonal()[1:].max()) < ANCHOR_TILT_SIGMA
+                key in variables.anchors or np.sqrt(self.covariance(key).diagonal()[TILTS].max()) < ANCHOR_TILT_SIGMA
             ):
                 variables.anchors[key] = self.errors(key)
 

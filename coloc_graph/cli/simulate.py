@@ -37,6 +37,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     errors = command.add_argument_group("errors of the simulated world (standard deviations; default: 0)")
     errors.add_argument("--noise", type=float, help="noise of a marker centre, px, with --depth tracks (default: 0.3)")
     errors.add_argument("--mount-sigma", type=float, default=0.0, help="tilt and roll of the mounts, deg")
+    errors.add_argument("--mount-yaw-sigma", type=float, default=0.0, help="yaw of the mounts, deg")
     errors.add_argument("--height-sigma", type=float, default=0.0, help="height of the mounts, m")
     errors.add_argument("--span-sigma", type=float, default=0.0, help="distance between a robot's markers, m")
     errors.add_argument("--floor-sigma", type=float, default=0.0, help="unevenness of the floor, deg")
@@ -80,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"--{name.replace('_', '-')} does not apply with --depth {args.depth}; leave it out")
     imperfections = Imperfections(
         mount_sigma_deg=args.mount_sigma,
+        mount_yaw_sigma_deg=args.mount_yaw_sigma,
         height_sigma=args.height_sigma,
         span_sigma=args.span_sigma,
         floor_sigma_deg=args.floor_sigma,

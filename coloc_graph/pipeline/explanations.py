@@ -141,7 +141,7 @@ def warnings_of_graph(
     else:
         warnings.append(unstated)
     warnings += _far(estimate)
-    return warnings + _misfit(estimate)
+    return [*warnings, *_unobservable(estimate), *_misfit(estimate)]
 
 
 def _misfit(estimate: Estimate) -> list[str]:
@@ -162,6 +162,18 @@ def _misfit(estimate: Estimate) -> list[str]:
             "odometry or noise"
         ]
     return []
+
+
+def _unobservable(estimate: Estimate) -> Iterator[str]:
+    """Tolerances of mounts that were stated, and that the measurements do not narrow."""
+    names: dict[str, list[str]] = {}
+    for row in estimate.calibration.unobservable:
+        names.setdefault(row.robot, []).append(row.what)
+    for robot, whats in names.items():
+        yield (
+            f"{robot}: {', '.join(whats)} not observable, and as uncertain as stated: record wheel odometry of {robot} "
+            "while it turns and drives between its stances"
+        )
 
 
 def _p_value(p_value: float) -> str:

@@ -17,13 +17,14 @@ MILD_LENS = (-0.10, 0.02, 5e-4, -3e-4)
 class Imperfections:
     """Standard deviations from which a truth is drawn, and the clocks' faults. Zero by default but the noise.
 
-    `mount_sigma_deg` holds for tilt and for roll of each mount, `floor_sigma_deg` for roll and for pitch of a
-    body wherever it stands; heights and spans are in metres. A robot other than the reference stamps an
-    instant t with t + `clock_offset` [s]. `time_jitter` [s] moves the true instant of each capture; the stamp
-    moves with it. `noise_px` is that of a marker centre per axis (tracks depth only: images bring their own).
+    `mount_sigma_deg` holds for tilt and for roll of each mount, `mount_yaw_sigma_deg` for its yaw, `floor_sigma_deg`
+    for roll and for pitch of a body wherever it stands; heights and spans are in metres. A robot other than the
+    reference stamps an instant t with t + `clock_offset` [s]. `time_jitter` [s] moves the true instant of each capture;
+    the stamp moves with it. `noise_px` is that of a marker centre per axis (tracks depth only: images bring their own).
     """
 
     mount_sigma_deg: float = 0.0
+    mount_yaw_sigma_deg: float = 0.0
     height_sigma: float = 0.0
     span_sigma: float = 0.0
     floor_sigma_deg: float = 0.0
@@ -73,6 +74,7 @@ def stated_team(team: Team, imperfections: Imperfections) -> Team:
             height_sigma=imperfections.height_sigma,
             tilt_sigma_deg=imperfections.mount_sigma_deg,
             roll_sigma_deg=imperfections.mount_sigma_deg,
+            yaw_sigma_deg=imperfections.mount_yaw_sigma_deg,
         )
         markers = robot.markers and replace(robot.markers, span_sigma=imperfections.span_sigma)
         return replace(robot, camera_if_any=camera, mount_if_any=mount, markers=markers)
@@ -88,14 +90,18 @@ def true_team(stated: Team, rng: np.random.Generator) -> Team:
     def drawn(robot: Robot) -> Robot:
         height, tilt, roll, span = rng.standard_normal(4).tolist()
         m = robot.mount
+        # drawn last and if wanted only: the other draws of a seed stay
+        yaw = float(rng.standard_normal()) if m.yaw_sigma_deg else 0.0
         mount = replace(
             m,
             height=m.height + height * m.height_sigma,
             tilt_deg=m.tilt_deg + tilt * m.tilt_sigma_deg,
             roll_deg=m.roll_deg + roll * m.roll_sigma_deg,
+            yaw_deg=m.yaw_deg + yaw * m.yaw_sigma_deg,
             height_sigma=0.0,
             tilt_sigma_deg=0.0,
             roll_sigma_deg=0.0,
+            yaw_sigma_deg=0.0,
         )
         markers = robot.markers
         if markers is not None and markers.span:

@@ -26,6 +26,8 @@ class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         Position of the optical centre on the body [m].
     height_sigma, tilt_sigma_deg, roll_sigma_deg : float
         Tolerances; 0 is exact.
+    yaw_sigma_deg, position_sigma : float
+        Tolerances of the yaw, and of x and y [m]; 0 is exact. Only wheel odometry makes them observable.
     """
 
     height: float
@@ -37,10 +39,13 @@ class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     height_sigma: float = 0.0
     tilt_sigma_deg: float = 0.0
     roll_sigma_deg: float = 0.0
+    yaw_sigma_deg: float = 0.0
+    position_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         require_finite(self)
         require_not_negative(self, ("height", "height_sigma", "tilt_sigma_deg", "roll_sigma_deg"))
+        require_not_negative(self, ("yaw_sigma_deg", "position_sigma"))
 
     @property
     def R_body_camera(self) -> Array:

@@ -18,7 +18,7 @@ MOUNT_I = Mount(height=0.4, tilt_deg=20.0, roll_deg=1.0, yaw_deg=5.0, x=0.05, y=
 MOUNT_J = Mount(height=0.38, tilt_deg=17.0, roll_deg=-2.0, yaw_deg=-3.0, x=0.02, y=0.01)
 MARKERS = Markers(height=0.15, positions=((0.0, 0.125), (0.03, -0.125)))
 T_WORLD_I = floor_pose(0.3, 0.1, 0.2) @ se3_exp(np.array([2e-3, -1e-3, 0, 0, 0, 1e-3]))
-EXACT = np.zeros(3), np.zeros(3), np.zeros(2), np.zeros(1)
+EXACT = np.zeros(6), np.zeros(6), np.zeros(2), np.zeros(1)
 T_WORLD_J = floor_pose(0.4, -0.6, 0.5) @ se3_exp(np.array([-1e-3, 2e-3, 0, 0, 0, -1e-3]))
 
 
@@ -54,7 +54,7 @@ def span_of(rng, T_i=T_WORLD_I, noise=0.0, n=40):
 def model_of(rng, on_floor=True, measured=None, spans=None):
     spans = (span_of(rng),) if spans is None else spans
     measured = measured or homography(rng, offset=rng.normal(size=8))
-    return HomographyModel(measured, spans, MOUNT_I, MOUNT_J, {"C": MARKERS}, on_floor, np.zeros(3), 0.01)
+    return HomographyModel(measured, spans, MOUNT_I, MOUNT_J, {"C": MARKERS}, on_floor, np.zeros(6), 0.01)
 
 
 def at(model, T_i, T_j, *errors):
@@ -69,22 +69,27 @@ def by_differences(f, x, step=1e-6):
 
 
 def test_a_mount_that_is_off_sits_where_one_that_is_stated_so_does(rng):
-    height, tilt, roll = 0.01, 0.03, -0.02
+    height, tilt, roll, yaw, x, y = at = 0.01, 0.03, -0.02, 0.04, 0.006, -0.007
     stated = Mount(
-        height=0.41, tilt_deg=20.0 + np.rad2deg(tilt), roll_deg=1.0 + np.rad2deg(roll), yaw_deg=5.0, x=0.05, y=-0.02
+        height=0.40 + height,
+        tilt_deg=20.0 + np.rad2deg(tilt),
+        roll_deg=1.0 + np.rad2deg(roll),
+        yaw_deg=5.0 + np.rad2deg(yaw),
+        x=0.05 + x,
+        y=-0.02 + y,
     )
-    camera = Mounts([MOUNT_I]).at(np.array([[height, tilt, roll]]))
+    camera = Mounts([MOUNT_I]).at(np.array([at]))
     R, t = camera.R[0], camera.t[0]
     np.testing.assert_allclose(R, stated.R_body_camera, atol=1e-14)
-    np.testing.assert_allclose(t, [0.05, -0.02, 0.41], atol=1e-14)
+    np.testing.assert_allclose(t, [0.056, -0.027, 0.41], atol=1e-14)
 
     def tangent(errors):
         """Of the camera that is off in the one that is not."""
-        off = Mounts([MOUNT_I]).at(np.array([[height, tilt, roll]]) + errors)
+        off = Mounts([MOUNT_I]).at(np.array([at]) + errors)
         W = R.T @ off.R[0]
         return np.array([W[2, 1], W[0, 2], W[1, 0], *(R.T @ (off.t[0] - t))])
 
-    np.testing.assert_allclose(camera.by_errors[0], by_differences(tangent, np.zeros(3)), atol=1e-9)
+    np.testing.assert_allclose(camera.by_errors[0], by_differences(tangent, np.zeros(6)), atol=1e-9)
 
 
 @pytest.mark.parametrize("on_floor", [True, False])
@@ -100,19 +105,19 @@ def test_jacobians_of_homography_and_spans(rng, on_floor):
     model = model_of(rng, on_floor)
     assert model.rows == 11
     # far from the truth, so that nothing that counts is small
-    x = np.concatenate([0.02 * rng.normal(size=12), 0.02 * rng.normal(size=6), 0.01 * rng.normal(size=2), [3e-3]])
+    x = np.concatenate([0.02 * rng.normal(size=12), 0.02 * rng.normal(size=12), 0.01 * rng.normal(size=2), [3e-3]])
 
     def moved(step):
         """Poses move from where they are, everything else adds up."""
         T_i = T_WORLD_I @ se3_exp(x[:6]) @ se3_exp(step[:6])
         T_j = T_WORLD_J @ se3_exp(x[6:12]) @ se3_exp(step[6:12])
         y = x + step
-        return at(model, T_i, T_j, y[12:15], y[15:18], y[18:20], y[20])
+        return at(model, T_i, T_j, y[12:18], y[18:24], y[24:26], y[26])
 
-    J = moved(np.zeros(21))[1]
-    expected = by_differences(lambda step: moved(step)[0], np.zeros(21))
+    J = moved(np.zeros(27))[1]
+    expected = by_differences(lambda step: moved(step)[0], np.zeros(27))
     np.testing.assert_allclose(J, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
-    assert (np.abs(expected).max(axis=0) > 1e-3 * np.abs(expected).max()).sum() >= 15  # the test says something
+    assert (np.abs(expected).max(axis=0) > 1e-3 * np.abs(expected).max()).sum() >= 21  # the test says something
 
 
 def test_the_residual_is_the_whitened_logarithm(rng):
@@ -142,7 +147,7 @@ def test_what_cannot_be_seen_is_told_apart(rng):
     below[2, 3] = -1.0
     assert not at(model, T_WORLD_I, below, *EXACT)[2]
     sight = MarkersModel(np.zeros((2, 2)), np.broadcast_to(1e-6 * np.eye(2), (2, 2, 2)), MOUNT_I, MARKERS)
-    assert not at(sight, T_WORLD_I, T_WORLD_I @ floor_pose(-2, 0, 0), np.zeros(3), np.zeros(2))[2]
+    assert not at(sight, T_WORLD_I, T_WORLD_I @ floor_pose(-2, 0, 0), np.zeros(6), np.zeros(2))[2]
 
 
 def test_spans_on_the_true_plane_are_the_markers(rng):
@@ -225,20 +230,20 @@ def test_sighted_markers(rng):
     covariance = np.broadcast_to(1e-6 * np.array([[1.0, 0.3], [0.3, 2.0]]), (2, 2, 2))
     model = MarkersModel(x, covariance, MOUNT_I, MARKERS)
     level = floor_pose(0.3, 0.1, 0.2)
-    assert np.abs(at(model, level, T_seen, np.zeros(3), np.zeros(2))[0]).max() < 1e-9
-    np.testing.assert_allclose(level @ floor_pose(*model.planar_pose(np.zeros(3), np.zeros(2))), T_seen, atol=1e-12)
-    assert model.planar_pose(np.array([0.0, -0.5, 0.0]), np.zeros(2)) is None  # it looks up
+    assert np.abs(at(model, level, T_seen, np.zeros(6), np.zeros(2))[0]).max() < 1e-9
+    np.testing.assert_allclose(level @ floor_pose(*model.planar_pose(np.zeros(6), np.zeros(2))), T_seen, atol=1e-12)
+    assert model.planar_pose(np.array([0.0, -0.5, 0, 0, 0, 0]), np.zeros(2)) is None  # it looks up
     T_off, mount, markers = (
         T_seen @ se3_exp(0.02 * rng.normal(size=6)),
-        0.01 * rng.normal(size=3),
+        0.01 * rng.normal(size=6),
         np.array([0.01, 2e-3]),
     )
 
     def moved(step):
         T_i, T_j = T_WORLD_I @ se3_exp(step[:6]), T_off @ se3_exp(step[6:12])
-        return at(model, T_i, T_j, mount + step[12:15], markers + step[15:])[0]
+        return at(model, T_i, T_j, mount + step[12:18], markers + step[18:])[0]
 
-    expected = by_differences(moved, np.zeros(17))
+    expected = by_differences(moved, np.zeros(20))
     got = at(model, T_WORLD_I, T_off, mount, markers)[1]
     np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
 
@@ -249,16 +254,16 @@ def test_factors_evaluated_at_once_are_those_evaluated_alone(rng):
     both = {"C": MARKERS, "D": MARKERS}
     made = [model_of(rng), model_of(rng, spans=(short,)), model_of(rng, False), model_of(rng, spans=())]
     made += [
-        HomographyModel(homography(rng), spans, MOUNT_I, MOUNT_J, both, True, np.zeros(3), 0.01)
+        HomographyModel(homography(rng), spans, MOUNT_I, MOUNT_J, both, True, np.zeros(6), 0.01)
         for spans in ((short, long), (long, short), (long,))
     ]
-    seen = [FactorEvaluator(model, (1, 2), (11, 12, *[21] * len(model.movers), 31), (3, 3, *[2] * len(model.movers), 1))
+    seen = [FactorEvaluator(model, (1, 2), (11, 12, *[21] * len(model.movers), 31), (6, 6, *[2] * len(model.movers), 1))
             for model in made]  # fmt: skip
-    seen.append(FactorEvaluator(made[0], (2, 1), (None, 12, 21, None), (3, 3, 2, 1)))
-    seen.append(FactorEvaluator(made[0], (1, 3), (11, 12, 21, 31), (3, 3, 2, 1)))  # robot 3 is below the floor
+    seen.append(FactorEvaluator(made[0], (2, 1), (None, 12, 21, None), (6, 6, 2, 1)))
+    seen.append(FactorEvaluator(made[0], (1, 3), (11, 12, 21, 31), (6, 6, 2, 1)))  # robot 3 is below the floor
     x = seen_by(T_WORLD_I, MOUNT_I, MARKERS.p_body @ T_WORLD_J[:3, :3].T + T_WORLD_J[:3, 3] + (1.0, 0.0, 0.0))
     sight = MarkersModel(x, np.broadcast_to(1e-6 * np.eye(2), (2, 2, 2)), MOUNT_I, MARKERS)
-    seen.append(FactorEvaluator(sight, (1, 2), (11, 21), (3, 2)))
+    seen.append(FactorEvaluator(sight, (1, 2), (11, 21), (6, 2)))
 
     def values_of(step):
         values = gtsam.Values()
@@ -266,7 +271,7 @@ def test_factors_evaluated_at_once_are_those_evaluated_alone(rng):
         down[2, 3] = -1.0
         for key, T in ((1, T_WORLD_I), (2, T_WORLD_J @ se3_exp(step * np.ones(6))), (3, down)):
             values.insert(key, gtsam.Pose3(T))
-        for key, size in ((11, 3), (12, 3), (21, 2), (31, 1)):
+        for key, size in ((11, 6), (12, 6), (21, 2), (31, 1)):
             values.insert(key, (step + 1e-3) * np.arange(1.0, size + 1))
         return values
 
@@ -285,7 +290,7 @@ def test_factors_evaluated_at_once_are_those_evaluated_alone(rng):
 
 def test_within_a_graph_a_factor_is_evaluated_alone_where_nothing_else_is_known(rng):
     model = model_of(rng)
-    seen = [FactorEvaluator(model, (1, j), (None, None, None, None), (3, 3, 2, 1)) for j in (2, 3)]
+    seen = [FactorEvaluator(model, (1, j), (None, None, None, None), (6, 6, 2, 1)) for j in (2, 3)]
     values = gtsam.Values()
     values.insert(1, gtsam.Pose3(T_WORLD_I))
     values.insert(2, gtsam.Pose3(T_WORLD_J))

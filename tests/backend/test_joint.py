@@ -269,7 +269,7 @@ def test_an_estimator_that_is_rebuilt_finds_the_mounts_as_batch_does(solved, mon
     anchors = estimator._live.factors_of.variables.anchors
     found = solved.estimate.calibration.mounts
     for robot in "AB":
-        assert np.abs(anchors[found[robot].key] - found[robot].errors)[1:].max() < np.deg2rad(0.3)
+        assert np.abs(anchors[found[robot].key] - found[robot].errors)[1:3].max() < np.deg2rad(0.3)
     estimator.save(tmp_path / "point.json")
     again = Estimator.resume(tmp_path / "point.json")
     assert len(asked) == 2
@@ -367,3 +367,22 @@ def fed(graph):
     for stance in graph.stances:
         estimator.add(stance, [m for m in graph.measurements if max(n for _, n in m.ends) == stance.index])
     return estimator
+
+
+def test_the_yaw_of_a_mount_is_found_by_odometry_and_else_named_as_not_observable(tmp_path):
+    imperfections = Imperfections(mount_sigma_deg=0.5, mount_yaw_sigma_deg=1.0, height_sigma=0.003)
+    simulate("hallway", tmp_path / "run.mcap", depth="tracks", seed=1, stances=14, imperfections=imperfections)
+    run = open_run(tmp_path / "run.mcap")
+    true = read_true_team(run.path)
+    solution = solve(run)
+    rows = {row.robot: row for row in solution.estimate.calibration.rows if row.what == "camera yaw"}
+    for robot in "AB":
+        row, yaw = rows[robot], true[robot].mount.yaw_deg
+        assert abs(yaw) > 0.5 and row.found_sigma < 0.15
+        assert abs(row.found - yaw) < 3 * row.found_sigma
+        assert solution.estimate.calibration.of_team(run.team)[robot].mount.yaw_deg == row.found
+    assert not solution.estimate.calibration.unobservable and not any("observable" in one for one in solution.warnings)
+
+    without = solve(run, SolveOptions(odometry=False))
+    assert {row.robot for row in without.estimate.calibration.unobservable} >= {"A", "B"}
+    assert any("A: camera yaw not observable" in one for one in without.warnings)
