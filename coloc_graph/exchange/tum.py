@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
+from coloc_graph.exchange.trajectory_rows import pose_rows
 from coloc_graph.geometry.lie import quaternion
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.input_file import read_text
@@ -45,14 +46,12 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
 def read_tum(path: Path) -> Trajectory:
     """Read the trajectory in a .tum file, with covariances if the .cov.csv is beside it; the robot is the file's name.
 
-    Raises `InputError` naming file and line, also if times do not ascend.
+    EuRoC's CSV and KITTI's poses with times are read as well (`trajectory_rows`). Raises `InputError` naming file and
+    line, also if times do not ascend.
     """
     poses: list[Array] = []
     times: list[float] = []
-    for number, line in enumerate(_lines(path), start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        values = _numbers(path, number, line.split(), 8)
+    for number, values in pose_rows(path, _lines(path)):
         length = float(np.linalg.norm(values[4:]))
         if abs(length - 1) > 1e-3:
             raise InputError(f"{path}, line {number}: the quaternion is not of unit length; write qx qy qz qw")

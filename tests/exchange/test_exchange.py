@@ -74,6 +74,30 @@ def test_tum_of_other_tools_is_read(tmp_path):
     np.testing.assert_allclose(read, R, atol=1e-3)
 
 
+NANOSECONDS = "1403636579763555584"
+HALF = np.sqrt(0.5)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"timestamp tx ty tz qx qy qz qw\n{NANOSECONDS} 1 2 3 0 0 {HALF} {HALF}\n",
+        f"timestamp,tx,ty,tz,qx,qy,qz,qw\n{NANOSECONDS},1,2,3,0,0,{HALF},{HALF}\n",
+        f"1403636579.763555584,1,2,3,0,0,{HALF},{HALF}\n",
+        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n"
+        f"{NANOSECONDS},1,2,3,{HALF},0,0,{HALF}\n",
+        f"{NANOSECONDS},1,2,3,{HALF},0,0,{HALF},0,0,0,0,0,0,0,0,0\n",
+        "1403636579.763555584 0 -1 0 1 1 0 0 2 0 0 1 3\n",
+    ],
+    ids=["header", "commas", "seconds and commas", "EuRoC", "EuRoC without header", "KITTI with times"],
+)
+def test_trajectories_of_other_formats_are_read(tmp_path, text):
+    (tmp_path / "x.tum").write_text(text)
+    read = read_tum(tmp_path / "x.tum")
+    assert read.times[0] == pytest.approx(1403636579.763555584, abs=1e-6)
+    np.testing.assert_allclose(read.T_world_body[0], se3(so3_exp([0, 0, np.pi / 2]), [1, 2, 3]), atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -89,7 +113,11 @@ def test_tum_of_other_tools_is_read(tmp_path):
             "x.tum, line 4: the time 2.0 does not come after 3.0",
         ),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "x.tum, line 2: the time 1.0 does not come after 1.0; sort the poses"),
-        ("1,0,0,0,0,0,0,1\n", "x.tum, line 1: 8 finite"),
+        ("1 0 0 0 1 0 0 0 1 0 0 0\n", "x.tum, line 1: is KITTI's format .* has no times"),
+        ("1 2 0 0 0 1 0 0 0 1 0 0 0\n", "x.tum, line 1: .* are no rotation"),
+        ("1403636579763555584,1,2,3,1,0,0,0\n", "x.tum, line 1: may be EuRoC's CSV"),
+        ("1403636579763 0 0 0 0 0 0 1\n", "x.tum, line 1: the time .* neither in seconds nor in nanoseconds"),
+        ("time x\ny z\n", "x.tum, line 1: 8 finite"),
     ],
 )
 def test_a_bad_tum_file_is_one_sentence_with_its_line(tmp_path, text, words):
