@@ -1,6 +1,6 @@
 """Rows of trajectory files of several formats, told apart by their header and number of columns.
 
-Read are TUM (also with a header, commas or times in nanoseconds), EuRoC's CSV and KITTI's poses with a time before each.
+Read are TUM (with a header, commas or times in nanoseconds, too), EuRoC's CSV and KITTI's poses after a time each.
 """
 
 from collections.abc import Iterator, Sequence
