@@ -196,7 +196,7 @@ def test_a_board_that_is_not_found_says_what_was_sought_and_what_to_try(call, im
     shown = images / "charuco" / "1.png"
     said = refused(call, "camera", shown, "--board", "11x9", *charuco)
     assert "markers of its dictionary are seen, up to id " in said
-    assert "is in 3 of 3 images, and at least 6 are needed" in refused(call, "camera", *few, *BOARD)
+    assert "is in 3 of 3 images, but at least 6 are needed" in refused(call, "camera", *few, *BOARD)
 
 
 @pytest.mark.parametrize(("arguments", "says"), [
@@ -233,7 +233,7 @@ def test_wrong_robots_and_places_are_refused_before_the_work(call, images, team,
     assert "the images have 640x480 pixels, but the camera of A" in refused(
         call, "mount", large, *BOARD, "--team", team, "--robot", "A"
     )
-    assert "is no calibration of a camera" in refused(
+    assert "not the calibration of a camera" in refused(
         call, "mount", one, *BOARD, "--team", team, "--robot", "A", "--calibration", tmp_path / "earlier"
     )
     assert team.read_text() == TEAM
