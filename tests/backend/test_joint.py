@@ -77,11 +77,12 @@ def test_the_fit_is_as_good_as_its_noise_and_the_poses_as_their_covariances(solv
 def test_incremental_is_batch(solved, wrong_mounts):
     again = solve(open_run(wrong_mounts), SolveOptions(incremental=True))
     assert again.estimate.method == "joint" and not again.estimate.rejected
-    assert again.estimate.chi2 == pytest.approx(solved.estimate.chi2, abs=0.5)
+    # but for the noise of pixels, of which the first stances knew less
+    assert again.estimate.chi2 == pytest.approx(solved.estimate.chi2, rel=0.02)
     for robot, trajectory in solved.estimate.trajectories.items():
         other = again.estimate.trajectories[robot]
         sigma = np.sqrt(trajectory.covariances[:, [3, 4], [3, 4]]).max()
-        assert np.abs(other.positions - trajectory.positions).max() < 0.05 * sigma + 1e-5, robot
+        assert np.abs(other.positions - trajectory.positions).max() < 0.2 * sigma + 1e-5, robot
 
 
 def test_as_it_comes_mounts_that_are_many_degrees_off_are_found_as_in_batch(tmp_path):
@@ -306,7 +307,8 @@ def test_a_result_reports_the_calibration_and_holds_the_team_as_it_turned_out(so
 
 def test_nothing_that_was_exact_is_reported(solutions, tmp_path, capsys):
     write_result(solutions["joint"], tmp_path / "result")
-    assert not (tmp_path / "result" / "team.toml").exists()
+    team = read_team(tmp_path / "result" / "team.toml")  # of the noise that was learnt
+    assert [one.mount_if_any for one in team.robots] == [one.mount_if_any for one in solutions["joint"].run.team.robots]
     assert "Calibration" not in (tmp_path / "result" / "report.html").read_text()
     print_calibration(solutions["joint"].estimate.calibration)
     assert capsys.readouterr().out == ""
