@@ -121,7 +121,7 @@ def test_a_team_that_is_not_there(refused, tmp_path):
     ("tracks", "words"),
     [
         (GOOD.replace("stance,time", "stance,t", 1), r"tracks.csv, line 1: the header is .*; it must be `stance,time"),
-        (GOOD.replace("150,100", "nan,100", 1), r"tracks.csv, line 6: `u` is `nan`; leave out"),
+        (GOOD.replace("150,100", "nan,100", 1), r"tracks.csv, line 6: `u` is `nan`; remove"),
         (
             GOOD.replace("0,100.2", "0,100.9", 1),
             r"tracks.csv, line 5: .*runs backwards, from 100.9 s.*; sort",
