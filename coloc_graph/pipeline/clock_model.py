@@ -25,6 +25,7 @@ MIN_DRIFT = 2e-3  # change of an offset over the run that a drift makes at least
 MIN_FOR_DRIFT = 4  # stances that tell a drift
 SAME_SIGMA = 5e-3  # camera and wheels of one robot share a clock to this [s]
 SAME_RATE = 1e-6  # and drift alike to this [s/s]
+MAX_CONTRADICTORY = 0.25  # share of the evidence that may fit no clock
 UNKNOWN = 100.0  # standard deviation of an offset of which nothing is known [s]
 ROBUST = 4.0  # evidence that is off by more sigmas counts less
 
@@ -107,6 +108,8 @@ def estimated_clocks(
     if not evidence:
         return {}
     parts = _split(sorted(evidence, key=lambda one: one.time))
+    if any(_contradictory(part) for part in parts):
+        return {}  # no clock explains it: what was compared is not the same motion
     solved = [_solve(team, part) for part in parts]
     sensors = list(dict.fromkeys(sensor for one in evidence for sensor in (one.first, one.second)))
     clocks: dict[Sensor, SensorClock] = {}
@@ -141,7 +144,7 @@ def _split(evidence: list[ClockEvidence]) -> list[list[ClockEvidence]]:
     whole = _chi2(evidence)
     best: tuple[float, list[ClockEvidence], list[ClockEvidence]] | None = None
     stances = sorted({one.stance for one in evidence})
-    for first in stances[1:]:
+    for first in stances[2:-1]:  # one stance alone tells no step
         before = [one for one in evidence if one.stance < first]
         after = [one for one in evidence if one.stance >= first]
         gain = whole - _chi2(before) - _chi2(after)
@@ -150,6 +153,12 @@ def _split(evidence: list[ClockEvidence]) -> list[list[ClockEvidence]]:
     if best is None or best[0] < STEP_CHI2 or _largest_step(best[1], best[2]) < MIN_STEP:
         return [evidence]
     return [*_split(best[1]), *_split(best[2])]
+
+
+def _contradictory(evidence: Sequence[ClockEvidence]) -> bool:
+    """Return whether much of the evidence fits no constant or drifting clocks."""
+    _, _, residuals = _fit(evidence, drifting=len({one.stance for one in evidence}) >= MIN_FOR_DRIFT)
+    return bool((np.abs(residuals) > 2 * ROBUST).mean() > MAX_CONTRADICTORY)
 
 
 def _largest_step(before: Sequence[ClockEvidence], after: Sequence[ClockEvidence]) -> float:
