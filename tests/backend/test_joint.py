@@ -151,7 +151,7 @@ def test_a_mount_that_is_not_as_stated_is_warned_of_by_name(wrong_mounts, copied
         wrong_mounts, tmp_path / "tilted.mcap", team=msgspec.structs.replace(run.team, robots=(tilted, *others))
     )
     solution = solve(open_run(path))
-    (warning,) = [one for one in solution.warnings if "sigmas from what the team states" in one]
+    (warning,) = [one for one in solution.warnings if "sigmas from the team's value" in one]
     assert warning.startswith("A: tilt") and "stated 26.00 +- 1.00" in warning
 
 
@@ -229,7 +229,7 @@ def test_clocks_that_differ_are_found_for_each_pair(tmp_path):
 def test_a_graph_that_knows_no_mounts_says_so(solved):
     with pytest.raises(EstimationError, match=r"mount of robot A cannot be calibrated.*PoseGraph.of.*smooth"):
         joint(replace(solved.estimate.graph, robot_models={}))
-    with pytest.raises(InputError, match="no method `guess`; choose one of chain, smooth, joint"):
+    with pytest.raises(InputError, match="no method `guess`: choose one of chain, smooth, joint"):
         SolveOptions(method="guess")
 
 

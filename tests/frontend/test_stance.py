@@ -12,8 +12,10 @@ from scipy.stats import chi2
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend import FrontendOptions, fit_homography, measure_pair
 from coloc_graph.frontend.homography.fit_checks import require_agreement, require_determined
+from coloc_graph.frontend.learnt_noise import NoiseBelief
 from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.run import Detections, Image, Planes, RunWriter, Stance, open_run, read_truth
+from coloc_graph.run.recorded import Restated
 from coloc_graph.simulation import EPOCH, Imperfections, reference_team, simulate
 from coloc_graph.team import Markers
 
@@ -44,8 +46,9 @@ def runs(tmp_path_factory):
 @pytest.mark.parametrize("scale", ["heights", "span"])
 @pytest.mark.parametrize("criterion", ["reprojection", "transfer"])
 def test_a_stance_gives_the_pose_between_its_observers(runs, depth, scale, criterion):
-    run, T_A_B = runs[depth]
-    found = measure_pair(run, run.stances[0], "A", "B", FrontendOptions(criterion=criterion, scale=scale))
+    recorded, T_A_B = runs[depth]
+    run = Restated(recorded, NoiseBelief.of(recorded.team).used(recorded.team))
+    found = measure_pair(run, recorded.stances[0], "A", "B", FrontendOptions(criterion=criterion, scale=scale))
     H, pose = found.homography, found.relative_pose
     assert H.unusable is None
     assert (H.stance, H.robot_i, H.robot_j) == (0, "A", "B")
@@ -54,7 +57,8 @@ def test_a_stance_gives_the_pose_between_its_observers(runs, depth, scale, crite
     assert H.points == len(found.correspondences)
     assert H.inliers >= 0.9 * H.points
     assert 1000 < H.overlap_px < 320 * 240
-    assert 0.5 < H.residual < 2.0
+    # the prior of the noise of images has a floor wider than what a rendered image has
+    assert (0.5 if depth == "tracks" else 0.1) < H.residual < 2.0
     xi = gtsam.Pose3.Logmap(gtsam.Pose3(pose.T_i_j).between(gtsam.Pose3(T_A_B)))
     assert (np.abs(xi) < 4 * np.sqrt(np.diag(pose.covariance))).all()
     assert xi @ np.linalg.solve(pose.covariance, xi) < chi2.ppf(1 - 6e-5, 6)

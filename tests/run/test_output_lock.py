@@ -126,7 +126,7 @@ def test_what_a_killed_command_wrote_is_said_and_can_be_read_and_does_not_lock(t
     assert main(["info", str(part)]) == 0
     capsys.readouterr()
     assert main(["simulate", "single-step", "--out", str(out)]) == 0
-    assert f"warning: {part} is left of a killed command; read it with `coloc info`" in capsys.readouterr().err
+    assert f"warning: {part} was left by a killed command: read it with `coloc info`" in capsys.readouterr().err
     assert names(tmp_path) == ["run.mcap", part.name]
 
 

@@ -47,7 +47,7 @@ def test_view_writes_a_page_of_a_graph(graph, tmp_path, capsys):
     assert main(["view", str(graph), "--export", str(tmp_path / "page.html")]) == 0
     assert (tmp_path / "page.html").stat().st_size > 1e5
     assert main(["view", str(graph), "--compare", str(tmp_path)]) == 2
-    assert "--compare and --run are for results of runs" in capsys.readouterr().err
+    assert "--compare and --run apply to results of runs" in capsys.readouterr().err
 
 
 def test_a_graph_in_parts_is_refused_in_words(graph):

@@ -281,11 +281,13 @@ def test_of_a_large_team_no_names_are_written_and_it_is_said():
 def test_an_edge_is_measured_again_and_decomposed_both_ways(scene, solutions):
     measured = solutions["joint"].measurements[2]
     found = inspect.examine(scene, 2)
-    assert np.allclose(found.measured.homography.H_j_i, measured.homography.H_j_i)
+    # measured with the noise that is stated, not that learnt from the run
+    assert np.allclose(found.measured.homography.H_j_i, measured.homography.H_j_i, atol=1e-3)
     taken = [n for n, one in enumerate(found.solutions) if one.chosen]
     assert taken == [measured.relative_pose.solution]
     assert found.solutions[taken[0]].normal_error_deg < found.solutions[1 - taken[0]].normal_error_deg
-    assert np.isclose(np.deg2rad(found.solutions[taken[0]].normal_error_deg), measured.relative_pose.normal_error)
+    error = np.deg2rad(found.solutions[taken[0]].normal_error_deg)
+    assert np.isclose(error, measured.relative_pose.normal_error, atol=1e-4)
     assert found.picture.ndim == 3 and found.picture.std() > 5
     text = inspect.edge_report(scene, 2, found)
     for word in ("inliers", "overlap", "clock", "decomposition", "**chosen**", f"{measured.homography.points}"):
@@ -430,7 +432,7 @@ def test_live_poses_that_cannot_be_shown_are_named_and_the_others_shown(short_so
     robots = short_solution.run.team.names
     poses = LivePoses(0.0, {"A": at(1.0, 0.0, 0.0), "B": np.full((4, 4), np.nan), "Z": np.eye(4), "C": np.eye(3)})
     words = poses.problems(robots)
-    assert "no robot Z" in words and "robot B is not a finite" in words and "robot C is no finite" in words
+    assert "no robot Z" in words and "robot B is not a finite" in words and "robot C is not a finite" in words
     shown = poses.over(robots, np.zeros((3, 4)))
     assert np.allclose(shown[0, :2], (1, 0)) and not shown[1:].any()
     with Viewer(empty_scene(short_solution.run, "joint"), port=0) as viewer:

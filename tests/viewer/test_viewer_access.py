@@ -189,7 +189,7 @@ def test_a_viewer_without_its_guard_does_not_start(monkeypatch, way):
     else:
         monkeypatch.setattr(Access, "refusal", lambda *_: None)
     listener = open_listener(port=0)
-    with pytest.raises(ColocError, match="would show the viewer to anybody"):
+    with pytest.raises(ColocError, match="would serve the viewer to anybody"):
         Viewer(Scene(("A",), ()), listener=listener)
 
 
