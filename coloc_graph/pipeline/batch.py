@@ -15,7 +15,7 @@ from coloc_graph.frontend import PairMeasurement, UnusedSighting, describe_unuse
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.pipeline.clocks import RunClocks, clocks_of_run, contradicts
+from coloc_graph.pipeline.clocks import RunClocks, clocks_of_run, contradicts, misfit
 from coloc_graph.pipeline.contents import require_applicable, unused_in
 from coloc_graph.pipeline.disagreement import moves_unstated
 from coloc_graph.pipeline.explanations import (
@@ -148,19 +148,26 @@ def solve(
 
 
 def _in_batch(
-    run: Run, options: SolveOptions, measure: "_Counted", clocks: RunClocks | None = None, before: float = 0.0
+    run: Run,
+    options: SolveOptions,
+    measure: "_Counted",
+    clocks: RunClocks | None = None,
+    before: float = 0.0,
+    *,
+    doubt_clocks: bool = True,
 ) -> _Solved:
     """Solve all stances together, and again with corrected stamps if `clocks` turn out to be wrong.
 
-    `before` are the seconds that were spent on measurements before.
+    `before` are the seconds that were spent on measurements before. Clocks that are corrected already, or which
+    `doubt_clocks` leaves alone, are not looked for.
     """
+    doubt_clocks = doubt_clocks and clocks is None
     started = time.perf_counter() - before
     belief = NoiseBelief.of(run.team)
     alone = [one for stance in run.stances for one in measure(stance, belief.used(run.team))]
     measured, clock_warnings = share_clock_offsets(alone, run.team.clock_sigma)
-    if clocks is None and (clocks := clocks_of_run(run, measured)) is not None:
-        run = clocks.corrected(run)
-        return _in_batch(run, options, measure.of(run), clocks, time.perf_counter() - started)
+    if doubt_clocks and (found := clocks_of_run(run, measured)) is not None:
+        return _best_explained(run, options, measure, found, time.perf_counter() - started)
     for _ in range(NOISE_ROUNDS):
         noise = belief.updated(measured)
         measured = measured_again(measured, noise.used(run.team))
@@ -170,9 +177,10 @@ def _in_batch(
     _require_ties(run, graph, measured)
     assert options.method is not None  # resolved
     estimate = BATCH[options.method](graph)
-    if clocks is None and contradicts(estimate) and (clocks := clocks_of_run(run, measured, any_pair=True)) is not None:
-        run = clocks.corrected(run)
-        return _in_batch(run, options, measure.of(run), clocks, made - started)
+    if doubt_clocks and contradicts(estimate):
+        found = clocks_of_run(run, measured, any_pair=True)
+        if found is not None:
+            return _best_explained(run, options, measure, found, made - started)
     arms = dict[str, LeverArm]()
     if options.method != "chain":
         arms, estimate = find_lever_arms(estimate, BATCH[options.method])
@@ -190,6 +198,22 @@ def _in_batch(
     warnings = _warnings(run, options, estimate, measured, of_clocks, sources.unused)
     missing = without_poses(run, options, estimate, measured, sources.unused)
     return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise)
+
+
+def _best_explained(run: Run, options: SolveOptions, measure: "_Counted", clocks: RunClocks, before: float) -> _Solved:
+    """Solve with corrected stamps, and with those of the run unless the corrected ones fit; keep the better fit."""
+    right = clocks.corrected(run)
+    try:
+        corrected = _in_batch(right, options, measure.of(right), clocks, before)
+    except EstimationError:
+        return _in_batch(run, options, measure, before=before, doubt_clocks=False)
+    if not contradicts(corrected.estimate):
+        return corrected
+    try:
+        plain = _in_batch(run, options, measure, before=before, doubt_clocks=False)
+    except EstimationError:
+        return corrected
+    return min(corrected, plain, key=lambda one: misfit(one.estimate))
 
 
 def _graph_of(

@@ -29,6 +29,8 @@ T = TypeVar("T")
 FIRST_CHECKED = 6  # stances that are compared first, of those in which clocks are doubted
 UNFIT_P_VALUE = 1e-6  # probability of a fit as bad as this by noise below which clocks are doubted
 MIN_INLIERS = 0.8  # share of inliers below which they are doubted, too
+MIN_STANCES = 2  # stances whose motion says so before a clock is called wrong
+REJECTION_PRICE = 25.0  # chi2 that a rejection or a bump counts for where two explanations are compared
 LEFT_SIGMA = 5e-3  # corrected clocks agree to this at least; the homographies tell the rest [s]
 
 
@@ -110,6 +112,12 @@ def contradicts(estimate: Estimate) -> bool:
     return bool(estimate.rejected or estimate.bumped) or chance < UNFIT_P_VALUE
 
 
+def misfit(estimate: Estimate) -> float:
+    """Return how badly an estimate explains its measurements: chi2 and the price of rejections, by residual."""
+    dropped = len(estimate.rejected) + len(estimate.bumped)
+    return (estimate.chi2 + REJECTION_PRICE * dropped) / max(estimate.dof, 1)
+
+
 def stance_evidence(run: Any, stance: Stance, measured: Sequence[PairMeasurement]) -> list[ClockEvidence]:
     """Return what the motion of a stance says of clocks, if one of its pairs is `suspicious`."""
     doubted = next(suspicious(measured), None) is not None
@@ -178,7 +186,11 @@ def run_clocks(team: Team, stances: Sequence[Stance], evidence: Sequence[ClockEv
     RunClocks or None
         None where no stamp needs a correction.
     """
-    clocks = estimated_clocks(team, stances, evidence)
+    clocks = {
+        sensor: clock
+        for sensor, clock in estimated_clocks(team, stances, evidence).items()
+        if clock.is_right or clock.stances >= MIN_STANCES
+    }
     if all(clock.is_right for clock in clocks.values()):
         return None
     usual = usual_offset(clocks)

@@ -83,16 +83,16 @@ class StanceModel:
         self.observers, self.mover = tuple(observers), mover
         self.p_markers = markers.p_body[:2]
         self._cameras = [team[name].camera for name in observers]
-        cameras = Mounts([team[name].mount for name in observers]).at(
-            np.zeros((len(observers), 3)) if mounts is None else mounts
-        )
+        errors = np.zeros((len(observers), 6))  # yaw and offset are taken as stated
+        errors[:, :3] = 0.0 if mounts is None else mounts
+        cameras = Mounts([team[name].mount for name in observers]).at(errors)
         self._R, self._t = cameras.R, cameras.t
         r = len(observers)
         self.variables = 9 * r + 2
         by = np.zeros((6 * r + 2, self.variables))
         for n in range(r):
             by[6 * n : 6 * n + 6, 9 * n : 9 * n + 6] = cameras.by_body[n]
-            by[6 * n : 6 * n + 6, 9 * n + 6 : 9 * n + 9] = cameras.by_errors[n]
+            by[6 * n : 6 * n + 6, 9 * n + 6 : 9 * n + 9] = cameras.by_errors[n, :, :3]
         by[-2:, -2:] = np.eye(2)
         self._by_variables = by
         noise = np.array([noise_px or camera.noise_px for camera in self._cameras])

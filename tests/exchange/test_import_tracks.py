@@ -95,7 +95,9 @@ def test_points_without_noise_give_the_pose_exactly(files):
         np.testing.assert_allclose(solution.estimate.pose("B", 0).matrix(), T_WORLD_B, atol=1e-6)
         # the points are no two markers of C, which is said where robots are sighted
         said = [] if method == "chain" else ["the names of its markers do not identify them"]
-        assert [warning.split(": ")[-1].split(";")[0] for warning in solution.warnings] == said
+        warnings = [warning.split(": ")[-1].split(";")[0] for warning in solution.warnings]
+        # and that the points have less noise than is stated
+        assert [one for one in warnings if one != "predicted uncertainties are too large"] == said
 
 
 def test_stated_planes_give_the_pose_of_cameras_off_the_floor_exactly(files):
@@ -414,7 +416,8 @@ def test_the_examples_of_the_documentation_come_in_and_are_enough_to_solve(tmp_p
     run = open_run(tmp_path / "run.mcap")
     assert inspect(run) == []
     solution = pipeline.solve(run)
-    assert solution.warnings == () and solution.estimate.disconnected == ()
+    (warning,) = solution.warnings  # the points of the page have no noise
+    assert "agree better than expected" in warning and solution.estimate.disconnected == ()
     # B drove ahead by a step and the two stand 0.72 m apart
     assert np.linalg.norm(np.diff(solution.estimate.trajectories["B"].positions, axis=0)) == pytest.approx(
         0.35, abs=0.03
