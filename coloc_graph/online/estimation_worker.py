@@ -11,6 +11,7 @@ from coloc_graph.frontend import FrontendOptions, StanceTracks
 from coloc_graph.online.visibility import Precision, precision
 from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver, measure_stance
 from coloc_graph.run import Recorded, Stance
+from coloc_graph.run.recorded import Restated
 
 CONTRADICTED = 1e-4  # a new stance less probable than this contradicts the estimate
 
@@ -80,7 +81,8 @@ class EstimationWorker:
         return self._tracks[1]
 
     def _enter(self, stance: Stance) -> EnteredStance | list[Bump]:
-        made = measure_stance(self._record, stance, self._solver.options, self._tracks_of(stance))
+        noisy = Restated(self._record, self._solver.noise.used(self._record.team))  # as a logged run is measured
+        made = measure_stance(noisy, stance, self._solver.options, self._tracks_of(stance))
         pairs = self._solver.measure(self._record, stance, made)
         unusable = [pair.homography.unusable for pair in pairs if pair.homography.unusable]
         if len(unusable) == len(pairs):
