@@ -186,9 +186,11 @@ def _in_batch(
         arms, estimate = find_lever_arms(estimate, BATCH[options.method])
     if options.method == "joint":
         shared = _shared_noise(estimate, noise)
-        if shared is not None:
-            noise = noise.with_bias(shared.size, shared.factor)
-            measured = measured_again(measured, noise.used(run.team))
+        noisier = noise if shared is None else noise.with_bias(shared.size, shared.factor)
+        again = measured if shared is None else measured_again(measured, noisier.used(run.team))
+        # errors so large that a pair tells nothing any more are none of the cameras'
+        if shared is not None and _usable(again) == _usable(measured):
+            noise, measured = noisier, again
             graph, sources = _graph_of(run, options, measured, noise.used(run.team))
             graph = with_lever_arms(graph, arms)
             _require_ties(run, graph, measured)
@@ -198,6 +200,11 @@ def _in_batch(
     warnings = _warnings(run, options, estimate, measured, of_clocks, sources.unused)
     missing = without_poses(run, options, estimate, measured, sources.unused)
     return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise)
+
+
+def _usable(measured: Sequence[PairMeasurement]) -> int:
+    """Number of pairs that have a relative pose."""
+    return sum(one.relative_pose is not None for one in measured)
 
 
 def _best_explained(run: Run, options: SolveOptions, measure: "_Counted", clocks: RunClocks, before: float) -> _Solved:
