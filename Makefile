@@ -14,7 +14,7 @@ DATA ?=
 GRAPHS ?=
 MRCLAM ?=
 
-.PHONY: demo test lint types unit ordinary realtime bench fuzz clean
+.PHONY: demo test lint types unit bench fuzz clean
 
 demo: $(VENV)/installed
 	$(BIN)/coloc demo $(ARGS)
@@ -30,18 +30,12 @@ types: $(VENV)/installed-dev
 
 ifeq ($(ARGS),)
 unit: $(VENV)/installed-dev
-	@$(MAKE) --no-print-directory --jobs 2 ordinary realtime
+	$(BIN)/pytest --numprocesses 2 --dist loadfile -m "not realtime" tests/experiments/test_notebooks.py tests
+	$(BIN)/pytest -m realtime
 else
 unit: $(VENV)/installed-dev
 	$(BIN)/pytest $(ARGS)
 endif
-
-# beside each other: those in real time mostly wait, and the others only take what they leave
-ordinary: $(VENV)/installed-dev
-	nice -n 19 $(BIN)/pytest --numprocesses 2 --dist loadfile -m "not realtime" tests/experiments/test_notebooks.py tests
-
-realtime: $(VENV)/installed-dev
-	$(BIN)/pytest -m realtime
 
 test-long: $(VENV)/installed-dev
 	$(BIN)/pytest --numprocesses 2 --whole -m long tests
