@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from coloc_graph.backend.shared_noise import SharedNoise
 from coloc_graph.frontend.homography.noise_components import NoiseEvidence, learn_components
 from coloc_graph.frontend.learnt_noise import NoiseBelief
 from coloc_graph.pipeline.batch import SolveOptions, StanceSolver, solve
@@ -128,3 +129,11 @@ def test_a_stance_that_is_withdrawn_takes_what_it_taught_with_it(hallway):
         beliefs.append(solver.noise)
     solver.withdraw()
     assert solver.noise is beliefs[0]
+
+
+def test_a_shared_error_with_which_a_pair_would_tell_nothing_is_not_taken(hallway, monkeypatch):
+    before = solve(open_run(hallway))
+    monkeypatch.setattr("coloc_graph.pipeline.batch._shared_noise", lambda *_: SharedNoise(1e4, 1.5))
+    after = solve(open_run(hallway))
+    assert after.count.used == before.count.used
+    np.testing.assert_allclose(after.estimate.chi2, before.estimate.chi2, rtol=0.1)

@@ -6,8 +6,11 @@ import msgspec
 import pytest
 
 from coloc_graph.evaluation import align, evaluate
+from coloc_graph.frontend.clock_evidence import ClockEvidence
+from coloc_graph.frontend.pairing.clock_offset import ClockOffset
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.clock_table import clock_table
+from coloc_graph.pipeline.clocks import run_clocks
 from coloc_graph.run import Clocks, RobotClock, RunWriter, open_run, read_truth
 from coloc_graph.simulation import simulate
 
@@ -82,6 +85,26 @@ def test_a_clock_that_is_off_is_found_stance_by_stance(right, tmp_path):
 
 def test_clocks_that_are_right_are_left_alone(right):
     assert not any("clock" in one for one in solve(right).warnings)
+
+
+@pytest.mark.parametrize(
+    ("offsets", "wrong"),
+    [
+        ((1.7,), False),  # one stance alone
+        ((1.7, 1.7), True),
+        ((0.0, 1.7, -0.4, 2.2, 0.9), False),  # no clock explains it
+        ((1.7, 1.7, 1.7, 1.7, 1.7), True),
+    ],
+)
+def test_a_clock_is_wrong_only_where_stances_agree_on_it(right, offsets, wrong):
+    evidence = [
+        ClockEvidence(stance.index, stance.start, ("A", "camera"), ("B", "camera"), ClockOffset(offset, 1e-3))
+        for stance, offset in zip(right.stances, offsets, strict=False)
+    ]
+    clocks = run_clocks(right.team, right.stances, evidence)
+    assert (clocks is not None) == wrong
+    if clocks is not None:
+        assert "B's clock is 1.700 s" in clocks.sentences()[0]
 
 
 def test_the_table_shows_offsets_by_motion(right, tmp_path):
