@@ -1,4 +1,4 @@
-"""Which tracks of one camera are which of another, by what they do alone: how often right, and how often sure of it.
+"""Association of tracks between two cameras by motion alone: share of right ones, and of sure ones.
 
     python benchmarks/association.py [--scenes 500] [--lockstep 200] [--json]
 
@@ -41,7 +41,7 @@ def pair_of_views(rng: np.random.Generator) -> list[View]:
 
 
 def tracks_of(seen: Seen, movers: int) -> tuple[list[Track], list[int]]:
-    """The movers' tracks in a camera, and the light that most of each is of."""
+    """Return the movers' tracks in a camera, and the light of most samples of each."""
     assert ROBOT.markers is not None and ROBOT.markers.span is not None
     tracker = MarkerTracker("A", Detector(), size=(320, 240))
     for one in seen.images:
@@ -69,7 +69,7 @@ def verdict(found: Association | None, lights: Sequence[Sequence[int]]) -> str:
 
 
 def scene(seed: int, *, lockstep: bool) -> tuple[str, float, int]:
-    """What becomes of one scene, how long the association took [s], and the fewest samples of its chosen pairs."""
+    """Return the result of one scene, the time of association [s], and the fewest samples of its chosen pairs."""
     rng = np.random.default_rng((seed, lockstep))
     movers, seconds = 2 if lockstep else 1 + seed % 5, rng.uniform(6, 12)
     poses = wander(1 if lockstep else movers, seconds + STEP, (0.8, 2.2, -0.6, 0.6), rng)

@@ -40,7 +40,7 @@ def graph_of(team: MeasuredTeam) -> PoseGraph:
 
 
 class Bare:
-    """What one writes with GTSAM alone: the keys are known, nothing is checked, gated, logged or diagnosed."""
+    """A program with GTSAM alone: the keys are known, nothing is checked, gated, logged or diagnosed."""
 
     def __init__(self, floor: Floor | None) -> None:
         self.floor = floor
@@ -71,7 +71,7 @@ class Bare:
         factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(measured.T_i_j), noise))
 
     def start(self, pose):
-        """Where the search for a pose starts."""
+        """Return the initial pose."""
         if self.floor is None:
             return pose
         return gtsam.Pose3(gtsam.Rot3.Yaw(pose.rotation().yaw()), np.array([pose.x(), pose.y(), 0.0]))

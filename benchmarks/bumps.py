@@ -1,4 +1,4 @@
-"""How often an anchor that was pushed is named, a healthy one is not, and a wrong homography is not taken for a push.
+"""Rates of pushed anchors named, healthy ones not named, and wrong homographies not taken for a push.
 
     python benchmarks/bumps.py [--seeds 60] [--json]
 
@@ -53,7 +53,7 @@ class Pushed:
 
 
 def one_seed(seed: int) -> dict[str, bool]:
-    """What is said of each of the three: whether it is right, and whether it is blamed on the other."""
+    """Return the verdict on each of the three: right or not, and blamed on the other or not."""
     rng = np.random.default_rng(seed)
     run = MemoryRun(simulated("hallway", seed, points=POINTS, stances=STANCES, imperfections=Imperfections()))
     k = int(rng.integers(1, STANCES - 1))

@@ -92,7 +92,7 @@ def trajectories(n: int) -> dict[str, tuple[Trajectory, Trajectory]]:
 
 
 def evo(program: str, evo_dir: Path, folder: Path, files: tuple[str, str], *options: str) -> tuple[Spread, Array]:
-    """What evo says of two files in a folder, truth first: its statistics and all errors."""
+    """Return evo's statistics and errors of two files in a folder, truth first."""
     zipped = folder / "result.zip"
     zipped.unlink(missing_ok=True)
     subprocess.run(

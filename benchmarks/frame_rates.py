@@ -95,7 +95,7 @@ def _sized(team: Team, width: int, fps: float) -> Team:
 
 
 def measured(fps: float, speed: float, width: int, seed: int) -> dict[str, object]:
-    """What one stance gives: used or why not, its errors [m], [deg], and its steps."""
+    """Measure one stance: used or the reason, errors [m], [deg], and steps [px]."""
     one = scene(fps, speed, width, seed)
     made = measure_pair(one, one.stance, "A", "B", FrontendOptions())  # type: ignore[arg-type]
     row: dict[str, object] = {"fps": fps, "speed": speed, "width": width, "seed": seed, "step": one.step,

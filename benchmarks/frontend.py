@@ -125,7 +125,7 @@ def tracking(repeats: int, width: int = 320, height: int = 240) -> dict[str, flo
 
 
 def real_time(repeats: int) -> dict[str, float]:
-    """How many times faster than 100 fps the front end takes a recorded stance of two cameras, raw images."""
+    """Time the front end on a recorded stance of two cameras, raw images, as a multiple of 100 fps."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
         simulate("hallway", path, depth="images", fps=100.0, points=1000, stances=1, image_format="raw")

@@ -229,7 +229,7 @@ def one_budget(seed: int, name: str, value: float) -> tuple[float, float, float]
 
 
 def budget(seeds: int, plot: Path | None) -> dict[str, list[dict[str, float]]]:
-    """What limits accuracy: one thing varied at a time."""
+    """Vary one source of error at a time."""
     table: dict[str, list[dict[str, float]]] = {}
     base: dict[str, float] | None = None
     for what, (name, values) in VARIED.items():

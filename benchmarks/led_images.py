@@ -30,7 +30,7 @@ SEEN = {
 
 
 def cores(blobs: Blobs) -> np.ndarray:
-    """Which blobs (n,) are LED cores."""
+    """Return the mask (n,) of blobs that are LED cores."""
     bright = ((blobs.flags & Flag.SATURATED) != 0) & ((blobs.flags & (Flag.BLURRED | Flag.CLIPPED)) == 0)
     return bright & (blobs.area < 3 * np.median(blobs.area[bright]))
 

@@ -23,7 +23,7 @@ from coloc_graph.simulation import simulate
 
 
 def seconds(folder: Path, out: Path, executors: Callable[[], AbstractContextManager[Executor]]) -> float:
-    """How long all runs of a folder take."""
+    """Time all runs of a folder."""
     runs = runs_in(folder)
     started = time.perf_counter()
     outcomes = solve_runs(runs, result_folders(runs, folder, out), executors=executors)

@@ -103,7 +103,7 @@ def rms_interval(errors: Sequence[float], confidence: float = 0.95) -> tuple[flo
 
 
 def anees_interval(poses: int, dimensions: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Where the average NEES per degree of freedom of so many independent poses lies if covariances are right."""
+    """Interval of the mean NEES per degree of freedom of independent poses if covariances are right."""
     dof = poses * dimensions
     low, high = chi2.ppf([(1 - confidence) / 2, (1 + confidence) / 2], dof)
     return low / dof, high / dof

@@ -47,7 +47,7 @@ def uncalibrated(run: Run) -> Run:
 
 
 def filtered(run: Run, between_robots: bool, at: Mapping[str, Trajectory]) -> tuple[dict[str, Trajectory], float]:
-    """What the EKF thinks at its time, at the instants of other trajectories; and the seconds it takes."""
+    """Run the EKF; return its estimates at the instants of other trajectories, and its time [s]."""
     drive = keyframes_of(run, between_robots=between_robots)
     started = time.process_time()
     found = filter_forward(run.team, drive)
@@ -117,7 +117,7 @@ def main() -> None:
 
 
 def _report_map(landmarks: Mapping[str, StaticPose], data: str) -> None:
-    """How well the landmarks are found, after one rigid alignment."""
+    """Errors of the landmarks after one rigid alignment."""
     truth = {f"L{int(row[0])}": row[1:3] for row in np.loadtxt(Path(data) / "Landmark_Groundtruth.dat")}
     p = np.array([one.planar[:2] for one in landmarks.values()])
     q = np.array([truth[name] for name in landmarks])

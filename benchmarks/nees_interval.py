@@ -1,4 +1,4 @@
-"""Whether the 95 % interval of a robot's NEES holds 95 % of honest runs: drifting, correlated, and real estimates.
+"""Coverage of the 95 % interval of a robot's NEES in honest runs: drifting, correlated, and real estimates.
 
     python benchmarks/nees_interval.py [--draws 2000] [--seeds 60] [--json]
 
@@ -41,7 +41,7 @@ def fading(rng: np.random.Generator, n: int, keep: float) -> Array:
 
 
 def of_errors(draw: Callable[[np.random.Generator, int], Array], n: int, draws: int) -> Iterator[Drawn]:
-    """What whitened errors that were drawn give."""
+    """Evaluate whitened errors that were drawn."""
     rng = np.random.default_rng(n)
     for _ in range(draws):
         z = draw(rng, n)
@@ -49,7 +49,7 @@ def of_errors(draw: Callable[[np.random.Generator, int], Array], n: int, draws: 
 
 
 def of_hallway(seed: int, stances: int) -> list[Drawn]:
-    """What the robots of one run give."""
+    """Evaluate the robots of one run."""
     wrong = Imperfections(mount_sigma_deg=0.5, height_sigma=0.003, floor_sigma_deg=0.1)
     _, accuracy = solved(
         build_world(scenario("hallway", stances=stances), seed=seed, imperfections=wrong), SolveOptions()
@@ -58,7 +58,7 @@ def of_hallway(seed: int, stances: int) -> list[Drawn]:
 
 
 def row_of(name: str, drawn: list[Drawn]) -> dict[str, object]:
-    """How many of the means are in their intervals [%]."""
+    """Share of the means that are in their intervals [%]."""
     mean, poses, effective = (np.array(part, float) for part in zip(*drawn, strict=True))
     inside = []
     for count in (effective, poses):

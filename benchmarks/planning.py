@@ -97,7 +97,7 @@ def missions(team: Team, fps: float, seconds: float, only: Sequence[str]) -> dic
 
 
 def outcome(seed: int, plan: Plan, fps: float, depth: str) -> Outcome:
-    """The run of a seed that follows a plan, solved and compared with its truth."""
+    """Simulate a seed that follows a plan, solve it and compare with its truth."""
     try:
         scenario = planned(plan, stream(seed, "formation"))
         world = build_world(scenario, seed=seed, fps=fps, imperfections=WRONG, depth=depth)  # type: ignore[arg-type]

@@ -66,7 +66,7 @@ def _measurement(fit, n: int) -> HomographyMeasurement:
 def spoiled(
     rng: np.random.Generator, good: tuple[np.ndarray, np.ndarray], more: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The good points and so many bad ones that 30 % of all lie anywhere in image j and 5 % are swapped markers."""
+    """Add bad points: 30 % of all lie anywhere in image j, and 5 % are swapped markers."""
     gross = round(0.30 / 0.65 * len(good[0]))
     swapped = round(0.05 / 0.65 * len(good[0]))
     bad_i, bad_j = more[0][: gross + swapped], more[1][: gross + swapped].copy()

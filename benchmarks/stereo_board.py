@@ -47,7 +47,7 @@ DEFAULT_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / 
 
 @dataclass(frozen=True, eq=False)
 class Stereo:
-    """What OpenCV makes of the images: both cameras, T_right_left (4, 4) [m], its RMS [px], the corners.
+    """OpenCV's calibration: both cameras, T_right_left (4, 4) [m], its RMS [px], the corners.
 
     `corners` are (pairs, 2 cameras, corners, 2) [px]; `planes` (pairs, 6) are N [unit] and d [m] in the left
     camera, by PnP, and for corners of 1 px how well: normal [deg], d [m].

@@ -46,7 +46,7 @@ WRONG = Imperfections(mount_sigma_deg=0.5, height_sigma=0.003, floor_sigma_deg=0
 
 
 def world_of(robots: int, stances: int, seed: int, at_once: int | None = None) -> World:
-    """What `coloc simulate team` makes of a seed."""
+    """Simulate the team of a seed, as `coloc simulate team`."""
     what = team_of(robots, at_once, stances, stream(seed, "formation"))
     return build_team_world(what, seed=seed, imperfections=WRONG)
 
@@ -128,7 +128,7 @@ def honesty(seeds: int, robots: int, stances: int) -> dict[str, object]:
 
 
 class Coloured(StanceTracks):
-    """What a camera sees where each mover has a colour of its own: a tracker for each, which is told its detections."""
+    """Track each mover by a colour of its own, a tracker for each."""
 
     def _of(self, robot: str, end: float) -> list[Track]:
         tracks: list[Track] = []
@@ -168,7 +168,7 @@ def blinking_seed(seed: int, robots: int, stances: int, clock: float) -> list[di
 
 
 def _whose(run: MemoryRun, world: World) -> dict[str, float]:
-    """How many samples of tracks are of the right robot's, of nobody's, and of a wrong one's."""
+    """Count samples of tracks of the right robot, of none, and of a wrong one."""
     right = undecided = wrong = 0
     for k, stance in enumerate(run.stances):
         tracks = StanceTracks(run, stance)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""What the viewer costs: server time an update while scrubbing, opening, and a live update for the estimator's thread.
+"""Cost of the viewer: server time an update while scrubbing, opening, and a live update on the estimator's thread.
 
 Times are by the clock and of the render thread alone; how fast the machine is at the moment is measured before and
 after, and the update is also given as it would be on a core that takes `NOMINAL_MS` for that.
@@ -49,7 +49,7 @@ def leapfrog(robots: int, stances: int) -> Scene:
 
 
 def calibration() -> float:
-    """How long a million additions in a Python loop take this thread at the moment [ms]; the best of three."""
+    """Time a million additions in a Python loop on this thread [ms], the best of three."""
     found = []
     for _ in range(3):
         started, total = time.thread_time(), 0

@@ -1,4 +1,4 @@
-"""What is fuzzed: every parser of files from outside, the messages between robots, and results. One function a target.
+"""Targets of fuzzing: every parser of foreign files, messages between robots, and results. One function a target.
 
 A target takes bytes. It may raise `ColocError` (ValueError where its docstring says so): anything else is a finding.
 """
