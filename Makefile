@@ -17,7 +17,7 @@ MRCLAM ?=
 .PHONY: demo test lint types unit bench fuzz clean
 
 demo: $(VENV)/installed
-	$(BIN)/coloc demo $(ARGS)
+	$(BIN)/coloc demo --force $(ARGS)
 
 test: lint types unit
 

@@ -28,6 +28,7 @@ from coloc_graph.cli import (
     team,
     view,
 )
+from coloc_graph.cli.verbosity import add_verbosity, causes, verbosity
 from coloc_graph.errors import ColocError
 
 
@@ -48,6 +49,7 @@ def parser() -> argparse.ArgumentParser:
         *(plan, coordinate, robot, certificates),
     ):
         module.add(commands)
+    add_verbosity(top)
     return top
 
 
@@ -57,11 +59,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     args = parser().parse_args(arguments)
     try:
-        code = int(args.run(args))
+        with verbosity(args):
+            code = int(args.run(args))
         sys.stdout.flush()  # so that a closed pipe is noticed here
         return code
     except ColocError as error:
         print(f"coloc: {error}", file=sys.stderr)
+        for cause in causes(error) if args.verbose else ():
+            print(cause, file=sys.stderr)
         return 2
     except BrokenPipeError:
         # the reader of the pipe has gone: discard what is buffered, without a message when the interpreter ends

@@ -3,6 +3,7 @@
 import argparse
 
 from coloc_graph.cli import calibrate_camera, calibrate_mount
+from coloc_graph.cli.place import add_force
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -61,5 +62,5 @@ def _add_team(command: argparse.ArgumentParser) -> None:
     command.add_argument("--team", metavar="TEAM.toml", help="team to write into; all else in it stays unchanged")
     command.add_argument("--robot", metavar="NAME", help="robot that carries the camera")
     command.add_argument("--out-team", metavar="TOML", help="write the team to this file instead of into --team")
-    command.add_argument("--force", action="store_true", help="replace existing --out, --camera-info or --out-team")
+    add_force(command)
     command.add_argument("--json", action="store_true", help="print the figures as JSON")

@@ -47,8 +47,8 @@ def seen_in(args: argparse.Namespace) -> "tuple[Views, Board]":
 
 def say_written(args: argparse.Namespace) -> None:
     """Print the written paths to stderr."""
-    import sys
+    from coloc_graph.cli.printing import note
 
     for path in (getattr(args, "out", None), args.out_team or args.team, getattr(args, "camera_info", None)):
         if path:
-            print(f"wrote {path}", file=sys.stderr)
+            note(f"wrote {path}")

@@ -2,6 +2,8 @@
 
 import argparse
 
+from coloc_graph.cli.place import add_force
+
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command and its arguments."""
@@ -15,6 +17,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("folder", metavar="DIR", help="folder to write")
     command.add_argument("team", metavar="TEAM.toml", help="description of the team")
     command.add_argument("--days", type=int, default=365, help="validity of the certificates [days] (default: 365)")
+    add_force(command)
     command.set_defaults(run=run)
 
 
@@ -24,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.team import read_team
 
     team = read_team(args.team)
-    make_certificates(args.folder, team.names, args.days)
+    make_certificates(args.folder, team.names, args.days, force=args.force)
     for name in ("coordinator", *team.names):
         print(f"for {name}: ca.pem, {name}.pem, {name}.key")
     print(f"ca.key in {args.folder} signs new certificates: keep it off the robots")

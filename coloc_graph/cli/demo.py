@@ -2,6 +2,8 @@
 
 import argparse
 
+from coloc_graph.cli.place import add_force, require_run_place
+
 #: Standard deviations of mounts [deg, m], of the markers' span [m] and of the floor [deg] in the demo.
 IMPERFECTIONS = {"mount_sigma_deg": 1.0, "height_sigma": 5e-3, "span_sigma": 1e-4, "floor_sigma_deg": 0.1}
 
@@ -36,6 +38,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument(
         "--port", type=int, help="port of the viewer with --online (default: 8080, or the first free one after it)"
     )
+    add_force(command)
     command.set_defaults(run=lambda args: online(args) if args.online else run(args))
 
 
@@ -47,17 +50,21 @@ def run(args: argparse.Namespace) -> int:
 
     from coloc_graph.cli.accuracy import print_accuracy, print_calibration, print_promised
     from coloc_graph.cli.printing import progress, warn
+    from coloc_graph.errors import InputError
     from coloc_graph.pipeline.batch import solve
     from coloc_graph.report import hero_figure
-    from coloc_graph.results.folder import require_output_folder
+    from coloc_graph.results.folder import holds_result, require_output_folder
     from coloc_graph.results.writer import assess, write_result
     from coloc_graph.run import open_run
     from coloc_graph.simulation import Imperfections, simulate
 
     out = Path(args.out)
-    require_output_folder(out / "result")
-    out.mkdir(parents=True, exist_ok=True)
     run_path = out / "hallway.mcap"
+    require_output_folder(out / "result")
+    require_run_place(str(run_path), force=args.force)
+    if not args.force and holds_result(out / "result"):
+        raise InputError(f"{out / 'result'} is an earlier result; replace it with --force, or give another folder")
+    out.mkdir(parents=True, exist_ok=True)
     try:
         with progress("stances rendered") as report:
             simulate(
@@ -96,6 +103,7 @@ def run(args: argparse.Namespace) -> int:
 
 def online(args: argparse.Namespace) -> int:
     """Lead a simulated team down the hallway and print the result."""
+    import shutil
     import time
     from pathlib import Path
 
@@ -110,7 +118,9 @@ def online(args: argparse.Namespace) -> int:
 
     out = Path(args.out) / "online"
     if out.exists():
-        raise InputError(f"{out} exists: remove it, or give another folder with --out")
+        if not args.force or not (out / "mission").is_dir():
+            raise InputError(f"{out} exists; replace an earlier demo with --force, or give another folder with --out")
+        shutil.rmtree(out)
     team, address = field_team(), free_address()
     if args.plan or args.formation == "plan":
         way = max(args.stances * PAPER.leap, 2 * PAPER.leap)

@@ -3,6 +3,8 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from coloc_graph.cli.place import add_force
+
 if TYPE_CHECKING:
     from coloc_graph.results.comparison import Comparison
 
@@ -42,7 +44,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "--max-gap", type=_seconds, metavar="S", help="longest gap over which truth is interpolated [s] (default: 0.25)"
     )
     command.add_argument("--plot", metavar="FILE|DIR", help="draw one picture (.png, .svg, .pdf), or a folder of three")
-    command.add_argument("--force", action="store_true", help="replace existing pictures")
+    add_force(command)
     command.add_argument("--json", action="store_true", help="print figures as JSON")
     files = command.add_argument_group("TUM files of any program")
     files.add_argument(

@@ -3,6 +3,7 @@
 import argparse
 from typing import Any
 
+from coloc_graph.cli.place import add_force
 from coloc_graph.cli.printing import print_json, print_table, progress
 
 NAMES = ("fig4", "fig5", "table1", "table2")
@@ -33,6 +34,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "--processes", type=int, default=2, metavar="N", help="number of worker processes (default: 2)"
     )
     command.add_argument("--cluster", metavar="ADDRESS", help="use the Dask scheduler at tcp://HOST:PORT instead")
+    add_force(command)
     command.add_argument("--json", action="store_true", help="print all numbers as JSON")
     command.set_defaults(run=run)
 
@@ -44,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.experiments.output import as_json
 
     out = args.out or f"experiment-{args.name}"
-    experiments.require_output_folder(out, args.name)  # before the work
+    experiments.require_output_folder(out, args.name, force=args.force)  # before the work
     options: dict[str, Any] = {key: getattr(args, key) for key in ("depth", "seed", "processes", "cluster")}
     options |= {key: value for key in ("runs", "draws") if (value := getattr(args, key)) is not None}
     single_step = args.name in ("fig4", "fig5")

@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coloc_graph.cli.place import add_force
+
 if TYPE_CHECKING:
     from coloc_graph.results.folder import Result
 
@@ -11,6 +13,9 @@ FORMATS = (
     "g2o and dot: one file; gtsam: a folder with the serialised factors and a script; tum: a file for each robot; "
     "ros2: a bag (.mcap) with tf, poses and paths; foxglove: an .mcap with frames, cameras, poses, truth and a 3D scene"
 )
+
+#: Endings of the files in an exported folder, by format.
+FOLDERS = {"tum": (".tum", ".cov.csv"), "gtsam": ("graph.txt", "values.txt", "keys.csv", "solve.py")}
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -22,6 +27,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--truth", action="store_true", help="tum: export the truth of the run, not the estimate")
     command.add_argument("--layout", action="store_true", help="foxglove: write a layout (.json) beside the file, too")
     command.add_argument("--run", dest="run_path", metavar="RUN", help="the result's run, if it has moved")
+    add_force(command)
     command.set_defaults(run=run)
 
 
@@ -33,11 +39,13 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.exchange.gtsam_files import unpack_gtsam
     from coloc_graph.results.folder import GTSAM_FACTORS, read_result
-    from coloc_graph.run.atomic_file import write_atomically
+    from coloc_graph.run.atomic_file import require_replaceable_folder, require_writable, write_atomically
 
     result, out = read_result(args.result), Path(args.out)
-    if os.path.lexists(out):
-        raise InputError(f"{out} exists; give another path, or remove it")
+    if args.format in FOLDERS:
+        require_replaceable_folder(out, FOLDERS[args.format], force=args.force)
+    elif os.path.lexists(out):
+        require_writable(out, force=args.force)
     if args.truth and args.format != "tum":
         raise InputError(f"--truth applies to tum, not to {args.format}: leave it out")
     if args.layout and args.format != "foxglove":
@@ -45,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     if args.truth:
         return _truth(result, args.run_path, out)
     if args.format == "foxglove":
-        return _foxglove(result, args.run_path, out, layout=args.layout)
+        return _foxglove(result, args.run_path, out, layout=args.layout, force=args.force)
     if args.format == "ros2":
         from coloc_graph.exchange.ros_export import write_ros2
 
@@ -65,6 +73,8 @@ def run(args: argparse.Namespace) -> int:
     if not source.exists():
         raise InputError(f"{result.path} does not contain {source.name}: solve the run again with this version")
     out.parent.mkdir(parents=True, exist_ok=True)
+    if out.is_dir():
+        shutil.rmtree(out)  # an earlier export, as was checked
     if args.format == "tum":
         shutil.copytree(source, out)
     elif args.format == "gtsam":
@@ -77,6 +87,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _truth(result: "Result", run_path: str | None, out: Path) -> int:
     """Write the true trajectories of a result's run as TUM files, in the world of the run."""
+    import shutil
+
     from coloc_graph.errors import InputError
     from coloc_graph.exchange.tum import write_tum
     from coloc_graph.run import read_truth
@@ -86,6 +98,8 @@ def _truth(result: "Result", run_path: str | None, out: Path) -> int:
     truth = read_truth(path)
     if not truth:
         raise InputError(f"{path}: the run holds no truth to export; leave --truth out")
+    if out.is_dir():
+        shutil.rmtree(out)  # an earlier export, as was checked
     out.mkdir(parents=True)
     for robot, trajectory in truth.items():
         write_tum(trajectory, out / f"{robot}.tum")
@@ -93,19 +107,21 @@ def _truth(result: "Result", run_path: str | None, out: Path) -> int:
     return 0
 
 
-def _foxglove(result: "Result", run_path: str | None, out: Path, *, layout: bool) -> int:
+def _foxglove(result: "Result", run_path: str | None, out: Path, *, layout: bool, force: bool) -> int:
     """Write a result for Foxglove, with a layout beside it."""
+    import os
+
     from coloc_graph.cli.printing import warn
     from coloc_graph.errors import InputError
     from coloc_graph.exchange.foxglove_export import LAYOUT
     from coloc_graph.results.foxglove import export_foxglove
-    from coloc_graph.run.atomic_file import write_atomically
+    from coloc_graph.run.atomic_file import require_writable, write_atomically
 
     if out.suffix != ".mcap":
         raise InputError(f"{out} is not the name of an MCAP file: give one that ends in .mcap")
     beside = out.with_suffix(".json")
-    if layout and beside.exists():
-        raise InputError(f"{beside} exists; give another --out, or remove it")
+    if layout and os.path.lexists(beside):
+        require_writable(beside, force=force)
     out.parent.mkdir(parents=True, exist_ok=True)
     messages, warnings = export_foxglove(result, out, Path(run_path) if run_path else None)
     warn(warnings)

@@ -1,4 +1,8 @@
-"""Check the path of a run to write: only runs are replaced, and only with --force."""
+"""One rule of outputs for all commands: what exists is replaced only with --force, and never anything else.
+
+A result that the same run, options and version make again is no other result, and needs no --force. Recordings of
+missions and robots are never replaced.
+"""
 
 import argparse
 
@@ -6,7 +10,12 @@ import argparse
 def add_out(command: argparse.ArgumentParser) -> None:
     """Add the arguments --out and --force of a command that writes a run."""
     command.add_argument("--out", required=True, metavar="RUN", help="run to write (.mcap)")
-    command.add_argument("--force", action="store_true", help="replace an existing run")
+    add_force(command)
+
+
+def add_force(command: argparse.ArgumentParser) -> None:
+    """Add the argument --force."""
+    command.add_argument("--force", action="store_true", help="replace outputs that exist (default: refuse)")
 
 
 def require_run_place(out: str, *, force: bool) -> None:

@@ -4,6 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from coloc_graph.cli.coordinate import waypoint
+from coloc_graph.cli.place import add_force
 from coloc_graph.cli.printing import print_json, print_table, warn
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--without-odometry", action="store_true", help="ignore wheel odometry")
     command.add_argument("--poses", metavar="CSV", help="write the plan, for `coloc simulate hallway --plan CSV`")
     command.add_argument("--draw", metavar="PNG", help="draw the plan and the paper's formation")
+    add_force(command)
     command.add_argument("--json", action="store_true", help="print figures as JSON")
     command.set_defaults(run=run)
 
@@ -87,8 +89,12 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.planning.plan import write_plan
     from coloc_graph.planning.prediction import Predictor
     from coloc_graph.planning.roles import pair_of
+    from coloc_graph.run.atomic_file import require_writable
     from coloc_graph.team import read_team
 
+    for path in (args.poses, args.draw):
+        if path is not None:
+            require_writable(path, force=args.force)
     team = read_team(args.team)
     for name, value in (("speed", args.speed), ("fps", args.fps), ("noise", args.noise)):
         if value is not None and not 0 < value < 1e6:

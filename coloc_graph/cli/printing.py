@@ -4,12 +4,29 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
+
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)  # set by -q
+
+
+def set_quiet(*, quiet: bool) -> None:
+    """Print neither progress nor warnings from here on, or print them again."""
+    _quiet.set(quiet)
+
+
+def note(text: str) -> None:
+    """Print a line about the work to stderr, unless -q is given."""
+    if not _quiet.get():
+        print(text, file=sys.stderr, flush=True)
 
 
 @contextmanager
 def progress(what: str) -> Iterator[Callable[[int, int], None]]:
     """Yield a callback (done, total) that shows a bar on a terminal, and a line at each quarter elsewhere."""
+    if _quiet.get():
+        yield lambda _done, _total: None
+        return
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -26,7 +43,7 @@ def progress(what: str) -> Iterator[Callable[[int, int], None]]:
         nonlocal quarter
         if 4 * done // total != quarter:
             quarter = 4 * done // total
-            print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
+            note(f"{what}: {done} of {total}")
 
     yield report
 
@@ -53,6 +70,6 @@ def warn(warnings: Sequence[str], *, kept: bool = True) -> None:
     """Print warnings to stderr, one a line; of many that are `kept` in a result, the first and the number of others."""
     shown = 8 if kept else len(warnings)
     for warning in warnings[:shown]:
-        print(f"warning: {warning}", file=sys.stderr)
+        note(f"warning: {warning}")
     if len(warnings) > shown:
-        print(f"warning: and {len(warnings) - 8} more, see summary.json and measurements.csv", file=sys.stderr)
+        note(f"warning: and {len(warnings) - shown} more, see summary.json and measurements.csv")

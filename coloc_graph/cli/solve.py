@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coloc_graph.cli.place import add_force
 from coloc_graph.cli.printing import counted, print_json, progress, warn
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from coloc_graph.frontend import TrackerOptions
     from coloc_graph.pipeline.batch import EnteredStance, Solution, SolveOptions
     from coloc_graph.run import Run
+    from coloc_graph.team import Team
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -31,6 +33,12 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "run_path", metavar="RUN|FOLDER|GRAPH", help="run (.mcap), folder of runs, or pose graph (.g2o)"
     )
     command.add_argument("--out", required=True, metavar="DIR", help="folder for the result, or for those of all runs")
+    add_force(command)
+    command.add_argument(
+        "--config",
+        metavar="TOML",
+        help="take the options from config.toml of a result; those given here replace them",
+    )
     command.add_argument("--incremental", action="store_true", help="solve stance by stance, as online")
     command.add_argument(
         "--tracking",
@@ -88,30 +96,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, listener: "socket | None") -> int:
-    from dataclasses import replace
-
     from coloc_graph.cli.solve_many import solve_folder
     from coloc_graph.cli.view import announce, show
     from coloc_graph.errors import InputError
-    from coloc_graph.pipeline.batch import EnteredStance, SolveOptions
+    from coloc_graph.pipeline.batch import EnteredStance
     from coloc_graph.pipeline.contents import require_applicable
+    from coloc_graph.results.config import require_same_team
+    from coloc_graph.results.earlier import require_replaceable
     from coloc_graph.results.folder import require_output_folder
     from coloc_graph.run import open_run
 
-    options = SolveOptions(
-        method=args.method,
-        odometry=not args.without_odometry,
-        incremental=args.incremental,
-        between_robots=not args.without_robots,
-    )
-    if args.scale is not None:
-        frontend = options.resolved().frontend
-        assert frontend is not None  # resolved
-        options = replace(options, frontend=replace(frontend, scale=args.scale))
-    if args.tracking:
-        frontend = options.resolved().frontend
-        assert frontend is not None  # resolved
-        options = replace(options, frontend=replace(frontend, tracker=_tracker(args.tracking)))
+    options, team = _options(args)
     if args.lenient:
         raise InputError(f"{args.run_path} is not a pose graph (.g2o): --lenient applies to pose graphs only")
     if Path(args.run_path).is_dir():
@@ -121,14 +116,17 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
     require_output_folder(args.out)  # before the work
     with _earlier_result_named(args.out):
         logged = open_run(args.run_path)
+        if team is not None:
+            require_same_team(team, logged.team, args.config, args.run_path)
         kind = require_applicable(logged, options)
+    require_replaceable(args.run_path, args.out, options, force=args.force)
     if not args.view:
         _solved(args, logged, options)
         return 0
 
     from coloc_graph.viewer import LiveStance, Viewer, empty_scene, scene_of_solution
 
-    if not args.incremental or kind == "ranges":
+    if not options.incremental or kind == "ranges":
         solution = _solved(args, logged, options)
         with Viewer(scene_of_solution(solution), listener=listener) as viewer:
             show(viewer, browser=not args.no_browser)
@@ -147,6 +145,38 @@ def _run(args: argparse.Namespace, listener: "socket | None") -> int:
             viewer.publish(scene_of_solution(solution))
             viewer.wait_closed()
     return 0
+
+
+def _options(args: argparse.Namespace) -> "tuple[SolveOptions, Team | None]":
+    """Options of --config, replaced by those given; and the team that they were used with, if the file states it."""
+    from dataclasses import replace
+
+    from coloc_graph._version import __version__
+    from coloc_graph.pipeline.options import SolveOptions
+
+    options, team, version = SolveOptions(), None, __version__
+    if args.config is not None:
+        from coloc_graph.results.config import read_options
+
+        options, team, version = read_options(args.config)
+    if version != __version__:
+        warn([f"{args.config} is of version {version}: this version may give another result"])
+    if args.method is not None and args.method != options.method:
+        # the front end of another method is not that of this one
+        options = replace(options, method=args.method, frontend=None)
+    options = replace(
+        options,
+        odometry=options.odometry and not args.without_odometry,
+        incremental=options.incremental or args.incremental,
+        between_robots=options.between_robots and not args.without_robots,
+    )
+    if args.scale is not None or args.tracking:
+        frontend = options.resolved().frontend
+        assert frontend is not None  # resolved
+        scale = frontend.scale if args.scale is None else args.scale
+        tracker = _tracker(args.tracking) if args.tracking else frontend.tracker
+        options = replace(options, frontend=replace(frontend, scale=scale, tracker=tracker))
+    return options, team
 
 
 def _tracker(given: list[str]) -> "TrackerOptions":

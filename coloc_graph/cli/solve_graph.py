@@ -13,18 +13,29 @@ def solve_graph(args: argparse.Namespace) -> int:
     """Solve a pose graph, write it and print a summary."""
     from coloc_graph.errors import InputError
     from coloc_graph.pipeline.pose_graph import solve_pose_graph
+    from coloc_graph.results.earlier import require_replaceable_graph
     from coloc_graph.results.folder import require_output_folder
     from coloc_graph.results.pose_graph import summarise_pose_graph, write_pose_graph_result
     from coloc_graph.run.output_lock import locked_output
 
     given = [
         name
-        for name in ("method", "scale", "incremental", "without_odometry", "without_robots", "processes", "tracking")
+        for name in (
+            "method",
+            "scale",
+            "incremental",
+            "without_odometry",
+            "without_robots",
+            "processes",
+            "tracking",
+            "config",
+        )
         if getattr(args, name)
     ]
     if given:
         raise InputError(f"{args.run_path} is a pose graph: --{given[0].replace('_', '-')} applies to runs only")
     require_output_folder(args.out)
+    require_replaceable_graph(args.run_path, args.out, force=args.force)
     with locked_output(args.out):
         solution = solve_pose_graph(args.run_path, lenient=args.lenient)
         write_pose_graph_result(solution, args.out)

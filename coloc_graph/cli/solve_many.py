@@ -1,10 +1,9 @@
 """coloc solve FOLDER --out DIR: solve every run in a folder."""
 
 import argparse
-import sys
 from typing import TYPE_CHECKING, Any
 
-from coloc_graph.cli.printing import counted, print_json, print_table
+from coloc_graph.cli.printing import counted, note, print_json, print_table
 
 if TYPE_CHECKING:
     from coloc_graph.pipeline.batch import SolveOptions
@@ -33,11 +32,11 @@ def solve_folder(args: argparse.Namespace, options: "SolveOptions") -> int:
         done += 1
         what = outcome.failed or ("solved before" if outcome.resumed else "solved")
         named = what if what.startswith(str(outcome.run)) else f"{outcome.run}: {what}"
-        print(f"{done} of {len(runs)}: {named}", file=sys.stderr, flush=True)
+        note(f"{done} of {len(runs)}: {named}")
 
     executors = partial(workers, processes, args.cluster)
     with locked_output(args.out):
-        outcomes = solve_runs(runs, places, options, executors=executors, on_outcome=on_outcome)
+        outcomes = solve_runs(runs, places, options, executors=executors, force=args.force, on_outcome=on_outcome)
     failed = [one for one in outcomes if one.failed]
     if args.json:
         print_json([_as_json(one) for one in outcomes])

@@ -3,6 +3,8 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from coloc_graph.cli.place import add_force
+
 if TYPE_CHECKING:
     from coloc_graph.team import Team
 
@@ -50,7 +52,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     new = kinds.add_parser("new", help="write a team.toml to correct: robots with a camera and two lights each")
     new.add_argument("robots", nargs="+", metavar="ROBOT", help="names of the robots; the first is the reference")
     new.add_argument("--out", required=True, metavar="TEAM.toml", help="file to write")
-    new.add_argument("--force", action="store_true", help="replace an existing file")
+    add_force(new)
     new.add_argument("--no-camera", action="append", default=[], metavar="ROBOT", help="robot without a camera")
     new.add_argument("--size", default="640x480", help="size of the images [px] (default: 640x480)")
     new.add_argument("--view-deg", type=float, default=60.0, help="horizontal angle of view [deg] (default: 60)")

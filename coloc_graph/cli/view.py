@@ -3,6 +3,8 @@
 import argparse
 from typing import TYPE_CHECKING
 
+from coloc_graph.cli.place import add_force
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from socket import socket
@@ -27,15 +29,14 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--dark", action="store_true", help="use dark colours")
     command.add_argument("--export", metavar="HTML", help="write a web page that needs no server, and end")
     command.add_argument("--png", metavar="PNG", help="write a picture, and end; needs Chromium")
+    add_force(command)
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Make the scene and show or write it."""
-    from pathlib import Path
-
     from coloc_graph.cli.printing import warn
-    from coloc_graph.errors import InputError
+    from coloc_graph.run.atomic_file import require_writable
     from coloc_graph.viewer import Viewer
     from coloc_graph.viewer.access import is_loopback
     from coloc_graph.viewer.browser import require_browser, write_png
@@ -43,8 +44,8 @@ def run(args: argparse.Namespace) -> int:
 
     writes = bool(args.export or args.png)
     for out in (args.export, args.png):
-        if out and not Path(out).absolute().parent.is_dir():
-            raise InputError(f"{out} cannot be written: its folder does not exist; make it, or give another path")
+        if out:
+            require_writable(out, force=args.force)
     if args.png:
         require_browser()
     host, port = ("127.0.0.1", 0) if writes else (args.host, args.port)

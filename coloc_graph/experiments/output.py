@@ -39,18 +39,25 @@ def as_json(experiment: Experiment) -> dict[str, Any]:
     return {"experiment": experiment.name, "version": __version__, **experiment.numbers()}
 
 
-def require_output_folder(out: str | Path, name: str) -> None:
-    """Raise `InputError` where an experiment's files cannot go to `out`, or something else is there."""
+def require_output_folder(out: str | Path, name: str, *, force: bool = True) -> None:
+    """Raise `InputError` where an experiment's files cannot go to `out`, or exist there and `force` is not given."""
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} exists and is not a folder; give another place, or remove it")
     if out.is_dir() and any(out.iterdir()) and not any(out.glob("*.json")):
         raise InputError(f"{out} holds something else than experiments; give another folder, or empty it")
+    if not force and (there := [path for path in _paths(out, name) if path.exists()]):
+        raise InputError(f"{there[0]} exists; replace it with --force, or give another folder")
     above = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
     if not above.is_dir():
         raise InputError(f"{out} cannot be made, since {above} is not a folder; give another folder")
     if not os.access(above, os.W_OK):
         raise InputError(f"{out} cannot be written, since {above} is not yours to write to; give another folder")
+
+
+def _paths(out: Path, name: str) -> tuple[Path, Path, Path]:
+    """Return the paths of an experiment's picture, drawing and numbers."""
+    return out / f"{name}.png", out / f"{name}.svg", out / f"{name}.json"
 
 
 def save(experiment: Experiment, out: str | Path) -> tuple[Path, Path, Path]:
@@ -63,7 +70,7 @@ def save(experiment: Experiment, out: str | Path) -> tuple[Path, Path, Path]:
 
     out = Path(out)
     require_output_folder(out, experiment.name)
-    png, svg, numbers = (out / f"{experiment.name}.{kind}" for kind in ("png", "svg", "json"))
+    png, svg, numbers = _paths(out, experiment.name)
     figure = draw(experiment)
     picture, text = png_bytes(figure), figure_svg(figure, experiment.name)
     out.mkdir(parents=True, exist_ok=True)

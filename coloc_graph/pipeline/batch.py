@@ -1,5 +1,6 @@
 """From a run to an estimate, whatever the run holds: `solve`. Stances as in sections III and IV of the paper."""
 
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -42,6 +43,8 @@ from coloc_graph.run.recorded import Restated
 from coloc_graph.team import Team
 
 __all__ = ["METHODS", "EnteredStance", "Progress", "Solution", "SolveOptions", "StanceSolver", "solve"]
+
+log = logging.getLogger(__name__)
 
 NOISE_ROUNDS = 2  # of learning the noise and measuring again: which points are inliers depends on it
 
@@ -171,6 +174,7 @@ def _in_batch(
     for _ in range(NOISE_ROUNDS):
         noise = belief.updated(measured)
         measured = measured_again(measured, noise.used(run.team))
+    log.info("%d stances measured: %d of %d pairs usable", len(run.stances), _usable(measured), len(measured))
     _require_poses(run, options, measured)
     made = time.perf_counter()
     graph, sources = _graph_of(run, options, measured, noise.used(run.team))
@@ -196,6 +200,7 @@ def _in_batch(
             _require_ties(run, graph, measured)
             estimate = joint(graph, start=estimate.values)
     measured = tuple(replace(one, with_team=None) for one in measured)
+    log.info("%s: chi2/dof %.6g/%d, %d rejected", options.method, estimate.chi2, estimate.dof, len(estimate.rejected))
     of_clocks = [*(clocks.sentences() if clocks else ()), *clock_warnings, *map(str, arms.values())]
     warnings = _warnings(run, options, estimate, measured, of_clocks, sources.unused)
     missing = without_poses(run, options, estimate, measured, sources.unused)

@@ -6,7 +6,6 @@ online/<robot>.tum; where landmarks were measured, landmarks.csv; and team.toml,
 was calibrated.
 """
 
-import dataclasses
 import json
 import os
 import shutil
@@ -18,23 +17,20 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import tomli_w
 
 from coloc_graph._version import __version__
 from coloc_graph.errors import InputError
 from coloc_graph.exchange.tum import read_tum
-from coloc_graph.frontend import FrontendOptions, TrackerOptions
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.input_file import convert, read_json, read_toml
-from coloc_graph.pipeline.options import SolveOptions
+from coloc_graph.input_file import convert, read_json
+from coloc_graph.results.config import Config, read_config
 from coloc_graph.run import run_id
 from coloc_graph.run.output_lock import locked_output
-from coloc_graph.team import Team, read_team, without_none
+from coloc_graph.team import Team, read_team
 from coloc_graph.team.landmark import require_name
 
 FORMAT = 1  # of summary.json, measurements.csv, landmarks.csv and config.toml, together
 SUMMARY = "summary.json"
-CONFIG = "config.toml"
 LANDMARKS = "landmarks.csv"
 MEASUREMENTS = "measurements.csv"
 GTSAM_FACTORS = "factors.zip"
@@ -112,39 +108,6 @@ def read_summary(path: str | Path) -> dict[str, Any]:
         had = "an earlier version of coloc-graph wrote it" if number is None else f"its format is {number}"
         raise InputError(f"{path} is a result that this version does not read ({had}): {REMEDY}")
     return summary
-
-
-@dataclass(frozen=True)
-class Config:
-    """Configuration of a result: version, options, and the team as stated."""
-
-    version: str
-    options: SolveOptions
-    team: Team
-
-
-def write_config(options: SolveOptions, team: Team, part: Path) -> None:
-    """Write config.toml into `part` of a result."""
-    config = {
-        "version": __version__,
-        "options": without_none(dataclasses.asdict(options)),
-        "team": without_none(msgspec.to_builtins(team)),
-    }
-    (part / CONFIG).write_text(tomli_w.dumps(config), encoding="utf-8")
-
-
-def read_config(path: str | Path) -> Config:
-    """Return the configuration of a result; `InputError` where config.toml is missing or damaged."""
-    file = Path(path) / CONFIG
-    config = read_toml(file, REMEDY)
-    team = convert(file, config.get("team"), Team, REMEDY)
-    try:
-        options, frontend = dict(config["options"]), None
-        if stated := options.pop("frontend", None):
-            frontend = FrontendOptions(**(stated | {"tracker": TrackerOptions(**stated.get("tracker", {}))}))
-        return Config(str(config["version"]), SolveOptions(frontend=frontend, **options), team)
-    except (KeyError, TypeError, ValueError, AttributeError, InputError) as error:
-        raise InputError(f"{file} is damaged ({error}); {REMEDY}") from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coloc_graph._version import __version__
 from coloc_graph.errors import ColocError, InputError
 from coloc_graph.pipeline.batch import SolveOptions, solve
-from coloc_graph.results.folder import SUMMARY, holds_result, read_config, read_summary, require_output_folder
+from coloc_graph.results.earlier import require_replaceable, same_result
+from coloc_graph.results.folder import SUMMARY, holds_result, read_summary, require_output_folder
 from coloc_graph.results.writer import write_result
-from coloc_graph.run import open_run, run_id
+from coloc_graph.run import open_run
 
 MAX_TRIES = 2  # of a run whose process died: with several under way it is not known whose fault it was
 
@@ -71,6 +71,7 @@ def solve_runs(
     options: SolveOptions | None = None,
     *,
     executors: Callable[[], AbstractContextManager[Executor]],
+    force: bool = True,
     on_outcome: Callable[[Outcome], None] | None = None,
 ) -> list[Outcome]:
     """Solve each run, and write its result to its folder.
@@ -83,6 +84,8 @@ def solve_runs(
         As of `solve`.
     executors : callable
         Makes an executor, and one more where it broke.
+    force : bool
+        Replace existing results of other runs, options or versions; otherwise their runs count as failed.
     on_outcome : callable, optional
         Called with each outcome as soon as it is known.
 
@@ -102,6 +105,8 @@ def solve_runs(
     for number, (run, out) in enumerate(zip(runs, folders, strict=True)):
         if (summary := _earlier(run, out, options)) is not None:
             take(number, Outcome(run, out, summary, resumed=True))
+        elif (failed := _replacing(run, out, options, force=force)) != "":
+            take(number, Outcome(run, out, {}, failed=failed))
     for tries in reversed(range(MAX_TRIES)):
         left = [number for number in range(len(runs)) if number not in outcomes]
         if not left:
@@ -136,18 +141,20 @@ def solve_one(run: Path, out: Path, options: SolveOptions) -> Outcome:
         return Outcome(run, out, {}, failed=f"{run}: cannot be solved ({type(error).__name__}: {error})")
 
 
-def _earlier(run: Path, out: Path, options: SolveOptions) -> dict[str, Any] | None:
-    """Return the summary of a result of this very run by these options and this version; None where there is none."""
-    if not holds_result(out):
-        return None
+def _replacing(run: Path, out: Path, options: SolveOptions, *, force: bool) -> str:
+    """Reason for which the result of a run must not be written; "" where it may be."""
     try:
-        summary, config = read_summary(out), read_config(out)
-        same = (
-            config.version == __version__
-            and config.options in (options, options.resolved())
-            and (out / SUMMARY).stat().st_mtime >= run.stat().st_mtime
-            and summary.get("run_id") == run_id(run)
-        )
-    except (OSError, ValueError, ColocError):
+        require_replaceable(run, out, options, force=force)
+    except (OSError, ColocError) as error:
+        return str(error)
+    return ""
+
+
+def _earlier(run: Path, out: Path, options: SolveOptions) -> dict[str, Any] | None:
+    """Return the summary of the same result, if it was written after the run; None where there is none."""
+    try:
+        if holds_result(out) and (out / SUMMARY).stat().st_mtime >= run.stat().st_mtime:
+            return same_result(run, out, options)
+    except (OSError, ColocError):
         return None
-    return summary if same else None
+    return None

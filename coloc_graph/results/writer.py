@@ -22,13 +22,13 @@ from coloc_graph.exchange.landmarks import landmark_rows, landmarks_csv, map_row
 from coloc_graph.exchange.tum import write_tum
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.solution import Solution
+from coloc_graph.results.config import write_config
 from coloc_graph.results.folder import (
     CALIBRATED_TEAM,
     GTSAM_FACTORS,
     LANDMARKS,
     MEASUREMENTS,
     atomic_result,
-    write_config,
     write_summary,
 )
 from coloc_graph.results.measurement_table import measurement_table

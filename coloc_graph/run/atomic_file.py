@@ -2,6 +2,7 @@
 
 import os
 import secrets
+from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,6 +20,30 @@ def require_writable(path: str | Path, *, force: bool = False, what: str = "a fi
         raise InputError(f"{path} exists; replace it with --force, or give another path")
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path} cannot be written: its folder does not exist; create it, or give another path")
+
+
+def require_replaceable_folder(path: str | Path, names: Collection[str], *, force: bool = False) -> None:
+    """Raise `InputError` if no folder can be written at `path`, or if one is there and may not be replaced.
+
+    Parameters
+    ----------
+    path
+        Folder to write.
+    names
+        Names, or endings of names (".tum"), of the files that it would hold. A folder with any other is never replaced.
+    force
+        Replace a folder of such files.
+    """
+    path = Path(path)
+    if not os.path.lexists(path):
+        return
+    if not force:
+        raise InputError(f"{path} exists; replace it with --force, or give another path")
+    if path.is_symlink() or not path.is_dir():
+        raise InputError(f"{path} is not a folder; give another path")
+    other = [one.name for one in path.iterdir() if not any(one.is_file() and one.name.endswith(name) for name in names)]
+    if other:
+        raise InputError(f"{path} holds {min(other)}, which this command does not write; give another path")
 
 
 def open_part(path: Path) -> tuple[int, Path]:

@@ -82,7 +82,7 @@ def test_simulate_solve_info_evaluate_round_trip(call, tmp_path):
     assert re.search(r"predicted 1-sigma at the end: A \d+\.\d mm, \d\.\d\d deg; B ", text)
     assert "stances measured: 3 of 3" in err and "stances measured" not in text
 
-    code, text, err = call("solve", run, "--out", out, "--json", "--method", "chain")
+    code, text, err = call("solve", run, "--out", out, "--json", "--method", "chain", "--force")
     solved = json.loads(text)
     assert code == 0 and solved["method"] == "chain"
     on_disk = json.loads((out / "summary.json").read_text())

@@ -198,7 +198,7 @@ def test_a_result_is_exported(result, tmp_path, capsys):
     assert len(read_tum(tmp_path / "tum" / "C.tum")) == 8
     capsys.readouterr()
     assert main(["export", "g2o", str(result), "--out", str(tmp_path / "g2o")]) == 2
-    assert "exists; give another path" in capsys.readouterr().err
+    assert "exists; replace it with --force" in capsys.readouterr().err
     assert main(["export", "g2o", str(tmp_path), "--out", str(tmp_path / "x")]) == 2
     assert "is not a result" in capsys.readouterr().err
 

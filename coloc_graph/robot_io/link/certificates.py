@@ -19,7 +19,9 @@ from coloc_graph.robot_io.link.zenoh_config import COORDINATOR
 VALID_DAYS = 365  # days for which certificates are valid
 
 
-def make_certificates(folder: str | Path, robots: Sequence[str], days: int = VALID_DAYS) -> tuple[Path, ...]:
+def make_certificates(
+    folder: str | Path, robots: Sequence[str], days: int = VALID_DAYS, *, force: bool = False
+) -> tuple[Path, ...]:
     """Write the authority's ca.pem and ca.key, and NAME.pem and NAME.key of the coordinator and each robot.
 
     Keys are readable by their owner only.
@@ -32,6 +34,8 @@ def make_certificates(folder: str | Path, robots: Sequence[str], days: int = VAL
         Names of the robots.
     days
         Validity [days].
+    force
+        Replace existing files.
 
     Returns
     -------
@@ -41,7 +45,7 @@ def make_certificates(folder: str | Path, robots: Sequence[str], days: int = VAL
     Raises
     ------
     InputError
-        If a file exists already, or a robot's name is reserved.
+        If a file exists and `force` is not given, or a robot's name is reserved.
     """
     if taken := {"ca", COORDINATOR} & set(robots):
         raise InputError(f"a robot cannot be called `{min(taken)}`: give it another name in the team's description")
@@ -50,9 +54,11 @@ def make_certificates(folder: str | Path, robots: Sequence[str], days: int = VAL
     folder = Path(folder)
     names = (COORDINATOR, *robots)
     paths = tuple(folder / f"{name}.{kind}" for name in ("ca", *names) for kind in ("pem", "key"))
-    if there := [path for path in paths if path.exists()]:
-        raise InputError(f"{there[0]} exists already and is not replaced: give another folder, or remove it")
+    if not force and (there := [path for path in paths if path.exists()]):
+        raise InputError(f"{there[0]} exists; replace it and all others with --force, or give another folder")
     folder.mkdir(parents=True, exist_ok=True)
+    for path in paths:
+        path.unlink(missing_ok=True)
     begin = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=1)  # for clocks that are slightly behind
     end = begin + datetime.timedelta(days=days)
     ca_key = ec.generate_private_key(ec.SECP256R1())
