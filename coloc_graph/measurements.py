@@ -133,13 +133,15 @@ class MarkerSpan:
     mover : str
         Robot that carries the markers.
     x_i : (n, 2, 2) float
-        Rays (x, y, 1) to both markers in camera i, estimated from both images and the measured homography.
+        Rays (x, y, 1) to both markers in a view of camera i, estimated from both images and the measured homography.
     covariance : (n, 2, 2, 2) float
         Covariances of the rays; at the true homography they are independent of its error.
     by_h : (n, 2, 2, 8) float
         Derivatives of the rays by the homography's coordinates h.
     shared : (n, 2, 2, q) float
         Square root of the covariance of errors that all rays to one marker share.
+    R_camera_view : (3, 3) float or None
+        Rotation of the frame of the rays; None: the camera's own.
     """
 
     mover: str
@@ -147,6 +149,7 @@ class MarkerSpan:
     covariance: Array
     by_h: Array
     shared: Array
+    R_camera_view: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +228,8 @@ class Sighting:
     x_markers, x_covariance
         Rays (x, y, 1) to its first two markers, (2, 2), and their covariance (2, 2, 2). The joint estimate takes these
         instead of the pose.
+    R_camera_view
+        Rotation (3, 3) of the frame of these rays; None: the camera's own.
     """
 
     stance: int
@@ -235,6 +240,7 @@ class Sighting:
     covariance: Array
     x_markers: Array | None = None
     x_covariance: Array | None = None
+    R_camera_view: Array | None = None
 
     def __post_init__(self) -> None:
         _as_arrays(self, "T_observer_seen", "covariance")

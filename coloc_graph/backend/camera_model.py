@@ -7,7 +7,7 @@ no graph.
 
 import math
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -156,7 +156,7 @@ def see(T_plane_body: Array, cameras: MountedCameras, height: Array) -> SeenPlan
 
 @dataclass(frozen=True, eq=False)
 class MarkersModel:
-    """Residual of the rays to two markers of a robot in another robot's camera.
+    """Residual of the rays to two markers of a robot in another robot's camera, in a view turned by `R_camera_view`.
 
     Variables: the observer's mount (3,), and the markers (2,).
     """
@@ -165,6 +165,7 @@ class MarkersModel:
     covariance: Array
     mount: Mount
     markers: Markers
+    R_camera_view: Array = field(default_factory=lambda: np.eye(3))
 
     rows = 4
     kind = "markers"
@@ -177,7 +178,7 @@ class MarkersModel:
     def planar_pose(self, mount: Array, markers: Array) -> tuple[float, float, float] | None:
         """Return x, y [m] and heading [rad] of the robot in a level observer; None where a ray goes up."""
         camera = Mounts([self.mount]).at(mount[None])
-        rays = np.column_stack([self.x, np.ones(2)]) @ camera.R[0].T
+        rays = np.column_stack([self.x, np.ones(2)]) @ (camera.R[0] @ self.R_camera_view).T
         above = camera.t[0, 2] - self.markers.height - markers[1]
         if not (above > 0 and rays[:, 2].max() < -1e-3):
             return None
@@ -196,6 +197,7 @@ class _Markers:
         self._x = np.array([one.x for one in models])
         self._roots = np.linalg.inv(np.linalg.cholesky(np.array([one.covariance for one in models])))
         self._mounts = Mounts([one.mount for one in models])
+        self._R_camera_view = np.array([one.R_camera_view for one in models])
         self._nominal = np.array([one.markers.p_body[:2] for one in models])
 
     @cached_property
@@ -215,14 +217,15 @@ class _Markers:
         R_cw = (R_wo @ cameras.R).mT
         t = T_world_j[:, :3, 3] - T_world_i[:, :3, 3] - (R_wo @ cameras.t[..., None])[..., 0]
         p_camera = (p_body @ R_ws.mT + t[:, None]) @ R_cw.mT
-        seen = p_camera[:, :, 2].min(axis=1) > 1e-3
-        w = 1 / np.where(seen[:, None], p_camera[..., 2], 1.0)
-        x = p_camera[..., :2] * w[..., None]
+        p_view = p_camera @ self._R_camera_view
+        seen = p_view[:, :, 2].min(axis=1) > 1e-3
+        w = 1 / np.where(seen[:, None], p_view[..., 2], 1.0)
+        x = p_view[..., :2] * w[..., None]
         e = (self._roots @ (x - self._x)[..., None])[..., 0]
         project = np.zeros((n, 2, 2, 3))
         project[..., 0, 0] = project[..., 1, 1] = w
         project[..., 2] = -x * w[..., None]
-        project = self._roots @ project
+        project = self._roots @ project @ self._R_camera_view[:, None].mT
         by_camera = np.concatenate([project @ hat(p_camera), -project], axis=-1).reshape(n, 4, 6)
         turned = project @ (R_cw @ R_ws)[:, None]
         by_seen = np.concatenate([-turned @ hat(p_body), turned], axis=-1).reshape(n, 4, 6)

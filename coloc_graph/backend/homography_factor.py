@@ -85,4 +85,6 @@ def sighted_pose(link: Sighting, variables: Variables, errors: Callable[[int], A
 def _markers_model(link: Sighting, variables: Variables) -> MarkersModel:
     assert link.x_markers is not None and link.x_covariance is not None
     markers = variables.markers_of(link.seen)
-    return MarkersModel(link.x_markers, link.x_covariance, variables.robot_models[link.observer].mount, markers)
+    mount = variables.robot_models[link.observer].mount
+    turn = np.eye(3) if link.R_camera_view is None else link.R_camera_view
+    return MarkersModel(link.x_markers, link.x_covariance, mount, markers, turn)

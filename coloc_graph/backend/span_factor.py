@@ -81,7 +81,8 @@ class SpanModel:
 
     `weights` (3, k) @ (lengths - `noise` - span) + `by_h` (3, 8) @ h, at the k instants whose rays are clear of the
     horizon. `noise` (k,) is the bias of each length by noise, `length` [m] the span as stated. `log_det` is the
-    logarithm of the determinant by which errors that samples share make the residual's covariance larger.
+    logarithm of the determinant by which errors that samples share make the residual's covariance larger. The rays
+    `x_i` are in a frame turned by `R_camera_view` (3, 3).
     """
 
     mover: str
@@ -91,6 +92,7 @@ class SpanModel:
     weights: Array
     by_h: Array
     log_det: float
+    R_camera_view: Array
 
     @classmethod
     def near(
@@ -100,6 +102,9 @@ class SpanModel:
 
         `normal_sigma` [rad] is that of the plane's normal. Spans with too few usable instants are left out.
         """
+        turn = spans[0].R_camera_view if spans else None
+        R = np.eye(3) if turn is None else turn
+        n = n @ R
         N = n / np.linalg.norm(n)
         some, clear = [], []
         for span, length in zip(spans, lengths, strict=True):
@@ -155,6 +160,7 @@ class SpanModel:
                 weights[at, :, :k],
                 by_h[at],
                 float(log_det[at]),
+                R,
             )
             for at, ((span, length), k, end) in enumerate(zip(some, count, ends, strict=True))
         )
@@ -178,6 +184,7 @@ class Spans:
             k = len(one.x_i)
             self._x_i[at, :k], self._noise[at, :k], self._weights[at, :, :k] = one.x_i, one.noise, one.weights
             self._x_i[at, k:] = one.x_i[0]
+        self._R = np.array([one.R_camera_view for one in models])
         self._length: Array = np.array([one.length for one in models])
         self._by_longer = -self._length[:, None] * self._weights.sum(axis=2)
 
@@ -187,6 +194,6 @@ class Spans:
         With their derivatives by the planes n, (s, 3, 3), and by `longer` (s,), the relative errors of the spans,
         (s, 3).
         """
-        lengths, by_n, _, _ = spans_on_plane(self._x_i, n)
+        lengths, by_n, _, _ = spans_on_plane(self._x_i, (n[:, None] @ self._R)[:, 0])
         off = lengths - self._noise - (self._length * (1 + longer))[:, None]
-        return (self._weights @ off[..., None])[..., 0], self._weights @ by_n, self._by_longer
+        return (self._weights @ off[..., None])[..., 0], self._weights @ by_n @ self._R.mT, self._by_longer

@@ -34,6 +34,8 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         help="correspondences a stance, at least 6 (default: 100; images and single-step 250; --blink 2000)",
     )  # fmt: skip
 
+    command.add_argument("--fisheye", type=float, metavar="DEG", help="cameras are fisheyes of DEG across (not team)")
+
     errors = command.add_argument_group("errors of the simulated world (standard deviations; default: 0)")
     errors.add_argument("--noise", type=float, help="noise of a marker centre, px, with --depth tracks (default: 0.3)")
     errors.add_argument("--mount-sigma", type=float, default=0.0, help="tilt and roll of the mounts, deg")
@@ -112,6 +114,7 @@ def run(args: argparse.Namespace) -> int:
             fps=10.0 if args.fps is None else args.fps,
             image_format=args.image_format or "jpeg",
             messy=args.messy,
+            fisheye_deg=args.fisheye,
             progress=report,
         )
     print(args.out)

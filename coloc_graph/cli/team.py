@@ -167,18 +167,17 @@ def findings(team: "Team") -> tuple[list[str], list[str]]:
                 )
         if not 0.02 < mount.height < 5:
             implausible.append(f"the camera of {robot.name} is {mount.height:g} m high: metres?")
-        view = math.degrees(2 * math.atan(camera.width / 2 / camera.fx))
-        if not 15 < view < 150:
+        across, down = map(math.degrees, camera.field_of_view)
+        if not 15 < across < (240 if camera.model == "fisheye" else 150):
             implausible.append(
-                f"the camera of {robot.name} sees {view:.0f} deg across: is fx ({camera.fx:g} px) of this size?"
+                f"the camera of {robot.name} sees {across:.0f} deg across: is fx ({camera.fx:g} px) of this size?"
             )
         if (
             abs(camera.cx - camera.width / 2) > 0.2 * camera.width
             or abs(camera.cy - camera.height / 2) > 0.2 * camera.height
         ):
             implausible.append(f"the principal point of {robot.name} is far from the middle: is it of this image size?")
-        top = mount.tilt_deg - math.degrees(math.atan(camera.height / 2 / camera.fy))
-        bottom = mount.tilt_deg + math.degrees(math.atan(camera.height / 2 / camera.fy))
+        top, bottom = mount.tilt_deg - down / 2, mount.tilt_deg + down / 2
         if bottom <= 0 or top >= 90:
             implausible.append(f"the camera of {robot.name} does not see the floor at a tilt of {mount.tilt_deg:g} deg")
         if mount.tilt_sigma_deg == 0 and mount.roll_sigma_deg == 0 and mount.height_sigma == 0:

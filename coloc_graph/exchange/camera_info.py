@@ -24,7 +24,9 @@ from coloc_graph.team.camera import MAX_SIDE
 Array = NDArray[np.float64]
 
 #: Distortion models of ROS that are OpenCV's, with their numbers of coefficients; "" is no distortion.
-MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "": (0,)}
+MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,), "": (0,), "equidistant": (4,), "fisheye": (4,)}
+#: Names of the fisheye model: ROS's, and OpenCV's, which some drivers write.
+FISHEYES = ("equidistant", "fisheye")
 MAX_SIZE = 64 * 1024  # bytes of one camera_info; PyYAML takes a second for some hundred kilobytes
 #: Names of the fields: those of a calibrator's file, of a message in ROS 2, and in ROS 1.
 NAMES = {
@@ -51,12 +53,24 @@ def camera_info_text(camera: Camera, name: str) -> str:
         "image_height": camera.height,
         "camera_name": name,
         "camera_matrix": _matrix(K),
-        "distortion_model": "rational_polynomial" if len(camera.distortion) == 8 else "plumb_bob",
-        "distortion_coefficients": _matrix(np.array([camera.distortion])),
+        "distortion_model": ros_model(camera),
+        "distortion_coefficients": _matrix(np.array([ros_coefficients(camera)])),
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(np.hstack([K, np.zeros((3, 1))])),
     }
     return yaml.safe_dump(fields, sort_keys=False, default_flow_style=None, width=200)
+
+
+def ros_model(camera: Camera) -> str:
+    """Return the name of a camera's lens model in ROS and in Foxglove."""
+    if camera.model == "fisheye":
+        return FISHEYES[0]
+    return "rational_polynomial" if len(camera.distortion) == 8 else "plumb_bob"
+
+
+def ros_coefficients(camera: Camera) -> tuple[float, ...]:
+    """Return a camera's coefficients of distortion; a fisheye has four also if it has no distortion."""
+    return camera.distortion or (0.0,) * 4 if camera.model == "fisheye" else camera.distortion
 
 
 def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Camera, tuple[str, ...]]:
@@ -77,7 +91,8 @@ def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Came
     Raises
     ------
     InputError
-        The file is not a `camera_info`, or describes a fisheye, skewed pixels, binned images or a region of interest.
+        The file is not a `camera_info`, or describes an unknown lens model, skewed pixels, binned images or a region of
+        interest.
     """
     path = Path(path)
     fields = _fields(path)
@@ -88,10 +103,10 @@ def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Came
     if K[0, 0] == 0:
         raise InputError(f"{path}: the camera is not calibrated (its matrix is zero); calibrate it first")
     if model not in MODELS:
-        known = " and ".join(name for name in MODELS if name)
+        known = "plumb_bob, rational_polynomial and equidistant"
         raise InputError(
-            f"{path}: `distortion_model` is {quoted(model)}{', a fisheye' if model == 'equidistant' else ''}, and the "
-            f"lens models here are {known}; calibrate the camera anew with `coloc calibrate camera`"
+            f"{path}: `distortion_model` is {quoted(model)}, and the lens models here are {known}; "
+            "calibrate the camera anew with `coloc calibrate camera`"
         )
     most = max(MODELS[model])
     if not D[most:].any():
@@ -115,6 +130,7 @@ def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Came
         "fy": float(K[1, 1]),
         "cx": float(K[0, 2]),
         "cy": float(K[1, 2]),
+        "model": "fisheye" if model in FISHEYES else "pinhole",
         "distortion": tuple(D.tolist()),
     }
     try:

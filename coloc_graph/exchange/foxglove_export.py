@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
+from coloc_graph.exchange.camera_info import ros_coefficients, ros_model
 from coloc_graph.exchange.landmarks import LandmarkRow
 from coloc_graph.exchange.ros_poses import ros_covariance
 from coloc_graph.geometry.lie import quaternion
@@ -181,8 +182,8 @@ def _statics(
 
 def _calibration(ns: int, robot: str, camera: Camera) -> Any:
     """Return a camera; OpenCV's models have the same coefficients in Foxglove."""
-    model = "rational_polynomial" if len(camera.distortion) > 5 else "plumb_bob"
-    size = 8 if len(camera.distortion) > 5 else 5
+    model, D = ros_model(camera), ros_coefficients(camera)
+    size = {"plumb_bob": 5, "rational_polynomial": 8}.get(model, len(D))
     K = [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
     return _stamp(
         _new(
@@ -191,7 +192,7 @@ def _calibration(ns: int, robot: str, camera: Camera) -> Any:
             width=camera.width,
             height=camera.height,
             distortion_model=model,
-            D=[*camera.distortion, *[0.0] * (size - len(camera.distortion))],
+            D=[*D, *[0.0] * (size - len(D))],
             K=K,
             R=[1, 0, 0, 0, 1, 0, 0, 0, 1],
             P=[*K[:3], 0, *K[3:6], 0, *K[6:], 0],

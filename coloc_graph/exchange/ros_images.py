@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
+from coloc_graph.exchange.camera_info import FISHEYES, MODELS
 from coloc_graph.exchange.ros_bag import COMPRESSED_IMAGE, Bag, BagMessage
 from coloc_graph.image_file import decode_image, to_8_bits
 from coloc_graph.input_file import quoted
@@ -38,8 +39,6 @@ ENCODINGS: dict[str, tuple[int, int | None]] = {
 }
 #: How files of an image begin.
 MAGIC: dict[bytes, Literal["jpeg", "png"]] = {b"\xff\xd8\xff": "jpeg", b"\x89PNG\r\n\x1a\n": "png"}
-#: Models of a lens whose coefficients are OpenCV's.
-LENSES = ("plumb_bob", "rational_polynomial", "")
 
 
 def image_of(bag: Bag, message: BagMessage, robot: str, time: float, camera: Camera) -> Image | EncodedImage:
@@ -120,10 +119,11 @@ def camera_of(bag: Bag, message: BagMessage, stated: Camera, *, rectified: bool)
     if rectified:
         P = _numbers(found, "p")
         K, D = [*P[0:3], *P[4:7], *P[8:11]], []
-    elif found.distortion_model not in LENSES:
+    elif found.distortion_model not in MODELS:
         raise bag.error(
             message,
-            f"has the lens model {quoted(found.distortion_model)}; calibrate with plumb_bob or rational_polynomial, or "
+            f"has the lens model {quoted(found.distortion_model)}; calibrate with plumb_bob, "
+            "rational_polynomial or equidistant, or "
             "import rectified images with `rectified = true`",
         )
     roi = found.roi
@@ -131,11 +131,15 @@ def camera_of(bag: Bag, message: BagMessage, stated: Camera, *, rectified: bool)
         raise bag.error(message, "has a region of interest, which is not read; record whole images")
     if max(found.binning_x, found.binning_y) > 1:
         raise bag.error(message, "has binning, which is not read; calibrate at the size of the images")
-    D = D[: next((n for n in (0, 4, 5, 8) if not any(D[n:])), len(D))]
+    wide = not rectified and found.distortion_model in FISHEYES
+    sizes = (0, 4) if wide else (0, 4, 5, 8)
+    D = D[: next((n for n in sizes if not any(D[n:])), len(D))]
     if not all(map(math.isfinite, (*K, *D))) or K[0] <= 0 or K[4] <= 0 or not found.width or not found.height:
         raise bag.error(message, "is of a camera that is not calibrated; calibrate it, or leave `camera_info` out")
-    if len(D) not in (0, 4, 5, 8):
-        raise bag.error(message, f"has {len(D)} coefficients of distortion; what is read is up to OpenCV's first 8")
+    if len(D) not in sizes:
+        raise bag.error(
+            message, f"has {len(D)} coefficients of distortion; what is read is up to OpenCV's first {sizes[-1]}"
+        )
     try:
         camera = msgspec.structs.replace(
             stated,
@@ -145,6 +149,7 @@ def camera_of(bag: Bag, message: BagMessage, stated: Camera, *, rectified: bool)
             fy=float(K[4]),
             cx=float(K[2]),
             cy=float(K[5]),
+            model="fisheye" if wide else "pinhole",
             distortion=tuple(float(one) for one in D),
         )
     except ValueError as error:
@@ -171,6 +176,8 @@ def differences(found: Camera, stated: Camera) -> list[str]:
         a, b = getattr(found, name), getattr(stated, name)
         if not math.isclose(a, b, rel_tol=1e-6, abs_tol=1e-6):
             said.append(f"{name} {a:g} (stated {b:g})")
+    if found.model != stated.model:
+        said.append(f"a {found.model} (stated a {stated.model})")
     if not np.allclose(_padded(found), _padded(stated), rtol=1e-6, atol=1e-9):
         said.append(f"distortion {_list(found)} (stated {_list(stated)})")
     return said

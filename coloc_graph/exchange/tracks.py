@@ -306,7 +306,7 @@ def _require_seen_in_front(
             f"robot `{robot.name}` has no rows at stance {stance} in {tracks.table.path}; "
             "correct the name or remove the row",
         )
-    if (robot.camera.normalise(seen) @ N[:2] + N[2] <= 0).mean() > 0.5:
+    if (robot.camera.rays(seen) @ N <= 0).mean() > 0.5:
         raise table.error(
             row,
             f"most markers that robot `{robot.name}` saw at stance {stance} are behind this normal; "

@@ -146,7 +146,7 @@ def _places(camera: Camera, mount: Mount, landmark: Landmark, uv: Array, floor: 
     markers = landmark.seen_as
     assert markers is not None and markers.span is not None
     T = mount.T_body_camera
-    p_camera = on_plane(camera.normalise(uv), plane_from_mount(mount, markers, floor))
+    p_camera = on_plane(camera.rays(uv), plane_from_mount(mount, markers, floor))
     places = (p_camera @ T[:3, :3].T + T[:3, 3])[:, :2]
     apart = float(np.linalg.norm(places[1] - places[0]))
     if not abs(apart / markers.span - 1) < SPAN_TOLERANCE:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from coloc_graph.frontend.homography.eq2_pose import turned_normal
 from coloc_graph.frontend.homography.plane import on_plane
 from coloc_graph.frontend.homography.plane_tilts import plausible_planes
+from coloc_graph.frontend.homography.plane_view import view_of_plane
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.correspondence import pair_by_time
 from coloc_graph.frontend.tracks.marker_pairs import longest_pair, named_pair, tracks_of
@@ -77,10 +78,10 @@ def sight(
     times = pair[0].times[shared[:, 0]]
     places = _on_floor(observer, plane, uv)
     length = np.linalg.norm(np.diff(markers.p_body[:2, :2], axis=0))
-    x = observer.camera.normalise(uv.reshape(-1, 2))
+    rays = observer.camera.rays(uv.reshape(-1, 2))
     likely = np.zeros(len(uv), bool)
     for one in plausible_planes(plane, observer.mount):
-        p = on_plane(x, one).reshape(-1, 2, 3)
+        p = on_plane(rays, one).reshape(-1, 2, 3)
         with np.errstate(invalid="ignore"):
             likely |= np.abs(np.linalg.norm(p[:, 1] - p[:, 0], axis=1) / length - 1) < SPAN_TOLERANCE
     good = np.flatnonzero(likely & np.isfinite(places).all(axis=(1, 2)))
@@ -97,8 +98,9 @@ def sight(
     pose, covariance = _pose(observer, markers, plane, uv[best], noise)
     T_observer_seen = floor_pose(pose[1], pose[2], pose[0])
     bias = observer.camera.bias_px**2 * np.eye(2)
-    x = observer.camera.normalise(uv[best])
-    J = observer.camera.per_pixel(x)
+    view = view_of_plane(observer.camera, plane.N)
+    x = view.normalise(uv[best])
+    J = view.per_pixel(x)
     return Sighting(
         stance=stance.index,
         observer=observer.name,
@@ -108,6 +110,7 @@ def sight(
         covariance=covariance,
         x_markers=x,
         x_covariance=J @ (noise + bias) @ J.mT,
+        R_camera_view=view.R_camera_view if view is not observer.camera else None,
     )
 
 
@@ -196,8 +199,7 @@ def _on_floor(observer: Robot, plane: Plane, uv: Array, errors: Array = _NO_ERRO
     sides = across(plane.N)
     N = (so3_exp(errors[:, :2] @ sides) @ N[..., None])[..., 0]
     d = plane.d + errors[:, 2] + errors[:, 3]
-    x = observer.camera.normalise(uv.reshape(-1, 2)).reshape(n, m, 2)
-    rays = np.concatenate([x, np.ones((n, m, 1))], axis=2)
+    rays = observer.camera.rays(uv.reshape(-1, 2)).reshape(n, m, 3)
     along = (rays @ N[..., None])[..., 0]
     p_camera = rays * (d[:, None] / np.where(along > 1e-6, along, np.nan))[..., None]
     p_body = p_camera @ T_body_camera[:, :3, :3].mT + T_body_camera[:, None, :3, 3]

@@ -16,6 +16,12 @@ from coloc_graph.frontend.homography.marker_span import marker_spans
 from coloc_graph.frontend.homography.ml_pose import most_likely_pose
 from coloc_graph.frontend.homography.plane import distance_from_span
 from coloc_graph.frontend.homography.plane_tilts import plausible_planes
+from coloc_graph.frontend.homography.plane_view import (
+    between_cameras,
+    measured_between_cameras,
+    span_in_view,
+    view_of_plane,
+)
 from coloc_graph.frontend.homography.refinement import Criterion
 from coloc_graph.frontend.landmarks import SeenLandmarks
 from coloc_graph.frontend.pairing.clock_offset import (
@@ -149,12 +155,16 @@ class _Seen:
             return True
         spans = [m.span for name in self.stance.movers if (m := team[name].markers) and m.span]
         return of_some_span(tracks, team[self.robot_i], plane, spans) and (
-            team.floor is None or on_one_floor(H_j_i, team[self.robot_i], team[self.robot_j], plane)
+            team.floor is None
+            or on_one_floor(between_cameras(H_j_i, *self.cameras), team[self.robot_i], team[self.robot_j], plane)
         )
 
     @property
     def cameras(self) -> tuple[Camera, Camera]:
-        return self.team[self.robot_i].camera, self.team[self.robot_j].camera
+        """Cameras of both observers, fisheyes as views of the marker plane."""
+        one, other = self.team[self.robot_i], self.team[self.robot_j]
+        down = other.mount.R_body_camera.T @ np.array([0.0, 0.0, -1.0])
+        return view_of_plane(one.camera, self.plane.N), view_of_plane(other.camera, down)
 
 
 def little_in_common(measured: HomographyMeasurement, stance: Stance) -> bool:
@@ -355,6 +365,7 @@ def _measured(
             by_time_offset=by_offset,
             warning=NOT_OBSERVABLE if offset.sigma > MAX_SIGMA_RATIO * said else None,
         )
+    measurement = measured_between_cameras(measurement, *seen.cameras)
     if seen.options.scale == "span":
         plane = _plane_by_span(plane, seen.tracks_i, robot_i.camera, stance_markers(seen.run, seen.stance))
     # without the floor: the graph knows it, and must not count it twice
@@ -374,7 +385,8 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
     if not (seen.plane.normal_from_mount and seen.plane.d_from_mount):
         return ()
     robot, movers = seen.team[seen.robot_i], seen.stance.movers
-    bias = _bias_root(found.uv_i, found.pairs.x_i, robot.camera)
+    view = seen.cameras[0]
+    bias = _bias_root(found.uv_i, found.pairs.x_i, view)
     named = any(track.marker for track in seen.tracks_i)
     couples: dict[str, tuple[int, int]] = {}
     for mover in movers:
@@ -390,18 +402,17 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
             couple = longest_pair([seen.tracks_i[n] for n in own], robot.camera, planes, markers.span)
             if couple is not None:
                 couples[mover] = own[couple[0]], own[couple[1]]
-    return marker_spans(couples, found, fit, bias) if couples else ()
+    return tuple(span_in_view(one, view) for one in marker_spans(couples, found, fit, bias)) if couples else ()
 
 
 def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: Markers | None) -> Plane:
     if markers is None or markers.span is None:
         raise DegenerateGeometry("no mover carries two markers: there is no span to take the scale from")
-    x_a, x_b = [], []
+    rays_a, rays_b = [np.empty((0, 3))], [np.empty((0, 3))]
     for a, b, shared in span_samples(tracks, camera, plane, markers.span):
-        x_a.append(camera.normalise(tracks[a].uv[shared[:, 0]]))
-        x_b.append(camera.normalise(tracks[b].uv[shared[:, 1]]))
-    none = np.empty((0, 2))
-    return distance_from_span(plane, np.concatenate([none, *x_a]), np.concatenate([none, *x_b]), markers)
+        rays_a.append(camera.rays(tracks[a].uv[shared[:, 0]]))
+        rays_b.append(camera.rays(tracks[b].uv[shared[:, 1]]))
+    return distance_from_span(plane, np.concatenate(rays_a), np.concatenate(rays_b), markers)
 
 
 def _measurement(

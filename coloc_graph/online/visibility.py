@@ -145,7 +145,7 @@ def _apart(a: Planar, b: Planar) -> float:
 
 def _on_plane(view: View, uv: Array, height: float) -> Array:
     """Project pixels (n, 2) onto a plane at a height above the floor [m]: (n, 2) [m], NaN above the horizon."""
-    rays = np.column_stack([view.camera.normalise(uv), np.ones(len(uv))]) @ view.T_world_camera[:3, :3].T
+    rays = view.camera.rays(uv) @ view.T_world_camera[:3, :3].T
     down = np.where(rays[:, 2] < -1e-3, rays[:, 2], np.nan)
     reach = (height - view.T_world_camera[2, 3]) / down
     return np.asarray(view.T_world_camera[:2, 3] + reach[:, None] * rays[:, :2])

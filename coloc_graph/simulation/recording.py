@@ -16,7 +16,7 @@ from coloc_graph.simulation.blinking import with_codes
 from coloc_graph.simulation.mess import messy_frames
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.planned import planned
-from coloc_graph.simulation.rig import Imperfections, reference_team
+from coloc_graph.simulation.rig import Imperfections, reference_team, wide_team
 from coloc_graph.simulation.scenarios import TeamScenario, scenario
 from coloc_graph.simulation.scenery import Scenery, frames, make_scenery
 from coloc_graph.simulation.teams import build_team_world
@@ -65,12 +65,14 @@ def simulate(
     fps: float = 10.0,
     image_format: ImageFormat = "jpeg",
     messy: bool = False,
+    fisheye_deg: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> World:
     """Simulate a scenario (`single-step`, `six-step`, `hallway`, `team`, `landmarks`), written as a run to `out`.
 
     `points` correspondences a stance (250 for single-step and for images, else 100), two from each frame at
-    depth images, which `messy` makes of a world of glare, mirrors, flicker and a person in the way. `l` [m] and
+    depth images, which `messy` makes of a world of glare, mirrors, flicker and a person in the way. Cameras are
+    fisheyes of `fisheye_deg` [deg] across where it is given. `l` [m] and
     `theta_deg` are single-step's; `robots`, how many move `at_once`, and whether they `blink` and markers have no names
     (2000 points then) are team's; `length` [m] in all, in how many `laps`, with a landmark every so many metres, and
     whether the team is told where these are (`known`), are landmarks'. `gait` is the formation of hallway and
@@ -102,11 +104,13 @@ def simulate(
     if isinstance(what, TeamScenario):
         if depth == "images":
             raise InputError("the scenario team has tracks and no images: leave out `depth`")
+        if fisheye_deg is not None:
+            raise InputError("the scenario team has pinhole cameras: leave out `fisheye_deg`")
         team = with_codes(reference_team(names=what.names)) if blink else None
         world = build_team_world(what, seed=seed, points=points, imperfections=imperfections, team=team)
     else:
         world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps,
-                            known=known)  # fmt: skip
+                            known=known, team=None if fisheye_deg is None else wide_team(fisheye_deg))  # fmt: skip
 
     with atomic_run(out, world.team, image_format=image_format) as writer:
         record(world, writer, depth, progress, messy=messy)

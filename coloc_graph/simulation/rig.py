@@ -7,10 +7,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from coloc_graph.errors import InputError
-from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Team
+from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Team, fisheye
 
 #: A mild lens, OpenCV's (k1, k2, p1, p2): what the images are rendered through.
 MILD_LENS = (-0.10, 0.02, 5e-4, -3e-4)
+
+MIN_ACROSS_DEG = 20.0  # deg, narrowest fisheye that is simulated
+MAX_ACROSS_DEG = 220.0  # deg, widest fisheye that is simulated
+FISHEYE = (-0.012, 0.003, -0.0012, 0.0001)  # k1 to k4 of the fisheye through which wide images are rendered
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,19 @@ def reference_team(
     markers = Markers(height=0.15, positions=((0.0, 0.125), (0.0, -0.125)))
     robots = tuple(Robot(name=name, camera_if_any=camera, mount_if_any=mount, markers=markers) for name in names)
     return Team(reference=names[0], robots=robots, floor=Floor())
+
+
+def wide_team(across_deg: float) -> Team:
+    """Return the reference team with fisheyes that see `across_deg` [deg] across the same sensor."""
+    if not MIN_ACROSS_DEG <= across_deg <= MAX_ACROSS_DEG:
+        raise InputError(
+            f"a fisheye of {across_deg:g} deg is not simulated; give {MIN_ACROSS_DEG:g} to {MAX_ACROSS_DEG:g} deg"
+        )
+    team = reference_team()
+    one = team.robots[0].camera
+    focal = one.width / 2 / float(fisheye.radius(FISHEYE, np.deg2rad(np.array(across_deg / 2))))
+    camera = replace(one, model="fisheye", fx=focal, fy=focal, distortion=FISHEYE)
+    return replace(team, robots=tuple(replace(robot, camera_if_any=camera) for robot in team.robots))
 
 
 def stated_team(team: Team, imperfections: Imperfections) -> Team:

@@ -1,12 +1,14 @@
-"""Camera model: a pinhole with a lens, `Camera`."""
+"""Camera model: a pinhole with a lens, or a fisheye, `Camera`."""
 
 import math
+from typing import Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.input_file import quoted
+from coloc_graph.team import fisheye
 from coloc_graph.team.centre_noise import CentreNoise
 from coloc_graph.team.checks import require_finite, require_not_negative
 
@@ -16,10 +18,11 @@ Array = NDArray[np.float64]
 MAX_SIDE = 65_535  # px, side of an image, as of a JPEG
 MAX_RAY = 15.0  # x / z of the outermost ray by which a lens model is checked, 86 deg off the axis
 RAYS = 6001  # number of these rays
+MIN_DEPTH = math.cos(math.radians(89.5))  # z of a unit ray below which a fisheye's (x, y, 1) is not defined
 
 
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Pinhole camera with OpenCV's distortion; pixel (0, 0) is the centre of the top-left pixel.
+    """Camera with a lens model of OpenCV; pixel (0, 0) is the centre of the top-left pixel.
 
     Parameters
     ----------
@@ -27,8 +30,10 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         Size of the image [px].
     fx, fy, cx, cy : float
         Focal lengths and principal point [px].
+    model : "pinhole" or "fisheye"
+        Lens model; "fisheye" is OpenCV's model of that name, ROS's `equidistant` (Kannala-Brandt).
     distortion : tuple of float
-        OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6]]); () for none.
+        OpenCV's (k1, k2, p1, p2[, k3[, k4, k5, k6]]) of a pinhole, (k1, k2, k3, k4) of a fisheye; () for none.
     fps : float
         Images per second.
     noise_px : float
@@ -50,6 +55,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     fy: float
     cx: float
     cy: float
+    model: Literal["pinhole", "fisheye"] = "pinhole"
     distortion: tuple[float, ...] = ()
     fps: float = 100.0
     noise_px: float = 0.3
@@ -69,6 +75,8 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         require_not_negative(self, ("shot_gain", "bias_px"))
         if not 1 < self.bias_factor <= 100:
             raise ValueError(f"`bias_factor` is {self.bias_factor}; give a number above 1, 100 at most")
+        if self.model == "fisheye" and len(self.distortion) not in (0, 4):
+            raise ValueError(f"`distortion` has {len(self.distortion)} numbers; give none, or a fisheye's 4, k1 to k4")
         if len(self.distortion) not in (0, 4, 5, 8):
             raise ValueError(
                 f"`distortion` has {len(self.distortion)} numbers; give none, or OpenCV's 4, 5 or 8 coefficients"
@@ -102,7 +110,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         Returns
         -------
         uv : (..., 2) float
-            Pixels; NaN of points behind the camera.
+            Pixels; NaN of points behind a pinhole camera.
         inside : (...) bool
             True of points in the image.
 
@@ -111,14 +119,55 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         Source: OpenCV, "Camera Calibration and 3D Reconstruction".
         """
         points = np.asarray(points_camera, float)
+        if self.model == "fisheye":
+            m, seen = fisheye.image_of(self.distortion, points)
+            uv = m * (self.fx, self.fy) + (self.cx, self.cy)
+            return uv, self._inside(uv) & seen
         ahead = points[..., 2] > 1e-9
         x, y = np.moveaxis(points[..., :2] / np.where(ahead, points[..., 2], np.nan)[..., None], -1, 0)
         ahead &= self._unfolded(x, y)
         x, y = self._distort(x, y)
         uv = np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=-1)
+        return uv, self._inside(uv) & ahead
+
+    def _inside(self, uv: Array) -> NDArray[np.bool_]:
+        """Return whether pixels (..., 2) are in the image."""
         with np.errstate(invalid="ignore"):
-            inside = (uv >= -0.5).all(-1) & (uv[..., 0] < self.width - 0.5) & (uv[..., 1] < self.height - 0.5)
-        return uv, inside & ahead
+            return np.asarray((uv >= -0.5).all(-1) & (uv[..., 0] < self.width - 0.5) & (uv[..., 1] < self.height - 0.5))
+
+    def rays(self, uv: ArrayLike) -> Array:
+        """Return the rays (n, 3) of pixels (n, 2) in the camera frame.
+
+        Those of a pinhole are (x, y, 1), those of a fisheye are of unit length. NaN where the lens model cannot be
+        inverted.
+        """
+        if self.model == "fisheye":
+            m = (np.asarray(uv, float).reshape(-1, 2) - (self.cx, self.cy)) / (self.fx, self.fy)
+            return fisheye.rays_of(self.distortion, m)
+        x = self.normalise(uv)
+        return np.concatenate([x, np.ones((len(x), 1))], axis=1)
+
+    def turned(self, R_camera_view: Array) -> "TurnedCamera":
+        """Return the camera with coordinates of a frame that is turned against its own; see `TurnedCamera`."""
+        fields = {name: getattr(self, name) for name in Camera.__struct_fields__}
+        return TurnedCamera(**fields, turn=tuple(np.asarray(R_camera_view, float).ravel().tolist()))
+
+    @property
+    def R_camera_view(self) -> Array:
+        """Rotation (3, 3) of the frame in which `normalise`, `per_pixel` and `project` work: the camera's own."""
+        return np.eye(3)
+
+    @property
+    def field_of_view(self) -> tuple[float, float]:
+        """Angles of view across and down through the principal point [rad]; of a pinhole without its distortion."""
+        if self.model == "fisheye":
+            edges = np.array(
+                [[-0.5, self.cy], [self.width - 0.5, self.cy], [self.cx, -0.5], [self.cx, self.height - 0.5]]
+            )
+            angles = np.arccos(np.clip(self.rays(edges)[:, 2], -1, 1))
+            left, right, up, down = np.where(np.isnan(angles), fisheye.largest_angle(self.distortion), angles).tolist()
+            return left + right, up + down
+        return 2 * math.atan(self.width / 2 / self.fx), 2 * math.atan(self.height / 2 / self.fy)
 
     def fold_radius(self) -> float | None:
         """Return the distance from the principal point at which the lens model folds back within the image [px].
@@ -126,6 +175,8 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         None if every pixel has one ray. Beyond the fold the model maps outer rays onto the same pixels, which no lens
         does, and which a calibration without corners there does not notice.
         """
+        if self.model == "fisheye":
+            return self._fisheye_fold()
         if not self.distortion:
             return None
         across = max(abs(edge - self.cx) for edge in (-0.5, self.width - 0.5)) / self.fx
@@ -137,6 +188,15 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             grows = self._unfolded(r, zero) & np.isfinite(seen) & (seen >= 0)
         # up to the first ray whose radius no longer grows
         reached = float(seen[: max(1, len(r) if grows.all() else int(np.argmin(grows)))].max())
+        return None if reached >= math.hypot(across, down) else reached * math.sqrt(self.fx * self.fy)
+
+    def _fisheye_fold(self) -> float | None:
+        """Return `fold_radius` of a fisheye, whose image may end within the sensor, at 90 deg and beyond."""
+        if fisheye.largest_angle(self.distortion) > math.pi / 2:
+            return None
+        across = max(abs(edge - self.cx) for edge in (-0.5, self.width - 0.5)) / self.fx
+        down = max(abs(edge - self.cy) for edge in (-0.5, self.height - 0.5)) / self.fy
+        reached = fisheye.largest_radius(self.distortion)
         return None if reached >= math.hypot(across, down) else reached * math.sqrt(self.fx * self.fy)
 
     def _unfolded(self, x: Array, y: Array) -> NDArray[np.bool_]:
@@ -171,8 +231,12 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     def normalise(self, uv: ArrayLike) -> Array:
         """Return the undistorted normalised coordinates (n, 2) of pixels (n, 2): the ray is (x, y, 1).
 
-        NaN where the lens model cannot be inverted (pixels far outside the image).
+        NaN where the lens model cannot be inverted (pixels far outside the image), and of a fisheye's rays 89.5 deg and
+        more off the axis.
         """
+        if self.model == "fisheye":
+            rays = self.rays(uv)
+            return rays[:, :2] / np.where(rays[:, 2] > MIN_DEPTH, rays[:, 2], np.nan)[:, None]
         seen = (np.asarray(uv, float).reshape(-1, 2) - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.distortion:
             return np.asarray(seen)
@@ -191,6 +255,8 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     def per_pixel(self, x: ArrayLike) -> Array:
         """Return the derivative (n, 2, 2) of normalised coordinates by pixels, at normalised coordinates x (n, 2)."""
         at = np.asarray(x, float)
+        if self.model == "fisheye":
+            return self._per_pixel_along(np.column_stack([at, np.ones(len(at))]), np.eye(3))
         if not self.distortion:
             return np.broadcast_to(np.diag([1 / self.fx, 1 / self.fy]), (len(at), 2, 2))
         step = 1e-6
@@ -203,3 +269,48 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         with np.errstate(all="ignore"):
             inverse = np.array([[d / self.fx, -b / self.fy], [-c / self.fx, a / self.fy]]) / (a * d - b * c)
         return np.moveaxis(inverse, -1, 0)
+
+    def _per_pixel_along(self, rays: Array, R_camera_view: Array) -> Array:
+        """Return the derivative (n, 2, 2) by pixels of x and y, at rays (x, y, 1) (n, 3) in a fisheye's turned view."""
+        by_ray = fisheye.derivative(self.distortion, rays @ R_camera_view.T)
+        (a, b), (c, d) = np.moveaxis(by_ray @ R_camera_view[:, :2], 0, -1)
+        with np.errstate(all="ignore"):
+            inverse = np.array([[d / self.fx, -b / self.fy], [-c / self.fx, a / self.fy]]) / (a * d - b * c)
+        return np.moveaxis(inverse, -1, 0)
+
+
+class TurnedCamera(Camera, frozen=True, kw_only=True):
+    """Fisheye whose `normalise`, `per_pixel` and `project` are in a frame that is turned about its optical centre.
+
+    Rays (x, y, 1) cover the half of space before an image plane. Turned towards the markers' plane, this half holds all
+    rays that meet the plane, also those beside and behind the camera.
+
+    Parameters
+    ----------
+    turn : tuple of float
+        R_camera_view, row by row.
+    """
+
+    turn: tuple[float, ...]
+
+    @property
+    def R_camera_view(self) -> Array:
+        """Rotation (3, 3) of the frame in which `normalise`, `per_pixel` and `project` work."""
+        return np.array(self.turn).reshape(3, 3)
+
+    def project(self, points_camera: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+        """Project points (..., 3) of the turned frame; NaN and not inside where they are behind it."""
+        points = np.asarray(points_camera, float)
+        uv, inside = super().project(points @ self.R_camera_view.T)
+        ahead = points[..., 2] > 1e-9
+        return np.where(ahead[..., None], uv, np.nan), inside & ahead
+
+    def normalise(self, uv: ArrayLike) -> Array:
+        """Return x and y (n, 2) of the rays (x, y, 1) of pixels (n, 2) in the turned frame; NaN behind it."""
+        rays = self.rays(uv) @ self.R_camera_view
+        return rays[:, :2] / np.where(rays[:, 2] > 1e-3, rays[:, 2], np.nan)[:, None]
+
+    def per_pixel(self, x: ArrayLike) -> Array:
+        """Return the derivative (n, 2, 2) of x and y in the turned frame by pixels, at x (n, 2)."""
+        at = np.asarray(x, float)
+        return self._per_pixel_along(np.column_stack([at, np.ones(len(at))]), self.R_camera_view)

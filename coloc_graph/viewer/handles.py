@@ -17,6 +17,7 @@ from coloc_graph.viewer.scene import TRUE, Scene
 FLOOR_MARGIN = 2.0  # m of floor around the data
 FINE_GRID_LIMIT = 60.0  # m, side of the largest floor with lines every half metre
 FRUSTUM = 0.14  # m, depth of a camera's frustum
+MAX_FRUSTUM_ANGLE = 2.4  # rad, at which the frustum of a fisheye ends: at pi it has no end
 MAX_NAMES = 16  # robots; of larger teams no names are written
 ONE_LABEL_SIZE = 8.0  # factor above which enlarged robots share one label
 ESTIMATE_PX = 5.0  # px, width of the estimated trajectory
@@ -77,8 +78,9 @@ class GraphView:
             )  # fmt: skip
             if robot is not None and robot.camera_if_any is not None:
                 T, camera = robot.mount.T_body_camera, robot.camera
+                down = min(camera.field_of_view[1], MAX_FRUSTUM_ANGLE)
                 self._frustums[name] = add.add_camera_frustum(
-                    f"{path}/camera", fov=float(2 * np.arctan2(camera.height / 2, camera.fy)),
+                    f"{path}/camera", fov=down,
                     aspect=camera.width / camera.height, scale=FRUSTUM, color=tint, thickness=2.0,
                     thickness_units="screen", wxyz=quaternion(T[:3, :3]), position=T[:3, 3], visible=False,
                     cast_shadow=False, receive_shadow=False,

@@ -12,7 +12,6 @@ from coloc_graph.frontend import PairMeasurement, measure_pair
 from coloc_graph.frontend.homography.decomposition import choose_by_normal, decompose_svd
 from coloc_graph.frontend.homography.fit import INLIER_GATE
 from coloc_graph.frontend.homography.plane import on_plane
-from coloc_graph.frontend.homography.refinement import squared_residuals
 from coloc_graph.frontend.stance_tracks import stance_plane
 from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.geometry.lie import floor_pose, so3_log
@@ -147,13 +146,14 @@ def _draw_points(run: Run, halves: list[Image], robots: tuple[str, str], measure
     some = np.unique(np.linspace(0, len(found) - 1, MAX_POINTS).round().astype(int))
     good = np.zeros(len(found), bool)
     if h.unusable is None:
-        good = squared_residuals(h.H_j_i, found.pairs) < INLIER_GATE
+        assert measured.fit is not None
+        good = measured.fit.squared_residuals < INLIER_GATE
         some = np.union1d(some, np.flatnonzero(~good)[:MAX_POINTS])  # what does not fit is what one looks for
     for half, points in zip(halves, (found.uv_i, found.uv_j), strict=True):
         for uv, fits in zip(points[some], good[some], strict=True):
             cv2.circle(half, _pixel(PICTURE_SCALE * uv), 5, (255, 255, 255) if fits else (240, 120, 20), 1, cv2.LINE_AA)
     if h.unusable is None:
-        warped = warp(h.H_j_i, run.team[robots[0]].camera.normalise(found.uv_i[some]), run.team[robots[1]].camera)
+        warped = warp(h.H_j_i, run.team[robots[0]].camera.rays(found.uv_i[some]), run.team[robots[1]].camera)
         for uv in warped[np.isfinite(warped).all(axis=1)]:
             at = _pixel(PICTURE_SCALE * uv)
             cv2.drawMarker(halves[1], at, (86, 180, 233), cv2.MARKER_TILTED_CROSS, 9, 1, cv2.LINE_AA)
@@ -164,10 +164,9 @@ def max_gap(times: Array) -> float:
     return max(IMAGE_TOLERANCE, GAP_FACTOR * float(np.median(np.diff(times)))) if len(times) > 1 else IMAGE_TOLERANCE
 
 
-def warp(H: Array, x: Array, camera: Camera) -> Array:
-    """Map normalised points (n, 2) of camera i by H to pixels (n, 2) of camera j; NaN behind it."""
-    y = np.concatenate([x, np.ones((len(x), 1))], axis=1) @ H.T
-    return camera.project(y * np.sign(np.linalg.det(H)))[0]
+def warp(H: Array, rays: Array, camera: Camera) -> Array:
+    """Map rays (n, 3) of camera i by H to pixels (n, 2) of camera j; NaN behind it."""
+    return camera.project(rays @ H.T * np.sign(np.linalg.det(H)))[0]
 
 
 def _pixel(uv: Array) -> tuple[int, int]:
@@ -230,7 +229,7 @@ def _on_floor(scene: Scene, team: Team, row: int, robot: str, T_world_body: Arra
     except DegenerateGeometry:
         return np.full((len(uv), 3), np.nan)
     T = T_world_body @ one.mount.T_body_camera
-    points = on_plane(one.camera.normalise(uv), plane)
+    points = on_plane(one.camera.rays(uv), plane)
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import yaml
+from msgspec.structs import replace
 
 from coloc_graph.errors import InputError
 from coloc_graph.exchange.camera_info import camera_info_text, read_camera_info, write_camera_info
@@ -60,6 +61,17 @@ def test_a_camera_comes_back_to_the_bit(tmp_path, coefficients):
     assert fields["distortion_coefficients"]["cols"] == coefficients and fields["camera_name"] == "A"
 
 
+def test_a_fisheye_is_written_as_equidistant_and_read_by_both_of_its_names(read, tmp_path):
+    for lens in ((), (0.02, -0.01, 0.003, -0.0005)):
+        camera = Camera(width=320, height=240, fx=115.0, fy=115.5, cx=159.0, cy=120.0, model="fisheye", distortion=lens)
+        write_camera_info(camera, "A", tmp_path / "a.yaml")
+        text = (tmp_path / "a.yaml").read_text()
+        assert yaml.safe_load(text)["distortion_model"] == "equidistant"
+        found, warnings = read_camera_info(tmp_path / "a.yaml")
+        assert found == replace(camera, distortion=lens or (0.0,) * 4) and warnings == ()
+        assert read(text.replace("equidistant", "fisheye")) == (found, ())
+
+
 def test_a_calibrators_file_and_a_printed_topic_are_the_same_camera(read):
     camera, warnings = read(FILE)
     assert warnings == () and camera.distortion == (-0.34, 0.11, 7e-05, -6e-04, 0.0)
@@ -77,8 +89,9 @@ def test_what_is_of_rectified_images_is_left_out_with_a_warning(read):
 
 
 @pytest.mark.parametrize(("old", "new", "says"), [
-    ("plumb_bob", "equidistant", "`distortion_model` is `equidistant`, a fisheye"),
-    ("plumb_bob", "division", "`distortion_model` is `division`, and the lens models here are plumb_bob and rational"),
+    ("plumb_bob", "kannala_brandt", "`distortion_model` is `kannala_brandt`, and the lens models here are plumb_bob,"),
+    ("plumb_bob\nd: [-0.34, 0.11, 7.0e-05, -0.0006, 0.0]", "equidistant\nd: [0.1, 0.2, 0.3]", "has 4 coefficients"),
+    ("plumb_bob", "division", "`distortion_model` is `division`, and the lens models here are plumb_bob, rational"),
     ("plumb_bob", "rational_polynomial", "`rational_polynomial` has 8 coefficients (zeros behind"),
     ("d: [-0.34, ", "d: [0.1, -0.34, 0.1, ", "`plumb_bob` has 0 or 4 or 5 coefficients (zeros"),
     ("plumb_bob", "''", "`` has 0 coefficients"),

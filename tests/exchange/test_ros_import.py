@@ -381,7 +381,10 @@ def test_a_camera_in_the_bag_is_that_of_the_run_and_what_the_team_says_otherwise
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"model": "equidistant"}, "has the lens model `equidistant`; calibrate with plumb_bob"),
+        (
+            {"model": "kannala"},
+            "has the lens model `kannala`; calibrate with plumb_bob, rational_polynomial or equidistant",
+        ),
         ({"roi": (2, 0, 4, 4)}, "has a region of interest"),
         ({"binning": 2}, "has binning"),
         ({"D": [0.1] * 14}, "has 14 coefficients of distortion"),
@@ -401,6 +404,7 @@ def test_cameras_as_ros_says_them(tmp_path):
         camera_info("/b", T0, CAMERA, D=[1, 2, 3, 4, 5, 6, 7, 8, 0, 0, 0, 0], model="rational_polynomial"),
         camera_info("/c", T0, CAMERA, D=[0.5] * 5, P=P, roi=(0, 0, 6, 8)),
         camera_info("/d", T0, CAMERA, D=[], model=""),
+        camera_info("/e", T0, CAMERA, D=[0.1, 0.02, 0.003, 0.0004], model="equidistant"),
     ]
     found = {}
     for kind in ("ros1", "mcap"):
@@ -412,6 +416,7 @@ def test_cameras_as_ros_says_them(tmp_path):
         c = found["/c"]
         assert (c.fx, c.fy, c.cx, c.cy, c.distortion) == (20.0, 21.0, 4.0, 3.0, ())
         assert found["/d"] == CAMERA
+        assert (found["/e"].model, found["/e"].distortion) == ("fisheye", (0.1, 0.02, 0.003, 0.0004))
 
 
 def test_a_calibration_that_changes_in_the_bag_is_refused(bring_in):

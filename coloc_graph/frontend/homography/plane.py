@@ -51,13 +51,13 @@ def plane_from_mount(mount: Mount, markers: Markers, floor: Floor | None = None)
     )
 
 
-def on_plane(x: Array, plane: Plane) -> Array:
+def on_plane(rays: Array, plane: Plane) -> Array:
     """Intersect rays with the plane.
 
     Parameters
     ----------
-    x
-        Normalised image coordinates, (n, 2).
+    rays
+        Rays in the camera frame, (n, 3) of any length, or normalised image coordinates, (n, 2).
     plane
         Plane in the camera frame.
 
@@ -66,20 +66,21 @@ def on_plane(x: Array, plane: Plane) -> Array:
     numpy.ndarray
         Points in the camera frame, (n, 3) [m]; NaN for rays that do not meet the plane in front of the camera.
     """
-    rays = np.concatenate([x, np.ones((len(x), 1))], axis=1)
+    if rays.shape[1] == 2:
+        rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
     along = rays @ plane.N
     return np.asarray(rays * (plane.d / np.where(along > 1e-6, along, np.nan))[:, None])
 
 
-def distance_from_span(plane: Plane, x_a: Array, x_b: Array, markers: Markers) -> Plane:
+def distance_from_span(plane: Plane, rays_a: Array, rays_b: Array, markers: Markers) -> Plane:
     """Scale the plane's distance so that two markers lie their known span apart.
 
     Parameters
     ----------
     plane
         Plane in the camera frame; its distance is replaced.
-    x_a, x_b
-        Both markers at the same n instants, normalised image coordinates, (n, 2).
+    rays_a, rays_b
+        Both markers at the same n instants, as in `on_plane`.
     markers
         Markers with a known span.
 
@@ -95,7 +96,7 @@ def distance_from_span(plane: Plane, x_a: Array, x_b: Array, markers: Markers) -
     """
     if markers.span is None:
         raise DegenerateGeometry("the robot carries one marker: there is no span to take the scale from")
-    spans = np.linalg.norm(on_plane(x_a, plane) - on_plane(x_b, plane), axis=1) / plane.d
+    spans = np.linalg.norm(on_plane(rays_a, plane) - on_plane(rays_b, plane), axis=1) / plane.d
     spans = spans[np.isfinite(spans)]
     if len(spans) < 2:
         raise DegenerateGeometry("both markers of the robot are never seen at once: let it turn towards the camera")

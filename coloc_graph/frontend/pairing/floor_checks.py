@@ -66,7 +66,7 @@ def of_some_span(tracks: Sequence[Track], robot: Robot, plane: Plane, spans: Seq
     """Return whether two tracks of a camera are a marker span apart, or no two tracks overlap in time."""
     if not spans:
         return True
-    seen = [robot.camera.normalise(track.uv) for track in tracks]
+    seen = [robot.camera.rays(track.uv) for track in tracks]
     pairs = [
         (a, b, shared)
         for a in range(len(tracks))
@@ -75,7 +75,7 @@ def of_some_span(tracks: Sequence[Track], robot: Robot, plane: Plane, spans: Seq
     ]
     for number, one in enumerate(plausible_planes(plane, robot.mount)):
         least = MIN_SHARE if number == 0 else MIN_SHARE_TILTED
-        places = [on_plane(x, one) for x in seen]
+        places = [on_plane(rays, one) for rays in seen]
         for a, b, shared in pairs:
             apart = np.linalg.norm(places[a][shared[:, 0]] - places[b][shared[:, 1]], axis=1)
             if any((np.abs(apart / span - 1) < SPAN_TOLERANCE).mean() > least for span in spans):

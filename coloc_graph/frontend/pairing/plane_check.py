@@ -37,7 +37,7 @@ def implausible(run: Recorded, stance: Stance, robot: str, found: Correspondence
         return None  # reported elsewhere
     stated = stance.index in run.planes and robot in run.planes[stance.index].planes
     remedy = "correct the stated plane (metres?)" if stated else "correct heights, tilt or units (metres?) in the team"
-    distance = np.linalg.norm(on_plane(camera.normalise(found.uv_i), plane), axis=1)
+    distance = np.linalg.norm(on_plane(camera.rays(found.uv_i), plane), axis=1)
     if not np.isfinite(distance).mean() > 0.5:
         return f"{robot} saw the markers above the horizon of the marker plane: {remedy}"
     if np.nanmedian(distance) > MAX_RANGE:
@@ -69,8 +69,8 @@ def _seen_span(found: Correspondences, camera: Camera, plane: Plane) -> tuple[fl
     _, first, count = np.unique(found.times[order], return_index=True, return_counts=True)
     a = order[first[count == 2]]
     b = order[first[count == 2] + 1]
-    x = camera.normalise(found.uv_i)
-    apart = np.linalg.norm(on_plane(x[a], plane) - on_plane(x[b], plane), axis=1)
+    rays = camera.rays(found.uv_i)
+    apart = np.linalg.norm(on_plane(rays[a], plane) - on_plane(rays[b], plane), axis=1)
     apart = apart[np.isfinite(apart)]
     if len(apart) < 3:
         return None

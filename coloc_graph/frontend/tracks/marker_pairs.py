@@ -63,7 +63,7 @@ def span_samples(
     list of tuple
         Indices of both tracks, and the indices (n, 2) of samples taken at the same time.
     """
-    on_floor = [on_plane(camera.normalise(track.uv), plane) for track in tracks]
+    on_floor = [on_plane(camera.rays(track.uv), plane) for track in tracks]
     found = []
     for a in range(len(tracks)):
         for b in range(a + 1, len(tracks)):

@@ -186,7 +186,7 @@ def _rows(images: Sequence[Detections], camera: Camera, plane: Plane, span: floa
     for number, one in enumerate(images):
         if len(one.uv) < 2:
             continue
-        places = on_plane(camera.normalise(one.uv), plane) @ axes.T
+        places = on_plane(camera.rays(one.uv), plane) @ axes.T
         a, b = np.triu_indices(len(places), 1)
         off = np.linalg.norm(places[a] - places[b], axis=1) / span - 1
         good = np.flatnonzero(np.abs(off) < SPAN_TOLERANCE)  # not of NaN, above the horizon
