@@ -40,7 +40,11 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "--formation", choices=("paper", "plan"), default="paper", help="`plan` is --plan (default: paper)"
     )
     command.add_argument(
-        "--pace", type=float, default=8.0, metavar="S", help="with --plan: seconds of images a metre (default: 8)"
+        "--pace",
+        type=float,
+        default=25.0,
+        metavar="S",
+        help="with --plan: seconds of the mission a metre, leaps included (default: 25)",
     )
     command.add_argument("--map", metavar="YAML", help="with --plan: ROS map_server map of the walls")
     command.add_argument(
@@ -96,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     if not 0 < args.speed <= 0.5:
         raise InputError(f"a Create drives at up to 0.5 m/s, not at {args.speed}: give --speed between 0 and 0.5")
     if not 0 < args.pace < 1e4:
-        raise InputError(f"--pace is {args.pace}; give seconds of images a metre, above 0")
+        raise InputError(f"--pace is {args.pace}; give seconds of the mission a metre, above 0")
     if args.map is not None and not (args.plan or args.formation == "plan"):
         raise InputError("--map is of plans: give --plan, too")
     team = read_team(args.team)

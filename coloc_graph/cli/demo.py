@@ -7,6 +7,8 @@ from coloc_graph.cli.place import add_force, require_run_place
 #: Standard deviations of mounts [deg, m], of the markers' span [m] and of the floor [deg] in the demo.
 IMPERFECTIONS = {"mount_sigma_deg": 1.0, "height_sigma": 5e-3, "span_sigma": 1e-4, "floor_sigma_deg": 0.1}
 
+PACE = 20.0  # duration of a planned mission online [s/m]
+
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command and its arguments."""
@@ -124,7 +126,7 @@ def online(args: argparse.Namespace) -> int:
     team, address = field_team(), free_address()
     if args.plan or args.formation == "plan":
         way = max(args.stances * PAPER.leap, 2 * PAPER.leap)
-        options = MissionOptions(goals=((way, 0.0),), speed=0.4, formation="plan")
+        options = MissionOptions(goals=((way, 0.0),), speed=0.4, formation="plan", pace=PACE)
     else:
         options = MissionOptions(goals=((100.0, 0.0),), stances=args.stances, speed=0.4)
     with (

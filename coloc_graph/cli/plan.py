@@ -41,8 +41,9 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "corners",
     )  # fmt: skip
     command.add_argument(
-        "--pace", type=float, default=8.0, metavar="S", help="with --goal: seconds of images a metre (default: 8)"
-    )
+        "--pace", type=float, default=40.0, metavar="S",
+        help="with --goal: seconds of the mission a metre, leaps included, unless there is --time (default: 40)",
+    )  # fmt: skip
     command.add_argument("--map", metavar="YAML", help="with --goal: ROS map_server map of the walls")
     command.add_argument("--mover", metavar="NAME", help="robot that drives before the others' cameras (default: last)")
     command.add_argument("--speed", type=float, default=0.2, metavar="V", help="speed of robots [m/s] (default: 0.2)")
@@ -149,25 +150,24 @@ def _along(args: argparse.Namespace, predictor: "Predictor", pair: tuple[str, st
     from coloc_graph.planning.horizon import Horizon
     from coloc_graph.planning.plan import write_plan
 
-    if args.time is not None or args.sigma_end is not None:
-        raise InputError("--time and --sigma-end are of straight ways: leave out --goal, or give its --pace")
+    if args.sigma_end is not None:
+        raise InputError("--sigma-end is of straight ways: leave out --goal, or give its --time")
     if not 0 < args.pace < 1e4:
-        raise InputError(f"--pace is {args.pace}; give seconds of images a metre, above 0")
+        raise InputError(f"--pace is {args.pace}; give seconds of the mission a metre, above 0")
     if args.map is not None:
         predictor = replace(predictor, floor_map=read_floor_map(args.map))
     course = Course(((0.0, 0.0), *args.goal))
-    horizon = Horizon(predictor, course, pair, mover, args.pace * course.length)
+    seconds = args.pace * course.length if args.time is None else args.time
+    horizon = Horizon(predictor, course, pair, mover, seconds, timed=True)
     starts = {}
     for k, name in enumerate(pair):
-        x, y, yaw = horizon.gait.stop(k)
+        x, y, yaw = predictor.stop(horizon.gait, pair, k)
         starts[name] = x - horizon.gait.leap / 2, y, yaw
     best = horizon.mission(Belief.start(predictor.team, {**starts, mover: (1.5, 0.0, 0.0)}))
     if args.json:
         print_json({"the plan": figures(horizon.gait, best)})
     else:
-        print(
-            f"{course.length:.1f} m with {args.pace:g} s of images a metre; {' and '.join(pair)} observe, {mover} moves"
-        )
+        print(f"{course.length:.1f} m in {seconds / 60:.1f} min; {' and '.join(pair)} observe, {mover} moves")
         print_table(_HEADER, [_row("the plan", horizon.gait, best, predictor.fps)])
         print("leap, abreast and toe-in: those by which the rest of the way is expected to go")
     if args.poses is not None:

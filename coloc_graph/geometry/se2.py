@@ -39,3 +39,22 @@ def between(a: Planar, b: Planar) -> Planar:
     c, s = math.cos(a[2]), math.sin(a[2])
     x, y = b[0] - a[0], b[1] - a[1]
     return c * x + s * y, -s * x + c * y, b[2] - a[2]
+
+
+def segment_distance(a: ArrayLike, b: ArrayLike, c: ArrayLike, d: ArrayLike) -> float:
+    """Least distance between two segments on the floor, from a to b and from c to d (2,) [m]."""
+    a, b, c, d = (np.asarray(point, float) for point in (a, b, c, d))
+    u, v, w = b - a, d - c, c - a
+    cross = u[0] * v[1] - u[1] * v[0]
+    if abs(cross) > 1e-12:
+        along = (w[0] * v[1] - w[1] * v[0]) / cross, (w[0] * u[1] - w[1] * u[0]) / cross
+        if all(0 <= share <= 1 for share in along):
+            return 0.0
+    return min(_to_segment(a, c, d), _to_segment(b, c, d), _to_segment(c, a, b), _to_segment(d, a, b))
+
+
+def _to_segment(point: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Distance of a point from the segment from a to b, (2,) each [m]."""
+    step = b - a
+    share = float(np.clip((point - a) @ step / max(float(step @ step), 1e-12), 0.0, 1.0))
+    return float(np.hypot(*(point - a - share * step)))

@@ -10,6 +10,7 @@ from typing import Self
 
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.online.commands import Commander, Stopped
+from coloc_graph.online.decision_worker import DecisionWorker
 from coloc_graph.online.estimation_worker import EstimationWorker
 from coloc_graph.online.formation import Formation
 from coloc_graph.online.horizon_planner import HorizonPlanner
@@ -105,17 +106,20 @@ class Coordinator:
             planner: StancePlanner
             if options.formation == "plan":
                 planner = HorizonPlanner(
-                    team, mover, observers, course, self._registry,
+                    team, mover, observers, course,
                     pace=options.pace, speed=options.speed, floor_map=floor_map,
                 )  # fmt: skip
             else:
-                planner = LeapPlanner(team, mover, Formation(course, observers), self._registry)
+                planner = LeapPlanner(team, mover, Formation(course, observers))
+            decisions = DecisionWorker(planner)
+            undo.callback(decisions.end)
             self._close = undo.pop_all()
         self.link = link
         self._mission = LeapFrog(
             team,
             options,
             planner,
+            decisions=decisions,
             registry=self._registry,
             commander=self._commander,
             worker=worker,

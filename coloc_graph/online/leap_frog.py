@@ -12,8 +12,9 @@ from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.online.bumps import displaced, pushed
 from coloc_graph.online.commands import Commander, Stopped
+from coloc_graph.online.decision_worker import DecisionWorker
 from coloc_graph.online.estimation_worker import EstimationWorker
-from coloc_graph.online.leap_planner import StancePlan, StancePlanner
+from coloc_graph.online.leap_planner import Situation, StancePlan, StancePlanner
 from coloc_graph.online.mission import MissionOptions, roles
 from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateChange, StateMachine
@@ -39,6 +40,7 @@ _WAITING = {
     MissionState.GATHERING,
     MissionState.SYNCHRONISING,
     MissionState.HOLDING,
+    MissionState.PLANNING,
     MissionState.COLLECTING,
     MissionState.ESTIMATING,
 }
@@ -51,8 +53,8 @@ class LeapFrog:
     ----------
     team, options
         The team, and the mission's goals and limits.
-    planner
-        Planner of the stances.
+    planner, decisions
+        Planner of the stances, and its thread.
     registry, commander, worker, log
         States of the robots, commands to them, the estimator's thread, and the mission's log.
     synchronised
@@ -67,6 +69,7 @@ class LeapFrog:
         options: MissionOptions,
         planner: StancePlanner,
         *,
+        decisions: DecisionWorker,
         registry: RobotRegistry,
         commander: Commander,
         worker: EstimationWorker,
@@ -75,6 +78,7 @@ class LeapFrog:
         on_stance: Callable[[EnteredStance], None] | None = None,
     ) -> None:
         self._team, self._options, self._planner = team, options, planner
+        self._decisions = decisions
         self._registry, self._commander, self._worker, self._log = registry, commander, worker, log
         self._synchronised, self._on_stance = synchronised, on_stance
         self.mover, self.observers = roles(team, options.mover)
@@ -90,6 +94,7 @@ class LeapFrog:
         self._steps = {
             MissionState.GATHERING: self._gather,
             MissionState.SYNCHRONISING: self._synchronise,
+            MissionState.PLANNING: self._await_plan,
             MissionState.PLACING: self._place,
             MissionState.LOOKING: self._look,
             MissionState.CAPTURING: self._capture,
@@ -148,39 +153,46 @@ class LeapFrog:
     def _synchronise(self) -> None:
         late = [name for name in self._team.names if not self._synchronised(name)]
         if not late:
-            self._begin_stance()
+            self._begin_plan()
         elif self.states.lasted(HOLD_TIME):
             self._fail(f"the clocks of {', '.join(late)} are not known to {1e3 * self._options.clock_limit:g} ms")
 
-    def _begin_stance(self) -> None:
-        """Plan the next stance, and send the robots off."""
-        self._plan = self._planner.plan(self._index, self.stances[-1] if self.stances else None, self._failures)
+    def _begin_plan(self) -> None:
+        """Have the next stance planned."""
+        anchors = self._anchors()
+        moved = tuple(name for name in self.observers if self.stances and name not in anchors)
+        self._decisions.decide(Situation(self._index, self._failures, self._registry.poses(), moved))
+        self._enter(MissionState.PLANNING)
+
+    def _await_plan(self) -> None:
+        """Send the robots off once the next stance is planned."""
+        plan = self._decisions.decided()
+        if plan is None:
+            return
+        if plan.leap is not None and not set(self._anchors()) - {plan.leap[0]}:
+            raise RobotError(f"{plan.leap[0]} is not sent off: no other observer stands where it stood before")
+        self._plan, self._leap = plan, plan.leap
         for robot in self._registry.robots.values():
             robot.arrived, robot.drive = True, None
-        self._leap = self._plan.leap
-        self._log.note(
-            "planned",
-            stance=self._index,
-            leap=self._leap,
-            patrol=np.round(self._plan.patrol, 3).tolist(),
-            duration=self._plan.duration,
-        )
-        if not self._plan.mover_first:
-            self._send_leaper()
-        self._commander.drive(self.mover, self._plan.patrol[:1])
+        self._log.note("planned", **plan.as_row())
+        self._send_leaper()
+        self._commander.drive(self.mover, plan.placing)
         self._enter(MissionState.PLACING)
 
     def _send_leaper(self) -> None:
-        """Send off the observer that is to leap, unless it is on its way."""
-        if self._leap is not None:
+        """Send off the observer that is to leap, unless it is on its way, or the mover is in its way."""
+        if self._leap is not None and self._plan is not None:
             leaper, (x, y, yaw) = self._leap
+            arrived = self._registry[self.mover].arrived and self._registry[self.mover].drive is not None
+            poses = self._registry.poses((leaper, self.mover))
+            if not arrived and not self._plan.may_leap(poses[leaper], poses[self.mover]):
+                return
             self._leap = None
             self._commander.drive(leaper, [(x, y)], yaw, backwards=False)
 
     def _place(self) -> None:
         self._commander.resume_drives()
-        if self._registry[self.mover].arrived:
-            self._send_leaper()
+        self._send_leaper()
         under_way = [name for name, robot in self._registry.robots.items() if not robot.arrived]
         if under_way:
             if self.states.lasted(DRIVE_TIME):
@@ -293,7 +305,7 @@ class LeapFrog:
         latency = self._registry.utc() - self._attempted().last_image
         self.latencies.append(latency)
         self._registry.follow(one)
-        self._planner.take(one)
+        self._decisions.take(one, self._registry.poses())
         self._log.note(
             "entered",
             stance=one.stance.index,
@@ -309,7 +321,7 @@ class LeapFrog:
         if self._at_goal():
             self._enter(MissionState.DONE, f"{len(self.stances)} stances")
         else:
-            self._begin_stance()
+            self._begin_plan()
 
     def _hold(self) -> None:
         waits = self._waits_for()
@@ -338,7 +350,7 @@ class LeapFrog:
         if self.states.now in _WAITING:
             return None
         for name, robot in self._registry.robots.items():
-            why = robot.trouble(drives=self._planner.drives(name))
+            why = robot.trouble(drives=self._plan is not None and self._plan.drives(name, self.mover))
             if why is None and not self._synchronised(name):
                 why = (
                     f"the clock of {name} jumped, or is no longer known to {1e3 * self._options.clock_limit:g} ms: "

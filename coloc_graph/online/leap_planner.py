@@ -1,5 +1,6 @@
 """The next stance's plan: the observer that leaps, its target, and the mover's waypoints; `LeapPlanner`."""
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -7,13 +8,36 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.geometry.se2 import Planar
+from coloc_graph.geometry.se2 import Planar, segment_distance
 from coloc_graph.online.formation import STAGGER, Formation
-from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.visibility import InView
 from coloc_graph.pipeline.incremental import EnteredStance
-from coloc_graph.run import Stance
 from coloc_graph.team import Team
+
+
+@dataclass(frozen=True, eq=False)
+class StancePromise:
+    """Promise of a planned stance.
+
+    Attributes
+    ----------
+    standing
+        Poses of the observers in the world (x [m], y [m], yaw [rad]), by name, leaps done.
+    covariances
+        Covariance (3, 3) of x [m], y [m] in the world and of yaw [rad] of each after the stance.
+    points
+        Expected number of correspondences.
+    end_sigma
+        Expected sigma of the last positions, and of the last headings at an arm of 2 m, together [m].
+    reason
+        What decided, in one line for people.
+    """
+
+    standing: Mapping[str, Planar]
+    covariances: Mapping[str, NDArray[np.float64]]
+    points: float
+    end_sigma: float
+    reason: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,84 +52,141 @@ class StancePlan:
         Waypoints (n, 2) [m] of the mover, in the world, spread over what all observers see.
     duration
         Time of the mover's drive after which the stance ends [s]; None to end it once it is precise enough.
-    mover_first
-        True if the observer leaps only once the mover is where its drive begins: their ways come near each other.
+    passing
+        The observer is sent off once its way is this far from what the mover still has to drive to its first waypoint
+        [m]; None to send it at once.
+    promise
+        What the stance is expected to bring; None where nothing is predicted.
+    approach
+        Waypoints (n, 2) [m] of the mover before the first one of `patrol`.
     """
 
     index: int
     leap: tuple[str, Planar] | None
     patrol: NDArray[np.float64]
     duration: float | None = None
-    mover_first: bool = False
+    passing: float | None = None
+    promise: StancePromise | None = None
+    approach: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def placing(self) -> NDArray[np.float64]:
+        """Waypoints (n, 2) [m] of the mover until it is where its drive begins."""
+        return np.array([*self.approach, self.patrol[0]])
+
+    def as_row(self) -> dict[str, object]:
+        """Return the plan as a row of the mission's log."""
+        row: dict[str, object] = {
+            "stance": self.index,
+            "leap": self.leap,
+            "patrol": np.round(self.patrol, 3).tolist(),
+            "duration": self.duration,
+        }
+        if self.promise is not None:
+            row["promise"] = {
+                "standing": {name: np.round(pose, 6).tolist() for name, pose in self.promise.standing.items()},
+                "covariances": {name: C.tolist() for name, C in self.promise.covariances.items()},
+                "points": round(self.promise.points),
+                "end_sigma": self.promise.end_sigma,
+                "reason": self.promise.reason,
+            }
+        return row
+
+    def may_leap(self, leaper: Planar, mover: Planar) -> bool:
+        """Return whether the observer, where it stands, may set off while the mover is on its way to its drive."""
+        if self.leap is None or self.passing is None:
+            return True
+        way = [mover[:2], *self.placing.tolist()]
+        return all(
+            segment_distance(leaper[:2], self.leap[1][:2], a, b) > self.passing for a, b in itertools.pairwise(way)
+        )
+
+    def drives(self, robot: str, mover: str) -> bool:
+        """Return whether a robot drives in this plan, whose mover is `mover`."""
+        return robot == mover or (self.leap is not None and self.leap[0] == robot)
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Situation in which a stance is planned.
+
+    Attributes
+    ----------
+    index, attempt
+        Number of the stance, and number of attempts at it that failed.
+    poses
+        Poses of all robots in the world (x [m], y [m], yaw [rad]), by name.
+    moved
+        Observers that have moved since the stance before: they are no anchors.
+    """
+
+    index: int
+    attempt: int
+    poses: Mapping[str, Planar]
+    moved: tuple[str, ...] = ()
 
 
 class StancePlanner(Protocol):
     """Planner of a mission's stances."""
 
-    def plan(self, index: int, before: Stance | None, attempt: int) -> StancePlan:
-        """Plan stance `index` after the one `before` it; `attempt` counts the attempts at it that failed."""
+    def plan(self, situation: Situation) -> StancePlan:
+        """Plan the next stance."""
 
-    def drives(self, robot: str) -> bool:
-        """Return whether a robot drives in the present plan."""
-
-    def take(self, entered: EnteredStance) -> None:
-        """Take in a stance that has entered the estimate."""
+    def take(self, entered: EnteredStance, poses: Mapping[str, Planar]) -> None:
+        """Take in a stance that has entered the estimate, and where all robots then stood."""
 
     def at_goal(self, poses: Mapping[str, Planar]) -> bool:
         """Return whether the observers have come to the goal."""
 
 
 class LeapPlanner:
-    """Plans stances from the robots' present poses; `mover` is not one of the formation's observers."""
+    """Plans stances in the paper's formation; `mover` is not one of the formation's observers."""
 
-    def __init__(self, team: Team, mover: str, formation: Formation, registry: RobotRegistry) -> None:
+    def __init__(self, team: Team, mover: str, formation: Formation) -> None:
         markers = team[mover].markers
         assert markers is not None
         self._team, self._mover, self._p_markers = team, mover, markers.p_body
-        self._formation, self._registry = formation, registry
+        self._formation = formation
         self._plan: StancePlan | None = None
 
-    def plan(self, index: int, before: Stance | None, attempt: int) -> StancePlan:
-        """Plan a stance after the one `before` it. Another attempt at it keeps the leap, and mirrors the patrol.
+    def plan(self, situation: Situation) -> StancePlan:
+        """Plan the next stance. Another attempt at it keeps the leap, and mirrors the patrol.
 
         Raises
         ------
         InputError
             If the observers see too little of the floor together.
         """
-        poses = self._registry.poses()
-        leap = None if before is None else self._next_leap(before, poses)
-        if self._plan is not None and self._plan.index == index:
+        index, poses = situation.index, dict(situation.poses)
+        leap = None if index == 0 else self._next_leap(situation)
+        if self._plan is not None and self._plan.index == index and leap is not None:
             leap = self._plan.leap
         if leap is not None:
             poses[leap[0]] = leap[1]
         standing = {name: poses[name] for name in self._formation.observers}
         views = list(InView(self._team, self._mover, standing).views.values())
-        patrol = self._formation.patrol(standing, views, self._p_markers, bool((index + attempt) % 2))
+        patrol = self._formation.patrol(standing, views, self._p_markers, bool((index + situation.attempt) % 2))
         self._plan = StancePlan(index, leap, patrol)
         return self._plan
 
-    def drives(self, robot: str) -> bool:
-        """Return whether a robot drives in the present plan."""
-        leap = self._plan.leap if self._plan is not None else None
-        return robot == self._mover or (leap is not None and leap[0] == robot)
-
-    def take(self, entered: EnteredStance) -> None:
+    def take(self, entered: EnteredStance, poses: Mapping[str, Planar]) -> None:
         """Take in a stance that has entered the estimate: the formation stays as it is."""
 
     def at_goal(self, poses: Mapping[str, Planar]) -> bool:
         """Return whether the middle of the observers has come within half a stagger of the goal."""
         return self._formation.progress(poses) >= self._formation.course.length - STAGGER / 2
 
-    def _next_leap(self, before: Stance, poses: dict[str, Planar]) -> tuple[str, Planar]:
-        """Choose the observer that leaps, and its target.
+    def _next_leap(self, situation: Situation) -> tuple[str, Planar] | None:
+        """Choose the observer that leaps, and its target; None if no anchor would be left.
 
         One that has set off already, under an earlier coordinator, is the one.
         """
         formation = self._formation
-        under_way = [name for name in formation.observers if self._registry[name].tracker.moved_since(before.end)]
-        if not under_way:
-            return formation.next_leap(poses)
-        ways = formation.ways(poses)
-        front = max(way for name, way in ways.items() if name != under_way[0])
-        return under_way[0], formation.place(under_way[0], front + STAGGER)
+        if not situation.moved:
+            return formation.next_leap(situation.poses)
+        if len(situation.moved) == len(formation.observers):
+            return None
+        leaper = situation.moved[0]
+        ways = formation.ways(situation.poses)
+        front = max(way for name, way in ways.items() if name != leaper)
+        return leaper, formation.place(leaper, front + STAGGER)

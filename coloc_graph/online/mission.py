@@ -45,7 +45,7 @@ class MissionOptions:
     formation
         "paper" for the paper's formation, "plan" for stances that are planned anew after each one.
     pace
-        Seconds of images for each metre of the way, with formation "plan".
+        Seconds of the mission for each metre of the way, leaps included, with formation "plan".
     map_path
         YAML file of a ROS map_server map whose walls are kept clear of, with formation "plan"; None for no walls.
     solve
@@ -63,7 +63,7 @@ class MissionOptions:
     clock_limit: float = 1e-3
     attempts: int = 20
     formation: Literal["paper", "plan"] = "paper"
-    pace: float = 8.0
+    pace: float = 25.0
     map_path: Path | None = None
     solve: SolveOptions = field(default_factory=SolveOptions)
 

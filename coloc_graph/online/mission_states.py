@@ -14,6 +14,7 @@ class MissionState(StrEnum):
 
     GATHERING = "gathering"  # wait until every robot answers, and its camera and wheels work
     SYNCHRONISING = "synchronising"  # wait until every clock is known
+    PLANNING = "planning"  # all stand: the next stance is decided
     PLACING = "placing"  # the next observer leaps, the mover drives to its first waypoint
     LOOKING = "looking"  # all stand: is the mover in the observers' views?
     CAPTURING = "capturing"  # the mover drives before the observers' cameras
@@ -27,13 +28,14 @@ class MissionState(StrEnum):
 
 NEXT_STATES: dict[MissionState, tuple[MissionState, ...]] = {
     MissionState.GATHERING: (MissionState.SYNCHRONISING,),
-    MissionState.SYNCHRONISING: (MissionState.PLACING, MissionState.HOLDING),
+    MissionState.SYNCHRONISING: (MissionState.PLANNING, MissionState.HOLDING),
+    MissionState.PLANNING: (MissionState.PLACING, MissionState.HOLDING),
     MissionState.PLACING: (MissionState.LOOKING, MissionState.HOLDING),
     MissionState.LOOKING: (MissionState.CAPTURING, MissionState.HOLDING),
     MissionState.CAPTURING: (MissionState.COLLECTING, MissionState.TURNING_BACK, MissionState.HOLDING),
     MissionState.TURNING_BACK: (MissionState.CAPTURING, MissionState.COLLECTING, MissionState.HOLDING),
     MissionState.COLLECTING: (MissionState.ESTIMATING, MissionState.HOLDING),
-    MissionState.ESTIMATING: (MissionState.PLACING, MissionState.DONE, MissionState.HOLDING),
+    MissionState.ESTIMATING: (MissionState.PLANNING, MissionState.DONE, MissionState.HOLDING),
     MissionState.HOLDING: (MissionState.SYNCHRONISING,),
     MissionState.DONE: (),
     MissionState.FAILED: (),

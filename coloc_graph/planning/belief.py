@@ -14,7 +14,9 @@ from coloc_graph.team import Team
 Array = NDArray[np.float64]
 
 POSE = 6  # roll, pitch, yaw [rad], x, y, z [m] in the body frame
-BLOCK = 11  # numbers of a robot: pose, mount (height, tilt, roll), markers (span, height)
+MOUNT = 6  # height [m], tilt, roll, yaw [rad], x, y [m] of a mount
+OBSERVER = POSE + MOUNT  # numbers of an observer: pose, mount
+BLOCK = OBSERVER + 2  # numbers of a robot: pose, mount, markers (span, height)
 UNKNOWN = 1.0  # standard deviation of a pose that nothing is known of [m, rad]
 FIXED = 1e-6  # standard deviation of the pose that defines the world [m, rad]
 MIN_TILT_SIGMA = 1e-5  # a floor that is stated as flat is taken to be flat to this [rad, m]
@@ -28,10 +30,10 @@ MIN_ODOMETRY_SIGMAS = (1e-3, 5e-4, 5e-4)  # wheel odometry is not taken to be be
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """Poses of robots in the world, and the joint covariance (..., 11 n, 11 n) of all that is unknown of them.
+    """Poses of robots in the world, and the joint covariance (..., 14 n, 14 n) of all that is unknown of them.
 
-    Of each robot in turn: pose (6,) in GTSAM's tangent, rotation first, body frame; mount (3,): height [m], tilt, roll
-    [rad]; markers (2,): span (relative), height [m].
+    Of each robot in turn: pose (6,) in GTSAM's tangent, rotation first, body frame; mount (6,): height [m], tilt, roll,
+    yaw [rad], x, y [m]; markers (2,): span (relative), height [m].
     """
 
     robots: tuple[str, ...]
@@ -59,11 +61,11 @@ class Belief:
             at = BLOCK * n
             sigmas[at : at + POSE] = tilt, tilt, free, free, free, height
             if (mount := robot.mount_if_any) is not None:
-                tolerances = np.radians([mount.tilt_sigma_deg, mount.roll_sigma_deg])
-                sigmas[at + POSE : at + POSE + 3] = mount.height_sigma, *tolerances
+                turned = np.radians([mount.tilt_sigma_deg, mount.roll_sigma_deg, mount.yaw_sigma_deg])
+                sigmas[at + POSE : at + OBSERVER] = mount.height_sigma, *turned, *2 * (mount.position_sigma,)
             if robot.markers is not None and robot.markers.span:
                 relative = robot.markers.span_sigma / robot.markers.span
-                sigmas[at + POSE + 3 : at + BLOCK] = relative, robot.markers.height_sigma
+                sigmas[at + OBSERVER : at + BLOCK] = relative, robot.markers.height_sigma
         return cls(robots, dict(poses), np.diag(sigmas**2), (tilt, height))
 
     def index(self, robot: str) -> int:
@@ -72,8 +74,8 @@ class Belief:
 
     def rows(self, observers: Sequence[str], mover: str) -> NDArray[np.int64]:
         """Return the rows of a stance's variables, in the order of `StanceModel`."""
-        blocks = [self.index(name) + np.arange(POSE + 3) for name in observers]
-        return np.concatenate([*blocks, self.index(mover) + np.array([POSE + 3, POSE + 4])])
+        blocks = [self.index(name) + np.arange(OBSERVER) for name in observers]
+        return np.concatenate([*blocks, self.index(mover) + np.array([OBSERVER, OBSERVER + 1])])
 
     def after_leap(self, robot: str, target: Planar, *, odometry: bool = True) -> "Belief":
         """Return what is known once a robot has driven to a target in the world."""
@@ -95,6 +97,12 @@ class Belief:
         R, at = np.array([[c, -s], [s, c]]), self.index(robot) + 3
         return np.asarray(R @ self.covariance[..., at : at + 2, at : at + 2] @ R.T)
 
+    def planar_covariance(self, robot: str) -> Array:
+        """Covariance (3, 3) of a robot's x, y [m] in the world and yaw [rad]."""
+        c, s = math.cos(self.poses[robot][2]), math.sin(self.poses[robot][2])
+        R, at = np.array([[0.0, c, -s], [0.0, s, c], [1.0, 0.0, 0.0]]), self.index(robot) + 2
+        return np.asarray(R @ self.covariance[at : at + 3, at : at + 3] @ R.T)
+
     def position_sigma(self, robots: Sequence[str]) -> float:
         """Root of the mean, over robots, of the trace of the positions' covariances [m]."""
         return math.sqrt(np.mean([np.trace(self.position_covariance(name)) for name in robots]))
@@ -112,7 +120,7 @@ class Belief:
         return float(np.mean([np.trace(J @ self.covariance @ J.T) for J in self.goal_rows(robots, goal)]))
 
     def goal_rows(self, robots: Sequence[str], goal: tuple[float, float]) -> list[Array]:
-        """Derivatives (2, 11 n) of a point at the goal that moves with a robot, of each robot."""
+        """Derivatives (2, 14 n) of a point at the goal that moves with a robot, of each robot."""
         rows = []
         for name in robots:
             (x, y, yaw), at = self.poses[name], self.index(name)

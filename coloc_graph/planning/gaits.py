@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.geometry.se2 import between
+from coloc_graph.geometry.se2 import Planar, between
 from coloc_graph.planning.belief import Belief, leap_model, updated
 from coloc_graph.planning.drive import effective_seconds
 from coloc_graph.planning.formation import PAPER, Gait
@@ -26,7 +26,7 @@ LEAPS = (0.185, 0.3, 0.45, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.5)  # [m]
 ABREAST = (0.45, 0.5, 0.6, 0.72, 0.9, 1.1)  # [m]
 TOE_INS = (-10.0, 0.0, 10.0, 17.0, 25.0, 35.0)  # [deg]
 REFINED = 5  # number of gaits whose drives are planned
-MIN_STANCE_DURATION = 3.0  # least duration of a stance [s]
+MIN_STANCE_DURATION = 4.0  # least duration of a stance [s]
 PAPER_SECONDS = 5.0  # duration of a stance of the paper's gait, where nothing is asked for [s]
 MAX_MISSION_DURATION = 3600.0  # time of a mission above which a wanted sigma is given up [s]
 
@@ -99,18 +99,21 @@ class GaitSearch:
     def _candidate(self, gait: Gait) -> Candidate | None:
         information = []
         for k in (0, 1):
-            standing = np.array([gait.stop(k), gait.stop(k + 1)])
+            standing = np.array([self._stop(gait, k), self._stop(gait, k + 1)])
             model = self.predictor.model((self.pair[k], self.pair[1 - k]), self.mover)
             margin = float(view_margin(2 * gait.leap, self.predictor.team[self.pair[1 - k]].camera.fx))
             found = cells(model, standing, margin)
             if len(found.places) < 3:
                 return None
             information.append(self.predictor.fps * found.information.mean(axis=0))
-        D = [between(gait.stop(k), gait.stop(k + 2)) for k in (0, 1)]
-        belief = Belief.start(self.predictor.team, {self.pair[0]: gait.stop(0)})
+        D = [between(self._stop(gait, k), self._stop(gait, k + 2)) for k in (0, 1)]
+        belief = Belief.start(self.predictor.team, {self.pair[0]: self._stop(gait, 0)})
         leaps = [leap_model(one, belief.floor, odometry=self.predictor.odometry) for one in D]
-        taken = leap_time(gait.stop(0), gait.stop(2), self.predictor.speed)
+        taken = leap_time(self._stop(gait, 0), self._stop(gait, 2), self.predictor.speed)
         return Candidate(gait, np.array(information), (leaps[0], leaps[1]), taken)
+
+    def _stop(self, gait: Gait, k: int) -> Planar:
+        return self.predictor.stop(gait, self.pair, k)
 
     def seconds(self, candidate: Candidate, time: float) -> float:
         """Return the duration of each stance in a mission of a whole `time` [s]; below 0 if its leaps take longer."""
@@ -121,7 +124,7 @@ class GaitSearch:
         """Return the sigma of the last positions [m] that stances of this duration are expected to bring."""
         gait, names = candidate.gait, (*self.pair, self.mover)
         seconds = float(effective_seconds(seconds, self.predictor.speed))
-        places = gait.stop(0), gait.stop(1), (1.5, 0.0, 0.0)
+        places = self._stop(gait, 0), self._stop(gait, 1), (1.5, 0.0, 0.0)
         belief = Belief.start(self.predictor.team, dict(zip(names, places, strict=True)))
         P = belief.covariance
         rows = [belief.rows((self.pair[k], self.pair[1 - k]), self.mover) for k in (0, 1)]
@@ -135,7 +138,7 @@ class GaitSearch:
                 P[:, pose] = P[:, pose] @ F.T
                 P[pose, pose] += Q
             P = updated(P, rows[k % 2], seconds * candidate.information[k % 2])
-        poses = {self.pair[n % 2]: gait.stop(n), self.pair[1 - n % 2]: gait.stop(n - 1), self.mover: (0.0, 0.0, 0.0)}
+        poses = {self.pair[k % 2]: self._stop(gait, k) for k in (n - 1, n)} | {self.mover: (0.0, 0.0, 0.0)}
         poses = {name: poses[name] for name in names}
         return replace(belief, poses=poses, covariance=P).position_sigma(self.pair)
 
@@ -155,6 +158,19 @@ class GaitSearch:
                 found.append((self.end_sigma(one, seconds), one, seconds))
         found.sort(key=lambda each: each[0])
         return [(one, seconds) for _, one, seconds in found]
+
+    def best(self, seconds: float, *, timed: bool) -> Candidate:
+        """Return the best gait of a mission with these `seconds` of images, or, if `timed`, of the whole mission.
+
+        Raises
+        ------
+        InputError
+            If the time is too short for any gait.
+        """
+        ranked = self.ranked(time=seconds) if timed else self.ranked(capture=seconds)
+        if not ranked:
+            raise InputError(f"{seconds:.0f} s are too short for {self.length:.1f} m: give a longer time")
+        return ranked[0][0]
 
     def planned(self, ranked: Sequence[tuple[Candidate, float]]) -> tuple[Gait, Mission]:
         """Plan the drives of the best candidates, and return the best gait with its mission.

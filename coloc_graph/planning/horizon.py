@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from coloc_graph.planning.belief import Belief, updated
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.drive import effective_seconds
 from coloc_graph.planning.formation import Gait
+from coloc_graph.planning.gaits import MIN_STANCE_DURATION
 from coloc_graph.planning.leaps import Leaps, possible_leaps
 from coloc_graph.planning.mission import Mission, best_stance, leap_time
 from coloc_graph.planning.mover_path import evenly_seen
@@ -28,7 +29,6 @@ DIFFERENT = 0.15  # poses are compared one by one from this distance on, in whic
 BEAM = 6  # plans that are followed from one stance to the next
 SHARES = (0.6, 1.0, 1.7)  # durations of a stance that are compared, relative to the pace of the mission
 PREFERRED = 1.03  # the gait's own leap is left for one that promises a variance this much smaller
-MIN_STANCE_DURATION = 5.0  # least duration of a stance [s]
 MAX_STANCE_DURATION = 60.0  # longest duration of a stance [s]
 MIN_CELLS = 3  # cells of the common view without which a stance is not planned
 MAX_STANCES = 2000
@@ -64,12 +64,15 @@ class Decision:
     expected
         Expected sigma of the observers' last poses at the end of the mission [m], as `Rollout.end_variance` has it; NaN
         where it is not computed.
+    reason
+        What decided, in one line for people.
     """
 
     stance: PlannedStance
     promise: Promise
     ahead: tuple[tuple[str, Planar, float], ...]
     expected: float = math.nan
+    reason: str = ""
 
 
 class Horizon:
@@ -84,13 +87,15 @@ class Horizon:
     observers, mover
         Names of the robots that leap, the reference among them, and of the one that drives before their cameras.
     seconds
-        Seconds of images of the whole mission.
+        Seconds of images of the whole mission; with `timed` of the mission, leaps included.
     objective, depth
         What decides, and the number of stances that are looked ahead.
     gait
         Formation by which the rest of the mission is expected to go; the best one by default.
     rng
         Random numbers of the objective "random".
+    timed
+        True to count the time of leaps, too.
 
     Raises
     ------
@@ -110,8 +115,9 @@ class Horizon:
         depth: int = DEPTH,
         gait: Gait | None = None,
         rng: np.random.Generator | None = None,
+        timed: bool = False,
     ) -> None:
-        self.predictor, self.course, self.mover = predictor, course, mover
+        self.predictor, self.course, self.mover, self.timed = predictor, course, mover, timed
         self.observers, self.seconds, self.objective, self.depth = tuple(observers), seconds, objective, depth
         self._rng = np.random.default_rng(0) if rng is None else rng
         if predictor.floor_map is not None:
@@ -125,7 +131,9 @@ class Horizon:
                 f"{len(self.observers)} observers are to leap, and plans are made for two and a mover: leave the "
                 "others out of the team"
             )
-        self._rollout = Rollout(predictor, course, (self.observers[0], self.observers[1]), mover, seconds, gait)
+        self._rollout = Rollout(
+            predictor, course, (self.observers[0], self.observers[1]), mover, seconds, gait, timed=timed
+        )
         self.gait = self._rollout.gait
 
     def mission(self, belief: Belief) -> Mission:
@@ -152,7 +160,7 @@ class Horizon:
             )
             stances.append(stance)
             promises.append(decision.promise)
-            belief, left = decision.promise.belief, left - stance.duration
+            belief, left = decision.promise.belief, left - stance.duration - self.timed * times[-1]
             if self.arrived(stance.standing):
                 return Mission(Plan(tuple(stances)), tuple(promises), tuple(times))
             if len(stances) > MAX_STANCES:
@@ -176,12 +184,12 @@ class Horizon:
             If the observers have no common view there.
         """
         standing = {name: belief.poses[name] for name in self.observers}
-        pace = self.seconds / max(self.course.length, ARRIVED)
-        seconds = min(max(1.5 * pace * 0.5, MIN_STANCE_DURATION), MAX_STANCE_DURATION, self.seconds)
+        each = self._rollout.stance_seconds(self.seconds)
+        seconds = min(max(each, MIN_STANCE_DURATION), MAX_STANCE_DURATION, max(self.seconds, 1.0))
         stance, promise = best_stance(self.predictor, belief, standing, (), self.mover, seconds, self.goal)
-        return Decision(stance, promise, ())
+        return Decision(stance, promise, (), reason="the first stance is where the team stands")
 
-    def next(self, belief: Belief, seconds: float, avoid: Sequence[Planar] = ()) -> Decision:
+    def next(self, belief: Belief, seconds: float, avoid: Sequence[Planar] = (), leaper: str | None = None) -> Decision:
         """Plan the next stance of a team that stands where `belief` has it.
 
         Parameters
@@ -189,9 +197,11 @@ class Horizon:
         belief
             The team after the stance before.
         seconds
-            Seconds of images that are left.
+            Seconds that are left.
         avoid
             Targets at which this stance failed.
+        leaper
+            The observer that has to leap; None to choose it.
 
         Raises
         ------
@@ -202,7 +212,13 @@ class Horizon:
         beam = [_Node(belief, standing, seconds, 0.0)]
         best = beam
         for depth in range(self.depth):
-            grown = [child for node in beam for child in self._expand(node, () if depth else avoid, in_lane=depth > 0)]
+            grown = [
+                child
+                for node in beam
+                for child in self._expand(
+                    node, () if depth else avoid, in_lane=depth > 0, leaper=None if depth else leaper
+                )
+            ]
             if not grown:
                 break
             grown.sort(key=lambda node: node.score)
@@ -221,8 +237,17 @@ class Horizon:
         placed = {name: after.poses[name] for name in (*anchors, leaper)}
         leapt = math.dist(belief.poses[leaper][:2], target[:2])
         stance, promise = best_stance(self.predictor, after, placed, anchors, self.mover, duration, self.goal, leapt)
-        expected = math.sqrt(best[0].score) if self.objective == "goal" else math.nan
-        return Decision(stance, promise, best[0].choices, expected)
+        if self.objective != "goal":
+            return Decision(stance, promise, best[0].choices)
+        ahead = best[0].choices
+        reason = self._rollout.reason(promise.belief, leaper, seconds - self._spent(duration, belief, leaper, target))
+        if not best[0].by_gait and len(ahead) == 1:
+            reason += "; this leap promises less than the gait's own"
+        return Decision(stance, promise, ahead, math.sqrt(best[0].score), reason)
+
+    def _spent(self, duration: Any, belief: Belief, leaper: str, target: Planar) -> Any:
+        """Return the seconds of the budget that a stance of a `duration` (...) [s] costs."""
+        return duration + (leap_time(belief.poses[leaper], target, self.predictor.speed) if self.timed else 0.0)
 
     @property
     def goal(self) -> tuple[float, float]:
@@ -230,15 +255,16 @@ class Horizon:
         x, y, _ = self.course.at(self.course.length)
         return x, y
 
-    def _expand(self, node: _Node, avoid: Sequence[Planar], *, in_lane: bool) -> list[_Node]:
+    def _expand(self, node: _Node, avoid: Sequence[Planar], *, in_lane: bool, leaper: str | None = None) -> list[_Node]:
         """Find the possible next stances of a team, each with its score: the least is the best.
 
         The one furthest behind leaps; if it cannot now, the other one. The rest of the mission goes by the gait;
         `in_lane` restricts them to where the gait goes on exactly.
         """
         by_way = sorted(self.observers, key=lambda name: self.course.way_of(node.standing[name]))
-        for leaper in by_way[:1] if in_lane else by_way:
-            grown = self._leaps_of(node, leaper, avoid, in_lane=in_lane)
+        by_way = by_way[:1] if in_lane else by_way
+        for name in by_way if leaper is None else (leaper,):
+            grown = self._leaps_of(node, name, avoid, in_lane=in_lane)
             if grown:
                 return grown
         return []
@@ -268,10 +294,14 @@ class Horizon:
     def _durations(self, node: _Node, leaps: Leaps, n: int) -> Array:
         """Durations of a stance that are compared, (3,) [s]."""
         left = max(self.remaining(node.standing), ARRIVED)
-        share = min(leaps.gains[n] / left, 1.0) * node.seconds
+        leapt = leaps.times[n] if self.timed else 0.0
+        seconds = node.seconds - leapt
         if leaps.gains[n] > left - ARRIVED:
-            return np.full(len(SHARES), max(node.seconds, MIN_STANCE_DURATION))
-        longest = min(MAX_STANCE_DURATION, max(node.seconds, MIN_STANCE_DURATION))
+            return np.full(len(SHARES), min(max(seconds, MIN_STANCE_DURATION), MAX_STANCE_DURATION))
+        # the leaps of the way that remains after this one
+        share = min(max(leaps.gains[n], 0.3 * self.gait.leap) / left, 1.0)
+        share *= max(seconds - (1 / share - 1) * leapt, 0.0)
+        longest = min(MAX_STANCE_DURATION, max(seconds, MIN_STANCE_DURATION))
         return np.asarray(np.clip(share * np.array(SHARES), MIN_STANCE_DURATION, longest))
 
     def _scored(
@@ -299,7 +329,10 @@ class Horizon:
         poses[leaps.leaper] = targets
         value = np.stack([
             self._rollout.end_variance(
-                after[:, k][:, used[:, None], used], poses, leaps.leaper, node.seconds - durations[:, k]
+                after[:, k][:, used[:, None], used],
+                poses,
+                leaps.leaper,
+                node.seconds - durations[:, k] - self.timed * leaps.times[seen],
             )
             for k in range(len(SHARES))
         ], axis=1)  # fmt: skip
@@ -320,7 +353,7 @@ class Horizon:
         C = node.belief.covariance if covariance is None else covariance
         belief = replace(node.belief, poses=poses, covariance=C)
         choice = leaps.leaper, target, seconds
-        left = node.seconds - seconds
+        left = node.seconds - seconds - self.timed * float(leaps.times[n])
         standing = {**node.standing, leaps.leaper: target}
         return _Node(belief, standing, left, score, (*node.choices, choice), bool(leaps.by_gait[n]))
 

@@ -12,7 +12,9 @@ from coloc_graph.planning.belief import Belief, leap_model
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
+from coloc_graph.planning.mission import leap_time
 from coloc_graph.planning.prediction import Predictor
+from coloc_graph.planning.route import TO_ROBOT
 from coloc_graph.planning.slip import view_margin
 
 Array = NDArray[np.float64]
@@ -25,7 +27,6 @@ TURNS = (0.0, 0.35, 0.7, 1.0)  # share of a corner by which a target is turned
 BEND = 0.1  # turn of the course that is a corner [rad]
 MAX_LEAP = 1.5  # advance of a target [m]
 TO_WALL = 0.25  # least distance of a robot's middle from walls [m]
-TO_ROBOT = 0.42  # least distance between the middles of two robots, where they stand and on the way [m]
 STEP = 0.1  # distance between places of a leap that are checked [m]
 FAILED = 0.15  # targets nearer to one that failed are avoided [m]
 
@@ -48,6 +49,8 @@ class Leaps:
         Distance (n,) of markers from the borders of images at which the view does not miss them [px].
     by_gait
         True (n,) for those of the gait itself.
+    times
+        Time (n,) of each until all robots stand [s].
     """
 
     leaper: str
@@ -58,6 +61,7 @@ class Leaps:
     Q: Array
     margins: Array
     by_gait: NDArray[np.bool_]
+    times: Array
 
 
 def possible_leaps(
@@ -104,7 +108,8 @@ def possible_leaps(
             continue
         c, s = np.cos(heading), np.sin(heading)
         lateral, turn = side * width * gait.abreast / 2, -side * toe * np.radians(gait.toe_in_deg)
-        targets.append((x - lateral * s, y + lateral * c, before + turned * bend + turn))
+        looks = before + turned * bend + turn
+        targets.append((x - lateral * s, y + lateral * c, looks - predictor.camera_yaw(leaper)))
         gains.append((way - ways[leaper]) / len(observers))
         by_gait.append(own and advance == 1.0)
     places = np.array(targets).reshape(-1, 3)
@@ -122,7 +127,8 @@ def possible_leaps(
     Q = np.array([one for _, one in made]).reshape(-1, 6, 6)
     leapt = np.hypot(*(places[:, :2] - np.array(belief.poses[leaper][:2])).T)
     margins = view_margin(leapt, predictor.team[leaper].camera.fx)
-    return Leaps(leaper, anchors, places, kept, F, Q, margins, np.array(by_gait, bool)[good])
+    times = np.array([leap_time(belief.poses[leaper], (x, y, w), predictor.speed) for x, y, w in places.tolist()])
+    return Leaps(leaper, anchors, places, kept, F, Q, margins, np.array(by_gait, bool)[good], times)
 
 
 def _clear(start: Array, targets: Array, others: Array, floor_map: FloorMap | None) -> NDArray[np.bool_]:

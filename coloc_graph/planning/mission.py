@@ -112,15 +112,16 @@ def leap_frog(
         If the observers see too little of the floor together.
     """
     goal = (length, 0.0)
-    belief = Belief.start(predictor.team, {pair[0]: gait.stop(0), pair[1]: gait.stop(1), mover: (1.5, 0.0, 0.0)})
+    starts = {name: predictor.stop(gait, pair, k) for k, name in enumerate(pair)}
+    belief = Belief.start(predictor.team, {**starts, mover: (1.5, 0.0, 0.0)})
     stances, promises, times = [], [], []
     for k in range(stances_of(gait, length)):
         anchor, leaper = pair[k % 2], pair[(k + 1) % 2]
-        target = gait.stop(k + 1)
+        target = predictor.stop(gait, pair, k + 1)
         times.append(leap_time(belief.poses[leaper], target, predictor.speed) if k else 0.0)
         if k:
             belief = belief.after_leap(leaper, target, odometry=predictor.odometry)
-        standing = {anchor: gait.stop(k), leaper: target}
+        standing = {anchor: belief.poses[anchor], leaper: target}
         stance, promise = best_stance(
             predictor, belief, standing, (anchor,) if k else (), mover, seconds, goal, designed
         )
@@ -146,7 +147,7 @@ def best_stance(
     Raises
     ------
     InputError
-        If the observers see too little of the floor together.
+        If the observers see too little of the floor together, or no drive is clear of robots and walls.
     """
     names = tuple(standing)
     margin = float(view_margin(leapt, predictor.team[names[-1]].camera.fx))
@@ -165,6 +166,9 @@ def best_stance(
             found, shares, belief.covariance, rows, G, duration=seconds, fps=predictor.fps, speed=predictor.speed
         )
         drives.append(patrol(found.places))
+        drives = [drive for drive in drives if found.clear(np.array(drive))]
+        if not drives:
+            raise InputError(f"{mover} finds no drive before {' and '.join(names)} that is clear: give it more room")
     options = [PlannedStance(standing, anchors, mover, drive, seconds) for drive in drives]
     promises = [predictor.of_stance(belief, option) for option in options]
     best = min(range(len(options)), key=lambda n: promises[n].belief.end_variance(names, goal))

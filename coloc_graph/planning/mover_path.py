@@ -1,6 +1,5 @@
 """Path of the mover in a stance: waypoints by optimal design within the common view; `MoverPlanner`."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations, permutations
 
@@ -8,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.planning.drive import SPEED, drive_through, there_and_back
+from coloc_graph.planning.route import Free, clear_way
 from coloc_graph.planning.stance_information import StanceModel
 
 Array = NDArray[np.float64]
@@ -28,9 +28,6 @@ KEPT = 3  # number of drives that are kept
 SPREAD = 14  # cells of a common view by which stances are compared
 SAMPLES = 24  # instants at which a drive is compared with the places
 
-#: Returns whether places (..., 2) [m] are free of walls by a distance [m].
-Free = Callable[[Array, float], NDArray[np.bool_]]
-
 
 @dataclass(frozen=True, eq=False)
 class Cells:
@@ -42,10 +39,20 @@ class Cells:
         Places (n, 2) [m] where all cameras see all its markers at any heading, and it is clear of robots and walls.
     information
         Information (n, d, d) of one image of each camera there.
+    standing
+        Places (r, 2) of the robots that stand [m].
+    free
+        Returns which places are free of walls; None without a map.
     """
 
     places: Array
     information: Array
+    standing: Array
+    free: Free | None = None
+
+    def clear(self, points: Array) -> bool:
+        """Return whether a drive through points (n, 2) is clear of the robots that stand and of walls."""
+        return clear_way(points, self.standing, self.free, to_robot=CLEARANCE - CELL / 10)
 
 
 def cells(model: StanceModel, standing: Array, margin: float, free: Free | None = None) -> Cells:
@@ -55,15 +62,16 @@ def cells(model: StanceModel, standing: Array, margin: float, free: Free | None 
     """
     places = places_in_common_view(model, standing, margin, free)
     if not len(places):
-        return Cells(places, np.zeros((0, model.variables, model.variables)))
+        return Cells(places, np.zeros((0, model.variables, model.variables)), standing[:, :2], free)
     drive = np.concatenate([np.column_stack([places, np.full(len(places), yaw)]) for yaw in YAWS])
     information = model.see(standing, drive).information
-    return Cells(places, information.reshape(len(YAWS), len(places), *information.shape[1:]).mean(axis=0))
+    mean = information.reshape(len(YAWS), len(places), *information.shape[1:]).mean(axis=0)
+    return Cells(places, mean, standing[:, :2], free)
 
 
 def places_in_common_view(model: StanceModel, standing: Array, margin: float, free: Free | None = None) -> Array:
     """Places (n, 2) [m] where all cameras see all markers of the mover at any heading, clear of robots and walls."""
-    xy = _grid(standing)
+    xy = _grid(model, standing)
     away = np.hypot(*np.moveaxis(xy[:, None] - standing[None, :, :2], -1, 0)).min(axis=1)
     xy = xy[away > CLEARANCE]
     if free is not None:
@@ -75,9 +83,9 @@ def places_in_common_view(model: StanceModel, standing: Array, margin: float, fr
     return np.asarray(xy[seen.all(axis=(0, 2))])
 
 
-def _grid(standing: Array) -> Array:
-    """Places (n, 2) of a grid ahead of the first observer, along its heading."""
-    x, y, yaw = standing[0]
+def _grid(model: StanceModel, standing: Array) -> Array:
+    """Places (n, 2) of a grid ahead of the first observer's camera."""
+    x, y, yaw = model.camera(standing[0])
     ahead, aside = np.meshgrid(np.arange(*AHEAD, CELL), np.arange(-ASIDE, ASIDE + 1e-9, CELL), indexing="ij")
     c, s = np.cos(yaw), np.sin(yaw)
     return np.column_stack([x + c * ahead.ravel() - s * aside.ravel(), y + s * ahead.ravel() + c * aside.ravel()])
@@ -126,7 +134,7 @@ def best_drives(
     fps: float,
     speed: float = SPEED,
 ) -> list[tuple[Waypoint, ...]]:
-    """Find the drives of a `duration` [s] that leave the goal's variance least, the best one first.
+    """Find the clear drives of a `duration` [s] that leave the goal's variance least, the best one first.
 
     The design's shares ignore that a robot must drive from place to place. Drives through two, three and four of the
     places that matter are compared by the information of the places that they pass.
@@ -141,14 +149,17 @@ def best_drives(
         Duration of the drive [s], images a second, and speed [m/s].
     """
     points = found.places[_knots(found.places, shares)]
-    paths = [list(pair) for pair in combinations(range(len(points)), 2)]
-    paths += [list(three) for three in permutations(range(len(points)), 3) if three[0] < three[2]]
+    clear = np.zeros((len(points), len(points)), bool)
+    for a, b in combinations(range(len(points)), 2):
+        clear[a, b] = clear[b, a] = found.clear(points[[a, b]])
+    paths = [list(pair) for pair in combinations(range(len(points)), 2) if clear[pair]]
+    paths += [[a, b, c] for a, b, c in permutations(range(len(points)), 3) if a < c and clear[a, b] and clear[b, c]]
     value = _values(found, points, paths, covariance, rows, goal, duration, fps, speed)
     longer = [
         [*paths[n], more]
         for n in np.argsort(value)[:LONGER].tolist()
         for more in range(len(points))
-        if more not in paths[n]
+        if more not in paths[n] and clear[paths[n][-1], more]
     ]
     value = np.concatenate([value, _values(found, points, longer, covariance, rows, goal, duration, fps, speed)])
     paths += longer
@@ -228,7 +239,7 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
     tuple
         Information (b, d, d), and the number (b,) of cells of the common view.
     """
-    xy = _grid(standing[0])
+    xy = _grid(model, standing[0])
     if free is not None:
         xy = xy[free(xy, CLEARANCE / 2)]
     reach = float(np.hypot(*model.p_markers[:, :2].T).max())

@@ -1,14 +1,17 @@
 """Prediction of the covariance of a team after planned stances; `Predictor`."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.geometry.se2 import Planar
 from coloc_graph.planning.belief import Belief
 from coloc_graph.planning.drive import SPEED, drive_through, there_and_back
 from coloc_graph.planning.floor_map import FloorMap
+from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.stance_information import StanceModel
 from coloc_graph.team import Team
@@ -61,6 +64,15 @@ class Predictor:
     def free(self) -> Callable[[Array, float], NDArray[np.bool_]] | None:
         """Returns which places (..., 2) [m] are free of walls by a distance [m]; None without a map."""
         return None if self.floor_map is None else self.floor_map.clear
+
+    def camera_yaw(self, robot: str) -> float:
+        """Return the heading of a robot's camera in its body [rad]."""
+        return math.radians(self.team[robot].mount.yaw_deg)
+
+    def stop(self, gait: Gait, pair: Sequence[str], k: int) -> Planar:
+        """Return standing pose number k of a gait, at which the camera, not the body, looks where the gait has it."""
+        x, y, yaw = gait.stop(k)
+        return x, y, yaw - self.camera_yaw(pair[k % 2])
 
     def model(self, observers: Sequence[str], mover: str) -> StanceModel:
         """Return the model of a stance of these robots."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.geometry.se2 import Planar, between
-from coloc_graph.planning.belief import Belief
+from coloc_graph.planning.belief import OBSERVER, POSE, Belief
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.drive import effective_seconds
 from coloc_graph.planning.formation import Gait
@@ -16,8 +16,6 @@ from coloc_graph.planning.prediction import Predictor
 
 Array = NDArray[np.float64]
 
-POSE = 6
-BLOCK = 9  # numbers of an observer: pose, mount
 HEADING_ARM = 2.0  # a last heading counts as what it displaces at this distance [m]
 SECONDS = tuple(0.5 * 1.3**n for n in range(20))  # durations of a stance for which the rest is computed [s]
 
@@ -61,6 +59,8 @@ class Rollout:
         Seconds of images of the mission.
     gait
         The gait; the best one by default.
+    timed
+        True if `seconds` are those of the mission, leaps included.
 
     Raises
     ------
@@ -76,13 +76,17 @@ class Rollout:
         mover: str,
         seconds: float,
         gait: Gait | None = None,
+        *,
+        timed: bool = False,
     ) -> None:
         search = GaitSearch(predictor, course.length, pair, mover, None if gait is None else (gait,))
-        (best, _), *_ = search.ranked(capture=seconds)
+        best = search.best(seconds, timed=timed)
         self.gait: Gait = best.gait
+        self._leap_time = best.leap_time if timed else 0.0
         self.pair, self.mover, self._course, self._speed = pair, mover, course, predictor.speed
+        self._yaws = [predictor.camera_yaw(name) for name in pair]
         most = max(math.ceil(course.length / self.gait.leap), 1) + 2
-        size = 2 * BLOCK + 2
+        size = 2 * OBSERVER + 2
         eye = np.broadcast_to(np.eye(size), (len(SECONDS), size, size))
         nothing = _Steps(eye, 0 * eye, 0 * eye)
         one = [self._stance(best.information, best.leaps, anchor) for anchor in (0, 1)]
@@ -100,13 +104,13 @@ class Rollout:
         self, information: Array, leaps: tuple[tuple[Array, Array], tuple[Array, Array]], anchor: int
     ) -> _Steps:
         """The leap of the other observer to beside the anchor, and the stance, at each of `SECONDS`."""
-        size, leaper = 2 * BLOCK + 2, 1 - anchor
+        size, leaper = 2 * OBSERVER + 2, 1 - anchor
         # the leap k of a gait is to its pose k + 1; information is in the order anchor, leaper, markers
         F, Q = leaps[leaper]
         A, C = np.eye(size), np.zeros((size, size))
-        at = slice(BLOCK * leaper, BLOCK * leaper + POSE)
+        at = slice(OBSERVER * leaper, OBSERVER * leaper + POSE)
         A[at, at], C[at, at] = F, Q
-        order = np.concatenate([BLOCK * n + np.arange(BLOCK) for n in (anchor, leaper)] + [[size - 2, size - 1]])
+        order = np.concatenate([OBSERVER * n + np.arange(OBSERVER) for n in (anchor, leaper)] + [[size - 2, size - 1]])
         own = np.zeros((size, size))
         own[np.ix_(order, order)] = information[anchor]
         B = effective_seconds(SECONDS, self._speed)[:, None, None] * own
@@ -116,8 +120,8 @@ class Rollout:
 
     def rows(self, belief: Belief) -> NDArray[np.int64]:
         """Return the rows of a belief's covariance that the rest depends on."""
-        blocks = [belief.index(name) + np.arange(BLOCK) for name in self.pair]
-        return np.concatenate([*blocks, belief.index(self.mover) + np.array([BLOCK, BLOCK + 1])])
+        blocks = [belief.index(name) + np.arange(OBSERVER) for name in self.pair]
+        return np.concatenate([*blocks, belief.index(self.mover) + np.array([OBSERVER, OBSERVER + 1])])
 
     def end_variance(self, P: Array, poses: dict[str, Array], front: str, seconds: Array) -> Array:
         """Return the mean variance of the observers' last poses [m^2] at the end of the mission.
@@ -133,7 +137,7 @@ class Rollout:
         front
             The observer in front, which stands still next.
         seconds
-            Seconds (b,) of images that are left.
+            Seconds (b,) that are left.
         """
         ways = np.array([self._course.way_of(pose) for pose in poses[front]])
         P = self._in_formation(P, poses, front, ways)
@@ -141,16 +145,49 @@ class Rollout:
         # the gait brings the other one to a leap ahead of the front, wherever it is now
         stances = np.maximum((self._course.length - ways) / self.gait.leap + 0.5, 0.0)
         fewer = np.minimum(np.floor(stances).astype(int), self._A.shape[1] - 2)
-        each = np.maximum(seconds, 0.0) / np.maximum(stances, 0.5)
+        each = np.maximum(seconds, 0.0) / np.maximum(stances, 0.5) - self._leap_time
         pace = np.clip(np.round(np.log(np.maximum(each, 1e-3) / SECONDS[0]) / math.log(1.3)), 0, len(SECONDS) - 1)
         share = np.clip(stances - fewer, 0.0, 1.0)
         few, many = (self._after(P, anchor, fewer + more, pace.astype(int)) for more in (0, 1))
         return np.asarray((1 - share) * few + share * many)
 
+    def stance_seconds(self, seconds: float) -> float:
+        """Return the duration of each stance [s] of a mission of these `seconds`, from its first stance on."""
+        stances = max(self._course.length / self.gait.leap + 0.5, 1.0)
+        return seconds / stances - self._leap_time
+
+    def reason(self, belief: Belief, front: str, seconds: float) -> str:
+        """Return which of what is not known after a stance costs most at the end, in one line.
+
+        Each kind of variable is taken to be known exactly, and the rest of the mission is computed again.
+        """
+        rows = self.rows(belief)
+        P = belief.covariance[np.ix_(rows, rows)]
+        both = np.array([[0], [OBSERVER]])
+        kinds = {
+            "headings": np.ravel(both + 2),
+            "positions": np.ravel(both + np.arange(3, 5)),
+            "mounts": np.ravel(both + np.arange(POSE, OBSERVER)),
+            "markers": np.array([len(P) - 2, len(P) - 1]),
+        }
+        exact = [P - P[:, of] @ np.linalg.pinv(P[np.ix_(of, of)], hermitian=True) @ P[of] for of in kinds.values()]
+        known = [P, *exact, 0 * P]
+        many = {name: np.repeat([belief.poses[name]], len(known), axis=0) for name in self.pair}
+        now, *without = self.end_variance(np.array(known), many, front, np.full(len(known), seconds)).tolist()
+        inherited = max(now - without[-1], 1e-30)
+        shares = {what: (now - value) / inherited for what, value in zip(kinds, without, strict=False)}
+        later = without[-1] / now
+        first, second = sorted(shares, key=lambda what: -shares[what])[:2]
+        return (
+            f"{1e3 * math.sqrt(now):.1f} mm expected at the goal, {100 * later:.0f} % of the variance by later "
+            f"stances; of the rest, exact {first} would take off {100 * shares[first]:.0f} %, "
+            f"{second} {100 * shares[second]:.0f} %"
+        )
+
     def _after(self, P: Array, anchor: int, stances: NDArray[np.int64], pace: NDArray[np.int64]) -> Array:
         A, B, C = (M[anchor, stances, pace] for M in (self._A, self._B, self._C))
         left = np.linalg.solve(np.eye(P.shape[-1]) + P @ B, P)
-        numbers = np.array([2, 3, 4, BLOCK + 2, BLOCK + 3, BLOCK + 4])
+        numbers = np.array([2, 3, 4, OBSERVER + 2, OBSERVER + 3, OBSERVER + 4])
         weight = np.array([HEADING_ARM**2, 1.0, 1.0] * 2) / 2
         a, c = A[:, numbers], C[:, numbers, numbers]
         return np.asarray(((a @ left * a).sum(axis=2) + c) @ weight)
@@ -163,9 +200,11 @@ class Rollout:
             for b, way in enumerate(ways - (0.0 if name == front else self.gait.leap)):
                 x, y, heading = self._course.at(float(way))
                 left, turn = side * self.gait.abreast / 2, -side * math.radians(self.gait.toe_in_deg)
-                aim = x - left * math.sin(heading), y + left * math.cos(heading), heading + turn
+                aim = x - left * math.sin(heading), y + left * math.cos(heading), heading + turn - self._yaws[n]
                 here: Planar = tuple(poses[name][b].tolist())
-                M[b, BLOCK * n : BLOCK * n + POSE, BLOCK * n : BLOCK * n + POSE] = _moved(between(here, aim))
+                M[b, OBSERVER * n : OBSERVER * n + POSE, OBSERVER * n : OBSERVER * n + POSE] = _moved(
+                    between(here, aim)
+                )
         return M @ P @ M.mT
 
 

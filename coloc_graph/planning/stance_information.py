@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from coloc_graph.backend.camera_model import Mounts
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.lie import floor_pose, hat
+from coloc_graph.planning.belief import MOUNT, OBSERVER, POSE
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.team import Team
 from coloc_graph.team.shared_view import hidden
@@ -46,7 +47,8 @@ class StanceModel:
     """Observers and the mover of a stance, whose information is predicted for many stances at once.
 
     The variables are, of each observer in turn, its pose (6,) in GTSAM's tangent, rotation first, body frame, and its
-    mount (3,): height [m], tilt, roll [rad]; at the end the mover's markers (2,): span (relative) and height [m].
+    mount (6,): height [m], tilt, roll, yaw [rad], x, y [m]; at the end the mover's markers (2,): span (relative) and
+    height [m].
 
     Parameters
     ----------
@@ -57,7 +59,7 @@ class StanceModel:
     noise_px
         Standard deviation of a marker centre per axis [px]; None for what the cameras state.
     mounts
-        Errors (r, 3) of the observers' mounts as they are estimated; None for mounts as stated.
+        Errors (r, 6) of the observers' mounts as they are estimated; None for mounts as stated.
     floor_map
         Walls that block the view; None where there are none.
 
@@ -83,22 +85,27 @@ class StanceModel:
         self.observers, self.mover = tuple(observers), mover
         self.p_markers = markers.p_body[:2]
         self._cameras = [team[name].camera for name in observers]
-        errors = np.zeros((len(observers), 6))  # yaw and offset are taken as stated
-        errors[:, :3] = 0.0 if mounts is None else mounts
+        errors = np.zeros((len(observers), MOUNT)) if mounts is None else mounts
         cameras = Mounts([team[name].mount for name in observers]).at(errors)
         self._R, self._t = cameras.R, cameras.t
         r = len(observers)
-        self.variables = 9 * r + 2
+        self.variables = OBSERVER * r + 2
         by = np.zeros((6 * r + 2, self.variables))
         for n in range(r):
-            by[6 * n : 6 * n + 6, 9 * n : 9 * n + 6] = cameras.by_body[n]
-            by[6 * n : 6 * n + 6, 9 * n + 6 : 9 * n + 9] = cameras.by_errors[n, :, :3]
+            at = OBSERVER * n
+            by[6 * n : 6 * n + 6, at : at + POSE] = cameras.by_body[n]
+            by[6 * n : 6 * n + 6, at + POSE : at + OBSERVER] = cameras.by_errors[n]
         by[-2:, -2:] = np.eye(2)
         self._by_variables = by
         noise = np.array([noise_px or camera.noise_px for camera in self._cameras])
         self._scale = np.array([[[c.fx], [c.fy]] for c in self._cameras]) / noise[:, None, None]
         self._bias = np.array([camera.bias_px for camera in self._cameras]) / noise
         self._clock_sigma = team.clock_sigma
+
+    def camera(self, standing: Array) -> Array:
+        """Place x, y [m] of the first observer, standing at a pose (3,), and the heading of its camera [rad]."""
+        ahead = self._R[0] @ [0.0, 0.0, 1.0]
+        return np.asarray(standing + np.array([0.0, 0.0, np.arctan2(ahead[1], ahead[0])]))
 
     def views(self, standing: Array) -> tuple[Array, Array]:
         """Return rotations (..., r, 3, 3) of the cameras in the world and their optical centres (..., r, 3) [m].

@@ -8,6 +8,7 @@ import pytest
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import between
 from coloc_graph.online.horizon_planner import HorizonPlanner
+from coloc_graph.online.leap_planner import Situation
 from coloc_graph.online.mission import in_world
 from coloc_graph.online.record import Record
 from coloc_graph.online.robot_registry import RobotRegistry
@@ -15,13 +16,12 @@ from coloc_graph.pipeline.incremental import StanceSolver, measure_stance
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.plan import Plan, PlannedStance
-from coloc_graph.run import Stance, atomic_run, open_run
+from coloc_graph.run import atomic_run, open_run
 from coloc_graph.simulation import Imperfections, build_world, record
 from coloc_graph.simulation.planned import planned
 from coloc_graph.simulation.simulated_team import field_team
 
 GAIT = Gait(0.8, 0.6, 20.0)
-BEFORE = Stance(0, 0.0, 10.0, ("A", "B"), ("C",), ())
 
 
 class Mission:
@@ -36,8 +36,11 @@ class Mission:
 
     def make(self, observers):
         return HorizonPlanner(
-            self.team, "C", observers, self.course, self.registry, pace=8.0, speed=0.4, gait=GAIT
+            self.team, "C", observers, self.course, pace=24.0, speed=0.4, gait=GAIT
         )  # fmt: skip
+
+    def plan(self, index, attempt=0, moved=()):
+        return self.planner.plan(Situation(index, attempt, self.registry.poses(), moved))
 
 
 @pytest.fixture
@@ -46,15 +49,17 @@ def mission(tmp_path):
 
 
 def test_the_first_stance_is_where_the_robots_stand_and_the_second_after_a_leap(mission):
-    first = mission.planner.plan(0, None, 0)
+    first = mission.plan(0)
     assert first.leap is None and first.duration > 3
-    second = mission.planner.plan(1, BEFORE, 0)
+    second = mission.plan(1)
     leaper, target = second.leap
     poses = mission.registry.poses()
     ways = {name: mission.course.way_of(poses[name]) for name in ("A", "B")}
     assert leaper == min(ways, key=ways.get)
     assert mission.course.way_of(target) > max(ways.values()) + 0.1
-    assert mission.planner.drives(leaper) and mission.planner.drives("C")
+    assert second.drives(leaper, "C") and second.drives("C", "C")
+    assert set(second.promise.covariances) == {"A", "B"} and second.promise.points > 50
+    assert "mm expected at the goal" in second.promise.reason
     # the mover stays clear of where the observers then stand
     standing = {**poses, leaper: target}
     for waypoint in second.patrol:
@@ -62,11 +67,14 @@ def test_the_first_stance_is_where_the_robots_stand_and_the_second_after_a_leap(
 
 
 def test_another_attempt_turns_the_drive_round_and_a_third_chooses_another_target(mission):
-    mission.planner.plan(0, None, 0)
-    plans = [mission.planner.plan(1, BEFORE, attempt) for attempt in range(3)]
+    mission.plan(0)
+    plans = [mission.plan(1, attempt) for attempt in range(3)]
     assert plans[1].leap == plans[0].leap
     middle = plans[0].patrol[:-1].mean(axis=0)
     np.testing.assert_allclose(plans[0].patrol[-1], middle)
+    assert math.dist(plans[0].patrol[0], mission.registry.poses()["C"][:2]) <= math.dist(
+        plans[0].patrol[-2], mission.registry.poses()["C"][:2]
+    )
     np.testing.assert_allclose(plans[1].patrol[0], middle)
     np.testing.assert_array_equal(plans[1].patrol[1:-1], plans[0].patrol[:-1][::-1])
     x, y, yaw = between(plans[0].leap[1], plans[2].leap[1])
@@ -74,7 +82,7 @@ def test_another_attempt_turns_the_drive_round_and_a_third_chooses_another_targe
 
 
 def test_a_stance_that_came_makes_the_team_better_known_and_spends_its_time(mission, tmp_path):
-    plan = mission.planner.plan(0, None, 0)
+    plan = mission.plan(0)
     poses = mission.registry.poses()
     came = PlannedStance({name: poses[name] for name in ("A", "B")}, (), "C", tuple(map(tuple, plan.patrol)), 10.0)
     world = build_world(planned(Plan((came,))), team=mission.team, fps=15.0, imperfections=Imperfections(noise_px=0.2))
@@ -86,9 +94,9 @@ def test_a_stance_that_came_makes_the_team_better_known_and_spends_its_time(miss
     pairs = solver.measure(run, stance, measure_stance(run, stance, solver.options))
     entered = solver.enter(run, stance, pairs)
     left = mission.planner.seconds_left
-    mission.planner.take(entered)
+    mission.planner.take(entered, poses)
     assert left - mission.planner.seconds_left == pytest.approx(stance.end - stance.start)
-    assert mission.planner.promised.position_sigma(("B",)) < 0.01
+    assert mission.planner.belief.position_sigma(("B",)) < 0.01
     # the noise of the next stances is that which was seen
     assert mission.planner.noise_px == pytest.approx(0.2, rel=0.2)
 
@@ -96,3 +104,32 @@ def test_a_stance_that_came_makes_the_team_better_known_and_spends_its_time(miss
 def test_three_observers_are_refused(mission):
     with pytest.raises(InputError, match="plans are made for two and a mover"):
         mission.make(("A", "B", "C"))
+
+
+def test_one_that_has_leapt_and_fails_leaps_on_and_the_anchor_stays(mission):
+    mission.plan(0)
+    leaper, target = mission.plan(1).leap
+    mission.registry[leaper].tracker.displace(math.inf, target)
+    again = mission.plan(1, 1, (leaper,))
+    assert again.leap == (leaper, target)
+    other = mission.plan(1, 2, (leaper,))
+    assert other.leap is not None and other.leap[0] == leaper
+    x, y, yaw = between(target, other.leap[1])
+    assert math.hypot(x, y) + abs(yaw) > 0.1
+
+
+def test_where_no_anchor_is_left_nobody_leaps(mission):
+    mission.plan(0)
+    for attempt in range(3):
+        assert mission.plan(1, attempt, ("A", "B")).leap is None
+
+
+def test_an_observer_waits_until_the_mover_is_out_of_its_way(mission):
+    mission.plan(0)
+    plan = mission.plan(1)
+    leaper, target = plan.leap
+    start = mission.registry.poses()[leaper]
+    x, y = np.mean([start[:2], target[:2]], axis=0)
+    assert not plan.may_leap(start, (x, y, 0.0))
+    ahead = plan.patrol[0] + (plan.patrol[0] - np.array(target[:2]))
+    assert plan.may_leap(start, (*ahead.tolist(), 0.0)) or math.dist(plan.patrol[0], target[:2]) < plan.passing

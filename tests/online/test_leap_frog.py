@@ -9,11 +9,12 @@ import pytest
 
 from coloc_graph.errors import RobotError
 from coloc_graph.online.commands import Commander, Stopped
+from coloc_graph.online.decision_worker import DecisionWorker
 from coloc_graph.online.estimation_worker import EstimationWorker
 from coloc_graph.online.formation import STAGGER, Formation
 from coloc_graph.online.inbox import Inbox
 from coloc_graph.online.leap_frog import CALM, LeapFrog
-from coloc_graph.online.leap_planner import LeapPlanner
+from coloc_graph.online.leap_planner import LeapPlanner, Situation
 from coloc_graph.online.mission import MissionOptions, in_world, roles
 from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import MissionState
@@ -46,7 +47,7 @@ class Link:
 class Mission:
     """A mission of robots that stand, none of which sees anything."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, planner=None):
         self.team, self.inbox, self.link = field_team(), Inbox(), Link()
         self.record = Record(folder / "run.mcap", self.team)
         starts, waypoints = in_world(self.team, "C", OPTIONS.goals)
@@ -56,10 +57,13 @@ class Mission:
         self.log = MissionLog(folder / "mission.jsonl", self.registry.utc)
         self.formation = Formation(Course(waypoints), roles(self.team, None)[1])
         self.synchronised = True
+        planner = planner or LeapPlanner(self.team, "C", self.formation)
+        self.decisions = DecisionWorker(planner)
         self.leap_frog = LeapFrog(
             self.team,
             OPTIONS,
-            LeapPlanner(self.team, "C", self.formation, self.registry),
+            planner,
+            decisions=self.decisions,
             registry=self.registry,
             commander=self.commander,
             worker=self.worker,
@@ -86,7 +90,14 @@ class Mission:
         self.leap_frog.step()
         assert self.leap_frog.states.now == state
 
+    def await_plan(self):
+        until = time.monotonic() + 20
+        while self.leap_frog.states.now == MissionState.PLANNING and time.monotonic() < until:
+            self.leap_frog.step()
+            time.sleep(0.002)
+
     def close(self):
+        self.decisions.end()
         self.worker.end()
         self.log.__exit__(None, None, None)
         self.record.__exit__(None, None, None)
@@ -107,7 +118,8 @@ def test_a_mission_places_its_robots_looks_and_holds_when_one_has_gone(mission):
     mission.synchronised = False
     mission.step(MissionState.SYNCHRONISING)
     mission.synchronised = True
-    mission.step(MissionState.PLACING)
+    mission.step(MissionState.PLANNING)
+    mission.await_plan()
     ((name, drive),) = mission.link.asked  # nobody leaps into the first stance
     assert name == "C" and isinstance(drive, Drive)
     mission.step(MissionState.PLACING)
@@ -149,35 +161,43 @@ def test_a_robot_whose_messages_wait_is_not_called_silent(mission):
 def test_a_leap_that_was_planned_or_begun_is_kept(mission):
     for name in "ABC":
         mission.report(name)
-    planner = LeapPlanner(mission.team, "C", mission.formation, mission.registry)
-    first = planner.plan(0, None, 0)
-    assert first.leap is None and planner.drives("C") and not planner.drives("A")
-    before = Stance(0, 0.0, mission.registry.utc() + 1.0, ("A", "B"), ("C",))
-    plan = planner.plan(1, before, 0)
+    planner, poses = LeapPlanner(mission.team, "C", mission.formation), mission.registry.poses()
+    first = planner.plan(Situation(0, 0, poses))
+    assert first.leap is None and first.drives("C", "C") and not first.drives("A", "C")
+    plan = planner.plan(Situation(1, 0, poses))
     leaper, target = plan.leap
-    assert planner.drives(leaper) and planner.plan(1, before, 1).leap == plan.leap
+    assert plan.drives(leaper, "C") and planner.plan(Situation(1, 1, poses)).leap == plan.leap
     way = mission.formation.course.way_of(target)
     assert way == pytest.approx(max(mission.formation.ways(mission.registry.poses()).values()) + STAGGER)
     other = "AB".replace(leaper, "")
-    mission.registry[other].tracker.displace(math.inf, mission.registry[other].tracker.pose())
-    assert planner.plan(2, before, 0).leap[0] == other  # it has set off already
+    assert planner.plan(Situation(2, 0, poses, (other,))).leap[0] == other  # it has set off already
+    assert planner.plan(Situation(2, 1, poses, ("A", "B"))).leap is None  # no anchor would be left
 
 
-class MoverFirst(LeapPlanner):
-    """The paper's formation, with a leap that must wait for the mover."""
+class Passing(LeapPlanner):
+    """The paper's formation, with a leap that must wait for the mover; it takes its time to decide."""
 
-    def plan(self, index, before, attempt):
-        plan = super().plan(index, before, attempt)
-        return replace(plan, leap=("A", (0.4, 0.0, 0.0)), mover_first=True)
+    def plan(self, situation):
+        time.sleep(0.3)
+        return replace(super().plan(situation), leap=("A", (0.4, 0.0, 0.0)), passing=100.0)
 
 
-def test_an_observer_whose_way_the_mover_crosses_leaps_once_the_mover_is_there(mission):
-    mission.leap_frog._planner = MoverFirst(mission.team, "C", mission.formation, mission.registry)
+def test_while_the_planner_decides_the_mission_goes_on_and_a_leap_waits_for_the_mover(tmp_path):
+    team = field_team()
+    _, waypoints = in_world(team, "C", OPTIONS.goals)
+    mission = Mission(tmp_path, Passing(team, "C", Formation(Course(waypoints), roles(team, None)[1])))
     mission.step(MissionState.GATHERING)
     for name in "ABC":
         mission.report(name)
+    mission.leap_frog.stances.append(Stance(0, 0.0, mission.registry.utc(), ("A", "B"), ("C",)))
     mission.step(MissionState.SYNCHRONISING)
-    mission.step(MissionState.PLACING)
+    mission.step(MissionState.PLANNING)
+    began = time.monotonic()
+    for _ in range(20):
+        mission.leap_frog.step()
+    assert time.monotonic() - began < 0.2 and mission.leap_frog.states.now == MissionState.PLANNING
+    assert not mission.link.asked  # nobody moves before there is a plan
+    mission.await_plan()
     mission.step(MissionState.PLACING)
     ((name, drive),) = mission.link.asked
     assert name == "C"
@@ -187,3 +207,21 @@ def test_an_observer_whose_way_the_mover_crosses_leaps_once_the_mover_is_there(m
     leap = mission.link.asked[-1][1]
     mission.registry["A"].take_event(Event(session="A", number=1, stamp=0, kind="arrived", text=str(leap.number)))
     mission.step(MissionState.LOOKING)
+    mission.close()
+
+
+def test_nobody_leaps_without_an_anchor(tmp_path):
+    team = field_team()
+    _, waypoints = in_world(team, "C", OPTIONS.goals)
+    mission = Mission(tmp_path, Passing(team, "C", Formation(Course(waypoints), roles(team, None)[1])))
+    mission.step(MissionState.GATHERING)
+    for name in "ABC":
+        mission.report(name)
+    mission.leap_frog.stances.append(Stance(0, 0.0, 1.0, ("A", "B"), ("C",)))
+    mission.registry["B"].tracker.displace(math.inf, mission.registry["B"].tracker.pose())  # pushed
+    mission.step(MissionState.SYNCHRONISING)
+    mission.step(MissionState.PLANNING)
+    mission.await_plan()
+    assert mission.leap_frog.states.now == MissionState.HOLDING
+    assert not any(isinstance(body, Drive) for _, body in mission.link.asked)
+    mission.close()

@@ -1,0 +1,122 @@
+"""Ways of robots clear of others and of walls: `clear_way`, `route`, `polyline_length`."""
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from coloc_graph.errors import InputError
+
+Array = NDArray[np.float64]
+
+#: Returns whether places (..., 2) [m] are free of walls by a distance [m].
+Free = Callable[[Array, float], NDArray[np.bool_]]
+
+TO_ROBOT = 0.42  # least distance between the middles of two robots, where they stand and on the way [m]
+TO_WALL = 0.22  # least distance of a driving robot's middle from walls [m]
+STEP = 0.05  # distance between places of a way that are checked [m]
+GRID = 0.15  # distance between places through which a way round is sought [m]
+ROUND = 2.5  # a way round goes this far beyond all robots [m]
+SLACK = 0.01  # a robot that stands nearer to another than it may does not come nearer than this less [m]
+
+
+def clear_way(points: ArrayLike, others: ArrayLike, free: Free | None = None, *, to_robot: float = TO_ROBOT) -> bool:
+    """Return whether a polyline (n, 2) is clear of robots at `others` (m, 2) and of walls [m].
+
+    Where it begins it may be as near to them as it is.
+    """
+    points, others = np.asarray(points, float), np.asarray(others, float).reshape(-1, 2)
+    way = _sampled(points)
+    if len(others):
+        least = np.minimum(to_robot, np.hypot(*(points[0] - others).T) - SLACK)
+        if (np.hypot(*np.moveaxis(way[:, None] - others, -1, 0)) < least).any():
+            return False
+    if free is None:
+        return True
+    walled = free(way, TO_WALL)
+    # out of a place that is too near to a wall, but not through it
+    outside = int(walled.argmax())
+    return bool(walled[outside:].all() and free(way[:outside], 0.0).all() and walled.any())
+
+
+def route(
+    start: ArrayLike, goal: ArrayLike, others: ArrayLike, free: Free | None = None, *, to_robot: float = TO_ROBOT
+) -> list[tuple[float, float]]:
+    """Find a short way from start to goal (2,), clear of robots at `others` (m, 2) and of walls; without its start.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    start, goal = np.asarray(start, float), np.asarray(goal, float)
+    others = np.asarray(others, float).reshape(-1, 2)
+    if clear_way([start, goal], others, free, to_robot=to_robot):
+        return [_pair(goal)]
+    every = np.vstack([start, goal, others])
+    low, high = every.min(axis=0) - ROUND, every.max(axis=0) + ROUND
+    x, y = (np.arange(a, b, GRID) for a, b in zip(low, high, strict=True))
+    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+    clear = np.ones(places.shape[:2], bool) if free is None else free(places, TO_WALL)
+    if len(others):
+        away = np.hypot(*np.moveaxis(places[:, :, None] - others, -1, 0))
+        clear &= (away > to_robot).all(axis=-1)
+    nodes = places[clear]
+    number = np.cumsum(clear).reshape(clear.shape) - 1
+    ends, lengths = [], []
+    for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        a = np.s_[: -dx or None, max(-dy, 0) : -dy if dy > 0 else None]
+        b = np.s_[dx:, max(dy, 0) : dy if dy < 0 else None]
+        both = clear[a] & clear[b]
+        ends.append(np.stack([number[a][both], number[b][both]]))
+        lengths.append(np.full(int(both.sum()), GRID * np.hypot(dx, dy)))
+    # start and goal reach the places that they see
+    total = len(nodes)
+    for extra, point in enumerate((start, goal)):
+        near = np.flatnonzero(np.hypot(*(nodes - point).T) < 4 * GRID)
+        seen = [n for n in near.tolist() if clear_way([point, nodes[n]], others, free, to_robot=to_robot)]
+        ends.append(np.array([[total + extra] * len(seen), seen], int).reshape(2, -1))
+        lengths.append(np.hypot(*(nodes[seen] - point).T) if seen else np.zeros(0))
+    (i, j), w = np.hstack(ends), np.concatenate(lengths)
+    graph = coo_array((w, (i, j)), shape=(total + 2, total + 2)).tocsr()
+    distance, before = dijkstra(graph, directed=False, indices=np.array([total]), return_predecessors=True)
+    if not np.isfinite(distance[0, total + 1]):
+        raise InputError(
+            f"there is no way for a robot from {start[0]:.1f}, {start[1]:.1f} to {goal[0]:.1f}, {goal[1]:.1f} that is "
+            "clear of robots and walls: give them more room"
+        )
+    at, back = total + 1, [goal]
+    while (at := int(before[0, at])) != total:
+        back.append(nodes[at])
+    return _pulled([start, *back[::-1]], others, free, to_robot)
+
+
+def _pulled(points: list[Array], others: Array, free: Free | None, to_robot: float) -> list[tuple[float, float]]:
+    """Leave out the points of a way between which it is clear; without its start."""
+    kept, at = [], 0
+    while at < len(points) - 1:
+        beyond = (n for n in range(len(points) - 1, at, -1))
+        at = next((n for n in beyond if clear_way([points[at], points[n]], others, free, to_robot=to_robot)), at + 1)
+        kept.append(_pair(points[at]))
+    return kept
+
+
+def polyline_length(points: ArrayLike) -> float:
+    """Length of a polyline (n, 2) [m]."""
+    return float(np.hypot(*np.diff(np.asarray(points, float), axis=0).T).sum())
+
+
+def _sampled(points: Array) -> Array:
+    """Places (m, 2) along a polyline (n, 2)."""
+    parts = [points[:1]]
+    for a, b in itertools.pairwise(points):
+        count = max(int(np.ceil(float(np.hypot(*(b - a))) / STEP)), 1)
+        parts.append(a + np.linspace(0.0, 1.0, count + 1)[1:, None] * (b - a))
+    return np.concatenate(parts)
+
+
+def _pair(point: Array) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
