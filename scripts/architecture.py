@@ -21,7 +21,7 @@ DRAWING = ROOT / "ARCHITECTURE.md"
 #: Layers from the bottom, with what they are for. A room imports itself and rooms of the rows above it in this list,
 #: never of its own row; the modules of the first row may import each other.
 LAYERS: list[tuple[str, set[str]]] = [
-    ("types and mathematics", {"_lazy", "_version", "errors", "geometry", "input_file", "measurements"}),
+    ("types and mathematics", {"_lazy", "_version", "errors", "geometry", "input_file", "machine", "measurements"}),
     ("robots", {"team"}),
     ("recorded data", {"run"}),
     ("image files", {"image_file"}),

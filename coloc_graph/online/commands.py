@@ -1,11 +1,10 @@
 """Commands to the robots, and their permission to move; `Commander`."""
 
 import contextlib
-import threading
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from coloc_graph.errors import ColocError, RobotError
+from coloc_graph.machine import machine
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.robot_io.deadlines import PERMISSION_PERIOD
 from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
@@ -39,13 +38,13 @@ class Commander:
         self, link: CoordinatorLink, registry: RobotRegistry, speed: float, on_drive_resumed: Callable[[str], None]
     ) -> None:
         self._link, self._registry, self._speed, self._on_drive_resumed = link, registry, speed, on_drive_resumed
-        self._drives = time.time_ns() // 1_000_000  # drive numbers are unique across coordinators
+        self._drives = machine.time_ns() // 1_000_000  # drive numbers are unique across coordinators
         self._renewed = -PERMISSION_PERIOD
-        self.stop = threading.Event()
+        self.stop = machine.new_event()
 
     def renew(self) -> None:
         """Renew the robots' permission to move, unless that was done within `PERMISSION_PERIOD`."""
-        now = time.monotonic()
+        now = machine.monotonic()
         if now - self._renewed >= PERMISSION_PERIOD:
             self._renewed = now
             self._link.hold()

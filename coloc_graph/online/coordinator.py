@@ -2,13 +2,13 @@
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.machine import machine
 from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.decision_worker import DecisionWorker
 from coloc_graph.online.estimation_worker import EstimationWorker
@@ -27,6 +27,7 @@ from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import read_floor_map
 from coloc_graph.robot_io.link.messages import Event, Sample, Status, Wheels
+from coloc_graph.robot_io.link.session import LinkSession, OpenSession
 from coloc_graph.robot_io.link.zenoh_config import Tls
 from coloc_graph.run.schemas import to_ns
 from coloc_graph.team import Team
@@ -51,6 +52,8 @@ class Coordinator:
         Address for the robots, and who may connect; see `CoordinatorLink`.
     resume
         Continue the mission whose record is in the folder.
+    open_session
+        Opens the link's session; another than zenoh's in a simulation.
     on_stance
         Called with each stance that has entered the estimate.
     on_status
@@ -74,6 +77,7 @@ class Coordinator:
         tls: Tls | None = None,
         exposed: bool = False,
         resume: bool = False,
+        open_session: OpenSession = LinkSession,
         on_stance: Callable[[EnteredStance], None] | None = None,
         on_status: Callable[[MissionStatus], None] | None = None,
     ) -> None:
@@ -88,11 +92,13 @@ class Coordinator:
         with contextlib.ExitStack() as undo:
             # the folder and the port are taken before anything of an earlier mission is touched
             held = undo.enter_context(MissionFolder(folder, resume=resume))
-            link = undo.enter_context(linked(self._inbox, team, listen=listen, tls=tls, exposed=exposed))
+            link = undo.enter_context(
+                linked(self._inbox, team, listen=listen, tls=tls, exposed=exposed, open_session=open_session)
+            )
             record, self._before = held.open_record(team)
             undo.enter_context(record)
             # UTC when a mission begins; the record's time does not run backwards where the system's clock was set back
-            epoch = max(time.time_ns(), to_ns(record.newest())) - time.monotonic_ns()
+            epoch = max(machine.time_ns(), to_ns(record.newest())) - machine.monotonic_ns()
             self._registry = RobotRegistry(
                 record, starts, lambda name: link.clocks[name].to_coordinator, epoch, self._inbox.status_times
             )
@@ -188,7 +194,7 @@ class Coordinator:
 
     def _tell(self) -> None:
         """Tell the listener the mission's status, now and then."""
-        now = time.monotonic()
+        now = machine.monotonic()
         if self._on_status is None or now - self._status_time < STATUS_PERIOD:
             return
         self._status_time = now

@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 
 from coloc_graph.geometry.se2 import Planar
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.create.odometry import WHEELS, arc, ticks_between
 from coloc_graph.run.atomic_file import write_atomically
 
@@ -44,6 +45,7 @@ class EncoderLog:
     def write(self, counted: Counted) -> None:
         """Write counts atomically; a disk that refuses does not stop a robot."""
         with contextlib.suppress(OSError):
+            machine.use_disk()
             write_atomically(self._path, msgspec.json.encode(counted))
 
 

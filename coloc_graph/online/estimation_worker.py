@@ -2,12 +2,13 @@
 
 import gc
 import logging
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import TypeVar
 
 from coloc_graph.backend import Bump
 from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.frontend import FrontendOptions, StanceTracks
+from coloc_graph.machine import machine
 from coloc_graph.online.visibility import Precision, precision
 from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver, measure_stance
 from coloc_graph.run import Recorded, Stance
@@ -28,7 +29,7 @@ class EstimationWorker:
 
     def __init__(self, record: Recorded, solver: StanceSolver) -> None:
         self._record, self._solver = record, solver
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="measuring")
+        self._worker = machine.new_worker("measuring")
         self._judging: Future[Precision] | None = None
         self._tracks: tuple[float, StanceTracks] | None = None
         self._entering: Future[EnteredStance | list[Bump]] | None = None

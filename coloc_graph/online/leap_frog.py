@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.geometry.se2 import Planar
+from coloc_graph.machine import machine
 from coloc_graph.online.bumps import displaced, pushed
 from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.decision_worker import DecisionWorker
@@ -89,7 +89,7 @@ class LeapFrog:
         self._plan: StancePlan | None = None
         self._leap: tuple[str, Planar] | None = None  # a leap that is still to be commanded
         self._failures = 0  # attempts at the present stance that failed
-        self._captures = time.time_ns() // 1_000_000  # capture numbers are unique across coordinators
+        self._captures = machine.time_ns() // 1_000_000  # capture numbers are unique across coordinators
         self._recovered = -math.inf
         self._steps = {
             MissionState.GATHERING: self._gather,
@@ -371,8 +371,8 @@ class LeapFrog:
             why = robot.trouble(drives=True)
             if why is not None:
                 fault = robot.present and robot.status is not None and robot.status.fault
-                if fault and time.monotonic() - self._recovered > RECOVER_PERIOD:
-                    self._recovered = time.monotonic()
+                if fault and machine.monotonic() - self._recovered > RECOVER_PERIOD:
+                    self._recovered = machine.monotonic()
                     with contextlib.suppress(RobotError):
                         self._commander.ask(name, Recover())
                 return why

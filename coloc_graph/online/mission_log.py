@@ -6,6 +6,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from coloc_graph.machine import machine
+
 
 class MissionLog:
     """Appends to `path`; a context manager.
@@ -23,6 +25,7 @@ class MissionLog:
 
     def note(self, what: str, **more: object) -> None:
         """Add a line, which a killed coordinator leaves behind complete."""
+        machine.use_disk()
         self._file.write(json.dumps({"time": self._now(), "what": what, **more}) + "\n")
         self._file.flush()
 

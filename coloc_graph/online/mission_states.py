@@ -1,10 +1,11 @@
 """States of a mission, and which may follow which."""
 
 import logging
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+
+from coloc_graph.machine import machine
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +59,7 @@ class StateMachine:
     def __init__(self, on_change: Callable[[StateChange], None]) -> None:
         self._on_change = on_change
         self.now = MissionState.GATHERING
-        self.since = time.monotonic()
+        self.since = machine.monotonic()
 
     def enter(self, state: MissionState, stance: int, reason: str = "") -> None:
         """Begin a state.
@@ -70,7 +71,7 @@ class StateMachine:
         """
         if state not in NEXT_STATES[self.now] and (state != MissionState.FAILED or not NEXT_STATES[self.now]):
             raise ValueError(f"{state} cannot follow {self.now}")
-        self.now, self.since = state, time.monotonic()
+        self.now, self.since = state, machine.monotonic()
         log.log(
             logging.WARNING if state in (MissionState.HOLDING, MissionState.FAILED) else logging.INFO,
             "stance %d: %s%s", stance, state, f": {reason}" if reason else "",
@@ -79,7 +80,7 @@ class StateMachine:
 
     def lasted(self, seconds: float) -> bool:
         """Return whether the present state has lasted for longer than `seconds` [s]."""
-        return time.monotonic() - self.since > seconds
+        return machine.monotonic() - self.since > seconds
 
 
 def as_dot() -> str:

@@ -1,6 +1,5 @@
 """Record of a mission: the newest minutes in memory, everything in a run on disk; `Record`."""
 
-import threading
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -10,6 +9,7 @@ from types import TracebackType
 from typing import Self, TypeVar
 
 from coloc_graph.errors import RunError
+from coloc_graph.machine import machine
 from coloc_graph.run import Detections, Image, Motion, OdometrySample, Planes, Run, RunWriter, Stance, open_run
 from coloc_graph.run.schemas import to_ns, to_seconds
 from coloc_graph.team import Team
@@ -32,7 +32,7 @@ class Record:
         self._detections: dict[str, list[Detections]] = defaultdict(list)
         self._odometry: dict[str, list[OdometrySample]] = defaultdict(list)
         self._moving: dict[str, tuple[bool, float]] = {}
-        self._lock = threading.Lock()
+        self._lock = machine.new_lock()
 
     def __enter__(self) -> Self:
         return self

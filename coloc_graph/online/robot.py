@@ -3,8 +3,6 @@
 import contextlib
 import logging
 import threading
-import time
-import uuid
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,13 +10,13 @@ from types import TracebackType
 from typing import Self
 
 from coloc_graph.errors import CameraError, ColocError, InputError, RobotError
-from coloc_graph.frontend import detector_for
 from coloc_graph.geometry.se2 import compose
+from coloc_graph.machine import machine
+from coloc_graph.online.devices import Devices
 from coloc_graph.online.encoder_log import Counted, EncoderLog, way_since
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_restart import JoinedOdometry
 from coloc_graph.online.record import Record
-from coloc_graph.robot_io.camera.open import open_camera
 from coloc_graph.robot_io.camera.source import CameraSource, Frame, clock_ahead
 from coloc_graph.robot_io.create.driver import Create
 from coloc_graph.robot_io.deadlines import PERMISSION_LEASE
@@ -68,6 +66,8 @@ class RobotProgram:
         Its certificate.
     clock
         Its monotonic clock [ns].
+    devices
+        Its devices; others than the real ones in a simulation.
 
     Raises
     ------
@@ -86,20 +86,21 @@ class RobotProgram:
         wheels: str | None = None,
         model: int | None = None,
         tls: Tls | None = None,
-        clock: Callable[[], int] = time.monotonic_ns,
+        clock: Callable[[], int] = machine.monotonic_ns,
+        devices: Devices | None = None,
     ) -> None:
         self.robot, self.team, self._clock = team[name], team, clock
         self.name = name
-        devices = self.robot.devices
-        spec = camera or (devices.camera if devices else None)
+        opened, described = devices or Devices(), self.robot.devices
+        spec = camera or (described.camera if described else None)
         if spec is None:
             raise InputError(f"robot {name} has no camera: give one with --camera, or in team.toml under devices")
-        port = wheels or (devices.wheels if devices else None)
-        model = model or (devices.model if devices else None)
-        self.session = uuid.uuid4().hex
-        self._epoch = time.time_ns() - clock()  # fixed: steps of the system's clock are not ours
-        self._lock = threading.RLock()
-        self._ended = threading.Event()
+        port = wheels or (described.wheels if described else None)
+        model = model or (described.model if described else None)
+        self.session = machine.unique()
+        self._epoch = machine.time_ns() - clock()  # fixed: steps of the system's clock are not ours
+        self._lock = machine.new_lock()
+        self._ended = machine.new_event()
         self._capture: int | None = None
         self._seen = self._samples = self._rolled = self._events = self._drive = 0
         self._follower: Follower | None = None
@@ -116,19 +117,27 @@ class RobotProgram:
             raise InputError(
                 "the robots' markers have several colours, but a robot's program detects one: give all the same hue"
             )
-        self._detect = detector_for(watched, self.robot.camera)
+        self._detect = opened.detector(watched, self.robot.camera)
         with contextlib.ExitStack() as undo:
-            self._camera: CameraSource = undo.enter_context(open_camera(spec, self.robot.camera, name, clock))
+            self._camera: CameraSource = undo.enter_context(opened.camera(spec, self.robot.camera, name, clock))
             self._wheels: Create | None = None
             if port is not None:
-                self._wheels = undo.enter_context(Create(port, model, robot=name, epoch=0.0))
+                self._wheels = undo.enter_context(opened.wheels(port, model, robot=name, epoch=0.0))
                 self._wheels_fault = self._wheels.fault
                 self._go_on_counting()
             self._record = undo.enter_context(Record(_new_file(Path(folder), name), team))
             self._link = undo.enter_context(
-                RobotLink(name, connect=connect, handler=self._obey, session=self.session, tls=tls, clock=clock)
+                RobotLink(
+                    name,
+                    connect=connect,
+                    handler=self._obey,
+                    session=self.session,
+                    tls=tls,
+                    clock=clock,
+                    open_session=opened.session,
+                )
             )
-            self._watcher = threading.Thread(target=self._watch, name=f"camera of {name}", daemon=True)
+            self._watcher = machine.new_thread(target=self._watch, name=f"camera of {name}")
             self._watcher.start()
             undo.callback(self._end)
             self._close = undo.pop_all()
@@ -153,10 +162,10 @@ class RobotProgram:
             if self._link.refused is not None:
                 raise RobotError(self._link.refused)
             self._roll()
-            now = time.monotonic()
+            now = machine.monotonic()
             if self._wheels is not None and self._wheels_lost and now - reopened > REOPEN_PERIOD:
                 reopened = now
-                threading.Thread(target=self._reopen_wheels, name=f"wheels of {self.name}", daemon=True).start()
+                machine.new_thread(target=self._reopen_wheels, name=f"wheels of {self.name}").start()
             if now - report >= REPORT_PERIOD:
                 report = now
                 self._link.put(self._status())
@@ -225,7 +234,7 @@ class RobotProgram:
         before, ticks = self._encoder_log.read(), self._wheels.state.ticks
         since = way_since(before, ticks) if before is not None and ticks is not None else None
         if before is None or since is None:
-            self._odometry, self._frame = JoinedOdometry(), uuid.uuid4().hex
+            self._odometry, self._frame = JoinedOdometry(), machine.unique()
             return
         self._frame = before.frame
         self._odometry.go_on(compose(before.pose, since[0]), since[1])
@@ -250,7 +259,7 @@ class RobotProgram:
                 self._still_since = self._clock()
             if self._follower is None:
                 return
-            if time.monotonic_ns() - self._link.last_heard > PERMISSION_LEASE * 1e9:
+            if machine.monotonic_ns() - self._link.last_heard > PERMISSION_LEASE * 1e9:
                 self._halt()
                 self._tell("stopped", f"no permission from the coordinator for {PERMISSION_LEASE} s")
                 return
@@ -284,8 +293,8 @@ class RobotProgram:
                 self._camera_fault = None
             except CameraError as error:
                 self._camera_fault = str(error)
-                if self._camera.fault is not None and time.monotonic() - reopened > REOPEN_PERIOD:
-                    reopened = time.monotonic()
+                if self._camera.fault is not None and machine.monotonic() - reopened > REOPEN_PERIOD:
+                    reopened = machine.monotonic()
                     with contextlib.suppress(CameraError):
                         self._camera.reopen()
                 self._ended.wait(0.05)

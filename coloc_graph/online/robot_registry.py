@@ -1,11 +1,11 @@
 """State of each robot as the coordinator knows it: presence, status, pose, clock; `RobotRegistry`."""
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from coloc_graph.geometry.se2 import Planar
+from coloc_graph.machine import machine
 from coloc_graph.measurements import Sighting
 from coloc_graph.online.odometry_restart import DROVE, JoinedOdometry
 from coloc_graph.online.pose_tracker import PoseTracker
@@ -66,7 +66,7 @@ class RobotState:
         """Describe what keeps the robot from taking part; None if nothing does. Hazards do not stop one that drives."""
         if not self.present or self.status is None:
             return f"{self.name} is not there: start its program, or check the network"
-        silent = time.monotonic() - self.status_times.get(self.name, -math.inf)
+        silent = machine.monotonic() - self.status_times.get(self.name, -math.inf)
         if silent > SILENT:
             return f"{self.name} has sent nothing for {silent:.1f} s: check the network"
         if self.status.camera_fault:
@@ -131,7 +131,7 @@ class RobotRegistry:
 
     def utc(self, stamp: int | None = None) -> float:
         """Convert an instant of the coordinator's clock [ns], by default now, to the record's time [UTC s]."""
-        return to_seconds((time.monotonic_ns() if stamp is None else stamp) + self.epoch)
+        return to_seconds((machine.monotonic_ns() if stamp is None else stamp) + self.epoch)
 
     def take_wheels(self, name: str, wheels: Wheels) -> None:
         """Take in a sample of odometry, unless it is recorded already."""
@@ -192,5 +192,5 @@ class RobotRegistry:
     def stood(self, seconds: float) -> bool:
         """Return whether all robots have stood for `seconds` [s]."""
         since = [robot.stands_since() for robot in self.robots.values()]
-        now = time.monotonic_ns()
+        now = machine.monotonic_ns()
         return all(one is not None and now - one >= seconds * 1e9 for one in since)

@@ -1,13 +1,13 @@
 """One attempt to measure a stance: images of it, their precision, and the mover in view; `StanceAttempt`."""
 
 import math
-import time
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.geometry.se2 import Planar
+from coloc_graph.machine import machine
 from coloc_graph.online.pose_tracker import PoseTracker
 from coloc_graph.online.visibility import InView, Precision
 from coloc_graph.run import Detections, Stance
@@ -45,7 +45,7 @@ class StanceAttempt:
         self._expected: dict[str, int] = {}
         self._newest = -math.inf
         self._out_since: float | None = None
-        self._judged = time.monotonic()
+        self._judged = machine.monotonic()
 
     def take(self, capture: int, seen: Detections, tracker: PoseTracker) -> None:
         """Take in an image of an observer; the mover's tracked pose follows it: its wheels drift within a minute."""
@@ -75,13 +75,13 @@ class StanceAttempt:
         if not missing:
             self._out_since = None
             return 0.0
-        now = time.monotonic()
+        now = machine.monotonic()
         self._out_since = now if self._out_since is None else self._out_since
         return now - self._out_since
 
     def to_judge(self, left: float) -> Stance | None:
         """Return the stance so far if its precision is to be judged now; `left` [s] of its time are left."""
-        now = time.monotonic()
+        now = machine.monotonic()
         if not now - self._judged > JUDGED < left:  # shortly before its end it would hold up the estimate
             return None
         self._judged = now

@@ -9,6 +9,7 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from coloc_graph.errors import InputError
+from coloc_graph.machine import machine
 
 #: Errors by file systems without locks.
 _WITHOUT_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS}
@@ -35,7 +36,8 @@ class OutputLock:
         self._path = output.with_name(f".{output.name}.lock")
         self._file: int | None = None
         while self._file is None:
-            file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK, 0o600)
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK
+            file = machine.opened(os.open(self._path, flags, 0o600))
             try:
                 _lock(file, path)
                 # its last holder may have removed it between the two steps

@@ -14,6 +14,7 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import ArrayLike
 
 from coloc_graph.errors import RunError
+from coloc_graph.machine import machine
 from coloc_graph.run import schemas
 from coloc_graph.run.atomic_file import open_part
 from coloc_graph.run.encode import (
@@ -81,8 +82,8 @@ class RunWriter:
         self._started = False
         self._closed = False
         self._failure: OSError | None = None
-        self._lock = threading.Lock()
-        self._stop = threading.Event()
+        self._lock = machine.new_lock()
+        self._stop = machine.new_event()
         self._output: OutputLock | None = None
         try:
             self._file = self._open()
@@ -101,9 +102,7 @@ class RunWriter:
         self._flusher: threading.Thread | None = None
         if flush_every is not None:
             # at twice the rate, so that a flush that comes late is still in time
-            self._flusher = threading.Thread(
-                target=self._flush_regularly, args=(flush_every / 2,), name="run-flush", daemon=True
-            )
+            self._flusher = machine.new_thread(target=self._flush_regularly, args=(flush_every / 2,), name="run-flush")
             self._flusher.start()
 
     def __enter__(self) -> Self:
@@ -173,7 +172,7 @@ class RunWriter:
             self._output = OutputLock(self.path)
         if self.path.is_symlink():
             raise RunError(f"{self.path}: is a link; give the path of the file itself")
-        file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        file = machine.opened(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666))
         if stat.S_ISREG(os.fstat(file).st_mode):
             os.ftruncate(file, 0)
         return os.fdopen(file, "wb")
@@ -255,6 +254,7 @@ class RunWriter:
 
     def _on_disk(self, action: Callable[[], None]) -> None:
         try:
+            machine.use_disk()
             action()
         except OSError as error:
             self._failure = error

@@ -1,8 +1,7 @@
 """Opening of cameras: a device, a video, or the camera of a simulated robot; `open_camera`, docs/cameras.md."""
 
-import time
-
 from coloc_graph.errors import InputError
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.camera.source import CameraSource, Clock, Device
 from coloc_graph.team import Camera
 
@@ -14,7 +13,7 @@ KINDS = {
 }
 
 
-def open_camera(spec: str, camera: Camera, robot: str, clock: Clock = time.monotonic_ns) -> CameraSource:
+def open_camera(spec: str, camera: Camera, robot: str, clock: Clock = machine.monotonic_ns) -> CameraSource:
     """Open a robot's camera.
 
     Parameters

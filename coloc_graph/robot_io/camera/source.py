@@ -1,7 +1,5 @@
 """An open camera that returns its newest frame within a timeout; `CameraSource`."""
 
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, Self
@@ -10,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import CameraError, ColocError
+from coloc_graph.machine import machine
 from coloc_graph.team import Camera
 
 #: A clock [ns].
@@ -120,9 +119,9 @@ class _Feed:
         self._frame: Frame | None = None
         self._came = 0.0
         self._opened = False
-        self._ended = threading.Event()
-        self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._ended = machine.new_event()
+        self._changed = machine.new_condition()
+        self._thread = machine.new_thread(target=self._run, name=name)
 
     def open(self, timeout: float) -> None:
         self._thread.start()
@@ -150,7 +149,7 @@ class _Feed:
         )
 
     def _fresh(self) -> Frame | None:
-        if self._frame is not None and time.monotonic() - self._came > STALE:
+        if self._frame is not None and machine.monotonic() - self._came > STALE:
             self._frame = None
             self.dropped += 1
         return self._frame
@@ -158,7 +157,7 @@ class _Feed:
     def close(self) -> None:
         self._ended.set()
         self._end(f"{self.name} is closed: open it again")
-        if self._thread is not threading.current_thread():
+        if self._thread is not machine.current_thread():
             self._thread.join(ENDING)
 
     def _run(self) -> None:
@@ -189,7 +188,7 @@ class _Feed:
             )
         with self._changed:
             self.dropped += self._frame is not None
-            self._frame, self._came = frame, time.monotonic()
+            self._frame, self._came = frame, machine.monotonic()
             self._changed.notify_all()
 
     def _end(self, why: str) -> None:
@@ -200,11 +199,11 @@ class _Feed:
 
 def clock_ahead(clock: Clock) -> int:
     """Offset of a clock from CLOCK_MONOTONIC now [ns]."""
-    if clock is time.monotonic_ns:
+    if clock == machine.monotonic_ns:
         return 0
     best = None
     for _ in range(5):  # an interruption between the readings would show as an offset
-        before, there, after = time.monotonic_ns(), clock(), time.monotonic_ns()
+        before, there, after = machine.monotonic_ns(), clock(), machine.monotonic_ns()
         if best is None or after - before < best[0]:
             best = after - before, there - (before + after) // 2
         if best[0] < 20_000:

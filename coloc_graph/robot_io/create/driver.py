@@ -7,16 +7,15 @@ the wheels instead (docs/wheels.md).
 import contextlib
 import logging
 import math
-import threading
-import time
 from collections.abc import Callable, Collection
 from typing import Self
 
 from coloc_graph.errors import InputError, RobotError
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.create import protocol as oi
 from coloc_graph.robot_io.create.exit_hooks import guard, release
 from coloc_graph.robot_io.create.feed import SensorFeed
-from coloc_graph.robot_io.create.line import LEAVE, CreateLine
+from coloc_graph.robot_io.create.line import LEAVE, CreateLine, Line
 from coloc_graph.robot_io.create.odometry import WHEELS
 from coloc_graph.robot_io.create.protocol import Mode, Packet
 from coloc_graph.robot_io.create.state import HAZARDS, CreateState
@@ -58,6 +57,10 @@ class Create:
         Time between two odometry samples while the robot moves [s].
     epoch
         Offset of the samples' times from the monotonic clock [s]; None for UTC when the line is opened.
+    open_line
+        Opens the line on a port; another than a serial one in a simulation.
+    exit_hooks
+        Stop the wheels when the process is told to end.
 
     Raises
     ------
@@ -81,6 +84,8 @@ class Create:
         full: bool = False,
         odometry_period: float = 0.05,
         epoch: float | None = None,
+        open_line: Callable[[str, int | None], Line] = CreateLine,
+        exit_hooks: bool = True,
     ) -> None:
         if model not in (None, *WHEELS):
             raise InputError(f"there is no Create {model}: the model is 1, 2, or None to detect it")
@@ -91,7 +96,8 @@ class Create:
         self.port, self.max_speed, self.max_turn, self._epoch = port, max_speed, max_turn, epoch
         self._asked_model, self._stop_on = model, frozenset(stop_on)
         self._mode, self._robot, self._period = Mode.FULL if full else Mode.SAFE, robot, odometry_period
-        self._line: CreateLine | None = None
+        self._open_line, self._exit_hooks = open_line, exit_hooks
+        self._line: Line | None = None
         self._feed = SensorFeed(2, robot, odometry_period, epoch)
 
     def open(self) -> Self:
@@ -106,23 +112,24 @@ class Create:
         """
         if self._line is not None:
             raise RobotError(f"the Create on {self.port} is open already: close it first")
-        line = CreateLine(self.port, self._asked_model)
+        line = self._open_line(self.port, self._asked_model)
         self.model = line.model
-        self._ended = threading.Event()
+        self._ended = machine.new_event()
         self._fault: str | None = None
         self._armed = self._ask = False
         self._halted_at, self._halts, self._blames = 0.0, object(), object()  # new ones with each stop, each fault
         self._deadline: float | None = None
         self._commanded, self._hazards = (0, 0), set[str]()
         self._feed = SensorFeed(line.model, self._robot, self._period, self._epoch)
-        self._last_ask = time.monotonic()
+        self._last_ask = machine.monotonic()
         self._threads = [
-            threading.Thread(target=self._alive, args=(work, line), name=f"{name} of {self.port}", daemon=True)
+            machine.new_thread(target=self._alive, args=(work, line), name=f"{name} of {self.port}")
             for name, work in (("reader", self._read), ("deadlines", self._watch))
         ]
         self._line = line
         try:
-            guard(self)
+            if self._exit_hooks:
+                guard(self)
             for thread in self._threads:
                 thread.start()
             line.send(self._enter_mode + oi.HALT)
@@ -150,7 +157,7 @@ class Create:
         with contextlib.suppress(RobotError):
             line.send(LEAVE)
         for thread in self._threads:
-            if thread.is_alive() and thread is not threading.current_thread():
+            if thread.is_alive() and thread is not machine.current_thread():
                 thread.join(timeout=1.0)
         line.close()
         self._line = None
@@ -193,7 +200,7 @@ class Create:
         wheel = (abs(v) + abs(w) * half) * 1e3 / oi.MAX_WHEEL_SPEED
         slower = max(1.0, abs(v) / self.max_speed, abs(w) / self.max_turn, wheel)
         left, right = (round((v + side * w * half) / slower * 1e3) for side in (-1, 1))
-        now = time.monotonic()
+        now = machine.monotonic()
         seen = min(self._feed.last, now - line.watchdog_silence, now if granted is None else granted)
         deadline = min(now + lease, seen + reaction_time(max(abs(left), abs(right)) * 1e-3))
         if deadline <= now:
@@ -246,7 +253,7 @@ class Create:
         asleep = self._feed.age > STALE or state is None or state.mode == Mode.OFF
         self._armed = False
         line.send((bytes([oi.START]) if asleep else b"") + self._enter_mode + oi.HALT + oi.stream(line.layouts[0]))
-        since = time.monotonic() + 2 * oi.STREAM_PERIOD
+        since = machine.monotonic() + 2 * oi.STREAM_PERIOD
         if not self._wait(lambda: self._armed and self._feed.last > since, timeout):
             why = f"it did not go back to {self._mode.name.lower()} mode{self._feed.because}"
             self._halt(why)
@@ -292,13 +299,13 @@ class Create:
     @property
     def frames(self) -> tuple[int, int]:
         """Counts of valid and of damaged frames since the line was opened."""
-        return (self._line.decoder.good, self._line.decoder.bad) if self._line else (0, 0)
+        return self._line.frames if self._line else (0, 0)
 
     @property
     def _enter_mode(self) -> bytes:
         return bytes([oi.FULL if self._mode == Mode.FULL else oi.SAFE])
 
-    def _may_drive(self) -> CreateLine:
+    def _may_drive(self) -> Line:
         """Return the line. Raises `RobotError` if the robot must not drive."""
         if self._line is None:
             raise RobotError(f"the Create on {self.port} is not open: open it, best as a context manager")
@@ -316,7 +323,7 @@ class Create:
         """Stop the wheels and keep the reason; never raises."""
         self._halts, self._blames = object(), object() if fault else self._blames
         new, self._fault = bool(fault and not self._fault), self._fault or fault
-        self._deadline, self._commanded, self._halted_at = None, (0, 0), time.monotonic()
+        self._deadline, self._commanded, self._halted_at = None, (0, 0), machine.monotonic()
         if self._line is not None:
             with contextlib.suppress(RobotError):
                 self._line.send(oi.HALT)
@@ -328,7 +335,7 @@ class Create:
     def _wait(self, met: Callable[[], bool], timeout: float) -> bool:
         return self._feed.wait(met, lambda: self._line is None or self._line.lost is not None, timeout)
 
-    def _alive(self, work: Callable[[CreateLine], None], line: CreateLine) -> None:
+    def _alive(self, work: Callable[[Line], None], line: Line) -> None:
         """Run a thread's work; when it fails, stop the wheels and report it."""
         try:
             work(line)
@@ -338,7 +345,7 @@ class Create:
                 if line.lost and work == self._read:
                     line.stop_when_back(self._ended)
 
-    def _read(self, line: CreateLine) -> None:
+    def _read(self, line: Line) -> None:
         """Reader thread: take in frames, and stop for what they report."""
         while not self._ended.is_set():
             for values in line.read():
@@ -348,8 +355,8 @@ class Create:
                 if state is not None:
                     self._judge(state)
                 self._feed.notify()
-            if line.model == 1 and (self._ask or time.monotonic() - self._last_ask > DELTA_PERIOD):
-                self._ask, self._last_ask = False, time.monotonic()
+            if line.model == 1 and (self._ask or machine.monotonic() - self._last_ask > DELTA_PERIOD):
+                self._ask, self._last_ask = False, machine.monotonic()
                 line.send(oi.stream(line.layouts[1]))
 
     def _judge(self, state: CreateState) -> None:
@@ -363,11 +370,11 @@ class Create:
         elif new:
             self._halt(f"it met {' and '.join(new)}")
 
-    def _watch(self, line: CreateLine) -> None:
+    def _watch(self, line: Line) -> None:
         """Deadline thread: end each motion in time, and repeat a stop that the robot has not taken."""
         while not self._ended.wait(WATCH_PERIOD):
             line.beat()
-            now, deadline = time.monotonic(), self._deadline
+            now, deadline = machine.monotonic(), self._deadline
             if deadline is not None and now >= deadline:
                 self._halt(None)
             elif deadline is not None and self._feed.age > STALE:

@@ -9,21 +9,21 @@ import argparse
 import contextlib
 import os
 import select
-import struct
 import termios
 import threading
 import time
 import tty
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.robot_io.create import protocol as oi
+from coloc_graph.robot_io.create.firmware import Firmware, mark
 from coloc_graph.robot_io.create.odometry import WHEELS
-from coloc_graph.robot_io.create.physics import Body, Physics
-from coloc_graph.robot_io.create.protocol import Mode, Packet
+from coloc_graph.robot_io.create.physics import Physics
+from coloc_graph.robot_io.create.protocol import Mode
 from coloc_graph.robot_io.create.state import CLIFFS, DROPS
 
 _BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
@@ -63,16 +63,12 @@ class CreateEmulator:
         encoders: tuple[int, int] = (0, 0),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.model, self._clock, self._encoders = model, clock, encoders
-        self._body = Body(model, physics or Physics(), clock())
-        self.mode = Mode.OFF
+        self.model, self._clock = model, clock
+        self._firmware = Firmware(model, physics or Physics(), encoders, clock())
+        self._body = self._firmware.body
         self.mute = False
         self.corruption = 0.0
         self.received = bytearray()
-        self._cliffs, self._drops, self._docked = set[str](), set[str](), False
-        self._asked_at = [0.0, 0.0]
-        self._listed: tuple[int, ...] = ()
-        self._streaming, self._next_frame, self._pending = False, 0.0, b""
         self._rng = np.random.default_rng(self._body.physics.seed + 1)
         self._lock = threading.RLock()
         self._wired = self._ended = False
@@ -108,6 +104,11 @@ class CreateEmulator:
             tty.setraw(self._slave)
             os.set_blocking(self._master, False)
             self.port, self._wired = os.ttyname(self._slave), True
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of the Open Interface."""
+        return self._firmware.mode
 
     @property
     def wired(self) -> bool:
@@ -155,22 +156,22 @@ class CreateEmulator:
     def cliff(self, where: str, there: bool = True) -> None:
         """Put a cliff under the sensor "left", "front left", "front right" or "right", or take it away."""
         with self._lock:
-            _mark(self._cliffs, CLIFFS.values(), where, there)
+            mark(self._firmware.cliffs, CLIFFS.values(), where, there)
 
     def wheel_drop(self, where: str, there: bool = True) -> None:
         """Drop the "left" or "right" wheel or the "caster" (Create 1), or raise it."""
         with self._lock:
-            _mark(self._drops, DROPS.values(), where, there)
+            mark(self._firmware.drops, DROPS.values(), where, there)
 
     def dock(self, there: bool = True) -> None:
         """Put the robot on the charger, or take it off."""
         with self._lock:
-            self._docked = there
+            self._firmware.docked = there
 
     def restart(self) -> None:
         """Restart the robot as after a flat battery: mode, stream and speed are lost."""
         with self._lock:
-            self.mode, self._streaming, self._body.wanted = Mode.OFF, False, (0.0, 0.0)
+            self._firmware.restart()
 
     def _run(self) -> None:
         while not self._ended:
@@ -187,16 +188,11 @@ class CreateEmulator:
                 self._tick()
 
     def _tick(self) -> None:
-        """Advance the physics, react as the robot does by itself, and send a frame if one is due."""
+        """Advance the robot, and send a frame if one is due."""
         now = self._clock()
-        self._body.advance(now)
-        forward = max(self._body.wanted) > 0
-        if self.mode == Mode.SAFE and (self._drops or self._docked or (self._cliffs and forward)):
-            self.mode, self._body.wanted = Mode.PASSIVE, (0.0, 0.0)
-        if self._streaming and now >= self._next_frame:
-            late = now - self._next_frame
-            self._next_frame += oi.STREAM_PERIOD * (1 + late // oi.STREAM_PERIOD)
-            values = {i: self._value(i) for i in self._listed}
+        self._firmware.advance(now)
+        values = self._firmware.frame(now)
+        if values is not None:
             self._send(oi.encode_frame(values, header_counts=self.model == 2))
 
     def _receive(self) -> None:
@@ -207,86 +203,12 @@ class CreateEmulator:
             if not self._same_baud():
                 return  # noise to its ears
             self.received += data
-            self._body.advance(self._clock())
-            self._pending += data
-            while True:
-                command, self._pending = oi.split_command(self._pending)
-                if command is None:
-                    break
-                self._obey(command)
+            answer = self._firmware.take(data, self._clock())
+            if answer:
+                self._send(answer)
 
     def _same_baud(self) -> bool:
         return _BAUDS.get(termios.tcgetattr(self._slave)[4]) == WHEELS[self.model].baud
-
-    def _obey(self, command: bytes) -> None:
-        op = command[0]
-        if op == oi.START:
-            self._enter(Mode.PASSIVE)
-        elif op in (oi.RESET, oi.STOP_INTERFACE) and self.model == 2:
-            self._enter(Mode.OFF)
-            self._streaming = False
-        elif self.mode == Mode.OFF:
-            return
-        elif op == oi.POWER and self.model == 2:
-            self._enter(Mode.PASSIVE)
-        elif op in (oi.SAFE, oi.FULL):
-            self.mode = Mode.SAFE if op == oi.SAFE else Mode.FULL
-        elif op == oi.DRIVE_DIRECT and self.mode >= Mode.SAFE:
-            right, left = struct.unpack(">hh", command[1:])
-            self._drive(left, right)
-        elif op == oi.DRIVE and self.mode >= Mode.SAFE:
-            speed, radius = struct.unpack(">hh", command[1:])
-            self._drive(*_of_radius(speed, radius, WHEELS[self.model].base * 1e3))
-        elif op in (oi.SENSORS, oi.QUERY_LIST):
-            asked = self._known(command[1:] if op == oi.SENSORS else command[2:])
-            self._send(b"".join(oi.encode_value(i, self._value(i)) for i in asked))
-        elif op == oi.STREAM:
-            self._listed = self._known(command[2:])
-            self._streaming, self._next_frame = bool(self._listed), self._clock()
-        elif op == oi.PAUSE_RESUME:
-            self._streaming = bool(command[1]) and bool(self._listed)
-
-    def _enter(self, mode: Mode) -> None:
-        self.mode, self._body.wanted = mode, (0.0, 0.0)
-
-    def _known(self, packets: bytes) -> tuple[int, ...]:
-        known = [i for i in packets if i in oi.PACKETS or i in oi.GROUPS]
-        return tuple(i for i in oi.expand(known) if i <= oi.LAST_PACKET[self.model])
-
-    def _drive(self, left: int, right: int) -> None:
-        top = oi.MAX_WHEEL_SPEED
-        self._body.wanted = (max(-top, min(top, left)) / 1e3, max(-top, min(top, right)) / 1e3)
-
-    def _value(self, packet: int) -> int:
-        body = self._body
-        if packet == Packet.BUMPS_DROPS:
-            bumps = body.bump_left * oi.BumpDrop.BUMP_LEFT | body.bump_right * oi.BumpDrop.BUMP_RIGHT
-            return int(bumps | sum(bit for bit, where in DROPS.items() if where in self._drops))
-        if packet in CLIFFS:
-            return int(CLIFFS[Packet(packet)] in self._cliffs)
-        if packet in (Packet.LEFT_TICKS, Packet.RIGHT_TICKS):
-            i = packet - Packet.LEFT_TICKS
-            return self._encoders[i] + int(body.counted[i] // WHEELS[2].metres)
-        if packet in (Packet.DISTANCE, Packet.ANGLE):
-            # whole units since it was last asked; the remainder is lost, as on the real one
-            left, right = body.counted
-            i = packet - Packet.DISTANCE
-            counted = ((left + right) / 2 * 1e3, np.degrees((right - left) / body.base))[i]
-            whole = int(counted - self._asked_at[i])
-            self._asked_at[i] = counted
-            return whole
-        rest: dict[int, int] = {
-            Packet.MODE: int(self.mode),
-            Packet.CHARGERS: 2 * self._docked,
-            Packet.CHARGING_STATE: 2 * self._docked,
-            Packet.VOLTAGE: 15_400,
-            Packet.CHARGE: 2_100,
-            Packet.CAPACITY: 2_696,
-            Packet.REQUESTED_LEFT: round(body.wanted[0] * 1e3),
-            Packet.REQUESTED_RIGHT: round(body.wanted[1] * 1e3),
-            38: len(self._listed),
-        }
-        return rest.get(packet, 0)
 
     def _send(self, data: bytes) -> None:
         if self.mute or not self._wired:
@@ -299,22 +221,6 @@ class CreateEmulator:
             data = bytes(int(n) if c else b for b, c, n in zip(data, changed, noise, strict=True) if not c or n < 256)
         with contextlib.suppress(OSError):  # nobody reads: lost, as on a wire
             os.write(self._master, data)
-
-
-def _mark(marked: set[str], known: Collection[str], where: str, there: bool) -> None:
-    if where not in known:
-        raise ValueError(f'"{where}" is none of {", ".join(known)}')
-    (marked.add if there else marked.discard)(where)
-
-
-def _of_radius(speed: int, radius: int, base: float) -> tuple[int, int]:
-    """Wheel speeds (left, right) [mm/s] of the drive command 137: radius [mm], -1 and 1 spin, 0x8000 is straight."""
-    if radius in (-0x8000, 0x7FFF):
-        return speed, speed
-    if abs(radius) == 1:
-        return -speed * radius, speed * radius
-    share = base / 2 / radius if radius else 0.0
-    return round(speed * (1 - share)), round(speed * (1 + share))
 
 
 def main() -> None:

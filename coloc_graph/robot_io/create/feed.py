@@ -1,11 +1,10 @@
 """Sensor feed: the newest state and the odometry from a Create's frames; `SensorFeed`."""
 
 import math
-import threading
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
 
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.create.odometry import DeltaOdometry, EncoderOdometry, Odometer
 from coloc_graph.robot_io.create.state import CreateState, read_state
 from coloc_graph.run.messages import OdometrySample
@@ -21,17 +20,17 @@ class SensorFeed:
         self.state: CreateState | None = None
         self.sample: OdometrySample | None = None
         #: Time of the newest frame [s, monotonic].
-        self.last = time.monotonic()
-        self._epoch = time.time() - self.last if epoch is None else epoch
+        self.last = machine.monotonic()
+        self._epoch = 1e-9 * machine.time_ns() - self.last if epoch is None else epoch
         # a Create 1 reports its distance seldom, and then all of it
         self._odometer = Odometer(robot, period) if model == 2 else Odometer(robot, period, math.inf)
         self._way = EncoderOdometry() if model == 2 else DeltaOdometry()
         self._samples: deque[OdometrySample] = deque(maxlen=20_000)
-        self._fresh = threading.Condition()
+        self._fresh = machine.new_condition()
 
     def take(self, values: Mapping[int, int]) -> CreateState | None:
         """Take in a frame that has just come; return its state, None if it is damaged though its checksum fits."""
-        now = time.monotonic()
+        now = machine.monotonic()
         try:
             state = read_state(values, self._epoch + now)
         except ValueError:
@@ -65,10 +64,10 @@ class SensorFeed:
         bool
             True if the condition is met within `timeout` [s], False if not, or if it was given up.
         """
-        until = time.monotonic() + timeout
+        until = machine.monotonic() + timeout
         with self._fresh:
             while not met():
-                left = until - time.monotonic()
+                left = until - machine.monotonic()
                 if left <= 0 or given_up():
                     return False
                 self._fresh.wait(min(left, 0.05))
@@ -77,7 +76,7 @@ class SensorFeed:
     @property
     def age(self) -> float:
         """Age of the newest frame [s]."""
-        return time.monotonic() - self.last
+        return machine.monotonic() - self.last
 
     @property
     def told_to_move(self) -> bool:

@@ -4,13 +4,15 @@ import contextlib
 import errno
 import select
 import threading
-import time
+from typing import Protocol
 
 import serial
 
 from coloc_graph.errors import RobotError
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.create import protocol as oi
 from coloc_graph.robot_io.create.odometry import WHEELS
+from coloc_graph.robot_io.create.protocol import Packet
 from coloc_graph.robot_io.create.state import DELTAS, STREAMED
 from coloc_graph.robot_io.create.watchdog import Watchdog
 
@@ -21,6 +23,40 @@ RETURN_TIMEOUT = 10.0  # s to wait for a lost port
 RELEASE_TIMEOUT = 0.5  # s to wait for a port that another driver held
 #: Commands that leave a robot standing, silent and in passive mode.
 LEAVE = oi.HALT + oi.pause_stream() + bytes([oi.START])
+
+
+class Line(Protocol):
+    """A line to a robot that streams; see `CreateLine`."""
+
+    model: int
+    layouts: list[tuple[Packet, ...]]
+    lost: str | None
+
+    def send(self, data: bytes) -> None:
+        """Write these bytes."""
+
+    def read(self) -> list[dict[int, int]]:
+        """Return the frames that come within `READ`."""
+
+    def permit(self, until: float | None) -> None:
+        """Tell the watchdog until when the wheels may turn [s, monotonic]."""
+
+    def beat(self) -> None:
+        """Show the watchdog that the driver runs."""
+
+    @property
+    def watchdog_silence(self) -> float:
+        """Time for which the watchdog has not answered [s]."""
+
+    @property
+    def frames(self) -> tuple[int, int]:
+        """Counts of valid and of damaged frames."""
+
+    def stop_when_back(self, ended: threading.Event) -> bool:
+        """Stop the robot if its port comes back; return whether it did."""
+
+    def close(self) -> None:
+        """Close the line."""
 
 
 class CreateLine:
@@ -47,7 +83,7 @@ class CreateLine:
     def __init__(self, port: str, model: int | None) -> None:
         self.port = port
         self.lost: str | None = None
-        self._lock = threading.RLock()
+        self._lock = machine.new_lock()
         self._watchdog: Watchdog | None = None
         models = [model] if model else [2, 1]
         try:
@@ -72,14 +108,14 @@ class CreateLine:
 
     def _first_opened(self, model: int) -> serial.Serial:
         """Open the port, waiting until the watchdog of a driver that was killed has closed it."""
-        until = time.monotonic() + RELEASE_TIMEOUT
+        until = machine.monotonic() + RELEASE_TIMEOUT
         while True:
             try:
                 return self._opened(model)
             except OSError as error:
-                if error.errno != errno.EAGAIN or time.monotonic() > until:
+                if error.errno != errno.EAGAIN or machine.monotonic() > until:
                     raise
-                time.sleep(0.01)
+                machine.sleep(0.01)
 
     def _answers(self, model: int) -> bool:
         """Return whether valid frames come at this model's baud rate."""
@@ -91,8 +127,8 @@ class CreateLine:
         except OSError as error:
             raise RobotError(f"{self.port} cannot be set to {WHEELS[model].baud} baud ({error})") from error
         self.send(bytes([oi.START]) + oi.stream(self.layouts[0]))
-        until = time.monotonic() + ANSWER_TIMEOUT
-        while time.monotonic() < until and self.decoder.header_counts is None:
+        until = machine.monotonic() + ANSWER_TIMEOUT
+        while machine.monotonic() < until and self.decoder.header_counts is None:
             self.read()
         return self.decoder.header_counts is not None
 
@@ -112,9 +148,9 @@ class CreateLine:
 
     def _write(self, data: bytes) -> None:
         # pyserial's own timeout fails if this process did not run meanwhile, though all was written
-        until = time.monotonic() + WRITE
+        until = machine.monotonic() + WRITE
         while data:
-            _, ready, _ = select.select([], [self._serial.fileno()], [], max(until - time.monotonic(), 0))
+            _, ready, _ = select.select([], [self._serial.fileno()], [], max(until - machine.monotonic(), 0))
             if not ready:
                 raise RobotError(f"{self.port} takes no bytes: check the cable and its flow control")
             data = data[self._serial.write(data) or 0 :]
@@ -140,6 +176,11 @@ class CreateLine:
         self._require_watchdog(self._watchdog is None or self._watchdog.beat())
 
     @property
+    def frames(self) -> tuple[int, int]:
+        """Counts of valid and of damaged frames."""
+        return self.decoder.good, self.decoder.bad
+
+    @property
     def watchdog_silence(self) -> float:
         """Time for which the watchdog has not answered [s]."""
         return self._watchdog.silence if self._watchdog is not None else 0.0
@@ -154,9 +195,9 @@ class CreateLine:
 
     def stop_when_back(self, ended: threading.Event) -> bool:
         """Stop the robot if its port comes back within `RETURN_TIMEOUT`; return whether it did."""
-        until = time.monotonic() + RETURN_TIMEOUT
+        until = machine.monotonic() + RETURN_TIMEOUT
         self.close()
-        while time.monotonic() < until and not ended.wait(0.05):
+        while machine.monotonic() < until and not ended.wait(0.05):
             with contextlib.suppress(OSError, ValueError), self._opened(self.model) as again:
                 again.write(LEAVE)
                 again.flush()

@@ -23,7 +23,7 @@ LAST_STOPS = 4  # stop commands after the driver has ended: the first may comple
 WRITE_TIMEOUT = 0.2  # s that the serial line may take to accept a command
 REALTIME_PRIORITY = 50  # of SCHED_FIFO, where the user may have it
 _MESSAGE = struct.Struct("<q")  # deadline of the motion [ns, CLOCK_MONOTONIC], or one of the next two
-_STANDING = 0
+STANDING = 0
 _END = -1
 
 
@@ -49,7 +49,7 @@ class Watchdog:
         assert self._process.stdin is not None and self._process.stdout is not None
         self._pipe, self._answers = self._process.stdin.fileno(), self._process.stdout.fileno()
         self._lock = threading.RLock()  # a signal handler may stop the wheels amid a command
-        self._deadline = _STANDING
+        self._deadline = STANDING
         self._sent = 0.0
         self._unanswered: deque[float] = deque()
         self._alive = os.read(self._answers, 1) != b""  # it has started
@@ -65,7 +65,7 @@ class Watchdog:
             False if the watchdog has ended.
         """
         with self._lock:
-            self._deadline = _STANDING if until is None else round(1e9 * until)
+            self._deadline = STANDING if until is None else round(1e9 * until)
             return self._beat()
 
     def beat(self) -> bool:
@@ -128,6 +128,28 @@ class Watchdog:
         return True
 
 
+class StopTimer:
+    """Time at which the wheels are to be stopped, by the driver's messages; times are CLOCK_MONOTONIC [s]."""
+
+    def __init__(self, now: float) -> None:
+        self._limit, self._stopped = now + SILENCE, 0.0
+
+    def take(self, word: int, now: float) -> None:
+        """Take in the newest message: the deadline of a motion [ns], or that the wheels stand."""
+        self._limit = now + SILENCE if word == STANDING else word * 1e-9
+
+    def due(self, now: float) -> bool:
+        """Return whether a stop command is to be sent now; it is to be repeated until a message comes."""
+        if not (self._limit <= now and self._stopped + REPEAT_PERIOD <= now):
+            return False
+        self._stopped = now
+        return True
+
+    def next(self, now: float) -> float:
+        """Return when a stop command is due next."""
+        return self._limit if self._limit > now else self._stopped + REPEAT_PERIOD
+
+
 def _stand_by(line: int, halt: bytes, leave: bytes) -> None:
     """Run the watchdog until the driver has ended."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE):
@@ -135,14 +157,12 @@ def _stand_by(line: int, halt: bytes, leave: bytes) -> None:
     _raise_priority()
     os.set_blocking(1, False)
     os.write(1, b".")
-    limit, stopped = time.monotonic() + SILENCE, 0.0
+    timer = StopTimer(time.monotonic())
     while True:
         now = time.monotonic()
-        if limit <= now and stopped + REPEAT_PERIOD <= now:
+        if timer.due(now):
             _write(line, halt)
-            stopped = now
-        wait = limit if limit > now else stopped + REPEAT_PERIOD
-        if not select.select([0], [], [], max(wait - time.monotonic(), 0.0))[0]:
+        if not select.select([0], [], [], max(timer.next(now) - time.monotonic(), 0.0))[0]:
             continue
         words = [word for (word,) in _MESSAGE.iter_unpack(os.read(0, 128 * _MESSAGE.size))]
         if not words:  # the driver has ended without a word
@@ -151,7 +171,7 @@ def _stand_by(line: int, halt: bytes, leave: bytes) -> None:
             return
         with contextlib.suppress(OSError):
             os.write(1, bytes(len(words)))
-        limit = time.monotonic() + SILENCE if words[-1] == _STANDING else words[-1] * 1e-9
+        timer.take(words[-1], time.monotonic())
     for _ in range(LAST_STOPS):
         _write(line, halt)
         time.sleep(REPEAT_PERIOD)

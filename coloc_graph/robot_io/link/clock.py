@@ -1,13 +1,13 @@
 """Offset of a robot's clock from the coordinator's: four timestamps, guaranteed bounds, drift; `ClockFilter`."""
 
 import math
-import threading
 from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from coloc_graph.errors import RobotError
+from coloc_graph.machine import machine
 
 MAX_EXCHANGES = 64  # exchanges that are kept
 MIN_EXCHANGES = 8  # exchanges that are needed to be synchronised
@@ -79,7 +79,7 @@ class ClockFilter:
         self._kept: deque[_Exchange] = deque(maxlen=MAX_EXCHANGES)
         self._fit: _Fit | None = None
         self._jumps = 0
-        self._lock = threading.Lock()
+        self._lock = machine.new_lock()
 
     def add(self, t1: int, t2: int, t3: int, t4: int) -> None:
         """Add an exchange [ns]. Raises `ValueError` if it is impossible."""

@@ -1,11 +1,11 @@
 """Commands as a robot takes them: each once, in time, and only for this session of its program; `CommandFilter`."""
 
 import logging
-import time
 from collections import OrderedDict
 from collections.abc import Callable
 
 from coloc_graph.errors import ColocError
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.link.counters import LinkCounter
 from coloc_graph.robot_io.link.messages import Body, Command, Hold, MessageError, Reply, decode
 
@@ -85,4 +85,4 @@ class CommandFilter:
             self._counter.add("replayed")
             return
         age = max(self._clock() - hold.sent, 0)
-        self.last_heard = max(self.last_heard, time.monotonic_ns() - age)
+        self.last_heard = max(self.last_heard, machine.monotonic_ns() - age)

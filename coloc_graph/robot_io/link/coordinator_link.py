@@ -1,4 +1,4 @@
-"""The coordinator's end of the link to its robots, on zenoh; `CoordinatorLink`, docs/link.md.
+"""The coordinator's end of the link to its robots; `CoordinatorLink`, docs/link.md.
 
 What robots measure arrives complete and in order, also after a cut; commands are carried out once and in time, or
 refused.
@@ -6,17 +6,14 @@ refused.
 
 import contextlib
 import queue
-import threading
-import time
-import uuid
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import msgspec
-import zenoh
 
 from coloc_graph.errors import RobotError
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.link.clock import ClockFilter
 from coloc_graph.robot_io.link.counters import Counts, LinkCounter
 from coloc_graph.robot_io.link.messages import (
@@ -40,8 +37,8 @@ from coloc_graph.robot_io.link.messages import (
 )
 from coloc_graph.robot_io.link.recovery import Recovery
 from coloc_graph.robot_io.link.robot_inbox import RobotInbox
-from coloc_graph.robot_io.link.session import KEPT_KINDS, URGENT, LinkSession, on_receiving_thread, robot_of, session_of
-from coloc_graph.robot_io.link.zenoh_config import Tls, config_of
+from coloc_graph.robot_io.link.session import KEPT_KINDS, LinkSession, OpenSession, Take, robot_of, session_of
+from coloc_graph.robot_io.link.zenoh_config import Tls
 from coloc_graph.team import Team
 
 M = TypeVar("M", bound=msgspec.Struct)
@@ -76,6 +73,8 @@ class CoordinatorLink:
         Accept connections from other machines without certificates.
     clock
         This machine's monotonic clock [ns].
+    open_session
+        Opens the session; another than zenoh's in a simulation.
 
     Attributes
     ----------
@@ -102,7 +101,8 @@ class CoordinatorLink:
         on_presence: Callable[[str, bool], None],
         tls: Tls | None = None,
         exposed: bool = False,
-        clock: Clock = time.monotonic_ns,
+        clock: Clock = machine.monotonic_ns,
+        open_session: OpenSession = LinkSession,
     ) -> None:
         self.team, self._clock = team, clock
         self.clocks = {name: ClockFilter() for name in team.names}
@@ -111,34 +111,30 @@ class CoordinatorLink:
         }  # fmt: skip
         self._on_presence = on_presence
         self._counter = LinkCounter()
-        self._lock = threading.RLock()
+        self._lock = machine.new_lock()
         self._inboxes = {name: self._inbox(name) for name in team.names}
-        self._ended = threading.Event()
-        self._session = LinkSession(listen, config_of(listen=listen, tls=tls, robots=team.names, exposed=exposed))
-        session, keep = self._session.zenoh, self._session.keep
+        self._ended = machine.new_event()
+        self._session = open_session(listen=listen, tls=tls, robots=team.names, exposed=exposed)
+        session = self._session
         try:
             self._publishers = {
-                (name, kind): keep(session.declare_publisher(f"coloc/{name}/{kind}", **URGENT))
+                (name, kind): session.publisher(f"coloc/{name}/{kind}")
                 for name in team.names
                 for kind in ("question", "hold", "refusal")
             }
-            keep(session.declare_subscriber("coloc/*/status", self._receiver(Status)))
-            keep(session.declare_subscriber("coloc/*/time", on_receiving_thread(self._take_time)))
-            self._subscribers = [
-                keep(session.declare_subscriber(f"coloc/{name}/{kind}", self._receiver(type_)))
-                for name in team.names
-                for kind, type_ in KEPT_KINDS.items()
-            ]
-            keep(session.liveliness().declare_subscriber("coloc/*/alive/*", self._take_presence, history=True))
-            keep(session.liveliness().declare_token("coloc/coordinator/alive"))
+            session.subscribe("coloc/*/status", self._receiver(Status))
+            session.subscribe("coloc/*/time", self._take_time, at_once=True)
+            for name in team.names:
+                for kind, type_ in KEPT_KINDS.items():
+                    session.subscribe(f"coloc/{name}/{kind}", self._receiver(type_))
+            session.watch("coloc/*/alive/*", self._take_presence)
+            session.announce("coloc/coordinator/alive")
         except BaseException:
-            self._session.close()
+            session.close()
             raise
-        self._clock_thread = threading.Thread(target=self._compare_clocks, name="clocks", daemon=True)
+        self._clock_thread = machine.new_thread(target=self._compare_clocks, name="clocks")
         self._clock_thread.start()
-        receivers: dict[type, Callable[[zenoh.Sample], None]] = {
-            type_: self._receiver(type_, requested=True) for type_ in KEPT_KINDS.values()
-        }
+        receivers = {type_: self._receiver(type_, requested=True) for type_ in KEPT_KINDS.values()}
         self._recoveries = {
             name: Recovery(name, inbox, self._lock, session, receivers) for name, inbox in self._inboxes.items()
         }
@@ -154,10 +150,10 @@ class CoordinatorLink:
     def close(self) -> None:
         """Close the link."""
         self._ended.set()
-        until = time.monotonic() + 2.0
+        until = machine.monotonic() + 2.0
         self._clock_thread.join(2.0)
         for recovery in self._recoveries.values():
-            recovery.end(max(until - time.monotonic(), 0.0))
+            recovery.end(max(until - machine.monotonic(), 0.0))
         self._session.close()
 
     @property
@@ -175,9 +171,8 @@ class CoordinatorLink:
         for robot, inbox in self._inboxes.items():
             session = inbox.session
             if session is not None and session == inbox.in_charge and inbox.present and self.clocks[robot].known:
-                with contextlib.suppress(zenoh.ZError):
-                    message = Hold(session=session, sent=self.clocks[robot].to_robot(now))
-                    self._publishers[robot, "hold"].put(encode(message))
+                message = Hold(session=session, sent=self.clocks[robot].to_robot(now))
+                self._publishers[robot, "hold"](encode(message))
 
     def ask(self, robot: str, body: Body, timeout: float, waiting: Callable[[], None] = lambda: None) -> Reply:
         """Have one robot carry out a command; `ask_each` for one robot. Raises `RobotError` if it does not answer."""
@@ -211,11 +206,12 @@ class CoordinatorLink:
         dict
             The reply of each robot, None for one that did not answer in time.
         """
-        until, came = time.monotonic() + timeout, queue.SimpleQueue[tuple[str, Reply | None]]()
+        until = machine.monotonic() + timeout
+        came: queue.Queue[tuple[str, Reply | None]] = machine.new_queue()
         commands: dict[str, Command] = {}
         again = dict.fromkeys(bodies, 0.0)
         replies: dict[str, Reply | None] = dict.fromkeys(bodies)
-        while (left := until - (now := time.monotonic())) > 0 and None in replies.values():
+        while (left := until - (now := machine.monotonic())) > 0 and None in replies.values():
             for robot, body in bodies.items():
                 if replies[robot] is None and now >= again[robot]:
                     command = commands.get(robot) or self._command(robot, body, left)
@@ -233,7 +229,7 @@ class CoordinatorLink:
             with contextlib.suppress(queue.Empty):
                 robot, reply = came.get(timeout=max(min(left, WAITING_PERIOD), 0.001))
                 if reply is None:  # this query is over, and nobody answered it
-                    again[robot] = min(again[robot], time.monotonic() + SESSION_PERIOD)
+                    again[robot] = min(again[robot], machine.monotonic() + SESSION_PERIOD)
                 elif reply.id == commands[robot].id:
                     replies[robot] = reply
         return replies
@@ -244,41 +240,33 @@ class CoordinatorLink:
         if session is None or not (clock.known or isinstance(body, Halt)):
             return None
         deadline = clock.to_robot(self._clock() + round(1e9 * left)) if clock.known else MAX_STAMP - 1
-        return Command(id=uuid.uuid4().hex, session=session, deadline=deadline, body=body)
+        return Command(id=machine.unique(), session=session, deadline=deadline, body=body)
 
     def _send(
-        self, robot: str, command: Command, timeout: float, came: "queue.SimpleQueue[tuple[str, Reply | None]]"
+        self, robot: str, command: Command, timeout: float, came: "queue.Queue[tuple[str, Reply | None]]"
     ) -> None:
         """Send a command as a query; the robot's replies, and None at the query's end, are put into `came`."""
 
-        def take(one: zenoh.Reply) -> None:
-            if one.ok is None:
-                return
+        def take(data: bytes) -> None:
             try:
-                came.put((robot, decode(one.ok.payload.to_bytes(), Reply)))
+                came.put((robot, decode(data, Reply)))
             except MessageError as error:
                 self._counter.refuse(error, f"an answer of {robot}")
 
-        self._session.zenoh.get(
-            f"coloc/{robot}/command/{command.session}",
-            zenoh.handlers.Callback(take, lambda: came.put((robot, None)), indirect=False),
-            payload=encode(command),
-            timeout=timeout,
-            **URGENT,
-        )
+        key = f"coloc/{robot}/command/{command.session}"
+        self._session.ask(key, encode(command), timeout, take, lambda: came.put((robot, None)))
 
     def _inbox(self, robot: str) -> RobotInbox:
         return RobotInbox(robot, lambda message: self._calls[type(message)](robot, message), self._counter)
 
-    def _receiver(self, type_: type[M], requested: bool = False) -> Callable[[zenoh.Sample], None]:
-        """Callback that takes in messages of one kind and never raises into zenoh's threads."""
+    def _receiver(self, type_: type[M], requested: bool = False) -> Take:
+        """Callback that takes in messages of one kind and never raises into the session's threads."""
 
-        def take(sample: zenoh.Sample) -> None:
-            robot = robot_of(sample)
+        def take(key: str, data: bytes) -> None:
+            robot = robot_of(key)
             if robot not in self._inboxes:
                 self._counter.add("foreign", f"refused a message of `{robot[:40]}`, which is not a robot of the team")
                 return
-            data = sample.payload.to_bytes()
             try:
                 message = decode(data, type_)
             except MessageError as error:
@@ -296,14 +284,14 @@ class CoordinatorLink:
 
         return take
 
-    def _take_presence(self, sample: zenoh.Sample) -> None:
-        robot, session = robot_of(sample), session_of(sample)
+    def _take_presence(self, key: str, present: bool) -> None:
+        robot, session = robot_of(key), session_of(key)
         if robot not in self._inboxes or not is_session(session):
             return
         inbox = self._inboxes[robot]
         with self._lock:
             before = inbox.in_charge, inbox.present
-            if sample.kind == zenoh.SampleKind.PUT:
+            if present:
                 inbox.connect(session, self._clock())
             else:
                 inbox.disconnect(session)
@@ -318,16 +306,15 @@ class CoordinatorLink:
         """Thread that asks robots for the time."""
         while not self._ended.wait(CLOCK_PERIOD):
             for robot in [robot for robot, inbox in self._inboxes.items() if inbox.present]:
-                with contextlib.suppress(zenoh.ZError):
-                    self._publishers[robot, "question"].put(encode(ClockQuestion(asked=self._clock())))
+                self._publishers[robot, "question"](encode(ClockQuestion(asked=self._clock())))
 
-    def _take_time(self, sample: zenoh.Sample) -> None:
-        received, robot = self._clock(), robot_of(sample)
+    def _take_time(self, key: str, data: bytes) -> None:
+        received, robot = self._clock(), robot_of(key)
         if robot not in self._inboxes:
             self._counter.add("foreign", f"refused the time of `{robot[:40]}`, which is not a robot of the team")
             return
         try:
-            reply = decode(sample.payload.to_bytes(), ClockReply)
+            reply = decode(data, ClockReply)
             inbox = self._inboxes[robot]
             if reply.session != inbox.in_charge:
                 self._counter.add("unknown")
@@ -349,5 +336,4 @@ class CoordinatorLink:
         text = f"another program runs as robot {robot} already: end it first, or give this one its own name"
         for session in sessions:
             self._counter.add("duplicate", f"refused a second program that runs as robot {robot}: end one of them")
-            with contextlib.suppress(zenoh.ZError):
-                self._publishers[robot, "refusal"].put(encode(Refusal(session=session, text=text)))
+            self._publishers[robot, "refusal"](encode(Refusal(session=session, text=text)))

@@ -1,11 +1,10 @@
 """Counts of the messages of a link that were taken and refused, logged at intervals."""
 
 import logging
-import threading
-import time
 from collections import Counter
 from dataclasses import dataclass, fields
 
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.link.messages import MessageError, OversizedError
 
 log = logging.getLogger(__name__)
@@ -54,13 +53,13 @@ class LinkCounter:
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._logged: dict[str, float] = {}
-        self._lock = threading.Lock()
+        self._lock = machine.new_lock()
 
     def add(self, what: str, why: str = "", times: int = 1) -> None:
         """Count messages under a field of `Counts`, and log `why`, if given."""
         with self._lock:
             self._counts[what] += times
-            number, now = self._counts[what], time.monotonic()
+            number, now = self._counts[what], machine.monotonic()
             if not why or now - self._logged.get(what, -LOG_PERIOD) < LOG_PERIOD:
                 return
             self._logged[what] = now

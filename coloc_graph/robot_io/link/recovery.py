@@ -1,13 +1,10 @@
 """Recovery of a robot's missing messages: they are requested until they have come or are lost; `Recovery`."""
 
 import threading
-import time
-from collections.abc import Callable
 
-import zenoh
-
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.link.robot_inbox import RobotInbox
-from coloc_graph.robot_io.link.session import KEPT_KINDS
+from coloc_graph.robot_io.link.session import KEPT_KINDS, Session, Take
 
 RECOVERY_PERIOD = 0.2  # s between two requests for missing messages
 NEWEST_PERIOD = 1.0  # s without a message of a kind after which the newest one is requested
@@ -26,7 +23,7 @@ class Recovery:
     lock
         Guards the inbox.
     session
-        The coordinator's zenoh session.
+        The coordinator's session.
     receivers
         By kind of message: takes in a message that was requested.
     """
@@ -36,12 +33,12 @@ class Recovery:
         robot: str,
         inbox: RobotInbox,
         lock: threading.RLock,
-        session: zenoh.Session,
-        receivers: dict[type, Callable[[zenoh.Sample], None]],
+        session: Session,
+        receivers: dict[type, Take],
     ) -> None:
         self._robot, self._inbox, self._lock, self._session, self._receivers = robot, inbox, lock, session, receivers
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"recovery of {robot}", daemon=True)
+        self._ended = machine.new_event()
+        self._thread = machine.new_thread(target=self._run, name=f"recovery of {robot}")
         self._thread.start()
 
     def end(self, timeout: float) -> None:
@@ -66,20 +63,8 @@ class Recovery:
             a robot that cannot be reached sends none either.
         """
         name = next(name for name, one in KEPT_KINDS.items() if one is kind)
-        count = 0
-        try:
-            replies = self._session.get(
-                f"coloc/{self._robot}/{name}/@adv/pub/**?{which}",
-                timeout=RECOVERY_TIMEOUT,
-                accept_replies=zenoh.ReplyKeyExpr.ANY,
-                consolidation=zenoh.ConsolidationMode.NONE,
-            )
-            for one in replies:
-                if one.ok is None:
-                    return False
-                self._receivers[kind](one.ok)
-                count += 1
-        except zenoh.ZError:
+        count = self._session.kept(f"coloc/{self._robot}/{name}", which, RECOVERY_TIMEOUT, self._receivers[kind])
+        if count is None:
             return False
         return count > 0 or (which != "_max=1" and self.request(kind, "_max=1"))
 
@@ -88,10 +73,10 @@ class Recovery:
         while not self._ended.wait(0.0 if self._recover() else RECOVERY_PERIOD):
             # where the last message of a kind was lost no later one tells of the gap: the newest is requested
             for kind in KEPT_KINDS.values():
-                quiet = time.monotonic() - inbox.last_taken.get(kind, 0.0) > NEWEST_PERIOD
+                quiet = machine.monotonic() - inbox.last_taken.get(kind, 0.0) > NEWEST_PERIOD
                 if quiet and inbox.present and inbox.session == inbox.in_charge is not None:
                     self.request(kind, "_max=1")
-                    inbox.last_taken[kind] = time.monotonic()
+                    inbox.last_taken[kind] = machine.monotonic()
 
     def _recover(self) -> bool:
         """Request each gap once; return True if a gap has become smaller, and something is still missing."""

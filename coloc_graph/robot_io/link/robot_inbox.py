@@ -1,10 +1,10 @@
 """Messages of one robot as the coordinator takes them in: which session counts, and what is handed on; `RobotInbox`."""
 
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.link.counters import LinkCounter
 from coloc_graph.robot_io.link.messages import decode
 from coloc_graph.robot_io.link.reordering import REQUEST_SIZE, ReorderBuffer
@@ -98,7 +98,7 @@ class RobotInbox:
         """
         kind, session, number = type(message), message.session, message.number
         if session == self.session:
-            self.last_taken[kind] = time.monotonic()
+            self.last_taken[kind] = machine.monotonic()
             buffer = self._buffers[kind]
             if not (requested and buffer.knows(number)):
                 self._hand_on(kind, buffer, lambda: buffer.take(number, data), message, data)

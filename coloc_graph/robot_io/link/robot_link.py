@@ -1,17 +1,13 @@
-"""A robot's end of the link to the coordinator, on zenoh; `RobotLink`, docs/link.md."""
+"""A robot's end of the link to the coordinator, `RobotLink`, docs/link.md."""
 
 import contextlib
 import queue
-import threading
-import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-import zenoh
-import zenoh.ext
-
 from coloc_graph.errors import InputError
+from coloc_graph.machine import machine
 from coloc_graph.robot_io.link.command_filter import CommandFilter
 from coloc_graph.robot_io.link.counters import Counts, LinkCounter
 from coloc_graph.robot_io.link.messages import (
@@ -28,8 +24,8 @@ from coloc_graph.robot_io.link.messages import (
     encode,
     is_session,
 )
-from coloc_graph.robot_io.link.session import CACHED, KEPT_KINDS, URGENT, LinkSession, on_receiving_thread, payload_of
-from coloc_graph.robot_io.link.zenoh_config import Tls, config_of
+from coloc_graph.robot_io.link.session import KEPT_KINDS, LinkSession, OpenSession, Question
+from coloc_graph.robot_io.link.zenoh_config import Tls
 
 Clock = Callable[[], int]
 
@@ -55,6 +51,8 @@ class RobotLink:
         Certificates of this end.
     clock
         The robot's monotonic clock [ns].
+    open_session
+        Opens the session; another than zenoh's in a simulation.
 
     Raises
     ------
@@ -70,44 +68,34 @@ class RobotLink:
         handler: Callable[[Body], str],
         session: str,
         tls: Tls | None = None,
-        clock: Clock = time.monotonic_ns,
+        clock: Clock = machine.monotonic_ns,
+        open_session: OpenSession = LinkSession,
     ) -> None:
         if not is_session(session):
             raise InputError(f"`{session}` is not a name of a session: use letters, digits, - and _")
         self.name, self.session, self._clock = name, session, clock
         self._counter = LinkCounter()
         self._commands = CommandFilter(name, session, handler, clock, self._counter)
-        self._asked: queue.Queue[zenoh.Query | None] = queue.Queue(MAX_WAITING)
+        self._asked: queue.Queue[Question | None] = machine.new_queue(MAX_WAITING)
         self._connected = False
         self._refused: str | None = None
-        self._session = LinkSession(connect, config_of(connect=connect, tls=tls))
-        session_, keep = self._session.zenoh, self._session.keep
+        self._session = open_session(connect=connect, tls=tls)
         try:
             self._publishers = {
-                type_: keep(
-                    zenoh.ext.declare_advanced_publisher(
-                        session_,
-                        f"coloc/{name}/{kind}",
-                        congestion_control=zenoh.CongestionControl.DROP,
-                        cache=zenoh.ext.CacheConfig(max_samples=CACHED),
-                        sample_miss_detection=zenoh.ext.MissDetectionConfig(),  # type: ignore[call-arg]
-                    )
-                )
-                for kind, type_ in KEPT_KINDS.items()
+                type_: self._session.kept_publisher(f"coloc/{name}/{kind}") for kind, type_ in KEPT_KINDS.items()
             }
-            self._publishers[Status] = keep(session_.declare_publisher(f"coloc/{name}/status", **URGENT))
-            keep(session_.declare_subscriber(f"coloc/{name}/hold", self._take_hold))
-            keep(session_.declare_queryable(f"coloc/{name}/command/{session}", self._take_command))
-            keep(session_.declare_subscriber(f"coloc/{name}/refusal", self._take_refusal))
-            self._time = keep(session_.declare_publisher(f"coloc/{name}/time", **URGENT))
-            keep(session_.declare_subscriber(f"coloc/{name}/question", on_receiving_thread(self._tell_time)))
-            liveliness = session_.liveliness()
-            keep(liveliness.declare_subscriber("coloc/coordinator/alive", self._take_presence, history=True))
-            keep(liveliness.declare_token(f"coloc/{name}/alive/{session}"))
+            self._publishers[Status] = self._session.publisher(f"coloc/{name}/status")
+            self._session.subscribe(f"coloc/{name}/hold", self._take_hold)
+            self._session.on_question(f"coloc/{name}/command/{session}", self._take_command)
+            self._session.subscribe(f"coloc/{name}/refusal", self._take_refusal)
+            self._tell = self._session.publisher(f"coloc/{name}/time")
+            self._session.subscribe(f"coloc/{name}/question", self._tell_time, at_once=True)
+            self._session.watch("coloc/coordinator/alive", self._take_presence)
+            self._session.announce(f"coloc/{name}/alive/{session}")
         except BaseException:
             self._session.close()
             raise
-        self._worker = threading.Thread(target=self._carry_out, name=f"commands to {name}", daemon=True)
+        self._worker = machine.new_thread(target=self._carry_out, name=f"commands to {name}")
         self._worker.start()
 
     def __enter__(self) -> Self:
@@ -147,45 +135,39 @@ class RobotLink:
 
     def put(self, message: Sample | Wheels | Event | Status) -> None:
         """Send a message; never waits."""
-        with contextlib.suppress(zenoh.ZError):
-            self._publishers[type(message)].put(encode(message))
+        self._publishers[type(message)](encode(message))
 
-    def _take_command(self, query: zenoh.Query) -> None:
+    def _take_command(self, question: Question) -> None:
         with contextlib.suppress(queue.Full):
-            self._asked.put_nowait(query)
+            self._asked.put_nowait(question)
 
     def _carry_out(self) -> None:
         """Thread that carries out commands, one after the other."""
-        while (query := self._asked.get()) is not None:
-            reply = self._commands.answer(payload_of(query))
-            with contextlib.suppress(zenoh.ZError):  # who asked has gone
-                if reply is not None:
-                    query.reply(query.key_expr, encode(reply))
-            query.drop()  # type: ignore[no-untyped-call]
-            del query
+        while (question := self._asked.get()) is not None:
+            reply = self._commands.answer(question.payload)
+            question.answer(None if reply is None else encode(reply))
+            del question
 
-    def _take_hold(self, sample: zenoh.Sample) -> None:
-        self._commands.take_hold(sample.payload.to_bytes())
+    def _take_hold(self, _: str, data: bytes) -> None:
+        self._commands.take_hold(data)
 
-    def _take_refusal(self, sample: zenoh.Sample) -> None:
+    def _take_refusal(self, _: str, data: bytes) -> None:
         try:
-            refusal = decode(sample.payload.to_bytes(), Refusal)
+            refusal = decode(data, Refusal)
         except MessageError as error:
             self._counter.refuse(error, f"a refusal of {self.name}")
             return
         if refusal.session == self.session:
             self._refused = refusal.text
 
-    def _take_presence(self, sample: zenoh.Sample) -> None:
-        self._connected = sample.kind == zenoh.SampleKind.PUT
+    def _take_presence(self, _: str, present: bool) -> None:
+        self._connected = present
 
-    def _tell_time(self, sample: zenoh.Sample) -> None:
+    def _tell_time(self, _: str, data: bytes) -> None:
         received = self._clock()
         try:
-            asked = decode(sample.payload.to_bytes(), ClockQuestion).asked
-            reply = ClockReply(session=self.session, asked=asked, received=received, sent=self._clock())
-            self._time.put(encode(reply))
+            asked = decode(data, ClockQuestion).asked
         except MessageError as error:
             self._counter.refuse(error, f"a request for the time of {self.name}")
-        except zenoh.ZError:
-            pass  # who asked has gone
+            return
+        self._tell(encode(ClockReply(session=self.session, asked=asked, received=received, sent=self._clock())))
