@@ -1,37 +1,43 @@
 """Share of drawn faults whose true cause is named, alone or among equals, and of innocent robots that are blamed.
 
-    python benchmarks/blame.py [--seeds 60] [--first 0] [--json]
+    python benchmarks/blame.py [--worlds 34] [--first 1] [--healthy] [--json]
 
-Each seed is a hallway, or a team of four, of 12 stances at depth tracks, with one fault: a clock, an odometry jump, a
-lever arm of odometry, a robot that moved and is called an anchor, a bump, or a wrong homography; and the same without.
-A fault counts where it moves a pose by more than 3 sigma, if nothing is named.
+Each world is a hallway, or a team of four, of 8 stances at depth tracks, and is solved once for each kind of fault,
+with one drawn fault of the kind: a clock, an odometry jump, a lever arm of odometry, a robot that moved and is called
+an anchor, a bump, or a wrong homography. `--healthy` solves worlds without a fault instead. A fault counts where it
+moves a pose by more than 3 sigma, or leaves one without a pose, if nothing is named.
 """
 
 import argparse
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from monte_carlo import MemoryRun, over_seeds, simulated
 
-from coloc_graph.backend import joint
+from coloc_graph.backend import Estimate, PoseGraph, joint
+from coloc_graph.backend.cause import Cause
+from coloc_graph.backend.graph import StayPut
 from coloc_graph.errors import ColocError
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.geometry.se2 import compose
-from coloc_graph.measurements import Odometry, RelativePose
+from coloc_graph.measurements import Measurement, Odometry, RelativePose, Sighting
 from coloc_graph.pipeline.batch import Solution, SolveOptions, solve
+from coloc_graph.pipeline.incremental import OdometryAndSightings, measure_stance
 from coloc_graph.run import Detections, OdometrySample, Stance
 from coloc_graph.simulation import Imperfections
 from coloc_graph.simulation.scenarios import team_of
 from coloc_graph.simulation.teams import build_team_world
 
-STANCES = 12  # stances of a run
+STANCES = 8  # stances of a run
 POINTS = 100  # points of a stance of a hallway
-TEAM_POINTS = 600  # points of a pair of a stance of a team: 7.5 images a second
+TEAM_POINTS = 400  # points of a pair of a stance of a team
+COUNTED = 3.0  # sigmas by which a fault that counts changes a pose
 KINDS = ("clock", "jump", "arm", "moves", "bump", "homography")
 
 
@@ -156,24 +162,34 @@ def drawn(run: MemoryRun, kind: str, rng: np.random.Generator) -> Fault:
     return Fault(kind, str(rng.choice(driving)), k, 0.2 + far, T)
 
 
+def accused(cause: Cause) -> Iterator[tuple[str, str]]:
+    """A cause as (kind, robot), of each robot of which one is at fault."""
+    link = cause.links[0]
+    for robot in cause.robots:
+        if isinstance(link, StayPut):
+            yield "moved", robot
+        elif isinstance(link, Odometry):
+            yield "odometry", robot
+        elif isinstance(link, RelativePose | Sighting):
+            yield f"homography {link.stance}", robot
+
+
 def accusations(solution: Solution) -> list[set[tuple[str, str]]]:
     """Every fault that is named as the causes that are said to explain it equally well: (kind, robot)."""
     said: list[set[tuple[str, str]]] = [
-        {("moved", bump.stay_put.robot), *(("odometry", one.robot) for one in bump.alternative)}
+        {one for cause in (Cause((bump.stay_put,)), *bump.alternative) for one in accused(cause)}
         for bump in solution.estimate.bumped
     ]
-    for one in solution.estimate.rejected:
-        m = one.measurement
-        if isinstance(m, Odometry):
-            said.append({("odometry", m.robot)})
-        elif isinstance(m, RelativePose):
-            said.append({(f"homography {m.stance}", robot) for robot in (m.robot_i, m.robot_j)})
+    said += [
+        {one for cause in (Cause((rejection.measurement,)), *rejection.alternative) for one in accused(cause)}  # type: ignore[arg-type]
+        for rejection in solution.estimate.rejected
+    ]
     for sentence in solution.warnings:
         said += [
             {(what, robot)}
             for what in ("clock", "odometry")
             for robot in solution.run.team.names
-            if f"{robot}'s {what}" in sentence or f"the {what} of {robot} " in sentence
+            if f"{robot}'s {what}" in sentence or sentence.startswith(f"the {what} of {robot} ")
         ]
     return said
 
@@ -186,17 +202,23 @@ def verdict(solution: Solution, fault: Fault) -> tuple[bool, bool]:
     return any(right in one for one in said), any(all(robot != fault.robot for _, robot in one) for one in said)
 
 
-def effect(solution: Solution, world: MemoryRun) -> float:
-    """Largest distance of a pose from the one estimated without the fault, in its sigmas, if nothing is rejected."""
-    healthy = solve(world, SolveOptions()).estimate  # type: ignore[arg-type]
-    naive = joint(solution.estimate.graph, reject=False)
+def effect(run: Any, healthy: Estimate) -> float:
+    """Largest change of a pose in its sigmas if nothing is doubted in a run; infinite where one has no pose."""
+    motions = OdometryAndSightings(run.team)
+    made = list[Measurement]()
+    for stance in run.stances:
+        pairs = list(measure_stance(run, stance, SolveOptions().resolved()))
+        made += [one.relative_pose for one in pairs if one.relative_pose is not None]
+        made += motions.of_stance(run, stance, pairs)
     far = 0.0
-    for robot, stance in healthy.graph.nodes:
-        try:
-            off = healthy.pose(robot, stance).localCoordinates(naive.pose(robot, stance))[2:5]
-            far = max(far, float(off @ np.linalg.solve(healthy.covariance(robot, stance)[2:5, 2:5], off)))
-        except ColocError:
-            continue
+    try:
+        naive = joint(PoseGraph.of(run.team, run.stances, made), reject=False)
+        for robot, stance in healthy.graph.nodes:
+            if robot not in run.stances[stance].movers:  # whose pose is that at the time of an image
+                off = healthy.pose(robot, stance).localCoordinates(naive.pose(robot, stance))[2:5]
+                far = max(far, float(off @ np.linalg.solve(healthy.covariance(robot, stance)[2:5, 2:5], off)))
+    except ColocError:
+        return float("inf")
     return round(float(np.sqrt(far)), 1)
 
 
@@ -209,57 +231,67 @@ def world_of(seed: int) -> MemoryRun:
     return MemoryRun(world)
 
 
-def one_seed(seed: int) -> dict[str, Any]:
-    """One fault, drawn by the seed, or none where it is negative (of the same world)."""
-    world = world_of(abs(seed))
-    rng = np.random.default_rng((abs(seed), 7))
+def healthy_world(number: int) -> list[dict[str, Any]]:
+    """What is said of a world without a fault."""
+    solution = solve(world_of(number), SolveOptions())  # type: ignore[arg-type]
+    said = [sorted(one) for one in accusations(solution)]
+    return [{"kind": "healthy", "world": number, "said": said, "innocent": bool(said), "warnings": solution.warnings}]
+
+
+def faulty_world(number: int, kinds: Sequence[str] = KINDS) -> list[dict[str, Any]]:
+    """One fault of each kind of a world."""
+    world = world_of(number)
+    healthy = solve(world, SolveOptions()).estimate  # type: ignore[arg-type]
+    return [faulted(world, healthy, number, kind) for kind in kinds]
+
+
+def faulted(world: MemoryRun, healthy: Estimate, number: int, kind: str) -> dict[str, Any]:
+    """What is said of a world with a drawn fault."""
+    fault = drawn(world, kind, np.random.default_rng((number, KINDS.index(kind))))
     began = time.process_time()
-    if seed < 0:
-        said = accusations(solve(world, SolveOptions()))  # type: ignore[arg-type]
-        return {"kind": "healthy", "seed": seed, "said": [sorted(one) for one in said]}
-    kind = KINDS[(seed // 2) % len(KINDS)]
-    fault = drawn(world, kind, rng)
-    row: dict[str, Any] = {"kind": kind, "seed": seed, "robot": fault.robot, "stance": fault.stance}
+    row: dict[str, Any] = {"kind": fault.kind, "world": number, "robot": fault.robot, "stance": fault.stance}
     row["size"] = round(fault.size, 3)
+    faulty = bumped(world, fault) if fault.kind == "bump" else Faulty(world, fault)
+    row["effect"] = effect(faulty, healthy)
     try:
-        faulty = bumped(world, fault) if fault.kind == "bump" else Faulty(world, fault)
         solution = solve(faulty, SolveOptions())  # type: ignore[arg-type]
     except Exception as error:  # one failure must not end the others
         return {**row, "error": f"{type(error).__name__}: {error}"}
     right, innocent = verdict(solution, fault)
-    row["effect"] = effect(solution, world)
     said = [sorted(one) for one in accusations(solution)]
-    row["kind"] = fault.kind
-    return {**row, "right": right, "innocent": innocent, "said": said, "seconds": time.process_time() - began,
+    seconds = round(time.process_time() - began, 2)
+    return {**row, "right": right, "innocent": innocent, "said": said, "seconds": seconds,
+            "chi2": round(solution.estimate.chi2 / max(solution.estimate.dof, 1), 2),
             "warnings": list(solution.warnings)}  # fmt: skip
 
 
 def main() -> None:
     """Run it, print it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=60)
-    parser.add_argument("--first", type=int, default=1, help="first seed (default: 1)")
-    parser.add_argument("--healthy", action="store_true", help="run the same worlds without a fault")
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--json", action="store_true", help="print every seed, one after the other")
+    parser.add_argument("--worlds", type=int, default=34, help="number of worlds (default: 34)")
+    parser.add_argument("--first", type=int, default=1, help="first world (default: 1)")
+    parser.add_argument("--healthy", action="store_true", help="solve the worlds without a fault")
+    parser.add_argument("--processes", type=int, default=2, help="number of processes (default: 2)")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write every fault to a file, one a line")
     options = parser.parse_args()
-    seeds = range(options.first, options.first + options.seeds)
-    drawn_seeds = [-seed if options.healthy else seed for seed in seeds]
-    if options.json:
-        for seed in drawn_seeds:
-            print(json.dumps(one_seed(seed), default=str), flush=True)
-        return
-    rows = over_seeds(one_seed, drawn_seeds, options.processes)
+    work = healthy_world if options.healthy else faulty_world
+    worlds = range(options.first, options.first + options.worlds)
+    rows = [row for every in over_seeds(work, worlds, options.processes) for row in every]
+    if options.json is not None:
+        options.json.write_text("".join(json.dumps(row, default=str) + "\n" for row in rows))
     counts: Counter[tuple[str, str]] = Counter()
     for row in rows:
+        row["counted"] = row.get("effect", np.inf) > COUNTED
         counts[row["kind"], "drawn"] += 1
-        for what in ("right", "innocent", "error"):
-            counts[row["kind"], what] += bool(row.get(what))
+        for what in ("counted", "right", "innocent", "error"):
+            counts[row["kind"], what] += bool(row["counted"] and row.get(what))
         counts[row["kind"], "named"] += bool(row.get("said"))
-    print(f"{'fault':12} {'drawn':>6} {'named':>6} {'right':>6} {'innocent alone':>15} {'no result':>10}")
+    print(
+        f"{'fault':12} {'drawn':>6} {'counted':>8} {'named':>6} {'right':>6} {'innocent alone':>15} {'no result':>10}"
+    )
     for kind in dict.fromkeys(row["kind"] for row in rows):
-        cells = [counts[kind, what] for what in ("drawn", "named", "right", "innocent", "error")]
-        print(f"{kind:12} {cells[0]:6} {cells[1]:6} {cells[2]:6} {cells[3]:15} {cells[4]:10}")
+        cells = [counts[kind, what] for what in ("drawn", "counted", "named", "right", "innocent", "error")]
+        print(f"{kind:12}" + "".join(f"{cell:15}" for cell in cells))
 
 
 if __name__ == "__main__":

@@ -3,33 +3,33 @@
 `smooth` estimates poses alone, `joint` the mounts, markers and clocks of the team with them.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+import itertools
+from collections.abc import Mapping
 
 import gtsam
-import numpy as np
-from scipy.special import chdtri
 
+from coloc_graph.backend.blame import (
+    SEARCHED,
+    SIGMAS_ALONE,
+    TESTED,
+    WarmStart,
+    bumps_of,
+    find_faults,
+    moved,
+    scale_of,
+)
 from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, innovation
 from coloc_graph.backend.estimate import Bump, Estimate, Rejection, make_estimate, rejection_of
-from coloc_graph.backend.factors import Method, calibrations_in, require_robot_models
+from coloc_graph.backend.factors import Method, require_robot_models
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
-from coloc_graph.backend.landmarks import ALWAYS, OnMap
 from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
 from coloc_graph.backend.solver import robust_parameters, with_stack
 from coloc_graph.errors import EstimationError
-from coloc_graph.measurements import Odometry, RelativePose, Sighting
-from coloc_graph.team import Slip
+from coloc_graph.measurements import RelativePose, Sighting
 
 MIN_FIT_P_VALUE = 1e-4  # probability of a fit as bad as this by noise below which outliers are searched for
 CHI2_PER_DOF_OF_MODEL = 1.1  # chi2/dof up to which a fit passes in any case: no model is better than that
-TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)  # slip that a stay-put constraint is given to test it
-MAX_BUMPS = 3  # bumped anchors that are searched for
-TESTED = (RelativePose, Sighting, OnMap)  # links that are tested to see whether anything is wrong
-SEARCHED = (*TESTED, Odometry)  # links that may be wrong once something is
 REJECTION_PRICE = 30.0  # chi2 that one more outlier must explain
-EQUAL_CHI2 = 9.0  # two causes explain equally well if chi2 differs by less
-SIGMAS_ALONE = 12.0  # a measurement that alone ties a pose is kept up to this: a wrong one is off by many more
 MAX_ROUNDS = 20  # rounds of rejecting the worst link and taking back those that then agree
 
 
@@ -90,10 +90,17 @@ def _optimised(method: Method, graph: PoseGraph, reject: bool, start: gtsam.Valu
     if suspects is not None:
         warm = WarmStart(graph, fit.values, suspects) if suspects and len(fit.links) > ALL_TESTED else None
         del fit  # of a large graph it holds gigabytes
-        bumped = _bumps(method, graph, warm)
-        for bump in bumped:
-            graph = _with_bump(graph, bump)
-        rejected, fit = _find_outliers(method, graph, warm)
+        faults, freed, explained = find_faults(method, graph, warm)
+        if explained:
+            bumped, graph = bumps_of(faults, graph), freed
+            rejected = tuple(one for fault in faults for one in fault.rejections())
+            without = graph.without(one.measurement for one in rejected)
+            fit = fit_graph(method, without, warm.start(without) if warm else None)
+        else:  # many are wrong: which anchors moved is known of those that explain more than any measurement
+            bumped = bumps_of(tuple(itertools.takewhile(lambda one: one.cause.is_bump, faults)), graph)
+            for bump in bumped:
+                graph = moved(graph, bump.stay_put)
+            rejected, fit = _find_outliers(method, graph, warm)
     return make_estimate(
         method,
         graph,
@@ -119,40 +126,6 @@ def _suspects(fit: Fit) -> tuple[Link, ...] | None:
         return ()
     tested = fit.agreements((*TESTED, StayPut))
     return tuple(fit.links[index] for index, one in tested.items() if one.p_value() < REJECTION_P_VALUE) or None
-
-
-@dataclass(frozen=True, eq=False)
-class WarmStart:
-    """Fit of a large graph that only a few links, the `suspects`, contradict: initial values of further searches."""
-
-    graph: PoseGraph
-    values: gtsam.Values
-    suspects: tuple[Link, ...]
-
-    @property
-    def robots(self) -> set[str]:
-        """Robots that may have been bumped."""
-        return {robot for link in self.suspects for robot, _ in link.ends}
-
-    def start(self, graph: PoseGraph) -> gtsam.Values:
-        """Return initial values for a graph with the same nodes and fewer stay-put constraints."""
-        start = gtsam.Values()
-        for key, errors in calibrations_in(self.values).items():
-            start.insert(key, errors)
-        for node in (*graph.nodes, *((name, ALWAYS) for name in graph.pose_keys.static())):
-            before, now = self.graph.pose_keys.key(node), graph.pose_keys.key(node)
-            if self.values.exists(before) and not start.exists(now):
-                start.insert(now, self.values.atPose3(before))
-        return start
-
-
-def _scale(tested: Iterable[Agreement]) -> float:
-    """Ratio of actual to stated variances by the median measurement; 1 at least.
-
-    An error that all measurements share, such as a wrong mount, is no reason to reject a few of them.
-    """
-    ratios = [one.chi2 / chdtri(one.dof, 0.5) for one in tested if one.dof]
-    return max(1.0, float(np.median(ratios))) if ratios else 1.0
 
 
 def _find_outliers(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tuple[tuple[Rejection, ...], Fit]:
@@ -200,7 +173,7 @@ def _search(
             # without these nothing ties the robots to each other: they disagree, and it is not known which are wrong
             return {}, fit_graph(method, graph, start)
         tested = fit.agreements(SEARCHED)
-        scale = _scale(tested.values())
+        scale = scale_of(tested.values())
         kept = {index for index, off in tested.items() if id(fit.links[index]) in alone and off.sigmas < SIGMAS_ALONE}
         worst = min(tested.keys() - kept, key=lambda index: tested[index].log_p_value(), default=None)
         refusing = worst is not None and tested[worst].p_value(scale) < REJECTION_P_VALUE
@@ -257,112 +230,5 @@ def _innovation(fit: Fit, link: Link) -> Agreement:
 
 
 def find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
-    """Find the anchors that did not stay put, the most significant first; none where an outlier explains more.
-
-    Where a bump and an outlier explain the measurements equally well, as they may in the last stance, it is a bump.
-    """
-    return with_stack(len(graph.nodes), lambda: _bumps(method, graph, None))
-
-
-def _bumps(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tuple[Bump, ...]:
-    robots = warm.robots.intersection(graph.robots) if warm else graph.robots
-    tested_graph = replace(graph, slips={**dict.fromkeys(robots, TEST_SLIP), **graph.slips})
-    start = warm.start(tested_graph) if warm else None
-    bumps: list[Bump] = []
-    for _ in range(MAX_BUMPS):
-        fit = fit_graph(method, tested_graph, start)
-        tested = fit.agreements((StayPut, *SEARCHED))
-        stays = {index: one for index, one in tested.items() if isinstance(fit.links[index], StayPut) and one.dof}
-        if not stays:
-            break
-        plainest = min(stays, key=lambda index: stays[index].log_p_value())
-        if stays[plainest].p_value() > REJECTION_P_VALUE:
-            break
-        stay = fit.links[plainest]
-        assert isinstance(stay, StayPut)
-        freed = _moved(tested_graph, stay)
-        moved = fit_graph(method, freed, start)
-        # scale of the variances once the anchor may have moved: a bump distorts all other residuals
-        rest = moved.agreements(TESTED)
-        scale = _scale(rest.values())
-        if stays[plainest].p_value(scale) > REJECTION_P_VALUE:
-            break
-        others = {
-            index: one
-            for index, one in tested.items()
-            if index not in stays and not isinstance(fit.links[index], Odometry)
-        }
-        if others:
-            wrong = min(others, key=lambda index: others[index].log_p_value())
-            without = fit_graph(method, tested_graph.without([fit.links[wrong]]), start)
-            more = Agreement(max(moved.chi2 - without.chi2, 0.0), max(moved.dof - without.dof, 1))
-            if more.p_value(scale) < REJECTION_P_VALUE:
-                break
-        before, after = (moved.values.atPose3(freed.pose_keys.key(node)) for node in stay.ends)
-        named = replace(stay, slip=graph.slips.get(stay.robot))
-        bump = Bump(named, before.between(after), stays[plainest].sigmas)
-        instead = _odometry_instead(method, tested_graph, stay, tested, fit, moved, start)
-        if instead is not None:
-            links, more_chi2 = instead
-            if more_chi2 < -EQUAL_CHI2 * scale:
-                break  # the odometry explains more: it is rejected in the search for wrong measurements
-            if more_chi2 < EQUAL_CHI2 * scale:
-                bump = replace(bump, alternative=links)
-        tested_graph = _with_bump(tested_graph, bump)
-        bumps.append(bump)
-    return tuple(bumps)
-
-
-def _odometry_instead(
-    method: Method,
-    graph: PoseGraph,
-    stay: StayPut,
-    tested: Mapping[int, Agreement],
-    fit: Fit,
-    moved: Fit,
-    start: gtsam.Values | None,
-) -> tuple[tuple[Odometry, ...], float] | None:
-    """Find odometry of one robot that, if wrong, explains the same as a bump, and by how much its chi2 is larger.
-
-    None where no odometry across the stay-put contradicts anything.
-    """
-    by_robot: dict[str, list[Odometry]] = {}
-    for index, one in tested.items():
-        link = fit.links[index]
-        if isinstance(link, Odometry) and link.before < stay.after <= link.after and one.p_value() < REJECTION_P_VALUE:
-            by_robot.setdefault(link.robot, []).append(link)
-    best: tuple[tuple[Odometry, ...], float] | None = None
-    for links in by_robot.values():
-        without = fit_graph(method, graph.without(links), start)
-        # the expected value of chi2 is its degrees of freedom
-        more = (without.chi2 - without.dof) - (moved.chi2 - moved.dof)
-        if best is None or more < best[1]:
-            best = tuple(links), more
-    return best
-
-
-def _with_bump(graph: PoseGraph, bump: Bump) -> PoseGraph:
-    """Return the graph without the bumped anchor; odometry that may be wrong instead gets the bump as its sigma."""
-    graph = _moved(graph, bump.stay_put)
-    if not bump.alternative:
-        return graph
-    xi = gtsam.Pose3.Logmap(bump.T_before_after)[2:5]
-    uncertain = {
-        id(one): replace(
-            one, covariance=one.covariance + np.diag(np.square(np.maximum(np.abs(xi), np.abs(xi).max() / 2)))
-        )
-        for one in bump.alternative
-    }
-    measurements = tuple(uncertain.get(id(one), one) for one in graph.measurements)
-    return replace(graph, measurements=measurements)
-
-
-def _moved(graph: PoseGraph, stay: StayPut) -> PoseGraph:
-    """Return the graph in which a robot was no anchor at the later of two stances."""
-    stances = tuple(
-        replace(stance, anchors=tuple(robot for robot in stance.anchors if robot != stay.robot))
-        if stance.index == stay.after
-        else stance
-        for stance in graph.stances
-    )
-    return replace(graph, stances=stances)
+    """Find the anchors that did not stay put, the most significant first; none where another cause explains more."""
+    return with_stack(len(graph.nodes), lambda: bumps_of(find_faults(method, graph, None)[0], graph))

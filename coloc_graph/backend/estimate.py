@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.calibration import Calibration, Variables, size_of
+from coloc_graph.backend.cause import Cause, or_else, to_check
 from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
 from coloc_graph.backend.graph import PoseGraph, StayPut
@@ -18,7 +19,7 @@ from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.ranging import RangingProblem
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.measurements import Measurement, Node, Odometry, RangeBearing
+from coloc_graph.measurements import Measurement, Node, RangeBearing
 
 Array = NDArray[np.float64]
 
@@ -35,11 +36,14 @@ class Rejection:
         Reason in words.
     sigmas : float
         Distance from all other measurements in standard deviations; NaN of a ranging run, whose weights are robust.
+    alternative : tuple of Cause
+        Other causes that would explain the measurements as well.
     """
 
     measurement: Measurement | RangeBearing | OnMap
     reason: str
     sigmas: float = float("nan")
+    alternative: tuple[Cause, ...] = ()
 
 
 def rejection_of(measurement: Measurement | OnMap, off: Agreement) -> Rejection:
@@ -59,15 +63,15 @@ class Bump:
         Its body after the bump in its body before, by the other measurements.
     sigmas : float
         Distance from the stay-put constraint in standard deviations.
-    alternative : tuple of Odometry
-        Odometry that, if wrong, would explain the measurements as well; it is then taken to be as uncertain as the
-        bump is large.
+    alternative : tuple of Cause
+        Other causes that would explain the measurements as well; what they say is wrong is taken to be as uncertain as
+        it then is off.
     """
 
     stay_put: StayPut
     T_before_after: gtsam.Pose3
     sigmas: float
-    alternative: tuple[Odometry, ...] = ()
+    alternative: tuple[Cause, ...] = ()
 
     @property
     def description(self) -> str:
@@ -81,11 +85,9 @@ class Bump:
 
     def __str__(self) -> str:
         if self.alternative:
-            first = self.alternative[0]
             return (
-                f"{self.description}, or else the {first} is wrong: both explain the measurements equally well and the "
-                f"estimate is as uncertain as either; check whether {self.stay_put.robot} was pushed, and the wheels "
-                f"and clock of {first.robot}"
+                f"{self.description}{or_else(self.alternative)}: both explain the measurements equally well and the "
+                f"estimate is as uncertain as either; check {to_check(Cause((self.stay_put,)), *self.alternative)}"
             )
         return f"{self.description}; do not name it as an anchor of stance {self.stay_put.after}"
 

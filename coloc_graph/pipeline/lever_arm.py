@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from coloc_graph.backend import Estimate, PoseGraph
-from coloc_graph.backend.batch import EQUAL_CHI2, REJECTION_PRICE
+from coloc_graph.backend.batch import REJECTION_PRICE
+from coloc_graph.backend.blame import EQUAL_CHI2
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.lie import floor_pose, se3_between, se3_inverse
 from coloc_graph.measurements import Odometry, Sighting

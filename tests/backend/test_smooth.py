@@ -121,7 +121,7 @@ def test_in_a_large_graph_a_few_wrong_homographies_are_found_from_where_the_fit_
 def test_of_many_residuals_a_little_too_much_is_no_suspicion(monkeypatch):
     team = team_of(6, 8, seed=1)
     graph = graph_of_team(team)
-    monkeypatch.setattr(sys.modules["coloc_graph.backend.batch"], "_bumps", lambda *_: pytest.fail("searched"))
+    monkeypatch.setattr(sys.modules["coloc_graph.backend.batch"], "find_faults", lambda *_: pytest.fail("searched"))
     monkeypatch.setattr(sys.modules["coloc_graph.backend.batch"], "MIN_FIT_P_VALUE", 1.0)
     assert 0.5 < smooth(graph).chi2 / smooth(graph).dof < 1.1
     worse = [replace(m, covariance=m.covariance / 1.4) for m in team.measurements]
