@@ -1,6 +1,6 @@
 """Share of drawn faults whose true cause is named, alone or among equals, and of innocent robots that are blamed.
 
-    python benchmarks/blame.py [--worlds 34] [--first 1] [--healthy] [--json]
+    python benchmarks/blame.py [--worlds 34] [--first 1] [--healthy] [--json FILE]
 
 Each world is a hallway, or a team of four, of 8 stances at depth tracks, and is solved once for each kind of fault,
 with one drawn fault of the kind: a clock, an odometry jump, a lever arm of odometry, a robot that moved and is called
@@ -13,12 +13,14 @@ import json
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from monte_carlo import MemoryRun, over_seeds, simulated
+from monte_carlo import MemoryRun, simulated
 
 from coloc_graph.backend import Estimate, PoseGraph, joint
 from coloc_graph.backend.cause import Cause
@@ -36,7 +38,7 @@ from coloc_graph.simulation.teams import build_team_world
 
 STANCES = 8  # stances of a run
 POINTS = 100  # points of a stance of a hallway
-TEAM_POINTS = 400  # points of a pair of a stance of a team
+TEAM_POINTS = 300  # points of a pair of a stance of a team
 COUNTED = 3.0  # sigmas by which a fault that counts changes a pose
 KINDS = ("clock", "jump", "arm", "moves", "bump", "homography")
 
@@ -272,13 +274,17 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1, help="first world (default: 1)")
     parser.add_argument("--healthy", action="store_true", help="solve the worlds without a fault")
     parser.add_argument("--processes", type=int, default=2, help="number of processes (default: 2)")
-    parser.add_argument("--json", metavar="FILE", type=Path, help="write every fault to a file, one a line")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="append every fault to a file, one a line")
     options = parser.parse_args()
     work = healthy_world if options.healthy else faulty_world
     worlds = range(options.first, options.first + options.worlds)
-    rows = [row for every in over_seeds(work, worlds, options.processes) for row in every]
-    if options.json is not None:
-        options.json.write_text("".join(json.dumps(row, default=str) + "\n" for row in rows))
+    rows = list[dict[str, Any]]()
+    with ProcessPoolExecutor(options.processes, mp_context=get_context("spawn")) as pool:
+        for every in pool.map(work, worlds):
+            rows += every
+            if options.json is not None:
+                with options.json.open("a") as out:
+                    out.writelines(json.dumps(row, default=str) + "\n" for row in every)
     counts: Counter[tuple[str, str]] = Counter()
     for row in rows:
         row["counted"] = row.get("effect", np.inf) > COUNTED

@@ -285,6 +285,8 @@ def _with_fault(graph: PoseGraph, best: _Tried, others: list[_Tried]) -> PoseGra
         if isinstance(stay, StayPut):
             graph = moved(graph, stay)
     wrong = {id(link) for link in best.cause.links}
+    if isinstance(best.cause.links[0], Odometry):  # which is wrong far more often than all that a camera measured
+        others = [one for one in others if one.cause.view is None]
     widened = {
         id(link): _widened(link, one.fit)
         for one in others

@@ -77,3 +77,35 @@ def test_where_a_bump_and_wrong_odometry_explain_as_much_both_are_named_and_the_
         float(np.sqrt(np.trace(estimate.covariance(*node)[3:5, 3:5]))) for node in team.T_world_body if node[1] == last
     )
     assert sigma > 0.5 * far
+
+
+def test_in_a_run_of_two_stances_wrong_odometry_is_rejected_and_the_covariance_holds():
+    team = team_of(3, 2, 3)
+    ways = [m for m in team.measurements if isinstance(m, Odometry)]
+    bad = replace(ways[-1], T_before_after=ways[-1].T_before_after @ floor_pose(0.3, 0.2, 0.0))
+    estimate = smooth(graph_of_team(team, [bad if m is ways[-1] else m for m in team.measurements]))
+    named = [one.measurement for one in estimate.rejected]
+    named += [link for bump in estimate.bumped for cause in bump.alternative for link in cause.links]
+    assert bad in named
+    assert estimate.chi2 < 3 * max(estimate.dof, 1)
+    assert all(planar_nees(estimate, team, node) < 30 for node in team.T_world_body)
+
+
+@pytest.mark.parametrize("robots", [3, 4])
+def test_a_camera_that_moved_within_a_stance_is_no_bump_to_and_fro(robots):
+    team = team_of(robots, 10, 1)
+    stance, robot = 5, team.stances[5].anchors[0]
+    off = floor_pose(0.06, -0.05, 0.12)
+    made = []
+    for m in team.measurements:
+        if isinstance(m, RelativePose) and m.stance == stance and robot in (m.robot_i, m.robot_j):
+            m = replace(m, T_i_j=se3_inverse(off) @ m.T_i_j if m.robot_i == robot else m.T_i_j @ off)
+        elif isinstance(m, Sighting) and m.stance == stance and m.observer == robot:
+            m = replace(m, T_observer_seen=se3_inverse(off) @ m.T_observer_seen)
+        made.append(m)
+    estimate = smooth(graph_of_team(team, made))
+    assert not [bump for bump in estimate.bumped if not bump.alternative]
+    causes = [(one.measurement, one.alternative) for one in estimate.rejected]
+    assert causes
+    for m, alternative in causes:
+        assert robot in {name for name, _ in m.ends} or any(robot in cause.robots for cause in alternative)
