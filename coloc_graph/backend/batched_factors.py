@@ -124,8 +124,15 @@ class BatchedFactors:
         }
         self._values: dict[int, bytes] = {}  # poses and calibration variables of the last evaluation
         self._found: list[tuple[Array, list[Array]]] = []
+        self._before: list[BatchedFactors | None] = []
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """Keys of all poses and calibration variables."""
+        return *self._poses, *self._variables
 
     def __enter__(self) -> "BatchedFactors":
+        self._before = [one.among for one in self.members]
         for one in self.members:
             one.among = self
         return self
@@ -133,8 +140,8 @@ class BatchedFactors:
     def __exit__(
         self, kind: type[BaseException] | None, why: BaseException | None, where: TracebackType | None
     ) -> None:
-        for one in self.members:
-            one.among = None
+        for one, before in zip(self.members, self._before, strict=True):
+            one.among = before
 
     def at(self, member: FactorEvaluator, values: gtsam.Values) -> tuple[Array, list[Array]] | None:
         """Result of `FactorEvaluator.alone`, from the batch; None where the values lack a variable of the graph."""

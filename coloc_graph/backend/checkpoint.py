@@ -18,7 +18,7 @@ from coloc_graph.run import Stance
 from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.team import Floor, Landmark, Robot, Slip
 
-FORMAT = "coloc-graph-checkpoint-5"
+FORMAT = "coloc-graph-checkpoint-6"
 
 #: Measurements; `Any`, since msgspec cannot decode a union of dataclasses: a file has each under its `KINDS`.
 Measurements = tuple[Any, ...]
@@ -64,6 +64,7 @@ class Checkpoint:
     slips: dict[str, Slip]
     robot_models: dict[str, Robot]
     landmarks: dict[str, Landmark]
+    lag: int
     base: Base
     journal: tuple[Entry, ...]
     waiting: tuple[WaitingStance, ...]

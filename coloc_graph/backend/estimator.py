@@ -3,6 +3,8 @@
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
+from math import ceil
 from pathlib import Path
 
 import gtsam
@@ -16,6 +18,7 @@ from coloc_graph.backend.checkpoint import Base, Entry, WaitingStance
 from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
 from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate, rejection_of
 from coloc_graph.backend.factors import Factors, Method, require_robot_models
+from coloc_graph.backend.fixed_lag import LAG, MAX_STANCES_PER_LAG
 from coloc_graph.backend.graph import (
     Link,
     PoseGraph,
@@ -68,11 +71,16 @@ class Estimator:
         Mounts and markers, which are then calibrated along with the poses, as by `joint`; None: poses alone.
     landmarks : mapping of str to Landmark
         Landmarks that may be sighted.
+    lag : int
+        Where mounts are calibrated, number of last stances whose poses stay variables. Poses before them keep their
+        estimates, while their measurements go on to count, linearised; so a stance costs the same in a run of any
+        length. A measurement of an older pose that comes late makes all of them variables again, which takes as long
+        as a batch estimate.
 
     Raises
     ------
     EstimationError
-        The reference is not one of the robots, or a robot's model is missing.
+        The reference is not one of the robots, a robot's model is missing, or the lag is not positive.
 
     Notes
     -----
@@ -89,7 +97,11 @@ class Estimator:
         slips: Mapping[str, Slip] | None = None,
         robot_models: Mapping[str, Robot] | None = None,
         landmarks: Mapping[str, Landmark] | None = None,
+        lag: int = LAG,
     ) -> None:
+        if lag < 1:
+            raise EstimationError(f"a lag of {lag} stances leaves no pose to estimate: give 1 or more")
+        self.lag = lag
         self.reference, self.robots, self.floor, self.slips = reference, tuple(robots), floor, dict(slips or {})
         self.robot_models, self.landmarks = dict(robot_models or {}), dict(landmarks or {})
         self._on_map = map_positions(self.landmarks)
@@ -146,10 +158,10 @@ class Estimator:
             raise
 
     @classmethod
-    def of(cls, team: Team, method: Method = "joint") -> "Estimator":
+    def of(cls, team: Team, method: Method = "joint", lag: int = LAG) -> "Estimator":
         """Return the estimator of a team: with its mounts to be calibrated, or of poses alone (`smooth`)."""
         robot_models = {robot.name: robot for robot in team.robots} if method == "joint" else None
-        return cls(team.reference, team.names, team.floor, slips_of(team), robot_models, landmarks_of(team))
+        return cls(team.reference, team.names, team.floor, slips_of(team), robot_models, landmarks_of(team), lag)
 
     @property
     def method(self) -> Method:
@@ -379,7 +391,7 @@ class Estimator:
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint atomically, from which `resume` continues."""
-        team = self.reference, self.robots, self.floor, self.slips, self.robot_models, self.landmarks
+        team = self.reference, self.robots, self.floor, self.slips, self.robot_models, self.landmarks, self.lag
         came = self._base, tuple(self._journal), tuple(self._waiting.values())
         checkpoint.write(checkpoint.Checkpoint(*team, *came), Path(path))
 
@@ -395,7 +407,9 @@ class Estimator:
             The file is no checkpoint of this version, or a damaged one.
         """
         saved = checkpoint.read(Path(path))
-        estimator = cls(saved.reference, saved.robots, saved.floor, saved.slips, saved.robot_models, saved.landmarks)
+        estimator = cls(
+            saved.reference, saved.robots, saved.floor, saved.slips, saved.robot_models, saved.landmarks, saved.lag
+        )
         try:
             estimator._replay(saved.base, saved.journal)
         except EstimationError as error:
@@ -405,6 +419,9 @@ class Estimator:
 
     def _enter(self, stance: Stance | None, taken: tuple[Measurement, ...]) -> StanceEstimate:
         before = next(reversed(self._stances.values()), None)
+        if any(map(self._is_marginalised, taken)):
+            self._changed = True
+            self._begin(_base(self.stances, self.measurements, self._rejected))
         links: list[Link] = [*self._disconnected, *taken, *self._new_map_positions(taken)]
         if stance is not None:
             if before is not None:
@@ -421,6 +438,7 @@ class Estimator:
                 del self._stances[stance.index]
             raise
         rejected, agreement = self._update(plan)
+        self._marginalise()
         self._journal.append(Entry(stance, taken))
         self._log += taken
         self._instants |= instants
@@ -459,6 +477,27 @@ class Estimator:
         except Exception as failure:
             raise EstimationError(f"the graph cannot be solved with this, and was restored: {failure}") from failure
         return tuple(_rejection(link, off) for link, off in outcome.rejected), outcome.agreement
+
+    def _marginalise(self) -> None:
+        """Marginalise the poses of old stances where mounts are calibrated."""
+        most = ceil(MAX_STANCES_PER_LAG * self.lag)
+        recent = list(islice(reversed(self._stances), most))
+        if not self.robot_models or len(recent) < most:
+            return
+        key, live = self._pose_keys.key, self._live
+        keep = {key((robot, index)) for robot in self.robots for index in recent[: self.lag]}
+        if not {key((robot, recent[-1])) for robot in self.robots} & live.tied - live.marginalised.keys() - keep:
+            return
+        for robot in self.robots:
+            # a robot that was not seen for long is seen again, or its odometry goes on
+            keys = (key((robot, index)) for index in reversed(self._stances))
+            keep.update(islice((one for one in keys if one in live.tied), 1))
+        live.marginalise(keep | set(self._pose_keys.static().values()))
+
+    def _is_marginalised(self, measurement: Measurement) -> bool:
+        """Return whether a measurement is of a pose that is no variable any more."""
+        nodes = (node for node in measurement.ends if node in self._pose_keys)
+        return any(self._pose_keys.key(node) in self._live.marginalised for node in nodes)
 
     def _keys(self, link: Link) -> tuple[int, int]:
         i, j = map(self._pose_keys.key, link.ends)

@@ -1,6 +1,6 @@
 """The graph inside an estimator: ISAM2 with QR, insertion of links and removal of outliers."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import gtsam
@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from coloc_graph.backend.calibration import ANCHOR_TILT_SIGMA, TILTS, is_calibration
+from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors
+from coloc_graph.backend.calibration import ANCHOR_TILT_SIGMA, PLANE, TILTS, is_calibration
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, agreement, innovation, keys_of
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
+from coloc_graph.backend.fixed_lag import marginal_factors
 from coloc_graph.backend.graph import Link, PoseGraph
 from coloc_graph.backend.insertion import InsertionPlan, Tie
 from coloc_graph.backend.optimize import fit_graph
@@ -50,34 +52,47 @@ class Isam2Graph:
     def __init__(self, factors_of: Factors) -> None:
         self.factors_of = factors_of
         self.tied: set[int] = set()
+        #: Poses that were marginalised: T_world_body and covariance (6, 6) at that time.
+        self.marginalised: dict[int, tuple[gtsam.Pose3, Array]] = {}
         self._calibrated: dict[int, Array] = {}  # calibration variables at the last linearisation of everything
-        self.isam = gtsam.ISAM2(isam_parameters(calibrates=factors_of.variables is not None))
+        self._former: dict[int, Array] = {}  # planes of marginalised stances, at their estimates
+        self._batched: dict[int, BatchedFactor] = {}  # factors of numpy models, by index
+        self._latest = _batch([])  # factors of the last insertion
+        self._made: dict[int, tuple[Link, gtsam.NonlinearFactor]] = {}  # their links and factors, by a link's identity
+        self.isam = self._new_isam()
+
+    def _new_isam(self) -> gtsam.ISAM2:
+        return gtsam.ISAM2(isam_parameters(calibrates=self.factors_of.variables is not None))
 
     def pose(self, key: int) -> gtsam.Pose3:
         """Return T_world_body of a tied key."""
-        return self.isam.calculateEstimatePose3(key)
+        return self.marginalised[key][0] if key in self.marginalised else self.isam.calculateEstimatePose3(key)
 
     def covariance(self, key: int) -> Array:
         """Return the covariance (6, 6) of a tied key."""
-        return np.asarray(self.isam.marginalCovariance(key))
+        return np.asarray(self.marginalised[key][1] if key in self.marginalised else self.isam.marginalCovariance(key))
 
     def errors(self, key: int) -> Array:
         """Return the estimate of a calibration variable: as stated while no factor is on it."""
         if key in self._calibrated:
             return np.asarray(self.isam.calculateEstimateVector(key))
-        return self.factors_of.nominal(key)
+        return self._former.get(key, self.factors_of.nominal(key))
 
     def residual(self, tie: Tie) -> float:
         """Return the RMS residual of a link between tied keys in units of its noise."""
-        factor = self.factors_of.of_link(*tie)
-        values = gtsam.Values()
-        for key in map(int, factor.keys()):
-            values.insert(key, self._known(key))
-        return float(np.sqrt(2 * factor.error(values) / self.factors_of.rows(tie[0], factor)))
+        link, factor = self._made.get(id(tie[0]), (None, None))
+        if factor is None or link is not tie[0]:
+            factor = self.factors_of.of_link(*tie)
+        with self._latest:
+            error = factor.error(self._known_of([factor]))
+        return float(np.sqrt(2 * error / self.factors_of.rows(tie[0], factor)))
 
     def values(self) -> gtsam.Values:
         """Return the estimates of all variables."""
-        return self.isam.calculateEstimate()
+        values = self.isam.calculateEstimate()
+        for key, (pose, _) in self.marginalised.items():
+            values.insert(key, pose)
+        return values
 
     def enter(self, plan: InsertionPlan) -> Outcome:
         """Insert poses and links, without outliers."""
@@ -89,6 +104,21 @@ class Isam2Graph:
                 factors.add(factor)
         made = [self.factors_of.of_link(*tie) for tie in (*plan.ties, *plan.near)]
         far = {id(tie): self.factors_of.of_link(*tie) for tie in plan.far}
+        links = (*plan.ties, *plan.near, *plan.far)
+        self._made = {id(tie[0]): (tie[0], one) for tie, one in zip(links, (*made, *far.values()), strict=True)}
+        self._latest = _batch(made + list(far.values()))
+        with self._latest:
+            return self._enter(plan, factors, values, made, far)
+
+    def _enter(
+        self,
+        plan: InsertionPlan,
+        factors: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        made: list[gtsam.NonlinearFactor],
+        far: dict[int, gtsam.NonlinearFactor],
+    ) -> Outcome:
+        """Insert the factors of a plan: those of its poses, its ties and near links, and its distant links."""
         gates = {id(tie): self._gate(tie) for tie in plan.far}
         self._new_variables([*made, *far.values()], factors, values)
         first = factors.size() + len(plan.ties)
@@ -100,8 +130,10 @@ class Isam2Graph:
             # with mounts that are degrees off a first full step may diverge
             values, _ = optimise(factors, values)
         indices = self._into_isam(factors, values) if factors.size() else []
-        inside = {index: InsertedLink(tie[0], self.isam.getFactorsUnsafe().at(index))
-                  for index, tie in zip(indices[first:], plan.near, strict=True)}  # fmt: skip
+        inside = {
+            index: InsertedLink(tie[0], factor)
+            for index, factor, tie in zip(indices[first:], made[len(plan.ties) :], plan.near, strict=True)
+        }
         rejected = self._enter_far([(InsertedLink(tie[0], far[id(tie)]), gates[id(tie)]) for tie in plan.far], inside)
         if plan.far or not clear:
             rejected += self._take_out(inside)
@@ -141,7 +173,7 @@ class Isam2Graph:
         Where mounts change, everything is linearised anew until they converge: poses shift with them, further than one
         step reaches.
         """
-        indices = list(self.isam.update(factors, values, list(instead_of)).getNewFactorsIndices())
+        indices = self._update(factors, values, instead_of)
         for _ in range(MAX_STEPS):
             now = {key: self.errors(key) for key in self._calibrated}
             changes = (np.abs(now[key] - before).max() for key, before in self._calibrated.items())
@@ -151,14 +183,61 @@ class Isam2Graph:
             self._calibrated = now
         return indices
 
+    def _update(
+        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, instead_of: Sequence[int] = ()
+    ) -> list[int]:
+        """Insert factors, `instead_of` others, take one step, and return their indices."""
+        indices = list(self.isam.update(factors, values, list(instead_of)).getNewFactorsIndices())
+        for index in instead_of:
+            self._batched.pop(index, None)
+        for n, index in enumerate(indices):
+            factor = factors.at(n)
+            if isinstance(factor, BatchedFactor):
+                self._batched[index] = factor
+        return indices
+
     def _linearise(self) -> None:
         """Linearise everything anew at its estimate, and take one step."""
         again = gtsam.ISAM2UpdateParams()
         again.force_relinearize = True
-        self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), again)
+        with _batch(self._batched.values()):
+            self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), again)
+
+    def marginalise(self, keep: Collection[int]) -> None:
+        """Marginalise all poses but those to `keep`, with the planes that were stated for their stances.
+
+        Their estimates stay as they are now; what their measurements say of the others remains, linearised.
+        """
+        inside = self.isam.getFactorsUnsafe()
+        factors = {n: inside.at(n) for n in range(inside.size()) if inside.exists(n)}
+        gone = self.tied - self.marginalised.keys() - set(keep)
+        planes = {key for key in self._calibrated if gtsam.mrsymbolChr(key) == PLANE}
+        for factor in factors.values():
+            keys = set(map(int, factor.keys()))
+            if not keys & gone and len(keys) > 1:
+                planes -= keys
+        values = self.isam.calculateEstimate()
+        self.marginalised |= {key: (values.atPose3(key), self.covariance(key)) for key in gone}
+        self._former |= {key: self.errors(key) for key in planes}
+        past, left = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+        for factor in factors.values():
+            (past if (gone | planes).intersection(factor.keys()) else left).add(factor)
+        oldest_first = [key for key in keys_of(past.at(n) for n in range(past.size())) if key in gone]
+        with _batch(self._batched.values()):
+            for summary in marginal_factors(past, values, (*oldest_first, *sorted(planes))):
+                left.add(summary)
+            for key in gone | planes:
+                values.erase(key)
+            self._begin_with(left, values)
+
+    def _begin_with(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        """Hold these factors and variables, and nothing else."""
+        self.isam, self._batched = self._new_isam(), {}
+        self._update(factors, values)
+        self._calibrated = calibrations_in(values)
 
     def _known(self, key: int) -> gtsam.Pose3 | Array:
-        return self.errors(key) if is_calibration(key) else self.isam.calculateEstimatePose3(key)
+        return self.errors(key) if is_calibration(key) else self.pose(key)
 
     def _with_known(self, new: gtsam.Values, factors: gtsam.NonlinearFactorGraph) -> gtsam.Values:
         """Return the initial values of new variables, and the estimates of all others that factors are on."""
@@ -204,7 +283,7 @@ class Isam2Graph:
         """Insert factors that lead the poses to where others can be evaluated, optimise, and return their indices."""
         if not leading.size():
             return []
-        indices = list(self.isam.update(leading, gtsam.Values()).getNewFactorsIndices())
+        indices = self._update(leading, gtsam.Values())
         keys = keys_of([leading.at(n) for n in range(leading.size())])
         before = [self.isam.calculateEstimatePose3(key) for key in keys]
         for _ in range(MAX_STEPS):
@@ -230,17 +309,28 @@ class Isam2Graph:
                 self._linearise()
                 continue
             rejected.append((inside.pop(worst).link, among[worst]))
-            self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [worst])
+            self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [worst])
             before = np.inf
         return rejected
 
     def _agreement(self, factors: list[gtsam.NonlinearFactor], *, inside: bool = True) -> Agreement:
         if not factors:
             return UNCHECKED
-        values, keys = gtsam.Values(), keys_of(factors)
-        for key in keys:
+        joint = joint_covariance(self.isam, keys_of(factors))
+        return (agreement if inside else innovation)(factors, self._known_of(factors), joint)
+
+    def _known_of(self, factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.Values:
+        """Return the estimates of all variables that factors are on, and those of the latest batch."""
+        values = gtsam.Values()
+        batch = (key for key in self._latest.keys if self.isam.valueExists(key))
+        for key in dict.fromkeys((*keys_of(factors), *batch)):
             values.insert(key, self._known(key))
-        return (agreement if inside else innovation)(factors, values, joint_covariance(self.isam, keys))
+        return values
+
+
+def _batch(factors: Iterable[gtsam.NonlinearFactor]) -> BatchedFactors:
+    """Return the context in which those of numpy models among factors are evaluated together."""
+    return BatchedFactors([one.evaluator for one in factors if isinstance(one, BatchedFactor)])
 
 
 def rebuilt(graph: PoseGraph, method: Method) -> tuple[Isam2Graph, tuple[Link, ...]]:
@@ -250,7 +340,6 @@ def rebuilt(graph: PoseGraph, method: Method) -> tuple[Isam2Graph, tuple[Link, .
     fit = with_stack(len(graph.nodes), lambda: fit_graph(method, graph))
     live = Isam2Graph(fit.factors_of)
     with fit.batched:
-        live.isam.update(fit.factors, fit.values)
+        live._begin_with(fit.factors, fit.values)
     live.tied = set(poses_in(fit.values))
-    live._calibrated = calibrations_in(fit.values)
     return live, fit.links

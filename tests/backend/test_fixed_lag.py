@@ -1,0 +1,111 @@
+"""Estimator whose old poses are marginalised: as accurate as with all of them, at the cost of the last ones."""
+
+from collections import defaultdict
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coloc_graph.backend import Estimator
+from coloc_graph.errors import EstimationError
+from coloc_graph.measurements import Odometry, Sighting
+from coloc_graph.pipeline.batch import solve
+from coloc_graph.run import open_run
+from coloc_graph.simulation import Imperfections, simulate
+
+WRONG = Imperfections(mount_sigma_deg=1.0, height_sigma=0.005, span_sigma=1e-4, floor_sigma_deg=0.1)
+LAG = 5
+STANCES = 18
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory):
+    """Graph of a hallway whose mounts are wrong."""
+    path = tmp_path_factory.mktemp("lag") / "hallway.mcap"
+    simulate("hallway", path, stances=STANCES, seed=4, points=80, imperfections=WRONG)
+    return solve(open_run(path)).estimate.graph
+
+
+def fed(graph, lag, late=(), stances=STANCES):
+    """Estimator of a graph's stances in their order; measurements in `late` are left out."""
+    by_stance = defaultdict(list)
+    for one in graph.measurements:
+        if one not in late:
+            by_stance[max(stance for _, stance in one.ends)].append(one)
+    estimator = Estimator(
+        graph.reference, graph.robots, graph.floor, graph.slips, graph.robot_models, graph.landmarks, lag
+    )
+    before = None
+    for stance in graph.stances[:stances]:
+        here = stance if before is not None else replace(stance, anchors=())
+        estimator.add(here, by_stance[stance.index], after=before)
+        before = stance.index
+    return estimator
+
+
+@pytest.fixture(scope="module")
+def short(graph):
+    return fed(graph, LAG)
+
+
+def in_sigmas(one, other, robot):
+    """Distance of a robot's last poses, in the standard deviations of the second."""
+    off = np.asarray(other.pose(robot).localCoordinates(one.pose(robot)))
+    return float(np.sqrt(off @ np.linalg.solve(other.covariance(robot), off) / 6))
+
+
+def test_the_last_poses_are_those_of_all_poses(graph, short):
+    whole = fed(graph, STANCES)
+    for robot in "AB":
+        assert in_sigmas(short, whole, robot) < 0.1
+        np.testing.assert_allclose(
+            np.sqrt(short.covariance(robot).diagonal()), np.sqrt(whole.covariance(robot).diagonal()), rtol=0.03
+        )
+
+
+def test_no_more_poses_stay_variables_than_the_lag_has(graph, short):
+    half = fed(graph, LAG, stances=STANCES // 2)
+    sizes = [one._live.isam.calculateEstimate().size() for one in (half, short)]
+    assert max(sizes) < 3 * (1.5 * LAG + 2) + len(short.estimate().calibration.values)
+    assert abs(sizes[1] - sizes[0]) <= 3 * LAG
+    # all poses are there, and a batch estimate has all measurements
+    assert {node for node in graph.nodes if node[0] in "AB"} <= {
+        (robot, stance.index) for robot in "AB" for stance in graph.stances if short.pose(robot, stance.index)
+    }
+    assert short.estimate().chi2 == pytest.approx(fed(graph, STANCES).estimate().chi2, abs=0.01)
+
+
+def test_a_late_measurement_of_an_old_pose_counts(graph):
+    late = [one for one in graph.measurements if isinstance(one, Odometry | Sighting) and one.ends[1][1] == 3]
+    estimator = fed(graph, LAG, late=late)
+    assert any(estimator._is_marginalised(one) for one in late)
+    before = estimator.pose("A")
+    estimator.insert(*late)
+    assert not estimator.rejected
+    assert not before.equals(estimator.pose("A"), 1e-9)
+    whole = fed(graph, STANCES)
+    assert all(in_sigmas(estimator, whole, robot) < 0.1 for robot in "AB")
+
+
+def test_a_checkpoint_resumes_to_the_bit(graph, short, tmp_path):
+    short.save(tmp_path / "point.json")
+    resumed = Estimator.resume(tmp_path / "point.json")
+    assert resumed.lag == LAG
+    for node in graph.nodes:
+        np.testing.assert_array_equal(resumed.pose(*node).matrix(), short.pose(*node).matrix())
+        np.testing.assert_array_equal(resumed.covariance(*node), short.covariance(*node))
+
+
+def test_a_stance_is_withdrawn_and_comes_again(graph):
+    estimator = fed(graph, LAG)
+    expected = estimator.pose("A")
+    taken = [one for one in graph.measurements if max(index for _, index in one.ends) == graph.stances[-1].index]
+    stance = estimator.withdraw()
+    estimator.add(stance, taken, after=graph.stances[-2].index)
+    off = np.asarray(expected.localCoordinates(estimator.pose("A")))
+    assert np.sqrt(off @ np.linalg.solve(estimator.covariance("A"), off) / 6) < 0.1
+
+
+def test_a_lag_of_nothing_is_refused(graph):
+    with pytest.raises(EstimationError, match="a lag of 0 stances"):
+        fed(graph, 0)
