@@ -1,4 +1,4 @@
-"""coloc export g2o|gtsam|tum|dot|ros2|foxglove DIR --out PATH."""
+"""coloc export g2o|gtsam|pyfg|jrl|tum|dot|ros2|foxglove DIR --out PATH."""
 
 import argparse
 from pathlib import Path
@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from coloc_graph.results.folder import Result
 
 FORMATS = (
-    "g2o and dot: one file; gtsam: a folder with the serialised factors and a script; tum: a file for each robot; "
-    "ros2: a bag (.mcap) with tf, poses and paths; foxglove: an .mcap with frames, cameras, poses, truth and a 3D scene"
+    "g2o, pyfg, jrl and dot: one file; gtsam: a folder with the serialised factors and a script; tum: a file for each "
+    "robot; ros2: a bag (.mcap) with tf, poses and paths; foxglove: an .mcap with frames, cameras, poses, truth and a 3D scene"
 )
 
 #: Endings of the files in an exported folder, by format.
@@ -20,9 +20,15 @@ FOLDERS = {"tum": (".tum", ".cov.csv"), "gtsam": ("graph.txt", "values.txt", "ke
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command and its arguments."""
-    command = commands.add_parser("export", help="export a result for g2o, GTSAM, TUM, Graphviz, ROS 2 or Foxglove")
-    command.add_argument("format", choices=("g2o", "gtsam", "tum", "dot", "ros2", "foxglove"), help=FORMATS)
-    command.add_argument("result", metavar="DIR", help="result of `coloc solve`")
+    command = commands.add_parser(
+        "export", help="export a result for g2o, GTSAM, PyFG, JRL, TUM, Graphviz, ROS 2 or Foxglove"
+    )
+    command.add_argument(
+        "format", choices=("g2o", "gtsam", "pyfg", "jrl", "tum", "dot", "ros2", "foxglove"), help=FORMATS
+    )
+    command.add_argument(
+        "result", metavar="DIR", help="result of `coloc solve`; pyfg, jrl: or a graph (.pyfg, .jrl, .g2o)"
+    )
     command.add_argument("--out", required=True, metavar="PATH", help="file to write; for tum and gtsam a folder")
     command.add_argument("--truth", action="store_true", help="tum: export the truth of the run, not the estimate")
     command.add_argument("--layout", action="store_true", help="foxglove: write a layout (.json) beside the file, too")
@@ -41,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.results.folder import GTSAM_FACTORS, read_result
     from coloc_graph.run.atomic_file import require_replaceable_folder, require_writable, write_atomically
 
-    result, out = read_result(args.result), Path(args.out)
+    out = Path(args.out)
     if args.format in FOLDERS:
         require_replaceable_folder(out, FOLDERS[args.format], force=args.force)
     elif os.path.lexists(out):
@@ -50,6 +56,11 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--truth applies to tum, not to {args.format}: leave it out")
     if args.layout and args.format != "foxglove":
         raise InputError(f"--layout applies to foxglove, not to {args.format}: leave it out")
+    if args.format in ("pyfg", "jrl"):
+        return _range_graph(args, out)
+    if Path(args.result).suffix in (".pyfg", ".jrl", ".g2o") and Path(args.result).is_file():
+        raise InputError(f"{args.result} is exported to pyfg or jrl only: give the result of `coloc solve`")
+    result = read_result(args.result)
     if args.truth:
         return _truth(result, args.run_path, out)
     if args.format == "foxglove":
@@ -82,6 +93,42 @@ def run(args: argparse.Namespace) -> int:
     else:
         write_atomically(out, source.read_bytes())
     print(f"wrote {out}")
+    return 0
+
+
+def _range_graph(args: argparse.Namespace, out: Path) -> int:
+    """Write the graph of a result, or of a file, in a format of the field's benchmarks."""
+    from coloc_graph.cli.printing import counted
+    from coloc_graph.errors import InputError
+    from coloc_graph.exchange.g2o import read_g2o
+    from coloc_graph.exchange.range_graph_files import WRITERS, of_pose_graph, read_range_graph
+    from coloc_graph.results.folder import read_result
+
+    robots = ""
+    if Path(args.result).is_file():
+        graph = read_range_graph(args.result)
+    else:
+        result = read_result(args.result)
+        if result.is_ranging:
+            raise InputError(
+                f"{result.path} is the result of a ranging run, whose measurements are not exported to {args.format} "
+                "yet: export tum or ros2"
+            )
+        times = {
+            (robot, int(stance)): float(time)
+            for robot, one in result.trajectories.items()
+            if one.stances is not None
+            for stance, time in zip(one.stances, one.times, strict=True)
+        }
+        graph, letters = of_pose_graph(read_g2o(result.path / "graph.g2o"), times)
+        robots = "; robots " + ", ".join(f"{letter} = {robot}" for robot, letter in letters.items())
+    out.parent.mkdir(parents=True, exist_ok=True)
+    WRITERS[args.format](graph, out)
+    relative = f"{len(graph.relatives)} relative poses and positions"
+    print(
+        f"wrote {out}: {counted(len(graph.names), 'variable')}, {counted(len(graph.priors), 'prior')}, {relative}, "
+        f"{counted(len(graph.ranges), 'range')}, {counted(len(graph.bearings), 'bearing')}{robots}"
+    )
     return 0
 
 
