@@ -11,7 +11,8 @@ if TYPE_CHECKING:
 
 FORMATS = (
     "g2o, pyfg, jrl and dot: one file; gtsam: a folder with the serialised factors and a script; tum: a file for each "
-    "robot; ros2: a bag (.mcap) with tf, poses and paths; foxglove: an .mcap with frames, cameras, poses, truth and a 3D scene"
+    "robot; ros2: a bag (.mcap) with tf, poses and paths; foxglove: an .mcap with frames, cameras, poses, truth and a "
+    "3D scene"
 )
 
 #: Endings of the files in an exported folder, by format.

@@ -205,27 +205,41 @@ def values_of(values: Mapping[str, Any]) -> gtsam.Values:
 
 def _factors(graph: RangeGraph) -> Iterator[gtsam.NonlinearFactor]:
     planar, noise = graph.planar, gtsam.noiseModel.Gaussian.Covariance
+    kinds: dict[str, Any] = _PLANAR if planar else _SOLID
     for prior in graph.priors:
-        pose = gtsam.PriorFactorPose2 if planar else gtsam.PriorFactorPose3
-        point = gtsam.PriorFactorPoint2 if planar else gtsam.PriorFactorPoint3
-        kind = pose if is_pose(prior.value) else point
+        kind = kinds["pose prior" if is_pose(prior.value) else "point prior"]
         yield kind(key_of(prior.name), prior.value, noise(prior.covariance))
     seen = []
-    between = gtsam.BetweenFactorPose2 if planar else gtsam.BetweenFactorPose3
-    for one in graph.relatives:
-        if is_pose(one.value):
-            yield between(key_of(one.first), key_of(one.second), one.value, noise(one.covariance))
+    for step in graph.relatives:
+        if is_pose(step.value):
+            ends = key_of(step.first), key_of(step.second)
+            yield kinds["between"](*ends, step.value, noise(step.covariance))
         else:
-            seen.append(as_bearing(one))
+            seen.append(as_bearing(step))
     for one in graph.ranges:
-        of_pose = gtsam.RangeFactorPose2 if planar else gtsam.RangeFactorPose3
-        of_point = gtsam.RangeFactor2D if planar else gtsam.RangeFactor3D
-        kind = of_point if is_landmark(one.second) else of_pose
-        sigma = gtsam.noiseModel.Isotropic.Variance(1, one.variance)
-        yield kind(key_of(one.first), key_of(one.second), one.distance, sigma)
-    for one in (*seen, *graph.bearings):
-        of_pose = gtsam.BearingRangeFactorPose2 if planar else gtsam.BearingRangeFactorPose3
-        of_point = gtsam.BearingRangeFactor2D if planar else gtsam.BearingRangeFactor3D
-        kind = of_point if is_landmark(one.second) else of_pose
-        bearing = gtsam.Rot2(one.bearing) if planar else gtsam.Unit3(*one.bearing)
-        yield kind(key_of(one.first), key_of(one.second), bearing, one.distance, noise(one.covariance))
+        kind = kinds["range of point" if is_landmark(one.second) else "range of pose"]
+        yield kind(key_of(one.first), key_of(one.second), one.distance, noise(np.array([[one.variance]])))
+    for both in (*seen, *graph.bearings):
+        kind = kinds["bearing of point" if is_landmark(both.second) else "bearing of pose"]
+        bearing = gtsam.Rot2(both.bearing) if planar else gtsam.Unit3(*both.bearing)
+        yield kind(key_of(both.first), key_of(both.second), bearing, both.distance, noise(both.covariance))
+
+
+_PLANAR = {
+    "pose prior": gtsam.PriorFactorPose2,
+    "point prior": gtsam.PriorFactorPoint2,
+    "between": gtsam.BetweenFactorPose2,
+    "range of pose": gtsam.RangeFactorPose2,
+    "range of point": gtsam.RangeFactor2D,
+    "bearing of pose": gtsam.BearingRangeFactorPose2,
+    "bearing of point": gtsam.BearingRangeFactor2D,
+}
+_SOLID = {
+    "pose prior": gtsam.PriorFactorPose3,
+    "point prior": gtsam.PriorFactorPoint3,
+    "between": gtsam.BetweenFactorPose3,
+    "range of pose": gtsam.RangeFactorPose3,
+    "range of point": gtsam.RangeFactor3D,
+    "bearing of pose": gtsam.BearingRangeFactorPose3,
+    "bearing of point": gtsam.BearingRangeFactor3D,
+}
