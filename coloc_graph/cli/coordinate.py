@@ -128,6 +128,7 @@ def run(args: argparse.Namespace) -> int:
             resume=args.resume,
             on_stance=listener.on_stance,
             on_status=listener.on_status,
+            on_plan=listener.on_plan,
         )
         with coordinator:
             state = coordinator.run(stop)

@@ -137,7 +137,13 @@ def online(args: argparse.Namespace) -> int:
         field.start()
         began = time.monotonic()
         coordinator = Coordinator(
-            team, out / "mission", options, listen=address, on_stance=listener.on_stance, on_status=listener.on_status
+            team,
+            out / "mission",
+            options,
+            listen=address,
+            on_stance=listener.on_stance,
+            on_status=listener.on_status,
+            on_plan=listener.on_plan,
         )
         with coordinator:
             state = coordinator.run(stop)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from coloc_graph.online.leap_planner import StancePlan
     from coloc_graph.online.mission import MissionStatus
     from coloc_graph.pipeline.incremental import EnteredStance
     from coloc_graph.team import Team
@@ -24,6 +25,7 @@ class MissionListener:
 
     on_stance: "Callable[[EnteredStance], None] | None" = None
     on_status: "Callable[[MissionStatus], None] | None" = None
+    on_plan: "Callable[[StancePlan], None] | None" = None
 
 
 @contextmanager
@@ -34,6 +36,7 @@ def watched(team: "Team", port: int | None, *, browser: bool, view: bool = True)
         return
     from coloc_graph.cli.view import take_port
     from coloc_graph.viewer import LivePoses, LiveStance, Scene, Viewer
+    from coloc_graph.viewer.plans import plan_of_row
 
     scene = Scene(team.names, (), team=team, title="a mission")
     with take_port(port, say=log.info) as listener, Viewer(scene, listener=listener) as viewer:
@@ -43,6 +46,7 @@ def watched(team: "Team", port: int | None, *, browser: bool, view: bool = True)
         yield MissionListener(
             lambda one: viewer.publish(LiveStance(one.stance, one.estimate, one.measurements)),
             lambda one: viewer.publish(LivePoses(one.time, one.T_world_body, one.text)),
+            lambda one: viewer.publish(plan_of_row(one.as_row())) if one.promise is not None else None,
         )
 
 

@@ -53,6 +53,12 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--poses", metavar="CSV", help="write the plan, for `coloc simulate hallway --plan CSV`")
     command.add_argument("--draw", metavar="PNG", help="draw the plan and the paper's formation")
     add_force(command)
+    command.add_argument(
+        "--view", action="store_true",
+        help="show the plan in the browser, where robots can be dragged; --poses writes it as it was left",
+    )  # fmt: skip
+    command.add_argument("--port", type=int, help="port of --view (default: 8080, or the first free one after it)")
+    command.add_argument("--no-browser", action="store_true", help="with --view: do not open a browser")
     command.add_argument("--json", action="store_true", help="print figures as JSON")
     command.set_defaults(run=run)
 
@@ -136,6 +142,8 @@ def run(args: argparse.Namespace) -> int:
         from coloc_graph.report.plan import plan_figure
 
         plan_figure([(name, mission) for name, _, mission in rows]).savefig(args.draw, dpi=130)
+    if args.view:
+        _edit(args, predictor, best, (args.length, 0.0))
     return 0
 
 
@@ -176,7 +184,27 @@ def _along(args: argparse.Namespace, predictor: "Predictor", pair: tuple[str, st
         from coloc_graph.report.plan import plan_figure
 
         plan_figure([("the plan", best)], predictor.floor_map).savefig(args.draw, dpi=130)
+    if args.view:
+        _edit(args, predictor, best, horizon.goal)
     return 0
+
+
+def _edit(args: argparse.Namespace, predictor: "Predictor", mission: "Mission", goal: tuple[float, float]) -> None:
+    """Show a plan, have its robots dragged, and write what is left of it."""
+    from coloc_graph.cli.view import show, take_port
+    from coloc_graph.planning.plan import write_plan
+    from coloc_graph.viewer import PlanEditor, Viewer
+
+    editor = PlanEditor(predictor, mission.start, mission.plan, goal, mission.reasons)
+    with take_port(args.port) as listener, Viewer(editor.scene, listener=listener) as viewer:
+        editor.attach(viewer)
+        try:
+            show(viewer, browser=not args.no_browser)
+        finally:
+            editor.close()
+    if args.poses is not None and editor.updates:
+        write_plan(editor.plan, args.poses)
+        print(f"{args.poses}: {1e3 * editor.end_sigma:.1f} mm promised at the end")
 
 
 def figures(gait: "Gait", mission: "Mission") -> dict[str, float]:

@@ -16,7 +16,7 @@ from coloc_graph.online.formation import Formation
 from coloc_graph.online.horizon_planner import HorizonPlanner
 from coloc_graph.online.inbox import Inbox, Message, linked
 from coloc_graph.online.leap_frog import LeapFrog
-from coloc_graph.online.leap_planner import LeapPlanner, StancePlanner
+from coloc_graph.online.leap_planner import LeapPlanner, StancePlan, StancePlanner
 from coloc_graph.online.mission import MissionOptions, MissionStatus, in_world, roles
 from coloc_graph.online.mission_folder import MissionFolder
 from coloc_graph.online.mission_log import MissionLog
@@ -58,6 +58,8 @@ class Coordinator:
         Called with each stance that has entered the estimate.
     on_status
         Called with the mission's status ten times a second.
+    on_plan
+        Called with the plan of each stance, as soon as it is decided.
 
     Raises
     ------
@@ -80,6 +82,7 @@ class Coordinator:
         open_session: OpenSession = LinkSession,
         on_stance: Callable[[EnteredStance], None] | None = None,
         on_status: Callable[[MissionStatus], None] | None = None,
+        on_plan: Callable[[StancePlan], None] | None = None,
     ) -> None:
         options = options or MissionOptions()
         mover, observers = roles(team, options.mover)
@@ -132,6 +135,7 @@ class Coordinator:
             log=self._log,
             synchronised=lambda name: link.synchronised(name, options.clock_limit),
             on_stance=on_stance,
+            on_plan=on_plan,
         )
 
     def __enter__(self) -> Self:

@@ -59,8 +59,8 @@ class LeapFrog:
         States of the robots, commands to them, the estimator's thread, and the mission's log.
     synchronised
         Returns whether a robot's clock is known well enough.
-    on_stance
-        Called with each stance that has entered the estimate.
+    on_stance, on_plan
+        Called with each stance that has entered the estimate, and with each plan.
     """
 
     def __init__(
@@ -76,11 +76,12 @@ class LeapFrog:
         log: MissionLog,
         synchronised: Callable[[str], bool],
         on_stance: Callable[[EnteredStance], None] | None = None,
+        on_plan: Callable[[StancePlan], None] | None = None,
     ) -> None:
         self._team, self._options, self._planner = team, options, planner
         self._decisions = decisions
         self._registry, self._commander, self._worker, self._log = registry, commander, worker, log
-        self._synchronised, self._on_stance = synchronised, on_stance
+        self._synchronised, self._on_stance, self._on_plan = synchronised, on_stance, on_plan
         self.mover, self.observers = roles(team, options.mover)
         self.stances: list[Stance] = []
         self.latencies: list[float] = []
@@ -175,6 +176,8 @@ class LeapFrog:
         for robot in self._registry.robots.values():
             robot.arrived, robot.drive = True, None
         self._log.note("planned", **plan.as_row())
+        if self._on_plan is not None:
+            self._on_plan(plan)
         self._send_leaper()
         self._commander.drive(self.mover, plan.placing)
         self._enter(MissionState.PLACING)

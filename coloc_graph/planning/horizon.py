@@ -147,6 +147,8 @@ class Horizon:
         stances: list[PlannedStance] = []
         promises: list[Promise] = []
         times: list[float] = []
+        reasons: list[str] = []
+        start = belief
         left, decision = self.seconds, self.first(belief)
         while True:
             before, stance = belief.poses, decision.stance
@@ -160,9 +162,10 @@ class Horizon:
             )
             stances.append(stance)
             promises.append(decision.promise)
+            reasons.append(decision.reason)
             belief, left = decision.promise.belief, left - stance.duration - self.timed * times[-1]
             if self.arrived(stance.standing):
-                return Mission(Plan(tuple(stances)), tuple(promises), tuple(times))
+                return Mission(Plan(tuple(stances)), tuple(promises), tuple(times), start, tuple(reasons))
             if len(stances) > MAX_STANCES:
                 raise InputError(f"the goal is not reached in {MAX_STANCES} stances: give a nearer one, or more goals")
             decision = self.next(belief, left)

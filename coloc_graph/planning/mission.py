@@ -30,11 +30,17 @@ class Mission:
         Of each stance, the expected correspondences and the team's covariance after it.
     leap_times
         Time before each stance until all robots stand [s].
+    start
+        The team before the first stance.
+    reasons
+        Of each stance, one line on what decided; empty where nothing was chosen.
     """
 
     plan: Plan
     promises: tuple[Promise, ...]
     leap_times: tuple[float, ...]
+    start: Belief
+    reasons: tuple[str, ...] = ()
 
     @property
     def end(self) -> Belief:
@@ -113,7 +119,7 @@ def leap_frog(
     """
     goal = (length, 0.0)
     starts = {name: predictor.stop(gait, pair, k) for k, name in enumerate(pair)}
-    belief = Belief.start(predictor.team, {**starts, mover: (1.5, 0.0, 0.0)})
+    start = belief = Belief.start(predictor.team, {**starts, mover: (1.5, 0.0, 0.0)})
     stances, promises, times = [], [], []
     for k in range(stances_of(gait, length)):
         anchor, leaper = pair[k % 2], pair[(k + 1) % 2]
@@ -128,7 +134,7 @@ def leap_frog(
         stances.append(stance)
         promises.append(promise)
         belief = promise.belief
-    return Mission(Plan(tuple(stances)), tuple(promises), tuple(times))
+    return Mission(Plan(tuple(stances)), tuple(promises), tuple(times), start)
 
 
 def best_stance(

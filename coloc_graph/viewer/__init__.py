@@ -5,8 +5,10 @@
 
 from coloc_graph.viewer.app import Viewer
 from coloc_graph.viewer.live import LivePoses, LiveStance
+from coloc_graph.viewer.plan_editor import PlanEditor
+from coloc_graph.viewer.plan_scene import scene_of_plan
 from coloc_graph.viewer.pose_graphs import is_pose_graph, scene_of_pose_graph
-from coloc_graph.viewer.scene import Edges, Layer, Scene
+from coloc_graph.viewer.scene import Edges, Layer, Scene, ShownPlan
 from coloc_graph.viewer.sources import (
     empty_scene,
     is_run,
@@ -18,6 +20,7 @@ from coloc_graph.viewer.sources import (
 )
 
 __all__ = [
-    "Edges", "Layer", "LivePoses", "LiveStance", "Scene", "Viewer", "empty_scene", "is_pose_graph", "is_run",
-    "scene_of_estimate", "scene_of_pose_graph", "scene_of_result", "scene_of_run", "scene_of_solution", "with_other",
+    "Edges", "Layer", "LivePoses", "LiveStance", "PlanEditor", "Scene", "ShownPlan", "Viewer", "empty_scene",
+    "is_pose_graph", "is_run", "scene_of_estimate", "scene_of_plan", "scene_of_pose_graph", "scene_of_result",
+    "scene_of_run", "scene_of_solution", "with_other",
 ]  # fmt: skip

@@ -14,7 +14,7 @@ from coloc_graph.viewer.live import LivePoses, LiveStance
 from coloc_graph.viewer.panel import Panel, set_value
 from coloc_graph.viewer.prepared import readable_sigma
 from coloc_graph.viewer.renderer import Renderer
-from coloc_graph.viewer.scene import Scene
+from coloc_graph.viewer.scene import Scene, ShownPlan
 from coloc_graph.viewer.server import open_listener, start_server, stop_server, url_of
 
 CLOSE_TIMEOUT = 10.0  # s, for the render thread to end
@@ -88,8 +88,8 @@ class Viewer:
         stop_server(self.server)
         self._closed.set()
 
-    def publish(self, item: Scene | LiveStance | LivePoses) -> None:
-        """Show a new stance, the robots' current poses, or another scene of the same robots.
+    def publish(self, item: Scene | LiveStance | LivePoses | ShownPlan) -> None:
+        """Show a new stance, a plan of the next one, the robots' current poses, or another scene of the same robots.
 
         Returns at once. Of `LivePoses` the newest is shown while the last stance is shown; a scene ends them.
         """

@@ -67,7 +67,32 @@ class CommandMessage(_ClientMessage, tag="CommandTriggerMessage"):
     uuid: Text
 
 
-_decoder = msgspec.msgpack.Decoder(CameraMessage | ClickMessage | ControlMessage | CommandMessage)
+class DragMessage(_ClientMessage, tag="TransformControlsUpdateMessage"):
+    """New pose of something that is dragged by its arrows."""
+
+    name: Text
+    wxyz: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
+    position: Vector
+    owner: Text = ""
+
+
+class DragStartMessage(_ClientMessage, tag="TransformControlsDragStartMessage"):
+    """Beginning of a drag."""
+
+    name: Text
+    owner: Text = ""
+
+
+class DragEndMessage(_ClientMessage, tag="TransformControlsDragEndMessage"):
+    """End of a drag."""
+
+    name: Text
+    owner: Text = ""
+
+
+_decoder = msgspec.msgpack.Decoder(
+    CameraMessage | ClickMessage | ControlMessage | CommandMessage | DragMessage | DragStartMessage | DragEndMessage
+)
 
 
 def is_permitted(message: str | bytes, gui: viser.GuiApi | None) -> bool:
@@ -87,6 +112,8 @@ def is_permitted(message: str | bytes, gui: viser.GuiApi | None) -> bool:
     match decoded:
         case ClickMessage(ray_direction=direction):
             return math.hypot(*direction) > 0
+        case DragMessage(wxyz=wxyz):
+            return math.hypot(*wxyz) > 0
         case ControlMessage(uuid=uuid, updates=updates):
             control = gui and gui._gui_input_handle_from_uuid.get(uuid)  # viser has no public way to look it up
             return control is not None and _fits(control, updates.value)

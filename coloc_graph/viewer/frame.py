@@ -9,6 +9,7 @@ import numpy as np
 from coloc_graph.viewer import palette
 from coloc_graph.viewer.motion import pose_at
 from coloc_graph.viewer.palette import Colours
+from coloc_graph.viewer.plans import planned_lines
 from coloc_graph.viewer.prepared import (
     Z_ODOMETRY,
     Z_SIGHTING,
@@ -45,6 +46,7 @@ class ViewState:
     stays: bool = True
     sightings: bool = False
     odometry: bool = False
+    plans: bool = True
     k_sigma: float = 3.0
     picked: int | None = None
     aside: float = 0.0
@@ -87,6 +89,7 @@ class Frame:
     picked: Lines
     sightings: Lines
     odometry: Lines
+    planned: Lines
     ellipses: Batch
     wedges: Batch
     rings: Batch
@@ -135,6 +138,8 @@ def frame_of(scene: Scene, state: ViewState) -> Frame:
                 parts.lines["sightings"].append(_landmark_sightings(base, scene.landmarks, row, most, dark))
         if state.odometry:
             parts.lines["odometry"] = [_linked(base, scene.odometry, Z_ODOMETRY, palette.ODOMETRY, row, most, dark)]
+    if state.plans and scene.plans:
+        parts.lines["planned"] = [Lines(*planned_lines(scene, row, colours, state.k_sigma, dark))]
     count = row + 1
     note = "" if len(rows) >= count else (
         f"{len(rows):,} of {count:,} stances are drawn, the last {most // 2:,} among them"
@@ -216,7 +221,7 @@ class _Parts:
     def __init__(self) -> None:
         self.trajectories: dict[str, Lines] = {}
         self.lines: dict[str, list[Lines]] = {
-            name: [] for name in ("edges", "edges_now", "rejected", "picked", "sightings", "odometry")
+            name: [] for name in ("edges", "edges_now", "rejected", "picked", "sightings", "odometry", "planned")
         }
         self.ellipses: list[Batch] = []
         self.wedges: list[Batch] = []

@@ -90,7 +90,7 @@ class GraphView:
         add, none = self.server.scene, NO_LINES
         self._lines: dict[str, viser.LineSegmentsHandle] = {}
         for name, thickness in (("edges", 2.0), ("edges_now", 4.0), ("rejected", 2.0), ("picked", 7.0),
-                                ("sightings", 1.5), ("odometry", 1.5), ("markers_observed", 1.2),
+                                ("sightings", 1.5), ("odometry", 1.5), ("planned", 2.0), ("markers_observed", 1.2),
                                 ("markers_estimated", 2.5)):  # fmt: skip
             self._lines[name] = add.add_line_segments(
                 f"/{name}", none.points, none.colours, thickness=thickness, thickness_units="screen"
@@ -181,7 +181,7 @@ class GraphView:
         trajectories = {f"trajectory {name}": frame.trajectories.get(name, NO_LINES) for name in self.names}
         lines = trajectories | {
             "edges": frame.edges, "edges_now": frame.edges_now, "rejected": frame.rejected, "picked": frame.picked,
-            "sightings": frame.sightings, "odometry": frame.odometry,
+            "sightings": frame.sightings, "odometry": frame.odometry, "planned": frame.planned,
             "markers_observed": markers_observed, "markers_estimated": markers_estimated,
         }  # fmt: skip
         converted = {name: (one.points, palette.linear(one.colours)) for name, one in lines.items()}

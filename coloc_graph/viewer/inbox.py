@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from enum import Enum, auto
 
 from coloc_graph.viewer.live import LivePoses, LiveStance
-from coloc_graph.viewer.scene import Scene
+from coloc_graph.viewer.scene import Scene, ShownPlan
 
 Request = tuple[str, float]
 
@@ -27,7 +27,7 @@ class Inbox:
         self.idle = threading.Event()
         self.live_poses: LivePoses | None = None
         self._requests: deque[Request] = deque()
-        self._published: deque[Scene | LiveStance] = deque()
+        self._published: deque[Scene | LiveStance | ShownPlan] = deque()
         self._changed = threading.Condition()
         self._frame_is_due = True
         self._poses_are_due = self._closing = False
@@ -49,8 +49,8 @@ class Inbox:
         self._requests.append((kind, value))
         self.wake()
 
-    def publish(self, item: Scene | LiveStance | LivePoses) -> None:
-        """Leave a scene, a stance or poses; of poses only the newest is kept."""
+    def publish(self, item: Scene | LiveStance | LivePoses | ShownPlan) -> None:
+        """Leave a scene, a stance, a plan or poses; of poses only the newest is kept."""
         if isinstance(item, LivePoses):
             with self._changed:
                 self.live_poses, self._poses_are_due = item, True
@@ -70,7 +70,7 @@ class Inbox:
         while self._requests:
             yield self._requests.popleft()
 
-    def take_published(self) -> Iterator[Scene | LiveStance]:
+    def take_published(self) -> Iterator[Scene | LiveStance | ShownPlan]:
         """Take out scenes and stances, oldest first."""
         while self._published:
             yield self._published.popleft()

@@ -13,7 +13,7 @@ from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Measurement, RelativePose, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.viewer.landmarks import landmarks_in, sighted_in
-from coloc_graph.viewer.scene import Array, Scene, layer_of
+from coloc_graph.viewer.scene import Array, Scene, ShownPlan, layer_of
 from coloc_graph.viewer.sources import as_edges, stayed
 
 LIVE = "live"  # name of the layer if the first scene has none
@@ -94,6 +94,11 @@ class LiveScene:
         self._found: dict[int, list[tuple[int, str, str, float, str]]] = {}
         self._landmarks: dict[str, StaticPose] = {}
         self._sighted: dict[int, list[tuple[str, int, str]]] = {}
+        self._plans: dict[int, ShownPlan] = {}
+
+    def add_plan(self, plan: ShownPlan) -> None:
+        """Take in the plan of a stance; a later one of the same stance replaces it."""
+        self._plans[plan.stance] = plan
 
     def add(self, one: LiveStance) -> None:
         """Take in a stance; one that is in already is brought up to date."""
@@ -147,4 +152,5 @@ class LiveScene:
             edges=as_edges(found, robots, stances, RESIDUAL_AT_INSERTION),
             stayed=stayed(robots, stances, held),
             landmarks=landmarks_in(rows, sighted, robots, stances),
+            plans=tuple(self._plans[index] for index in sorted(self._plans)),
         )

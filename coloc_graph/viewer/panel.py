@@ -58,6 +58,10 @@ class Panel:
             )
             self.sightings = gui.add_checkbox("Sightings", False, hint="robots and landmarks seen by observers")
             self.odometry = gui.add_checkbox("Odometry", False, hint="wheel odometry from pose to pose")
+            self.plans = gui.add_checkbox(
+                "Plans", True, hint="planned stances: promised ellipses dashed, footprints and drive of the next one",
+                visible=bool(scene.plans),
+            )  # fmt: skip
             self.beside = gui.add_checkbox("Side by side", False, visible=compares)
             self.dark = gui.add_checkbox("Dark", False)
         with gui.add_folder("Plots"):
@@ -91,7 +95,7 @@ class Panel:
             slider.on_update(lambda event, what=what: self._on_slider(event, what))  # type: ignore[misc]
         for handle in (
             self.play, self.ellipses, self.wedges, self.edges, self.stays, self.markers, self.sightings,
-            self.odometry, self.beside, self.dark, self.follow,
+            self.odometry, self.plans, self.beside, self.dark, self.follow,
         ):  # fmt: skip
             handle.on_update(lambda _: self._ask("changed", 0))
         for label, hotkey, what, value in (
@@ -138,6 +142,8 @@ class Panel:
                 self._layers[layer.name] = box
         if self._legend.content != (means := legend(scene)):
             self._legend.content = means
+        if self.plans.visible != bool(scene.plans):
+            self.plans.visible = bool(scene.plans)
         self._curves = residual_curves(scene), error_curves(scene)
 
     @property
@@ -242,6 +248,8 @@ def legend(scene: Scene) -> str:
     if len(scene.landmarks):
         lines.insert(1, f'<span style="color:{_hex(palette.LANDMARK)}">&#9733;</span> '
                      f"{len(scene.landmarks)} landmarks")  # fmt: skip
+    if scene.plans:
+        lines.append("dashed ellipses and rings: as planned; filled ellipses: as they came")
     if scene.other is not None:
         lines.append(f"dashed, or at the side, and pale: {html.escape(scene.other.name)}; its curves are dashed")
     body = "".join(f'<div style="margin:.25em 0">{line}</div>' for line in lines)

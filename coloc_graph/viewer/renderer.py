@@ -15,12 +15,13 @@ from coloc_graph.viewer.inbox import Inbox, Work
 from coloc_graph.viewer.live import LiveScene
 from coloc_graph.viewer.notes import Notifications, missing_parts
 from coloc_graph.viewer.panel import Panel, set_value
+from coloc_graph.viewer.plans import planned_note
 from coloc_graph.viewer.playback import REST_DELAY, Playback
 from coloc_graph.viewer.prepared import readable_sigma
-from coloc_graph.viewer.scene import Scene
+from coloc_graph.viewer.scene import Scene, ShownPlan
 
 FRAME_INTERVAL = 0.03  # s between frames, so that the server has time to send them
-GROWTH_INTERVAL = 0.25  # s between scenes made of live stances
+GROWTH_INTERVAL = 0.12  # s between scenes made of live stances, or published
 PLOT_INTERVAL = 0.15  # s between plots while time moves; each is sent as a whole
 
 
@@ -93,6 +94,7 @@ class Renderer:
             stays=panel.stays.value,
             sightings=panel.sightings.value,
             odometry=panel.odometry.value,
+            plans=panel.plans.value,
             k_sigma=float(panel.k_sigma.value),
             picked=self.picked[1] if self.picked and self.picked[0] == "edge" else None,
             aside=self._aside,
@@ -150,6 +152,7 @@ class Renderer:
         notes = (
             live.note if live is not None else "",
             frame.note,
+            planned_note(self.scene, frame.row) if self._panel.plans.value else "",
             f"robots are drawn {size:.0f} times as large as they are, to be visible from afar" if size > 1 else "",
             f"names of more than {MAX_NAMES} robots are not shown: click one" if len(frame.roles) > MAX_NAMES else "",
             self._note,
@@ -189,6 +192,9 @@ class Renderer:
         for item in self._inbox.take_published():
             if isinstance(item, Scene):
                 whole, self._inbox.live_poses, self._note = item, None, "; ".join(missing_parts(item))
+            elif isinstance(item, ShownPlan):
+                self._live.add_plan(item)
+                whole = None
             else:
                 self._live.add(item)
                 self.details.keep(item.pairs)

@@ -183,6 +183,22 @@ NO_LANDMARKS = Landmarks()
 
 
 @dataclass(frozen=True, eq=False)
+class ShownPlan:
+    """Plan of a stance.
+
+    Number of the `stance`; by robot, `standing` (3,) of x, y [m], yaw [rad] and promised `covariances` (3, 3) of them;
+    waypoints of the mover's `drive` (n, 2) [m]; the robot that leaps before, if any; and the `reason` in one line.
+    """
+
+    stance: int
+    standing: Mapping[str, Array]
+    covariances: Mapping[str, Array]
+    drive: Array
+    leaper: str | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A run and its estimates as shown; immutable.
 
@@ -216,6 +232,8 @@ class Scene:
         Scene of another result, in a comparison: its first layer is `aside`, its edges are numbered on from `edges`.
     landmarks : Landmarks
         Estimated landmarks.
+    plans : tuple of ShownPlan
+        Planned stances, in their order.
     """
 
     robots: tuple[str, ...]
@@ -234,6 +252,7 @@ class Scene:
     notes: tuple[str, ...] = ()
     beside: "Scene | None" = None
     landmarks: Landmarks = NO_LANDMARKS
+    plans: tuple[ShownPlan, ...] = ()
 
     def __len__(self) -> int:
         return len(self.stances)

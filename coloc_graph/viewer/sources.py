@@ -24,6 +24,7 @@ from coloc_graph.run import Run, Stance, open_run
 from coloc_graph.viewer.landmarks import landmarks_in, sighted_in
 from coloc_graph.viewer.links import links_in, links_of, wheels_of
 from coloc_graph.viewer.moments import first_poses, moment_at, moments_of
+from coloc_graph.viewer.plans import LOG, read_plans
 from coloc_graph.viewer.scene import NO_EDGES, Edges, Index, Scene, layer_of
 from coloc_graph.viewer.truth import true_layers
 
@@ -173,6 +174,7 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
         title=title,
         notes=notes,
         landmarks=landmarks_in(landmarks, sighted, robots, stances),
+        plans=read_plans(result.path.absolute().parent / LOG),
     )
 
 
