@@ -16,8 +16,9 @@ from scipy.stats import chi2
 from coloc_graph.evaluation import Accuracy, align, evaluate
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.batch import Solution, SolveOptions, solve
-from coloc_graph.run import Detections, OdometrySample, Planes
+from coloc_graph.run import Detections, OdometrySample, Planes, Ranges
 from coloc_graph.simulation import EPOCH, World, build_world, observe, scenario
+from coloc_graph.simulation.uwb import uwb_ranges
 from coloc_graph.simulation.wheels import odometry
 from coloc_graph.simulation.world import stream
 
@@ -39,6 +40,7 @@ class MemoryRun:
             for tracks in observe(world, k):
                 self._detections[tracks.robot] += tracks.records()
         self._odometry: dict[str, list[OdometrySample]] = {}
+        self._ranges: dict[str, list[Ranges]] | None = None
         self._world = world
 
     def has_detections(self, robot: str) -> bool:
@@ -50,6 +52,19 @@ class MemoryRun:
         seen = self._detections[robot]
         first = bisect_left(seen, start, key=lambda one: one.time)
         return iter(seen[first : bisect_right(seen, end, key=lambda one: one.time)])
+
+    @property
+    def has_ranges(self) -> bool:
+        """As `Run`."""
+        return self._world.imperfections.uwb_sigma > 0
+
+    def ranges(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Ranges]:
+        """As `Run`."""
+        if self._ranges is None:
+            self._ranges = uwb_ranges(self._world)
+        for one in self._ranges.get(robot, ()):
+            if (start is None or one.time >= start) and (end is None or one.time <= end):
+                yield one
 
     def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
         """As `Run`."""

@@ -298,8 +298,56 @@ class Odometry:
         return f"odometry of {self.robot} from stance {self.before} to {self.after}"
 
 
+@dataclass(frozen=True, eq=False)
+class Range:
+    """Ranges between two robots at n instants, each at a known place in its robot's pose of a stance.
+
+    Parameters
+    ----------
+    robot, target : str
+        Names of the robot that measured, and of the one that it measured.
+    stance, target_stance : int
+        Stances whose poses of the two robots they refer to.
+    time : float
+        Mean time [UTC s].
+    range : (n,) float
+        Ranges as read [m], each the mean of some samples.
+    moved, target_moved : (n, 3) float
+        x [m], y [m], yaw [rad] of the two bodies at each instant, in their bodies at their stances: 0 where they stand.
+    covariance : (n, n) float
+        Covariance of the ranges [m^2], with that of the odometry that gave the places.
+    samples : int
+        Number of the averaged samples.
+    """
+
+    robot: str
+    target: str
+    stance: int
+    target_stance: int
+    time: float
+    range: Array
+    moved: Array
+    target_moved: Array
+    covariance: Array
+    samples: int
+
+    def __post_init__(self) -> None:
+        _as_arrays(self, "range", "moved", "target_moved", "covariance")
+
+    @property
+    def ends(self) -> tuple[Node, Node]:
+        """The two nodes that it relates, the measuring robot first."""
+        return (self.robot, self.stance), (self.target, self.target_stance)
+
+    def __str__(self) -> str:
+        return f"range of {self.target} by {self.robot} at {self.time:.3f} s"
+
+
+#: Measurement that gives the pose of one node in another.
+PoseMeasurement = RelativePose | Sighting | Odometry
+
 #: Measurement between two nodes of the graph.
-Measurement = RelativePose | Sighting | Odometry
+Measurement = PoseMeasurement | Range
 
 
 MAX_KEYFRAME_INTERVAL = 1.0  # s, between keyframes of a robot: a long step with turns in it is no arc

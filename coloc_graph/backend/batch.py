@@ -25,7 +25,7 @@ from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
 from coloc_graph.backend.solver import robust_parameters, with_stack
 from coloc_graph.errors import EstimationError
-from coloc_graph.measurements import RelativePose, Sighting
+from coloc_graph.measurements import Range, RelativePose, Sighting
 
 MIN_FIT_P_VALUE = 1e-4  # probability of a fit as bad as this by noise below which outliers are searched for
 CHI2_PER_DOF_OF_MODEL = 1.1  # chi2/dof up to which a fit passes in any case: no model is better than that
@@ -139,7 +139,8 @@ def _find_outliers(method: Method, graph: PoseGraph, warm: WarmStart | None) -> 
         offs, fit = _search(method, graph, {}, start)
     else:
         # poses alone for a start: GTSAM's optimiser copies its factors, which those that are Python cannot be
-        first = _outliers(fit_graph("smooth", graph))
+        ranges = [one for one in graph.measurements if isinstance(one, Range)]
+        first = _outliers(fit_graph("smooth", graph.without(ranges)))
         offs, fit = _search(method, graph, first, start)
         if first and len(fit.links) <= ALL_TESTED and len(offs) > 1:
             other, other_fit = _search(method, graph, {}, start)

@@ -15,13 +15,13 @@ from scipy.special import chdtri
 
 from coloc_graph.backend.cause import Cause, or_else, to_check
 from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, Agreement, agreement, keys_of
-from coloc_graph.backend.estimate import Bump, Rejection
+from coloc_graph.backend.estimate import NO_LINE_OF_SIGHT, Bump, Rejection
 from coloc_graph.backend.factors import Method, calibrations_in
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.landmarks import ALWAYS, OnMap
 from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
 from coloc_graph.errors import EstimationError
-from coloc_graph.measurements import Measurement, Odometry, RelativePose, Sighting
+from coloc_graph.measurements import Measurement, Odometry, Range, RelativePose, Sighting
 from coloc_graph.team import Slip
 
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)  # slip that a stay-put constraint is given to test it
@@ -30,7 +30,7 @@ MAX_FITTED = 5  # causes that are fitted in each round, the likeliest
 GROUP_PRICE = 30.0  # chi2 that several measurements must explain beyond one of them
 EQUAL_CHI2 = 9.0  # two causes explain equally well if chi2 differs by less
 SIGMAS_ALONE = 12.0  # a measurement that alone ties a pose is kept up to this: a wrong one is off by many more
-TESTED = (RelativePose, Sighting, OnMap)  # links that are tested to see whether anything is wrong
+TESTED = (RelativePose, Sighting, OnMap, Range)  # links that are tested to see whether anything is wrong
 SEARCHED = (*TESTED, Odometry)  # links that may be wrong once something is
 
 
@@ -93,6 +93,8 @@ class Fault:
         if self.cause.view is not None:
             robot, stance = self.cause.view
             reason += f", as all that {robot} observed in stance {stance}"
+        if isinstance(self.cause.links[0], Range):
+            reason += NO_LINE_OF_SIGHT
         if self.alternative:
             reason += (
                 f"{or_else(self.alternative)}: both explain the measurements equally well; "
@@ -301,6 +303,11 @@ def _widened(link: Measurement, fit: Fit) -> Measurement:
     keys = [fit.graph.pose_keys.key(node) for node in link.ends]
     if not all(map(fit.values.exists, keys)):
         return link
+    if isinstance(link, Range):
+        factor = fit.factors_of.of_link(link, *keys)
+        known = all(map(fit.values.exists, factor.keys()))
+        misfit = max(2 * factor.error(fit.values) / factor.dim(), 1.0) if known else 1.0
+        return replace(link, covariance=misfit * link.covariance)
     before, after = map(fit.values.atPose3, keys)
     off = gtsam.Pose3.Logmap(gtsam.Pose3(link.T_i_j).between(before.between(after)))
     off = off if isinstance(link, RelativePose) else off[2:5]

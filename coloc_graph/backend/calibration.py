@@ -10,7 +10,9 @@ from msgspec.structs import replace as with_fields
 from numpy.typing import NDArray
 
 from coloc_graph.backend.calibration_row import Row
-from coloc_graph.backend.sensor_calibration import CalibratedSensors
+from coloc_graph.backend.sensor_calibration import CalibratedSensors, SensorErrors
+from coloc_graph.backend.sensor_model import RANGING as RANGING_SIZE
+from coloc_graph.backend.sensor_model import Sensors
 from coloc_graph.measurements import RelativePose
 from coloc_graph.team import Landmark, Markers, Mount, Robot, Team
 
@@ -25,7 +27,8 @@ MOUNT = ord("m")  # height [m], tilt, roll, yaw [rad], x, y [m]
 MARKERS = ord("k")  # span (relative), height [m]
 CLOCKS = ord("o")  # offset of the clocks of a pair [s]
 PLANE = ord("p")  # normal in two directions [rad], distance (relative)
-SIZES = {MOUNT: 6, MARKERS: 2, CLOCKS: 1, PLANE: 3}  # dimension of each
+RANGING = ord("r")  # offset [m], scale, bearing [rad], x, y [m], depth, offset of robots [m]
+SIZES = {MOUNT: 6, MARKERS: 2, CLOCKS: 1, PLANE: 3, RANGING: RANGING_SIZE}  # dimension of each
 TILTS = slice(1, 3)  # tilt and roll among the errors of a mount
 YAW = "camera yaw"
 UNOBSERVABLE = 0.8  # part of a stated tolerance that is left of what nothing measures
@@ -97,6 +100,11 @@ class Variables:
     def plane(self, robot: str, stance: int, sigmas: Array) -> int | None:
         """Return the key of a plane that was stated for a stance."""
         return self._key(PLANE, robot, stance, sigmas.tolist())
+
+    def ranging(self, robot: str) -> int | None:
+        """Return the key of a robot's range sensor; None where it is exact, or the robot has none."""
+        sensor = self.robot_models[robot].ranging
+        return None if sensor is None else self._key(RANGING, robot, 0, Sensors([sensor]).tolerances[0].tolist())
 
     def _key(self, kind: int, name: str, index: int, sigmas: list[float]) -> int | None:
         if not any(sigmas):
@@ -254,7 +262,7 @@ class Calibration:
     ----------
     variables, values, covariances
         Of a joint estimate: its calibration variables, their estimates and covariances, by key.
-    sensors : mapping of str to CalibratedSensors
+    driven : mapping of str to CalibratedSensors
         Of a ranging run: wheels and range sensors by robot.
     landmarks : mapping of str to Landmark
         Of a ranging run: estimated landmarks whose positions the team does not state.
@@ -263,7 +271,7 @@ class Calibration:
     variables: Variables | None = None
     values: Mapping[int, Array] = field(default_factory=dict)
     covariances: Mapping[int, Array] = field(default_factory=dict)
-    sensors: Mapping[str, CalibratedSensors] = field(default_factory=dict)
+    driven: Mapping[str, CalibratedSensors] = field(default_factory=dict)
     landmarks: Mapping[str, Landmark] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
@@ -286,6 +294,16 @@ class Calibration:
         return {
             name: CalibratedMarkers(key, name, variables.markers_of(name), self.values[key], self.covariances[key])
             for key, name, variables in self._of(MARKERS)
+        }
+
+    @cached_property
+    def sensors(self) -> dict[str, CalibratedSensors]:
+        """Wheels and range sensors that were stated with a tolerance, by robot."""
+        return {**self.driven} | {
+            name: CalibratedSensors(
+                variables.robot_models[name], SensorErrors(None, (self.values[key], self.covariances[key]))
+            )
+            for key, name, variables in self._of(RANGING)
         }
 
     def _of(self, kind: int) -> Iterable[tuple[int, str, Variables]]:
@@ -311,7 +329,7 @@ class Calibration:
                 robot = with_fields(robot, mount_if_any=mount.mount)
             if markers is not None:
                 robot = with_fields(robot, markers=markers.markers)
-            robots.append(robot if sensors is None else sensors.calibrated)
+            robots.append(robot if sensors is None else sensors.of_robot(robot))
         landmarks = []
         for landmark in team.landmarks:
             if landmark.name in self.markers:
@@ -321,11 +339,12 @@ class Calibration:
 
     @property
     def unobservable(self) -> tuple[Row, ...]:
-        """Yaws and positions of mounts of which the measurements say next to nothing."""
+        """Yaws and positions of mounts, and numbers of range sensors, of which the measurements say next to nothing."""
+        mounts = (row for mount in self.mounts.values() for row in mount.rows[:3])
+        sensors = (row for one in self.sensors.values() if one.robot.name not in self.driven for row in one.rows)
         return tuple(
             row
-            for mount in self.mounts.values()
-            for row in mount.rows[:3]
+            for row in (*mounts, *sensors)
             if row.stated_sigma > 0 and row.found_sigma > UNOBSERVABLE * row.stated_sigma
         )
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from coloc_graph.backend.graph import Link, StayPut
-from coloc_graph.measurements import Node, Odometry, RelativePose, Sighting
+from coloc_graph.measurements import Node, Odometry, Range, RelativePose, Sighting
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,8 @@ class Cause:
             return first.robot_i, first.robot_j
         if isinstance(first, Sighting):
             return first.observer, first.seen
+        if isinstance(first, Range):
+            return first.robot, first.target
         return (first.robot,) if isinstance(first, StayPut | Odometry) else ()
 
     def __str__(self) -> str:
@@ -62,6 +64,8 @@ class Cause:
             return f"the cameras of {first.robot_i} and {first.robot_j} in stance {first.stance}"
         if isinstance(first, Sighting):
             return f"the markers of {first.seen} in stance {first.stance}"
+        if isinstance(first, Range):
+            return f"what stood between {first.robot} and {first.target} in stance {first.stance}"
         return "the landmark's position"
 
 

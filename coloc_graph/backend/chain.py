@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.estimate import Estimate, make_estimate
 from coloc_graph.backend.factors import GAUGE_SIGMA, link_covariance
-from coloc_graph.backend.graph import Link, PoseGraph, StayPut, pose_of
+from coloc_graph.backend.graph import Link, PoseGraph, PoseLink, StayPut, pose_of
 from coloc_graph.errors import EstimationError
-from coloc_graph.measurements import RelativePose
+from coloc_graph.measurements import Range, RelativePose
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ class Step(NamedTuple):
 
     via: int
     to: int
-    link: Link
+    link: PoseLink
     forwards: bool
 
 
@@ -65,11 +65,12 @@ def chain(graph: PoseGraph) -> Estimate:
 def spanning_tree(graph: PoseGraph, links: Sequence[Link]) -> list[Step]:
     """Return the shortest paths from the reference to every pose that links tie to it, nearer poses first (Dijkstra).
 
-    The length of a link is its variance: of the translation, and of the heading at one metre.
+    The length of a link is its variance: of the translation, and of the heading at one metre. Ranges place nothing.
     """
+    tying = [link for link in links if not isinstance(link, Range)]
     neighbours: dict[int, list[tuple[int, int, bool]]] = defaultdict(list)
     lengths = []
-    for index, link in enumerate(links):
+    for index, link in enumerate(tying):
         i, j = map(graph.pose_keys.key, link.ends)
         neighbours[i].append((j, index, True))
         neighbours[j].append((i, index, False))
@@ -85,7 +86,7 @@ def spanning_tree(graph: PoseGraph, links: Sequence[Link]) -> list[Step]:
             continue
         reached.add(at)
         if index >= 0:
-            steps.append(Step(via, at, links[index], forwards))
+            steps.append(Step(via, at, tying[index], forwards))
         for to, through, along in neighbours[at]:
             if to not in reached:
                 heapq.heappush(waiting, (length + lengths[through], through, at, to, along))
@@ -96,7 +97,7 @@ def compose(
     graph: PoseGraph,
     steps: Sequence[Step],
     project: Callable[[gtsam.Pose3], gtsam.Pose3] = lambda pose: pose,
-    expected: Callable[[Link], gtsam.Pose3] = pose_of,
+    expected: Callable[[PoseLink], gtsam.Pose3] = pose_of,
     known: Mapping[int, gtsam.Pose3] | None = None,
 ) -> dict[int, gtsam.Pose3]:
     """Compose poses T_world_body, by key, from the reference along `steps`.

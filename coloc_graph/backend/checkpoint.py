@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.input_file import read_bytes
-from coloc_graph.measurements import Odometry, RelativePose, Sighting
+from coloc_graph.measurements import Odometry, Range, RelativePose, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.team import Floor, Landmark, Robot, Slip
@@ -22,7 +22,12 @@ FORMAT = "coloc-graph-checkpoint-6"
 
 #: Measurements; `Any`, since msgspec cannot decode a union of dataclasses: a file has each under its `KINDS`.
 Measurements = tuple[Any, ...]
-KINDS: dict[str, type] = {"relative_pose": RelativePose, "sighting": Sighting, "odometry": Odometry}
+KINDS: dict[str, type] = {
+    "relative_pose": RelativePose,
+    "sighting": Sighting,
+    "odometry": Odometry,
+    "range": Range,
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.backend.graph import PoseGraph
-from coloc_graph.measurements import Node
+from coloc_graph.measurements import Node, Range
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,8 @@ def diagnose(graph: PoseGraph) -> tuple[DisconnectedComponent, ...]:
     tied = {graph.reference_key, *(step.to for step in spanning_tree(graph, graph.links))}
     neighbours: dict[int, list[int]] = defaultdict(list)
     for link in graph.links:
+        if isinstance(link, Range):  # it leaves a circle, and a mirrored one
+            continue
         i, j = map(graph.pose_keys.key, link.ends)
         neighbours[i].append(j)
         neighbours[j].append(i)

@@ -19,9 +19,11 @@ from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.ranging import RangingProblem
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.measurements import Measurement, Node, RangeBearing
+from coloc_graph.measurements import Measurement, Node, Range, RangeBearing
 
 Array = NDArray[np.float64]
+
+NO_LINE_OF_SIGHT = "; was something in the line of sight?"  # continues the reason of a range that is an outlier
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,8 @@ class Rejection:
 
 def rejection_of(measurement: Measurement | OnMap, off: Agreement) -> Rejection:
     """Return the rejection of an outlier, by its test statistic."""
-    return Rejection(measurement, f"an outlier: {off.sigmas:.0f} sigmas from the other measurements", off.sigmas)
+    cause = NO_LINE_OF_SIGHT if isinstance(measurement, Range) else ""
+    return Rejection(measurement, f"an outlier: {off.sigmas:.0f} sigmas from the other measurements{cause}", off.sigmas)
 
 
 @dataclass(frozen=True, eq=False)

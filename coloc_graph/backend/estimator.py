@@ -35,7 +35,7 @@ from coloc_graph.backend.isam2_graph import Isam2Graph, rebuilt
 from coloc_graph.backend.landmarks import StaticPose, landmarks_of, map_positions, positions_of
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError, MeasurementError
-from coloc_graph.measurements import Measurement, Node, RelativePose, Sighting
+from coloc_graph.measurements import Measurement, Node, Range, RelativePose, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.team import Floor, Landmark, Robot, Slip, Team
 
@@ -43,7 +43,7 @@ Array = NDArray[np.float64]
 
 
 def _rejection(link: Link, off: Agreement) -> Rejection:
-    assert isinstance(link, RelativePose | Sighting)
+    assert isinstance(link, RelativePose | Sighting | Range)
     return rejection_of(link, off)
 
 
@@ -366,7 +366,12 @@ class Estimator:
         if len(self._stances) < 2:
             raise EstimationError("the first stance defines the world and cannot be removed: make a new estimator")
         *left, stance = self.stances
-        gone = {id(one) for one in self._log if any(index == stance.index for _, index in one.ends)}
+        gone = {
+            id(one)
+            for one in self._log
+            if any(index == stance.index for _, index in one.ends)
+            or (isinstance(one, Range) and one.time > left[-1].end)
+        }
         with self._all_or_nothing():
             self._take_out(tuple(left), gone, self._newly)
         return stance

@@ -9,10 +9,16 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors
 from coloc_graph.backend.calibration import Variables, is_calibration
-from coloc_graph.backend.graph import Link, PoseGraph, StayPut, pose_of
-from coloc_graph.backend.homography_factor import homography_factor, homography_pose, markers_factor, sighted_pose
+from coloc_graph.backend.graph import Link, PoseGraph, PoseLink, StayPut, pose_of
+from coloc_graph.backend.homography_factor import (
+    homography_factor,
+    homography_pose,
+    markers_factor,
+    range_factor,
+    sighted_pose,
+)
 from coloc_graph.errors import EstimationError
-from coloc_graph.measurements import RelativePose, Sighting
+from coloc_graph.measurements import Range, RelativePose, Sighting
 from coloc_graph.team import Floor, Robot
 
 Array = NDArray[np.float64]
@@ -100,6 +106,8 @@ class Factors:
 
     def _as_seen(self, link: Link) -> bool:
         """Return whether a link becomes a factor on image measurements."""
+        if isinstance(link, Range):
+            return True
         if self.variables is None:
             return False
         if isinstance(link, Sighting):
@@ -125,6 +133,10 @@ class Factors:
         ready = self._ready.pop(id(link), None)
         if ready is not None and list(ready.keys()[:2]) == [i, j]:
             return ready
+        if isinstance(link, Range):
+            if self.variables is None:
+                raise EstimationError(f"the {link} needs a joint estimate, which calibrates range sensors: use `joint`")
+            return range_factor(link, i, j, self.variables)
         if self.variables is not None and self._as_seen(link):
             if isinstance(link, Sighting):
                 return markers_factor(link, i, j, self.variables)
@@ -133,15 +145,16 @@ class Factors:
         return self.between(link, i, j, pose_of(link))
 
     @staticmethod
-    def between(link: Link, i: int, j: int, T_i_j: gtsam.Pose3) -> gtsam.NonlinearFactor:
+    def between(link: PoseLink, i: int, j: int, T_i_j: gtsam.Pose3) -> gtsam.NonlinearFactor:
         """Return a link as a between-factor of the two poses alone, with its covariance as such."""
         return gtsam.BetweenFactorPose3(i, j, T_i_j, _noise(link))
 
-    def expected(self, link: Link, i: int, j: int, errors: Callable[[int], Array]) -> gtsam.Pose3:
+    def expected(self, link: PoseLink, i: int, j: int, errors: Callable[[int], Array]) -> gtsam.Pose3:
         """Return the pose of a link's second end in its first, with calibration variables at `errors` of their keys.
 
         The factor made for this is kept for the insertion of the link.
         """
+        assert not isinstance(link, Range)
         if self.variables is not None and self.floor is not None and self._as_seen(link):
             if isinstance(link, Sighting):
                 return sighted_pose(link, self.variables, errors)
@@ -203,7 +216,7 @@ class Factors:
         return gtsam.Pose3(gtsam.Rot3.Yaw(pose.rotation().yaw()), np.array([pose.x(), pose.y(), 0.0]))
 
 
-def link_covariance(link: Link) -> Array:
+def link_covariance(link: PoseLink) -> Array:
     """Return the covariance of a link, (6, 6), or (3, 3) of heading, x, y."""
     if isinstance(link, StayPut):
         assert link.slip is not None
@@ -212,7 +225,7 @@ def link_covariance(link: Link) -> Array:
     return link.covariance
 
 
-def _noise(link: Link) -> gtsam.noiseModel.Gaussian:
+def _noise(link: PoseLink) -> gtsam.noiseModel.Gaussian:
     C = link_covariance(link)
     if len(C) == 6:
         return gtsam.noiseModel.Gaussian.Covariance(C)

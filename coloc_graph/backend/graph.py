@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from coloc_graph.backend.landmarks import ALWAYS, MAP, OnMap, landmarks_of, map_positions, positions_of
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, MeasurementError
-from coloc_graph.measurements import Measurement, Node, Odometry, RelativePose, Sighting
+from coloc_graph.measurements import (
+    Measurement,
+    Node,
+    Odometry,
+    PoseMeasurement,
+    Range,
+    RelativePose,
+    Sighting,
+)
 from coloc_graph.run import Stance
 from coloc_graph.team import Floor, Landmark, Robot, Slip, Team
 
@@ -55,11 +63,14 @@ class StayPut:
         return f"{self.robot} staying put from stance {self.before} to {self.after}"
 
 
+#: A relation between two nodes of the graph that gives the pose of one in the other.
+PoseLink = PoseMeasurement | StayPut | OnMap
+
 #: A relation between two nodes of the graph.
-Link = Measurement | StayPut | OnMap
+Link = PoseLink | Range
 
 
-def pose_of(link: Link) -> gtsam.Pose3:
+def pose_of(link: PoseLink) -> gtsam.Pose3:
     """Pose of a link's second end in its first."""
     return gtsam.Pose3(link.T_i_j)
 
@@ -147,7 +158,7 @@ class PoseGraph:
     stances : tuple of Stance
         In the order of time.
     measurements : tuple of Measurement
-        Relative poses, sightings and odometry between nodes (robot, stance).
+        Relative poses, sightings, odometry and ranges between nodes (robot, stance). Ranges make no nodes.
     floor : Floor or None
         Floor that the robots stand on.
     slips : mapping of str to Slip
@@ -236,7 +247,7 @@ class PoseGraph:
         named: dict[int, dict[str, None]] = defaultdict(dict)
         for measured in self.measurements:
             for robot, index in measured.ends:
-                if robot not in self.landmarks:
+                if robot not in self.landmarks and not isinstance(measured, Range):
                     named[index][robot] = None
         nodes: list[Node] = []
         there: set[str] = set()
@@ -320,7 +331,7 @@ class PoseGraph:
         return tuple(node for node in self.nodes if self.pose_keys.key(node) not in keys)
 
     def __repr__(self) -> str:
-        kinds = {"relative pose": RelativePose, "sighting": Sighting, "odometry": Odometry}
+        kinds = {"relative pose": RelativePose, "sighting": Sighting, "odometry": Odometry, "range": Range}
         counts = [f"{sum(isinstance(m, of) for m in self.measurements)} {name}" for name, of in kinds.items()]
         slipping = sum(stay.slip is not None for stay in self.stay_puts)
         exact = len(self.stay_puts) - slipping
@@ -381,6 +392,8 @@ def require_ends(measured: Measurement, keys: PoseKeys, stances: Mapping[int, St
         return
     if robot_i == robot_j:
         raise MeasurementError(f"the {measured} relates a robot to itself: name two robots")
+    if isinstance(measured, Range):
+        return
     observers = (robot_i,) if isinstance(measured, Sighting) else (robot_i, robot_j)
     for robot in observers:
         if robot not in stances[before].observers:

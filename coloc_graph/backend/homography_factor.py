@@ -1,7 +1,7 @@
-"""GTSAM factors of homographies with marker spans, and of sighted markers, on poses and calibration variables.
+"""GTSAM factors of homographies with marker spans, sighted markers and ranges, on poses and calibration variables.
 
-The models are in `camera_model` and `homography_model`. A mount that is stated as exact is a constant; one with a
-tolerance is a variable, and one of the factor's keys after those of its two poses.
+The models are in `camera_model`, `homography_model` and `range_model`. A mount that is stated as exact is a constant;
+one with a tolerance is a variable, and one of the factor's keys after those of its two poses.
 """
 
 from collections.abc import Callable
@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.batched_factors import BatchedFactor, FactorEvaluator
-from coloc_graph.backend.calibration import MOUNT, SIZES, Variables, sigmas_of_plane
+from coloc_graph.backend.calibration import MOUNT, RANGING, SIZES, Variables, sigmas_of_plane
 from coloc_graph.backend.camera_model import MarkersModel
 from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
+from coloc_graph.backend.range_model import RangeModel
+from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.lie import floor_pose, yaw
-from coloc_graph.measurements import RelativePose, Sighting
+from coloc_graph.measurements import Range, RelativePose, Sighting
 
 Array = NDArray[np.float64]
 
@@ -80,6 +82,16 @@ def sighted_pose(link: Sighting, variables: Variables, errors: Callable[[int], A
     mount, markers = (np.zeros(n) if key is None else errors(key) for key, n in zip(keys, (MOUNT_SIZE, 2), strict=True))
     planar = _markers_model(link, variables).planar_pose(mount, markers)
     return gtsam.Pose3(link.T_i_j) if planar is None else gtsam.Pose3(floor_pose(*planar))
+
+
+def range_factor(link: Range, i: int, j: int, variables: Variables) -> BatchedFactor:
+    """Return the factor of ranges on the poses of both robots and the errors of their sensors."""
+    sensor = variables.robot_models[link.robot].ranging
+    if sensor is None:
+        raise EstimationError(f"the {link} has no noise: give robot {link.robot} a [robots.ranging] in team.toml")
+    model = RangeModel(link, sensor, variables.robot_models[link.target].ranging)
+    keys = variables.ranging(link.robot), None if model.antenna is None else variables.ranging(link.target)
+    return BatchedFactor(FactorEvaluator(model, (i, j), keys, (SIZES[RANGING], SIZES[RANGING])))
 
 
 def _markers_model(link: Sighting, variables: Variables) -> MarkersModel:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.factors import Factors
 from coloc_graph.backend.graph import Link, pose_of
-from coloc_graph.measurements import Odometry, RelativePose, Sighting
+from coloc_graph.measurements import Odometry, Range, RelativePose, Sighting
 
 Array = NDArray[np.float64]
 
@@ -75,12 +75,18 @@ class InsertionPlanner:
         far: list[Tie] = []
         rough: dict[int, float] = {}  # keys with initial values by odometry alone, with its sigma
         # odometry first: it is seldom wrong by much, so that its prediction can reject a wrong homography
-        left = sorted(links, key=lambda link: isinstance(link, RelativePose | Sighting))
+        left = sorted(links, key=lambda link: isinstance(link, RelativePose | Sighting | Range))
         while left:
             still: list[Link] = []
             for link in left:
                 i, j = self._ends(link)
                 has_i, has_j = (key in self._tied or key in start for key in (i, j))
+                if isinstance(link, Range):
+                    if has_i and has_j:
+                        far.append((link, i, j))
+                    else:
+                        still.append(link)
+                    continue
                 is_new = i not in self._tied or j not in self._tied
                 T_i_j = self._factors.expected(link, i, j, self._errors) if is_new else pose_of(link)
                 tested = isinstance(link, RelativePose | Sighting)

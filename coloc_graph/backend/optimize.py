@@ -13,7 +13,7 @@ from coloc_graph.backend.calibration import size_of
 from coloc_graph.backend.chain import compose, spanning_tree
 from coloc_graph.backend.chi2_test import Agreement, agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
-from coloc_graph.backend.graph import Link, PoseGraph, pose_of
+from coloc_graph.backend.graph import Link, PoseGraph, PoseLink, pose_of
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.solver import optimise
 
@@ -103,7 +103,7 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
     def errors(key: int) -> Array:
         return mounts.get(key, factors_of.nominal(key))
 
-    def expected(link: Link) -> gtsam.Pose3:
+    def expected(link: PoseLink) -> gtsam.Pose3:
         i, j = map(graph.pose_keys.key, link.ends)
         return factors_of.expected(link, i, j, errors) if mounts else pose_of(link)
 

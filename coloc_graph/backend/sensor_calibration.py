@@ -131,11 +131,6 @@ class CalibratedSensors:
             ]  # fmt: skip
         return tuple(row for row in rows if row.stated_sigma > 0)
 
-    @property
-    def calibrated(self) -> Robot:
-        """The robot with its estimated wheels and range sensor."""
-        return with_fields(
-            self.robot,
-            wheels=self.wheels or self.robot.wheels,
-            ranging=self.ranging or self.robot.ranging,
-        )
+    def of_robot(self, robot: Robot) -> Robot:
+        """Return a robot with the estimated wheels and range sensor."""
+        return with_fields(robot, wheels=self.wheels or robot.wheels, ranging=self.ranging or robot.ranging)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import MeasurementError
-from coloc_graph.measurements import Measurement, RelativePose
+from coloc_graph.measurements import Measurement, PoseMeasurement, Range, RelativePose
 from coloc_graph.team import Floor
 
 Array = NDArray[np.float64]
@@ -24,7 +24,32 @@ _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 def require_valid(measurements: Sequence[Measurement], floor: Floor | None) -> None:
     """Raise `MeasurementError` for the first invalid measurement, with the reason."""
-    if measurements and _all_well(measurements, floor):
+    for one in measurements:
+        if isinstance(one, Range):
+            _require_ranges(one)
+    poses = [one for one in measurements if not isinstance(one, Range)]
+    if poses:
+        _require_poses(poses, floor)
+
+
+def _require_ranges(measured: Range) -> None:
+    n = len(measured.range) if measured.range.ndim == 1 else 0
+    C = measured.covariance
+    why = None
+    if not n or measured.moved.shape != (n, 3) or measured.target_moved.shape != (n, 3) or C.shape != (n, n):
+        why = f"has ranges of shape {measured.range.shape}: give (n,), with places (n, 3) and a covariance (n, n)"
+    elif not all(np.isfinite(one).all() for one in (measured.range, measured.moved, measured.target_moved, C)):
+        why = "holds a number that is not finite"
+    elif not (measured.range.min() > 0 and measured.range.max() <= MAX_DISTANCE):
+        why = f"has a range of {measured.range.min():.3g} m: give metres above 0, at most {MAX_DISTANCE:.0e}"
+    elif np.abs(C - C.T).max() > ROUNDING * np.abs(C).max() or np.linalg.eigvalsh(C)[0] < MIN_SIGMA**2:
+        why = "has a covariance that is not symmetric and positive definite: every range needs an uncertainty"
+    if why is not None:
+        raise MeasurementError(f"the {measured} {why}")
+
+
+def _require_poses(measurements: Sequence[PoseMeasurement], floor: Floor | None) -> None:
+    if _all_well(measurements, floor):
         return
     for size, group in groupby(sorted(measurements, key=_size), key=_size):
         alike = list(group)
@@ -37,7 +62,7 @@ def require_valid(measurements: Sequence[Measurement], floor: Floor | None) -> N
                 raise MeasurementError(f"the {alike[index]} {why}")
 
 
-def _all_well(measurements: Sequence[Measurement], floor: Floor | None) -> bool:
+def _all_well(measurements: Sequence[PoseMeasurement], floor: Floor | None) -> bool:
     """Return whether all measurements pass the checks, in one vectorised pass."""
     C = np.empty((len(measurements), 6, 6))
     C[:] = np.eye(6)
@@ -67,11 +92,11 @@ def _all_well(measurements: Sequence[Measurement], floor: Floor | None) -> bool:
         return False
 
 
-def _size(measured: Measurement) -> int:
+def _size(measured: PoseMeasurement) -> int:
     return 6 if isinstance(measured, RelativePose) else 3
 
 
-def _why_not_poses(measurements: Sequence[Measurement]) -> tuple[int, str] | None:
+def _why_not_poses(measurements: Sequence[PoseMeasurement]) -> tuple[int, str] | None:
     for index, measured in enumerate(measurements):
         if measured.T_i_j.shape != (4, 4):
             return index, f"has a pose of shape {measured.T_i_j.shape}: give (4, 4)"
@@ -95,7 +120,7 @@ def _why_not_poses(measurements: Sequence[Measurement]) -> tuple[int, str] | Non
     return None
 
 
-def _why_not_covariances(measurements: Sequence[Measurement]) -> tuple[int, str] | None:
+def _why_not_covariances(measurements: Sequence[PoseMeasurement]) -> tuple[int, str] | None:
     size = _size(measurements[0])
     for index, measured in enumerate(measurements):
         if np.shape(measured.covariance) != (size, size):

@@ -46,6 +46,11 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     errors.add_argument("--clock-offset", type=float, default=0.0, help="offset of the other robots' clocks, s")
     errors.add_argument("--time-jitter", type=float, default=0.0, help="jitter of the instants of capture, s")
 
+    uwb = command.add_argument_group("ranges between robots (UWB, 10 Hz a pair)")
+    uwb.add_argument("--uwb-sigma", type=float, default=0.0, help="noise of a range, m (default: 0, no ranges)")
+    uwb.add_argument("--uwb-offset", type=float, default=0.0, help="offsets of the sensors (1 sigma), m (default: 0)")
+    uwb.add_argument("--uwb-nlos", type=float, default=0.0, help="share without line of sight, 0 to 1 (default: 0)")
+
     single = command.add_argument_group("scenarios single-step, hallway and landmarks")
     single.add_argument("-l", type=float, help="distance between the observers, m (default: 0.8; hallway 0.74)")
     single.add_argument("--theta", type=float, help="angle between the observers, deg (default: 35; hallway 34)")
@@ -89,6 +94,9 @@ def run(args: argparse.Namespace) -> int:
         floor_sigma_deg=args.floor_sigma,
         clock_offset=args.clock_offset,
         time_jitter=args.time_jitter,
+        uwb_sigma=args.uwb_sigma,
+        uwb_offset_sigma=args.uwb_offset,
+        uwb_nlos=args.uwb_nlos,
         noise_px=0.3 if args.noise is None else args.noise,
     )
     with progress("stances simulated") as report:

@@ -4,7 +4,7 @@ from collections import defaultdict
 
 from coloc_graph.backend import PoseGraph, StayPut
 from coloc_graph.backend.landmarks import OnMap
-from coloc_graph.measurements import Node, Odometry, RelativePose
+from coloc_graph.measurements import Node, Odometry, Range, RelativePose
 
 #: Colours that colour-blind readers tell apart (Okabe and Ito).
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -14,8 +14,8 @@ def to_dot(graph: PoseGraph) -> str:
     """Format a graph in the dot language; draw it with `dot -Tsvg`, or `neato` for large graphs.
 
     A box is one variable, labelled with all stances that share it; a double border marks a robot that stayed put
-    exactly. Dashed edges are stay-put constraints with a slip, dotted ones odometry, thin ones sightings. Landmarks are
-    hexagons, and so is the map, with dashed edges to the landmarks on it.
+    exactly. Dashed edges are stay-put constraints with a slip, dotted ones odometry, thin ones sightings, dashed
+    grey ones ranges. Landmarks are hexagons, and so is the map, with dashed edges to the landmarks on it.
     """
     places: dict[int, list[Node]] = defaultdict(list)
     for node in graph.nodes:
@@ -41,6 +41,8 @@ def to_dot(graph: PoseGraph) -> str:
             style = 'label="stay put", style=dashed'
         elif isinstance(link, OnMap):
             style = "style=dashed"
+        elif isinstance(link, Range):
+            style = 'style=dashed, color="#999999"'
         else:
             style = "style=dotted" if isinstance(link, Odometry) else "penwidth=0.5"
         lines.append(f"  {i} -- {j} [{style}];")

@@ -19,6 +19,7 @@ from coloc_graph.errors import EstimationError
 from coloc_graph.exchange.g2o import TRANSLATION_FIRST
 from coloc_graph.exchange.relative_edges import relative_edges
 from coloc_graph.geometry.lie import quaternion
+from coloc_graph.measurements import Range
 
 Array = NDArray[np.float64]
 
@@ -51,6 +52,8 @@ def write_g2o(estimate: Estimate, path: Path) -> None:
         for stay in graph.stay_puts
         if graph.key(stay.robot, stay.after) in ids
     ]
+    if ranges := sum(isinstance(one, Range) for one in graph.measurements):
+        lines.append(f"# left out: {ranges} ranges, which g2o cannot express; the poses are those with them")
     try:
         edges = relative_edges(estimate)
     except EstimationError as why:

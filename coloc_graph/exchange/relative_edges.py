@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from coloc_graph.backend import Estimate
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.backend.factors import GAUGE_SIGMA, Factors, link_covariance
-from coloc_graph.backend.graph import Link, StayPut
+from coloc_graph.backend.graph import PoseLink, StayPut
 from coloc_graph.backend.solver import optimise, with_stack
 from coloc_graph.geometry.lie import floor_pose
-from coloc_graph.measurements import RelativePose
+from coloc_graph.measurements import Range, RelativePose
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class Edge:
         In GTSAM's tangent at j: rotation first, then translation.
     """
 
-    link: Link
+    link: PoseLink
     i: int
     j: int
     T_i_j: gtsam.Pose3
@@ -61,8 +61,8 @@ class Edge:
         )
 
 
-def used_links(estimate: Estimate) -> tuple[Link, ...]:
-    """Return the links that an estimate uses, of a chain those that it was composed along."""
+def used_links(estimate: Estimate) -> tuple[PoseLink, ...]:
+    """Return the links of an estimate that give poses, without ranges; of a chain those that it was composed along."""
     graph = estimate.graph.without(one.measurement for one in estimate.rejected)
     if estimate.method == "chain":
         return tuple(
@@ -70,7 +70,8 @@ def used_links(estimate: Estimate) -> tuple[Link, ...]:
             for step in spanning_tree(graph, [one for one in graph.links if isinstance(one, RelativePose | StayPut)])
         )
     key, values = graph.pose_keys.key, estimate.values
-    ends = [(link, key(link.ends[0]), key(link.ends[1])) for link in graph.links]
+    links = [link for link in graph.links if not isinstance(link, Range)]
+    ends = [(link, key(link.ends[0]), key(link.ends[1])) for link in links]
     return tuple(link for link, i, j in ends if i != j and values.exists(i) and values.exists(j))
 
 

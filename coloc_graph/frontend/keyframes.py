@@ -77,8 +77,13 @@ def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
                 f"{'ahead of' if by > 0 else 'behind'} that of its odometry (1 sigma {sigma:.3f} s, by how bearings "
                 "change while it turns); the times of its measurements were corrected"
             )
+        if any(one.bearing is None for one in ranges[robot]):
+            raise InputError(
+                f"{run.path}: {robot} measured ranges without bearings, and the run holds no stances: ranges alone "
+                "leave robots on circles, and mirrored; record stances, or bearings"
+            )
         for one in ranges[robot]:
-            for target, distance, bearing in zip(one.targets, one.range.tolist(), one.bearing.tolist(), strict=True):
+            for target, distance, bearing in zip(one.targets, one.range.tolist(), _bearings(one).tolist(), strict=True):
                 if target in names and not between_robots:
                     continue
                 if not all(_is_covered(paths[numbers[who]], one.time) for who in (robot, target) if who in names):
@@ -116,6 +121,11 @@ def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
     )
 
 
+def _bearings(record: Ranges) -> Array:
+    """Return the bearings (n,) of a record [rad]; NaN where there are none."""
+    return np.full(len(record.range), np.nan) if record.bearing is None else record.bearing
+
+
 def _late(run: Run, paths: list[_Path | None], ranges: dict[str, list[Ranges]]) -> dict[str, tuple[float, float]]:
     """Robots whose measurements are stamped late against their odometry, with the delay and its sigma [s].
 
@@ -128,7 +138,7 @@ def _late(run: Run, paths: list[_Path | None], ranges: dict[str, list[Ranges]]) 
         seen = [
             (one.time, standing[target], distance, bearing)
             for one in ranges[robot]
-            for target, distance, bearing in zip(one.targets, one.range.tolist(), one.bearing.tolist(), strict=True)
+            for target, distance, bearing in zip(one.targets, one.range.tolist(), _bearings(one).tolist(), strict=True)
             if target in standing
         ]
         if path is None or not seen:

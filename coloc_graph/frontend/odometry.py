@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 
 MIN_SIGMAS = (1e-3, 5e-4, 5e-4)  # lower bounds of odometry between two stances: heading [rad], x, y [m]
 MAX_GAP = 1.0  # s between samples, above which the speed is unknown
+MAX_CHANGE = 0.01  # m, rad: change of the pose in such a gap above which the robot drove in it
 
 
 class WheelTrack:
@@ -47,6 +48,62 @@ class WheelTrack:
             return 0.0
         distance = np.hypot(*(self._poses[after, :2] - self._poses[after - 1, :2]))
         return float(distance / max(self.times[after] - self.times[after - 1], 1e-6))
+
+    def covers(self, times: Array) -> NDArray[np.bool_]:
+        """Return at which times (n,) the pose is known: not in a gap between samples in which it changed."""
+        after = np.clip(np.searchsorted(self.times, times), 1, max(len(self) - 1, 1))
+        if len(self) < 2:
+            return np.ones(len(times), bool)
+        change = np.abs(np.diff(self._poses, axis=0)).max(axis=1)
+        lost = (np.diff(self.times) > MAX_GAP) & (change > MAX_CHANGE)
+        inside = (times > self.times[0]) & (times < self.times[-1])
+        return np.asarray(~(inside & lost[after - 1]))
+
+    def moved(self, start: Array, end: Array) -> Array:
+        """Pose x [m], y [m], yaw [rad] (n, 3) of the body at times `end` (n,) in the body at `start` (n,)."""
+        before, after = self.pose_at(start), self.pose_at(end)
+        c, s = np.cos(before[:, 2]), np.sin(before[:, 2])
+        x, y, yaw = (after - before).T
+        return np.stack([c * x + s * y, -s * x + c * y, yaw], axis=1)
+
+    def place_errors(self, start: Array, end: Array, points: Array) -> Array:
+        """Square root of the joint covariance of points on the body at times `end`, in the body at `start`.
+
+        Parameters
+        ----------
+        start, end : (n,) float
+            Times [UTC s], in either order.
+        points : (n, 2) float
+            Points on the body [m].
+
+        Returns
+        -------
+        (n, 2, q) float
+            Errors of x and y [m] by q independent errors of unit variance, which the n points share.
+        """
+        low, high = np.minimum(start, end), np.maximum(start, end)
+        first = int(np.searchsorted(self.times, low.min(), side="right"))
+        last = int(np.searchsorted(self.times, high.max()))
+        steps = np.arange(max(first, 1), min(last, len(self) - 1) + 1)
+        if not len(steps):
+            return np.zeros((len(start), 2, 1))
+        begins, ends = self.times[steps - 1], self.times[steps]
+        overlap = np.minimum(high[:, None], ends) - np.maximum(low[:, None], begins)
+        part = np.sqrt(np.clip(overlap / np.maximum(ends - begins, 1e-9), 0.0, 1.0))  # (n, steps)
+        before, yaw = self.pose_at(start), self._poses[steps - 1, 2]
+        at = self.pose_at(end)
+        c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
+        p = at[:, :2] + np.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], axis=1)
+        arm = p[:, None] - self._poses[steps, :2]
+        J = np.zeros((len(p), len(steps), 2, 3))
+        J[..., 0, 0] = J[..., 1, 1] = np.cos(yaw)
+        J[..., 1, 0], J[..., 0, 1] = np.sin(yaw), -np.sin(yaw)
+        J[..., 0, 2], J[..., 1, 2] = -arm[..., 1], arm[..., 0]
+        variances, axes = np.linalg.eigh(self._covariances[steps])
+        J = part[:, :, None, None] * (J @ (axes * np.sqrt(variances.clip(min=0.0))[:, None, :]))
+        c, s = np.cos(before[:, 2]), np.sin(before[:, 2])
+        into = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)
+        return np.asarray((into[:, None] @ J).transpose(0, 2, 1, 3).reshape(len(p), 2, -1))
 
     def between(self, before: int, after: int, start: float, end: float, clock_sigma: float = 0.0) -> Odometry | None:
         """Integrate odometry from one stance to another.

@@ -17,7 +17,7 @@ from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.clocks import RunClocks, clocks_of_run, contradicts, misfit
-from coloc_graph.pipeline.contents import require_applicable, unused_in
+from coloc_graph.pipeline.contents import Unused, require_applicable, unused_in, unused_ranges
 from coloc_graph.pipeline.disagreement import moves_unstated
 from coloc_graph.pipeline.explanations import (
     implausible_planes,
@@ -37,6 +37,7 @@ from coloc_graph.pipeline.incremental import (
 from coloc_graph.pipeline.lever_arm import LeverArm, find_lever_arms, with_lever_arms
 from coloc_graph.pipeline.odometry_checks import CheckedRun
 from coloc_graph.pipeline.options import METHODS, SolveOptions
+from coloc_graph.pipeline.ranges import ranges_of_run
 from coloc_graph.pipeline.solution import Solution
 from coloc_graph.run import Run, Stance
 from coloc_graph.run.recorded import Restated
@@ -73,6 +74,7 @@ class _Solved:
     online: Mapping[str, Trajectory] = field(default_factory=dict)
     without_pose: Mapping[str, str] = field(default_factory=dict)
     noise: NoiseBelief | None = None
+    unused: tuple[Unused, ...] = ()
 
 
 def solve(
@@ -132,7 +134,7 @@ def solve(
         measurements=solved.measured,
         warnings=(
             *run.warnings,
-            *(str(one) for one in unused if not one.requested),
+            *(str(one) for one in (*unused, *solved.unused) if not one.requested),
             *solved.warnings,
             *(
                 f"robot {robot} has no pose: {why}"
@@ -143,7 +145,7 @@ def solve(
         seconds_frontend=solved.seconds_frontend,
         seconds_backend=time.perf_counter() - started - solved.seconds_frontend,
         seconds_updates=solved.seconds_updates,
-        unused=unused,
+        unused=(*unused, *solved.unused),
         online=solved.online,
         without_pose=solved.without_pose,
         noise=solved.noise,
@@ -199,12 +201,25 @@ def _in_batch(
             graph = with_lever_arms(graph, arms)
             _require_ties(run, graph, measured)
             estimate = joint(graph, start=estimate.values)
+    estimate, left_out = _with_ranges(run, options, estimate)
     measured = tuple(replace(one, with_team=None) for one in measured)
     log.info("%s: chi2/dof %.6g/%d, %d rejected", options.method, estimate.chi2, estimate.dof, len(estimate.rejected))
     of_clocks = [*(clocks.sentences() if clocks else ()), *clock_warnings, *map(str, arms.values())]
     warnings = _warnings(run, options, estimate, measured, of_clocks, sources.unused)
     missing = without_poses(run, options, estimate, measured, sources.unused)
-    return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise)
+    return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise, unused=left_out)
+
+
+def _with_ranges(run: Run, options: SolveOptions, estimate: Estimate) -> tuple[Estimate, tuple[Unused, ...]]:
+    """Return the joint estimate of stances and ranges, starting from the stances, and the ranges not in it."""
+    if options.method != "joint" or not run.has_ranges:
+        return estimate, ()
+    found = ranges_of_run(run, estimate, odometry=options.odometry)
+    if found.ranges:
+        graph = replace(estimate.graph, measurements=(*estimate.graph.measurements, *found.ranges))
+        both = joint(graph, start=estimate.values)
+        estimate = replace(both, bumped=(*estimate.bumped, *both.bumped))
+    return estimate, unused_ranges(found.unused)
 
 
 def _usable(measured: Sequence[PairMeasurement]) -> int:
@@ -263,7 +278,8 @@ def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: 
     """Solve one stance after the other."""
     solver = StanceSolver(run.team, options)
     for stance in run.stances:
-        one = solver.enter(run, stance, solver.measure(run, stance, measure(stance, solver.noise.used(run.team))))
+        measured = solver.measure(run, stance, measure(stance, solver.noise.used(run.team)))
+        one = solver.enter(run, stance, measured, solver.ranges_before(run, stance))
         if on_update is not None:
             on_update(one)
     _require_poses(run, options, solver.measured)
@@ -272,7 +288,8 @@ def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: 
     frontend, updates = zip(*solver.seconds, strict=True)
     warnings = _warnings(run, options, estimate, solver.measured, solver.warnings, solver.unused)
     missing = without_poses(run, options, estimate, solver.measured, solver.unused)
-    return _Solved(estimate, warnings, sum(frontend), solver.measured, updates, {}, missing, solver.noise)
+    left_out = unused_ranges(solver.unused_ranges)
+    return _Solved(estimate, warnings, sum(frontend), solver.measured, updates, {}, missing, solver.noise, left_out)
 
 
 def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_update: OnUpdate | None) -> _Solved:

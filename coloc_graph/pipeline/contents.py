@@ -1,6 +1,6 @@
 """Contents of a run: the kind of its solution, unused data, and applicable options."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -84,6 +84,11 @@ def unused_in(run: Run, options: SolveOptions | None = None) -> tuple[Unused, ..
     return tuple(_beside_ranges(run) if kind_of(run) == "ranges" else _beside_stances(run, options))
 
 
+def unused_ranges(unused: Mapping[str, int]) -> tuple[Unused, ...]:
+    """Return the ranges of a run with stances that its estimate does not use, by reason."""
+    return tuple(Unused("ranges", count, _noun(count, "range"), why) for why, count in unused.items())
+
+
 def require_applicable(run: Run, options: SolveOptions) -> Kind:
     """Return the kind of measurements that a run is solved by; `InputError` where an option does not apply to it."""
     kind = kind_of(run)
@@ -104,7 +109,14 @@ def require_applicable(run: Run, options: SolveOptions) -> Kind:
 def _beside_stances(run: Run, options: SolveOptions) -> Iterable[Unused]:
     """Unused data of a run that is solved by its stances."""
     names = run.team.names
-    found = [_unused(run, "ranges", names, "a run with stances is solved by its stances alone")]
+    found: list[Unused | None] = []
+    if options.method != "joint":
+        found.append(_unused(run, "ranges", names, f"`{options.method}` calibrates no range sensors; use `joint`"))
+    elif run.team.floor is None:
+        found.append(_unused(run, "ranges", names, "the team states no floor, and ranges are those along a floor"))
+    else:
+        for robot in (one.name for one in run.team.robots if one.ranging is None):
+            found.append(_unused(run, "ranges", [robot], f"the team states no [robots.ranging] of {robot}"))
     detected = [robot for robot in names if run.has_detections(robot)]
     found.append(_unused(run, "image", detected, "their markers are recorded as detections"))
     if options.method == "chain":

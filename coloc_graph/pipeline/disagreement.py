@@ -6,7 +6,7 @@ import numpy as np
 
 from coloc_graph.backend import Estimate, PoseGraph
 from coloc_graph.geometry.lie import se3_inverse, se3_log
-from coloc_graph.measurements import Odometry, RelativePose, Sighting
+from coloc_graph.measurements import Odometry, Range, RelativePose, Sighting
 from coloc_graph.run import Run
 
 MIN_MEAN_SQUARE = 3.0  # mean square of residuals in sigmas from which a kind of measurements is named
@@ -17,6 +17,7 @@ MAX_NAMED = 3  # kinds of measurements that are named
 CAUSES = {
     "odometry": "check its wheels, its clock, its covariances, and of which point of the body it is",
     "sightings": "check the positions and heights of its markers",
+    "ranges": "check the antennas' positions, what stood in their way, and the sensor's noise",
     "homographies": "an anchor moved, or mounts, heights, the floor or the noise are not as stated",
 }
 
@@ -44,6 +45,8 @@ def worst_kinds(estimate: Estimate) -> str:
             squares["odometry", one.robot].append(square)
         elif isinstance(one, Sighting):
             squares["sightings", one.seen].append(square)
+        elif isinstance(one, Range):
+            squares["ranges", f"{one.target} by {one.robot}"].append(square)
         elif isinstance(one, RelativePose):
             squares["homographies", " and ".join(sorted((one.robot_i, one.robot_j)))].append(square)
     means = {key: float(np.mean(every)) for key, every in squares.items()}

@@ -165,15 +165,19 @@ def _misfit(estimate: Estimate) -> list[str]:
 
 
 def _unobservable(estimate: Estimate) -> Iterator[str]:
-    """Tolerances of mounts that were stated, and that the measurements do not narrow."""
-    names: dict[str, list[str]] = {}
+    """Tolerances of mounts and range sensors that were stated, and that the measurements do not narrow."""
+    mounts = {name: set(mount.rows) for name, mount in estimate.calibration.mounts.items()}
+    names: dict[tuple[str, str], list[str]] = {}
     for row in estimate.calibration.unobservable:
-        names.setdefault(row.robot, []).append(row.what)
-    for robot, whats in names.items():
-        yield (
-            f"{robot}: {', '.join(whats)} not observable, and as uncertain as stated: record wheel odometry of {robot} "
-            "while it turns and drives between its stances"
+        remedy = (
+            f"record wheel odometry of {row.robot} while it turns and drives between its stances"
+            if row in mounts.get(row.robot, ())
+            else f"let it measure range at more distances to more robots, or state it as exact in {row.robot}'s "
+            "[robots.ranging]"
         )
+        names.setdefault((row.robot, remedy), []).append(row.what)
+    for (robot, remedy), whats in names.items():
+        yield f"{robot}: {', '.join(whats)} not observable, and as uncertain as stated: {remedy}"
 
 
 def _p_value(p_value: float) -> str:

@@ -12,7 +12,7 @@ from coloc_graph.backend.graph import PoseKeys, slips_of
 from coloc_graph.backend.landmarks import landmarks_of
 from coloc_graph.backend.planar import IncrementalKeyframes, Latest
 from coloc_graph.backend.planar.incremental import UPDATE_PERIOD
-from coloc_graph.errors import ColocError
+from coloc_graph.errors import ColocError, EstimationError
 from coloc_graph.frontend import (
     PairMeasurement,
     Scale,
@@ -29,11 +29,13 @@ from coloc_graph.frontend import (
 )
 from coloc_graph.frontend.clock_evidence import ClockEvidence
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
+from coloc_graph.frontend.stance_ranges import StanceRanges, merged
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Drive, Measurement, Sighting
 from coloc_graph.pipeline.clocks import CorrectedRun, RunClocks, run_clocks, stance_evidence
 from coloc_graph.pipeline.options import SolveOptions
-from coloc_graph.run import OdometrySample, Recorded, Stance
+from coloc_graph.pipeline.ranges import instants_in, place_ranges, standing_of
+from coloc_graph.run import OdometrySample, Ranges, Recorded, Run, Stance
 from coloc_graph.run.recorded import Restated
 from coloc_graph.team import Team
 
@@ -203,6 +205,8 @@ class StanceSolver:
         #: Noise of marker centres as it is known from the stances that are in, and before the last.
         self.noise = self._earlier_noise = self._next_noise = NoiseBelief.of(team)
         self._motions = OdometryAndSightings(team, odometry=self.options.odometry)
+        self._ranges: dict[int, StanceRanges] = {}  # by the stance with which they came
+        self._instants: dict[tuple[str, int], float] = {}  # when moving robots were sighted
         self._measuring = 0.0
 
     def measure(
@@ -238,10 +242,21 @@ class StanceSolver:
         self._measuring = time.perf_counter() - started
         return shared
 
+    def ranges_before(self, run: Run, stance: Stance) -> dict[str, list[Ranges]]:
+        """Return the recorded ranges since the last stance, up to the end of this one, by robot."""
+        if self.options.method != "joint" or not run.has_ranges:
+            return {}
+        since = self.estimator.stances[-1].end if self.estimator.stances else stance.start
+        return {robot: list(run.ranges(robot, since, stance.end)) for robot in self.team.names}
+
     def enter(
-        self, run: Recorded, stance: Stance, measured: tuple[PairMeasurement, ...] | None = None
+        self,
+        run: Recorded,
+        stance: Stance,
+        measured: tuple[PairMeasurement, ...] | None = None,
+        ranges: Mapping[str, Sequence[Ranges]] | None = None,
     ) -> EnteredStance:
-        """Add a stance with its measurements by `measure`.
+        """Add a stance with its measurements by `measure`, and the `ranges` since the last stance.
 
         Raises
         ------
@@ -264,10 +279,63 @@ class StanceSolver:
             if self.team.floor is not None:
                 self._motions.withdraw()
             raise
+        said = self._enter_ranges(run, here, before, said, made, ranges or {})
         self.seconds.append((self._measuring + adding - started, time.perf_counter() - adding))
         self.measured += tuple(replace(one, with_team=None) for one in shared)
         self._earlier_noise, self.noise = self.noise, self._next_noise
         return EnteredStance(here, said, made, shared)
+
+    def _enter_ranges(
+        self,
+        run: Recorded,
+        stance: Stance,
+        before: Stance | None,
+        said: StanceEstimate,
+        made: Iterable[Measurement],
+        recorded: Mapping[str, Sequence[Ranges]],
+    ) -> StanceEstimate:
+        """Add the ranges since a stance `before`, placed by the estimate without them."""
+        self._instants |= instants_in(made)
+        if not any(recorded.values()):
+            return said
+        stances = [stance] if before is None else [before, stance]
+        poses: dict[int, dict[str, Any]] = {stance.index: {name: T.matrix() for name, T in said.poses.items()}}
+        if before is not None:
+            poses[before.index] = self._poses(before)
+        standing = standing_of(stances, poses, self._instants)
+        begin, end = stances[0].start, stance.end
+        wheels = {
+            robot: list(run.odometry(robot, begin, end)) if self.options.odometry else [] for robot in self.team.names
+        }
+        found = place_ranges(self.team, standing, wheels, recorded, stances)
+        self._ranges[stance.index] = found
+        if not found.ranges:
+            return said
+        later = self.estimator.insert(*found.ranges)
+        return replace(
+            later,
+            rejected=(*said.rejected, *later.rejected),
+            agreement=said.agreement,
+            residuals=said.residuals,
+            landmarks=said.landmarks,
+        )
+
+    def _poses(self, stance: Stance) -> dict[str, Any]:
+        """Poses of the robots that have one at a stance."""
+        graph = self.estimator.graph
+        tied = (robot for robot, index in graph.nodes if index == stance.index)
+        found = {}
+        for robot in tied:
+            try:
+                found[robot] = self.estimator.pose(robot, stance.index).matrix()
+            except EstimationError:
+                continue
+        return found
+
+    @property
+    def unused_ranges(self) -> Mapping[str, int]:
+        """Number of samples of ranges that are not used, by reason."""
+        return merged(self._ranges.values()).unused
 
     def _as_corrected(self, run: Any) -> Any:
         return run if self.clocks is None or isinstance(run, CorrectedRun) else self.clocks.corrected(run)
@@ -283,6 +351,7 @@ class StanceSolver:
         self.noise = self._earlier_noise
         if self.team.floor is not None:
             self._motions.withdraw()
+        self._ranges.pop(index, None)
         self.measured = tuple(one for one in self.measured if one.homography.stance != index)
         self.seconds.pop()
 

@@ -11,11 +11,14 @@ from coloc_graph.backend.graph import Link
 from coloc_graph.frontend import PairMeasurement
 from coloc_graph.frontend.learnt_noise import NoiseBelief
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.measurements import Odometry, RelativePose, Sighting
+from coloc_graph.measurements import Odometry, Range, RelativePose, Sighting
 from coloc_graph.pipeline.contents import Unused
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
 from coloc_graph.team import Team
+
+#: Kinds in measurements.csv of the links of a graph.
+LINK_KINDS: dict[type, str] = {Sighting: "sighting", Odometry: "odometry", Range: "range"}
 
 
 @dataclass(frozen=True)
@@ -98,15 +101,15 @@ class Solution:
         return frozenset(self.estimate.disconnected)
 
     @property
-    def links(self) -> Iterator[tuple[str, Sighting | Odometry, str | None]]:
-        """Sightings and odometry of the graph: kind, measurement, and the reason where it is not used."""
+    def links(self) -> Iterator[tuple[str, Sighting | Odometry | Range, str | None]]:
+        """Sightings, odometry and ranges of the graph: kind, measurement, and the reason where it is not used."""
         for one in self.estimate.graph.measurements:
             if not isinstance(one, RelativePose):
-                yield ("odometry" if isinstance(one, Odometry) else "sighting"), one, self.reason(one)
+                yield LINK_KINDS[type(one)], one, self.reason(one)
 
     @cached_property
     def counts(self) -> dict[str, Count]:
-        """Number of measurements by kind: `homography`, `sighting` and `odometry`, or `range`."""
+        """Number of measurements by kind: `homography`, `sighting`, `odometry` and `range`, or `range` alone."""
         if self.estimate.is_ranging:
             used = self.estimate.ranging.used
             return {"range": Count(int(np.count_nonzero(used)), int(np.count_nonzero(~used)))}

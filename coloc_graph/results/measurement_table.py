@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from coloc_graph.errors import InputError
-from coloc_graph.measurements import Odometry
+from coloc_graph.measurements import Odometry, Range
 from coloc_graph.pipeline.solution import Solution
 
 #: `index_i` and `index_j` are stances, or, of a ranging run, keyframes (empty for a landmark). `residual` is the RMS
@@ -95,10 +95,14 @@ def _homographies(solution: Solution) -> Iterator[dict[str, Any]]:
 
 
 def _links(solution: Solution) -> Iterator[dict[str, Any]]:
-    """Rows of sightings and odometry."""
+    """Rows of sightings, odometry and ranges, which are means of `points` samples."""
     times = {stance.index: stance.start for stance in solution.run.stances}
     for kind, one, reason in solution.links:
         (robot_i, index_i), (robot_j, index_j) = one.ends
+        if isinstance(one, Range):
+            cells: dict[str, float] = {"range": float(one.range.mean()), "points": one.samples}
+        else:
+            cells = {"distance": float(np.linalg.norm(one.T_i_j[:3, 3]))}
         yield _row(
             kind,
             reason,
@@ -108,7 +112,7 @@ def _links(solution: Solution) -> Iterator[dict[str, Any]]:
             robot_j=robot_j,
             index_j=index_j if index_j >= 0 else "",
             residual=solution.estimate.residual(one),
-            distance=float(np.linalg.norm(one.T_i_j[:3, 3])),
+            **cells,
         )
 
 

@@ -82,7 +82,7 @@ def decode_motion(robot: str, ns: int, data: memoryview) -> Motion:
 def decode_ranges(robot: str, ns: int, data: memoryview) -> Ranges:
     """Decode the measurements of a range and bearing sensor at one time."""
     wire = _json(data, schemas.RangesWire)
-    if not len(wire.target) == len(wire.range) == len(wire.bearing):
+    if len(wire.target) != len(wire.range) or len(wire.bearing) not in (0, len(wire.target)):
         lengths = f"`range` has {len(wire.range)} and `bearing` {len(wire.bearing)}"
         raise MalformedError(f"{lengths} entries for {len(wire.target)} in `target`")
     try:
@@ -90,7 +90,8 @@ def decode_ranges(robot: str, ns: int, data: memoryview) -> Ranges:
     except RunError as error:
         raise MalformedError(str(error)) from error
     time = schemas.to_seconds(ns)
-    return Ranges(robot, time, tuple(wire.target), np.array(wire.range, float), np.array(wire.bearing, float))
+    bearing = np.array(wire.bearing, float) if wire.bearing else None
+    return Ranges(robot, time, tuple(wire.target), np.array(wire.range, float), bearing)
 
 
 def decode_stance(ns: int, data: memoryview) -> Stance:

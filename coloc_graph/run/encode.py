@@ -163,9 +163,9 @@ def _ranges(record: Ranges) -> schemas.RangesWire:
     n, time = len(record.targets), record.time
     of = f"`{record.robot}`'s ranges"
     range_ = _finite(f"`range` of {of}", time, (n,), record.range)
-    bearing = _finite(f"`bearing` of {of}", time, (n,), record.bearing)
+    bearing = [] if record.bearing is None else _finite(f"`bearing` of {of}", time, (n,), record.bearing).tolist()
     check_ranges(range_.tolist(), f"`range` of {of} at {time} s")
-    return schemas.RangesWire(target=list(record.targets), range=range_.tolist(), bearing=bearing.tolist())
+    return schemas.RangesWire(target=list(record.targets), range=range_.tolist(), bearing=bearing)
 
 
 def check_ranges(ranges: Sequence[float], where: str) -> None:

@@ -123,7 +123,7 @@ class OdometrySample:
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """Ranges and bearings measured by one robot at one time.
+    """Ranges, and bearings if its sensor has them, measured by one robot at one time.
 
     Parameters
     ----------
@@ -135,15 +135,15 @@ class Ranges:
         Robots and landmarks of the team.
     range : (n,) float
         Ranges [m].
-    bearing : (n,) float
-        Bearings [rad], positive to the left.
+    bearing : (n,) float or None
+        Bearings [rad], positive to the left; None of a sensor that measures none (UWB).
     """
 
     robot: str
     time: float
     targets: tuple[str, ...]
     range: Array
-    bearing: Array
+    bearing: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ class RangesWire(Wire, frozen=True):
 
     target: list[str]
     range: list[float]
-    bearing: list[float]
+    bearing: list[float] = []
 
 
 class MotionWire(Wire, frozen=True):

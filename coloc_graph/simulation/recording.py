@@ -11,7 +11,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.plan import Plan
 from coloc_graph.run import atomic_run
-from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Stance
+from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, Ranges, Stance
 from coloc_graph.simulation.blinking import with_codes
 from coloc_graph.simulation.mess import messy_frames
 from coloc_graph.simulation.paths import Array
@@ -21,12 +21,13 @@ from coloc_graph.simulation.scenarios import TeamScenario, scenario
 from coloc_graph.simulation.scenery import Scenery, frames, make_scenery
 from coloc_graph.simulation.teams import build_team_world
 from coloc_graph.simulation.tracks import observe
+from coloc_graph.simulation.uwb import uwb_ranges
 from coloc_graph.simulation.wheels import Odometry, move_times, odometry
 from coloc_graph.simulation.world import EPOCH, Capture, Depth, World, build_world, stream
 from coloc_graph.team import Team
 
 ImageFormat = Literal["jpeg", "raw", "png"]
-Record = Detections | Image | OdometrySample | Motion | Stance
+Record = Detections | Image | OdometrySample | Motion | Ranges | Stance
 
 
 class Recorder(Protocol):
@@ -135,11 +136,13 @@ def record(
         )
         for robot, path in world.paths.items()
     }
+    ranges = uwb_ranges(world)
     scenery = make_scenery(world) if depth == "images" else None
     begin = EPOCH
     for k, stance in enumerate(world.stances):
         events = _truth(world, begin, stance)
         events += _moves(world, begin, stance, wheels)
+        events += [_write(one, one.time) for each in ranges.values() for one in each if begin <= one.time < stance.end]
         events += _seen(world, k, scenery, messy_frames if messy else frames)
         # stable, so that what happens at one instant is written in the order above
         for _, happen in sorted(events, key=lambda event: event[0]):

@@ -7,11 +7,12 @@ import numpy as np
 from msgspec.structs import replace
 
 from coloc_graph.errors import InputError
-from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Team, fisheye
+from coloc_graph.team import Camera, Floor, Markers, Mount, Ranging, Robot, Team, fisheye
 
 #: A mild lens, OpenCV's (k1, k2, p1, p2): what the images are rendered through.
 MILD_LENS = (-0.10, 0.02, 5e-4, -3e-4)
 
+ANTENNA_X = -0.08  # m, place of a UWB antenna on the body: behind the camera
 MIN_ACROSS_DEG = 20.0  # deg, narrowest fisheye that is simulated
 MAX_ACROSS_DEG = 220.0  # deg, widest fisheye that is simulated
 FISHEYE = (-0.012, 0.003, -0.0012, 0.0001)  # k1 to k4 of the fisheye through which wide images are rendered
@@ -25,6 +26,8 @@ class Imperfections:
     for roll and for pitch of a body wherever it stands; heights and spans are in metres. A robot other than the
     reference stamps an instant t with t + `clock_offset` [s]. `time_jitter` [s] moves the true instant of each capture;
     the stamp moves with it. `noise_px` is that of a marker centre per axis (tracks depth only: images bring their own).
+    With a `uwb_sigma` [m] robots range each other, by sensors with offsets of `uwb_offset_sigma` [m]; a share
+    `uwb_nlos` of the ranges has no line of sight, and is too long.
     """
 
     mount_sigma_deg: float = 0.0
@@ -35,6 +38,9 @@ class Imperfections:
     clock_offset: float = 0.0
     time_jitter: float = 0.0
     noise_px: float = 0.3
+    uwb_sigma: float = 0.0
+    uwb_offset_sigma: float = 0.0
+    uwb_nlos: float = 0.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -43,6 +49,10 @@ class Imperfections:
                 raise InputError(f"`{field.name}` is {value}; give a finite number")
             if value < 0 and field.name != "clock_offset":
                 raise InputError(f"`{field.name}` is {value}; give a number that is not negative")
+        if self.uwb_nlos > 1:
+            raise InputError(f"`uwb_nlos` is {self.uwb_nlos}; give a share of all ranges, 0 to 1")
+        if self.uwb_sigma == 0 and (self.uwb_offset_sigma or self.uwb_nlos):
+            raise InputError("there are no ranges to be wrong: give `uwb_sigma` too")
 
     @property
     def clocks_differ(self) -> bool:
@@ -94,7 +104,15 @@ def stated_team(team: Team, imperfections: Imperfections) -> Team:
             yaw_sigma_deg=imperfections.mount_yaw_sigma_deg,
         )
         markers = robot.markers and replace(robot.markers, span_sigma=imperfections.span_sigma)
-        return replace(robot, camera_if_any=camera, mount_if_any=mount, markers=markers)
+        ranging = robot.ranging
+        if imperfections.uwb_sigma:
+            ranging = Ranging(
+                range_sigma=imperfections.uwb_sigma,
+                offset_sigma=imperfections.uwb_offset_sigma,
+                x=ANTENNA_X,
+                two_way=True,
+            )
+        return replace(robot, camera_if_any=camera, mount_if_any=mount, markers=markers, ranging=ranging)
 
     floor = Floor(tilt_sigma_deg=imperfections.floor_sigma_deg)
     robots = tuple(map(stated, team.robots))
@@ -125,7 +143,11 @@ def true_team(stated: Team, rng: np.random.Generator) -> Team:
             scale = 1 + span * markers.span_sigma / markers.span
             positions = tuple((x * scale, y * scale) for x, y in markers.positions)
             markers = replace(markers, positions=positions, span_sigma=0.0)
-        return replace(robot, mount_if_any=mount, markers=markers)
+        ranging = robot.ranging
+        if ranging is not None and ranging.offset_sigma:
+            offset = ranging.offset + float(rng.standard_normal()) * ranging.offset_sigma
+            ranging = replace(ranging, offset=offset, offset_sigma=0.0)
+        return replace(robot, mount_if_any=mount, markers=markers, ranging=ranging)
 
     return replace(stated, robots=tuple(map(drawn, stated.robots)), clock_sigma=0.0)
 

@@ -49,6 +49,7 @@ _STREAMS = (
     "person",
     "landmarks",
     "blink",
+    "uwb",
 )
 
 

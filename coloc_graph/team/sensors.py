@@ -13,7 +13,7 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     range_sigma, range_sigma_per_m2 : float
         Noise of a range r: `range_sigma` + `range_sigma_per_m2` r^2 [m].
     bearing_sigma_deg, across_sigma : float
-        Noise of a bearing: the hypotenuse of `bearing_sigma_deg` and `across_sigma` [m] / r.
+        Noise of a bearing: the hypotenuse of `bearing_sigma_deg` and `across_sigma` [m] / r; 0: it measures none.
     range_memory, bearing_memory : float
         Correlation times of the errors of one target [s]; 0: independent.
     offset, scale : float
@@ -27,12 +27,15 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         Ranges to robots read this much more than those to landmarks [m].
     x, y : float
         Position on the body [m].
+    two_way : bool
+        True of radio (UWB): a range is that between the antennas of both robots, at their `x`, `y`, and both `offset`s
+        add to it. Otherwise it is that to the origin of the other body.
     offset_sigma, scale_sigma, bearing_offset_sigma_deg, depth_sigma, robot_offset_sigma, place_sigma : float
         Tolerances, `place_sigma` of x and of y; a number with one is estimated along with the poses.
     """
 
     range_sigma: float
-    bearing_sigma_deg: float
+    bearing_sigma_deg: float = 0.0
     range_sigma_per_m2: float = 0.0
     across_sigma: float = 0.0
     range_memory: float = 0.0
@@ -50,15 +53,16 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     depth_sigma: float = 0.0
     robot_offset_sigma: float = 0.0
     place_sigma: float = 0.0
+    two_way: bool = False
 
     def __post_init__(self) -> None:
         require_finite(self)
-        for name in ("range_sigma", "bearing_sigma_deg", "scale"):
+        for name in ("range_sigma", "scale"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
         if not -0.5 <= self.depth <= 1.5:
             raise ValueError(f"`depth` is {self.depth}; give 0 where it measures range, 1 where it measures depth")
-        noise = ("range_sigma_per_m2", "across_sigma", "range_memory", "bearing_memory")
+        noise = ("bearing_sigma_deg", "range_sigma_per_m2", "across_sigma", "range_memory", "bearing_memory")
         tolerances = ("offset_sigma", "scale_sigma", "bearing_offset_sigma_deg", "depth_sigma", "robot_offset_sigma")
         require_not_negative(self, (*noise, *tolerances, "place_sigma"))
 

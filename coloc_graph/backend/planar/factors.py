@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from coloc_graph.backend.linear_system import Keys, LinearSystem, Rows
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.filter import Models
-from coloc_graph.backend.planar.model import RANGING, WHEELS
 from coloc_graph.backend.sensor_calibration import SensorErrors
+from coloc_graph.backend.sensor_model import RANGING, WHEELS
 from coloc_graph.geometry.se2 import wrap
 from coloc_graph.measurements import Drive
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.planar.initial_pose import RigidAlignmentRansac
-from coloc_graph.backend.planar.model import (
+from coloc_graph.backend.sensor_model import (
     RANGING,
     WHEELS,
     Pose,

@@ -6,7 +6,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.planar.model import Pose
+from coloc_graph.backend.sensor_model import Pose
 
 Array = NDArray[np.float64]
 

@@ -94,7 +94,7 @@ def ranging_estimate(
         rejected=tuple(
             Rejection(problem.measurements[row], problem.reason(row) or "") for row in np.flatnonzero(outliers).tolist()
         ),
-        calibration=Calibration(sensors=sensors, landmarks=positions),
+        calibration=Calibration(driven=sensors, landmarks=positions),
         landmarks=landmarks,
     )
 

@@ -1,0 +1,272 @@
+"""Runs that hold stances and ranges: one estimate of both, in batch and as it happens."""
+
+import csv
+import dataclasses
+
+import gtsam
+import msgspec
+import numpy as np
+import pytest
+
+from coloc_graph.backend import Estimator, PoseGraph, joint, smooth
+from coloc_graph.backend.range_model import RangeModel
+from coloc_graph.cli import main
+from coloc_graph.errors import EstimationError, MeasurementError
+from coloc_graph.exchange.dot import to_dot
+from coloc_graph.exchange.g2o import read_g2o
+from coloc_graph.exchange.g2o_writer import write_g2o
+from coloc_graph.frontend import WheelTrack
+from coloc_graph.measurements import Range
+from coloc_graph.pipeline.batch import SolveOptions, solve
+from coloc_graph.pipeline.explanations import warnings_of_graph
+from coloc_graph.results.measurement_table import measurement_table
+from coloc_graph.run import OdometrySample, Ranges, open_run, read_true_team
+from coloc_graph.simulation import Imperfections, simulate
+from coloc_graph.simulation.uwb import NLOS_EXCESS
+from coloc_graph.team import Ranging
+
+WRONG = Imperfections(uwb_sigma=0.05, uwb_offset_sigma=0.1, uwb_nlos=0.05)
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory):
+    """A hallway of 5 stances with ranges between its robots."""
+    path = tmp_path_factory.mktemp("mixed") / "mixed.mcap"
+    simulate("hallway", path, stances=5, seed=2, points=60, imperfections=WRONG)
+    return path
+
+
+@pytest.fixture(scope="module")
+def solution(mixed):
+    """Its solution."""
+    return solve(open_run(mixed))
+
+
+def ranges_of(estimate):
+    return [one for one in estimate.graph.measurements if isinstance(one, Range)]
+
+
+def test_jacobians_of_ranges_are_those_of_their_residuals(rng):
+    root = rng.normal(size=(4, 4))
+    sensor = Ranging(range_sigma=0.05, x=0.1, two_way=True, scale=1.1, offset=0.2)
+    other = Ranging(range_sigma=0.05, y=0.1, offset=0.1)
+    models = [
+        RangeModel(
+            Range("A", "B", 0, 0, 0.0, rng.uniform(1, 2, 4), rng.normal(0, 0.3, (4, 3)), rng.normal(0, 0.3, (4, 3)),
+                  root @ root.T + np.eye(4), 5),
+            sensor, other,
+        )
+        for _ in range(3)
+    ]  # fmt: skip
+    batch = RangeModel.batch(models)
+    poses = [[gtsam.Pose3.Expmap(rng.normal(0, 0.3, 6) + [0, 0, 0, far, 0, 0]) for _ in models] for far in (0, 2)]
+    errors = [rng.normal(0, 0.05, (3, 7)) for _ in range(2)]
+
+    def at(T, errors):
+        return batch.at(*(np.array([one.matrix() for one in each]) for each in T), errors)[0]
+
+    _, by, _ = batch.at(*(np.array([one.matrix() for one in each]) for each in poses), errors)
+    for slot in range(4):
+        for d in range(by[slot].shape[-1]):
+            step = np.zeros(by[slot].shape[-1])
+            step[d] = 1e-6
+            ahead, back = (
+                at([[one.retract(sign * step) if slot == k else one for one in each] for k, each in enumerate(poses)],
+                   [one + sign * step if slot == k + 2 else one for k, one in enumerate(errors)])
+                for sign in (1, -1)
+            )  # fmt: skip
+            np.testing.assert_allclose((ahead - back) / 2e-6, by[slot][..., d], atol=1e-6)
+
+
+def test_stances_and_ranges_are_one_estimate_and_offsets_calibrate(mixed, solution):
+    ranges = ranges_of(solution.estimate)
+    used = sum(one.samples for one in ranges)
+    left_out = {one.reason: one.count for one in solution.unused}
+    stances = open_run(mixed).stances
+    recorded = sum(
+        len(one.targets)
+        for robot in "ABC"
+        for one in open_run(mixed).ranges(robot)
+        if stances[0].start <= one.time <= stances[-1].end
+    )
+    outside = left_out.pop("they are from before the first stance, or after the last", 0)
+    assert used + sum(left_out.values()) == recorded and outside < 0.05 * recorded
+    # 5 % have no line of sight; those that are too long by less than noise are not told from the others
+    told = np.exp(-3.5 * WRONG.uwb_sigma / NLOS_EXCESS)
+    assert left_out["they are outliers among those next to them"] == pytest.approx(0.05 * told * recorded, rel=0.4)
+    assert solution.counts["range"].used >= 0.9 * len(ranges) > 10
+    true = read_true_team(mixed)
+    sensors = solution.estimate.calibration.sensors
+    offsets = np.array([sensors[name].ranging.offset - true[name].ranging.offset for name in "ABC"])
+    sigmas = np.array([sensors[name].ranging.offset_sigma for name in "ABC"])
+    assert (sigmas < 0.6 * WRONG.uwb_offset_sigma).all() and (np.abs(offsets) < 3.5 * sigmas).all()
+    assert {row.what for row in solution.estimate.calibration.rows} == {"range offset"}
+    assert solution.calibrated_team["A"].ranging.offset == sensors["A"].ranging.offset
+
+
+def test_ranges_make_poses_more_certain_and_move_them_within_that(mixed, solution, copied, tmp_path):
+    alone = copied(mixed, tmp_path / "alone.mcap")
+    without = solve(open_run(alone))
+    assert not any(one.kind == "ranges" for one in without.unused)
+    for robot, one in solution.estimate.trajectories.items():
+        other = without.estimate.trajectories[robot]
+        before, after = np.array(other.covariances), np.array(one.covariances)
+        assert np.trace(after[-1][3:, 3:]) < np.trace(before[-1][3:, 3:])
+        off = one.positions - other.positions
+        assert (np.abs(off) <= 4 * np.sqrt(np.diagonal(before, axis1=1, axis2=2)[:, 3:]) + 1e-4).all()
+
+
+def test_incremental_estimate_of_stances_and_ranges_is_that_of_the_batch(mixed, solution):
+    live = solve(open_run(mixed), SolveOptions(incremental=True))
+    assert abs(sum(one.samples for one in ranges_of(live.estimate)) - sum(
+        one.samples for one in ranges_of(solution.estimate))) < 60  # fmt: skip
+    for robot, one in solution.estimate.trajectories.items():
+        np.testing.assert_allclose(live.estimate.trajectories[robot].positions, one.positions, atol=3e-3)
+
+
+def test_a_blocked_pair_is_an_outlier_with_a_reason(mixed, copied, tmp_path):
+    run = open_run(mixed)
+    stance = run.stances[2]
+    blocked = [
+        dataclasses.replace(one, range=one.range + 0.6 * (stance.start <= one.time <= stance.end) * np.array(
+            [target == "B" for target in one.targets]))
+        for robot in "AB" for one in run.ranges(robot)
+    ]  # fmt: skip
+    found = solve(open_run(copied(mixed, tmp_path / "blocked.mcap", more=blocked)))
+    rejected = [one.measurement for one in found.estimate.rejected]
+    assert [(one.robot, one.target, one.stance) for one in rejected] == [("A", "B", stance.index)]
+    assert "line of sight" in found.estimate.rejected[0].reason
+    assert any("was rejected" in warning and "range of B by A" in warning for warning in found.warnings)
+    rows = list(csv.DictReader(measurement_table(found).splitlines()))
+    (row,) = (one for one in rows if one["kind"] == "range" and one["used"] == "no")
+    assert "line of sight" in row["reason"] and float(row["range"]) > 1.0 and int(row["points"]) > 50
+    live = solve(open_run(tmp_path / "blocked.mcap"), SolveOptions(incremental=True)).estimate
+    assert [str(one.measurement)[:15] for one in live.rejected] == ["range of B by A"]
+
+
+def test_exports_hold_ranges_or_say_what_is_missing(solution, tmp_path):
+    dot = to_dot(solution.estimate.graph)
+    assert dot.count('color="#999999"') == len(ranges_of(solution.estimate))
+    write_g2o(solution.estimate, tmp_path / "graph.g2o")
+    assert f"# left out: {len(ranges_of(solution.estimate))} ranges" in (tmp_path / "graph.g2o").read_text()
+    assert len(read_g2o(tmp_path / "graph.g2o").ends)
+
+
+def test_checkpoints_keep_ranges(solution, tmp_path):
+    graph = solution.estimate.graph
+    team = solution.run.team
+    estimator = Estimator.of(team)
+    for before, stance in zip((None, *graph.stances), graph.stances, strict=False):
+        here = [m for m in graph.measurements if max(index for _, index in m.ends) == stance.index]
+        estimator.add(stance, [m for m in here if not isinstance(m, Range)], after=before and before.index)
+        estimator.insert(*(m for m in here if isinstance(m, Range)))
+    estimator.save(tmp_path / "checkpoint")
+    again = Estimator.resume(tmp_path / "checkpoint")
+    np.testing.assert_array_equal(again.pose("B").matrix(), estimator.pose("B").matrix())
+    # a withdrawn stance leaves no range behind
+    count = len(again.measurements)
+    again.withdraw()
+    assert not [m for m in again.measurements if isinstance(m, Range) and m.time > graph.stances[-2].end]
+    assert len(again.measurements) < count
+
+
+def test_offsets_that_nothing_measures_are_reported(solution):
+    graph = solution.estimate.graph
+    sensor = msgspec.structs.replace(graph.robot_models["A"].ranging, bearing_offset_sigma_deg=2.0)
+    models = {**graph.robot_models, "A": msgspec.structs.replace(graph.robot_models["A"], ranging=sensor)}
+    found = joint(dataclasses.replace(graph, robot_models=models))
+    assert [(row.robot, row.what) for row in found.calibration.unobservable] == [("A", "bearing offset")]
+    (warning,) = [one for one in warnings_of_graph(found, (), ()) if "observable" in one]
+    assert "A: bearing offset not observable" in warning and "range" in warning
+
+
+def range_of(**fields):
+    given = {"robot": "A", "target": "B", "stance": 0, "target_stance": 0, "time": 0.0, "range": [1.0]}
+    given |= {"moved": np.zeros((1, 3)), "target_moved": np.zeros((1, 3)), "covariance": [[1e-4]], "samples": 1}
+    return Range(**(given | fields))
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"target": "A"}, "relates a robot to itself"),
+        ({"target": "X"}, "robot X, which is not in the team"),
+        ({"stance": 77}, "stance 77, which is none"),
+        ({"range": [-1.0]}, "give metres above 0"),
+        ({"range": [np.nan]}, "not finite"),
+        ({"covariance": [[0.0]]}, "every range needs an uncertainty"),
+        ({"moved": np.zeros((2, 3))}, "give (n,)"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused_in_one_sentence(fields, why, solution):
+    run = solution.run
+    with pytest.raises(MeasurementError) as error:
+        PoseGraph.of(run.team, run.stances, [range_of(**fields)])
+    assert why in str(error.value)
+
+
+def test_ranges_alone_tie_nothing(solution):
+    run = solution.run
+    graph = PoseGraph.of(run.team, run.stances[:1], [range_of()])
+    with pytest.raises(EstimationError, match="no measurement ties a robot"):
+        joint(graph)
+    with pytest.raises(EstimationError, match="needs a joint estimate"):
+        smooth(solution.estimate.graph)
+
+
+def test_ranges_that_no_estimate_can_use_are_named_with_their_count(mixed, copied, tmp_path, capsys):
+    run = open_run(mixed)
+    records = [one for robot in "AB" for one in run.ranges(robot)]
+    bare = copied(mixed, tmp_path / "bare.mcap", more=records,
+                  change=lambda one: None if isinstance(one, OdometrySample) and one.robot == "C" else one)  # fmt: skip
+    reasons = {one.reason: one.count for one in solve(open_run(bare)).unused}
+    assert any(reason.startswith("C drives and has no odometry") for reason in reasons)
+    assert main(["solve", str(mixed), "--out", str(tmp_path / "smooth"), "--method", "smooth"]) == 0
+    assert "range records not used: `smooth` calibrates no range sensors; use `joint`" in capsys.readouterr().err
+
+
+def test_ranges_without_bearings_and_without_stances_are_refused(mixed, copied, tmp_path, capsys):
+    records = [one for robot in "AB" for one in open_run(mixed).ranges(robot)]
+    only = copied(mixed, tmp_path / "only.mcap", stances=(), more=records)
+    assert main(["solve", str(only), "--out", str(tmp_path / "result")]) == 2
+    error = capsys.readouterr().err
+    assert "mirrored" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "result").exists()
+
+
+def test_errors_of_places_by_odometry_have_their_stated_covariance(rng):
+    """Many noisy copies of one drive scatter as their joint covariance says, forwards and backwards in time."""
+    times, steps = np.arange(41) * 0.1, np.tile([0.02, 0.0, 0.03], (41, 1))
+    steps[0] = 0.0
+    C = np.diag([4e-6, 1e-6, 1e-5])
+
+    def driven(errors):
+        poses = [np.zeros(3)]
+        for step in (steps + errors)[1:]:
+            x, y, yaw = poses[-1]
+            c, s = np.cos(yaw), np.sin(yaw)
+            poses.append(np.array([x + c * step[0] - s * step[1], y + s * step[0] + c * step[1], yaw + step[2]]))
+        return WheelTrack("A", [OdometrySample("A", t, p, C) for t, p in zip(times.tolist(), poses, strict=True)])
+
+    start, points = 2.0, np.array([[0.1, 0.05]] * 3)
+    at = np.array([0.35, 3.0, 4.0])
+
+    def places(track):
+        x, y, yaw = track.moved(np.full(3, start), at).T
+        c, s = np.cos(yaw), np.sin(yaw)
+        return np.stack([x + c * points[:, 0] - s * points[:, 1], y + s * points[:, 0] + c * points[:, 1]], 1).ravel()
+
+    true = driven(np.zeros((41, 3)))
+    drawn = [places(driven(rng.multivariate_normal(np.zeros(3), C, 41))) - places(true) for _ in range(1500)]
+    root = true.place_errors(np.full(3, start), at, points).reshape(6, -1)
+    predicted = root @ root.T
+    scale = np.sqrt(np.outer(predicted.diagonal(), predicted.diagonal()))
+    np.testing.assert_allclose(np.cov(np.array(drawn).T) / scale, predicted / scale, atol=0.13)
+
+
+def test_sensors_that_measure_no_bearing_need_no_noise_of_it():
+    assert Ranging(range_sigma=0.1).bearing_sigma_deg == 0.0
+    with pytest.raises(ValueError, match="bearing_sigma_deg"):
+        Ranging(range_sigma=0.1, bearing_sigma_deg=-1.0)
+    assert Ranges("A", 0.0, ("B",), np.ones(1)).bearing is None
+    assert msgspec.structs.asdict(Ranging(range_sigma=0.1))["two_way"] is False
