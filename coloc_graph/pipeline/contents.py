@@ -115,8 +115,8 @@ def _beside_stances(run: Run, options: SolveOptions) -> Iterable[Unused]:
     elif run.team.floor is None:
         found.append(_unused(run, "ranges", names, "the team states no floor, and ranges are those along a floor"))
     else:
-        for robot in (one.name for one in run.team.robots if one.ranging is None):
-            found.append(_unused(run, "ranges", [robot], f"the team states no [robots.ranging] of {robot}"))
+        without = (one.name for one in run.team.robots if one.ranging is None)
+        found += [_unused(run, "ranges", [name], f"the team states no [robots.ranging] of {name}") for name in without]
     detected = [robot for robot in names if run.has_detections(robot)]
     found.append(_unused(run, "image", detected, "their markers are recorded as detections"))
     if options.method == "chain":

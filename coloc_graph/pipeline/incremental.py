@@ -12,7 +12,7 @@ from coloc_graph.backend.graph import PoseKeys, slips_of
 from coloc_graph.backend.landmarks import landmarks_of
 from coloc_graph.backend.planar import IncrementalKeyframes, Latest
 from coloc_graph.backend.planar.incremental import UPDATE_PERIOD
-from coloc_graph.errors import ColocError, EstimationError
+from coloc_graph.errors import ColocError
 from coloc_graph.frontend import (
     PairMeasurement,
     Scale,
@@ -207,6 +207,7 @@ class StanceSolver:
         self._motions = OdometryAndSightings(team, odometry=self.options.odometry)
         self._ranges: dict[int, StanceRanges] = {}  # by the stance with which they came
         self._instants: dict[tuple[str, int], float] = {}  # when moving robots were sighted
+        self._posed: dict[int, tuple[str, ...]] = {}  # robots that have a pose, by stance
         self._measuring = 0.0
 
     def measure(
@@ -296,12 +297,15 @@ class StanceSolver:
     ) -> StanceEstimate:
         """Add the ranges since a stance `before`, placed by the estimate without them."""
         self._instants |= instants_in(made)
+        self._posed[stance.index] = tuple(said.poses)
         if not any(recorded.values()):
             return said
         stances = [stance] if before is None else [before, stance]
         poses: dict[int, dict[str, Any]] = {stance.index: {name: T.matrix() for name, T in said.poses.items()}}
         if before is not None:
-            poses[before.index] = self._poses(before)
+            poses[before.index] = {
+                robot: self.estimator.pose(robot, before.index).matrix() for robot in self._posed.get(before.index, ())
+            }
         standing = standing_of(stances, poses, self._instants)
         begin, end = stances[0].start, stance.end
         wheels = {
@@ -319,18 +323,6 @@ class StanceSolver:
             residuals=said.residuals,
             landmarks=said.landmarks,
         )
-
-    def _poses(self, stance: Stance) -> dict[str, Any]:
-        """Poses of the robots that have one at a stance."""
-        graph = self.estimator.graph
-        tied = (robot for robot, index in graph.nodes if index == stance.index)
-        found = {}
-        for robot in tied:
-            try:
-                found[robot] = self.estimator.pose(robot, stance.index).matrix()
-            except EstimationError:
-                continue
-        return found
 
     @property
     def unused_ranges(self) -> Mapping[str, int]:

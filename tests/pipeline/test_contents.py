@@ -47,7 +47,10 @@ def empty(tmp_path_factory, short, copied):
 def test_ranges_beside_stances_are_named_with_their_count(both, short_solution, tmp_path, capsys):
     solution = solve(open_run(both))
     assert [(one.kind, one.count) for one in unused_in(solution.run)] == [("ranges", RANGES)]
-    assert any(f"{RANGES} range records not used: the team states no [robots.ranging] of A" in warning for warning in solution.warnings)
+    assert any(
+        f"{RANGES} range records not used: the team states no [robots.ranging] of A" in warning
+        for warning in solution.warnings
+    )
     assert not any("not used" in warning for warning in short_solution.warnings)
     write_result(solution, tmp_path / "result")
     assert json.loads((tmp_path / "result" / "summary.json").read_text())["unused"] == {"ranges": RANGES}

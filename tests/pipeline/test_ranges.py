@@ -59,7 +59,7 @@ def test_jacobians_of_ranges_are_those_of_their_residuals(rng):
         for _ in range(3)
     ]  # fmt: skip
     batch = RangeModel.batch(models)
-    poses = [[gtsam.Pose3.Expmap(rng.normal(0, 0.3, 6) + [0, 0, 0, far, 0, 0]) for _ in models] for far in (0, 2)]
+    poses = [[gtsam.Pose3.Expmap(rng.normal(0, 0.3, 6) + far * np.eye(6)[3]) for _ in models] for far in (0, 2)]
     errors = [rng.normal(0, 0.05, (3, 7)) for _ in range(2)]
 
     def at(T, errors):
