@@ -9,7 +9,7 @@ import numpy as np
 from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.run.messages import Image
 from coloc_graph.simulation.paths import Array
-from coloc_graph.simulation.rendering import Field, Sensor, add_spots, expose, fill, spots
+from coloc_graph.simulation.rendering import Field, Sensor, add_spots, expose, fill, pixel_noise, spots
 from coloc_graph.simulation.scenery import Scenery, bright, dark, others_in_view, with_robots
 from coloc_graph.simulation.world import Capture, World, stream
 from coloc_graph.team import Camera
@@ -83,15 +83,18 @@ def paint(field: Field, camera: Camera, T_world_camera: Array, person: Person, t
             ]
         )
         ends = corners @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-        if ends[:, 2].min() > 0.1:
+        if camera.model == "fisheye":
+            if np.linalg.norm(ends, axis=1).min() > 0.1 and np.isfinite(uv := camera.project(ends)[0]).all():
+                fill(field, uv, DARK)
+        elif ends[:, 2].min() > 0.1:
             # without the lens, whose polynomial ends within the image of somebody so near
             uv = ends[:, :2] / ends[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
             fill(field, np.clip(uv, -5000, 5000), DARK)
     strips = np.column_stack([legs, np.full(2, ANKLE)]) @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    ahead = strips[:, 2] > 0.1
+    depth = np.linalg.norm(strips, axis=1) if camera.model == "fisheye" else strips[:, 2]
     uv, inside = camera.project(strips)
-    there = ahead & inside
-    add_spots(field, spots(uv[there], camera.fx * STRIP / strips[there, 2], SHINING))
+    there = (depth > 0.1) & inside
+    add_spots(field, spots(uv[there], camera.fx * STRIP / depth[there], SHINING))
 
 
 def messy_frames(world: World, k: int, capture: Capture, scenery: Scenery) -> Iterator[Image]:
@@ -110,4 +113,4 @@ def messy_frames(world: World, k: int, capture: Capture, scenery: Scenery) -> It
         time = float(capture.times[i])
         field = with_robots(np.asarray(unlit + np.float32(flicker(time)) * lights, np.float32), others, i)
         paint(field, camera, T_world_camera, person, time)
-        yield Image(capture.robot, stamp, expose(field, sensor, rng.standard_normal(field.shape, dtype=np.float32)))
+        yield Image(capture.robot, stamp, expose(field, sensor, pixel_noise(rng, field.shape)))

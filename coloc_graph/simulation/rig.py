@@ -78,15 +78,25 @@ def reference_team(
 
 
 def wide_team(across_deg: float) -> Team:
-    """Return the reference team with fisheyes that see `across_deg` [deg] across the same sensor."""
+    """Return the reference team with fisheyes of 640x480 that see `across_deg` [deg] across."""
     if not MIN_ACROSS_DEG <= across_deg <= MAX_ACROSS_DEG:
         raise InputError(
             f"a fisheye of {across_deg:g} deg is not simulated; give {MIN_ACROSS_DEG:g} to {MAX_ACROSS_DEG:g} deg"
         )
     team = reference_team()
-    one = team.robots[0].camera
-    focal = one.width / 2 / float(fisheye.radius(FISHEYE, np.deg2rad(np.array(across_deg / 2))))
-    camera = replace(one, model="fisheye", fx=focal, fy=focal, distortion=FISHEYE)
+    width, height = 640, 480
+    focal = width / 2 / float(fisheye.radius(FISHEYE, np.deg2rad(np.array(across_deg / 2))))
+    camera = replace(
+        team.robots[0].camera,
+        model="fisheye",
+        width=width,
+        height=height,
+        fx=focal,
+        fy=focal,
+        cx=(width - 1) / 2,
+        cy=(height - 1) / 2,
+        distortion=FISHEYE,
+    )
     return replace(team, robots=tuple(replace(robot, camera_if_any=camera) for robot in team.robots))
 
 
