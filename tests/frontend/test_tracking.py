@@ -208,7 +208,7 @@ def test_a_marker_that_turns_back_at_once_is_followed(speed):
         u = 100.0 + speed * 0.01 * (100 - abs(k - 100))
         tracker.take(T0 + 0.01 * k, Blobs(np.array([[u, 80.0]]), np.array([0.0025 * np.eye(2)]), flags, none, none))
         if k == 103:  # and three images on it knows how fast it goes
-            assert tracker._filters.velocity[0, 0] == pytest.approx(-speed, abs=0.2 * speed)
+            assert tracker._filters.points[0].du == pytest.approx(-speed, abs=0.2 * speed)
     (track,) = tracker.tracks()
     assert len(track) == 200
 

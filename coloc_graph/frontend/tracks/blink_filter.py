@@ -1,5 +1,7 @@
 """Filter the blink states of many lights, on or off, from image to image."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,10 +47,12 @@ class BlinkFilter:
         self._stage = np.concatenate([passing, np.maximum(long, 0.0)[:, None]], axis=1)
         self.on = np.clip(self._stage[:, STEPS:].sum(axis=1), 1e-9, 1.0)
 
-    def update(self, seen: NDArray[np.bool_], detected: float) -> None:
-        """Update by which lights were seen, (n,); `detected` is the detection probability of one that is on."""
+    def update(self, rows: Sequence[int], detected: float) -> None:
+        """Update by the lights that were seen, `rows`; `detected` is the detection probability of one that is on."""
         if not self._bit:
             return
+        seen = np.zeros(len(self.on), bool)
+        seen[list(rows)] = True
         self._stage[:, STEPS:] *= np.where(seen, 1.0, 1 - detected)[:, None]
         self._stage[:, :STEPS] *= ~seen[:, None]
         whole = self._stage.sum(axis=1)

@@ -12,6 +12,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from scipy.optimize import linear_sum_assignment
 
 from coloc_graph.frontend.images.detection import Blobs, Candidate, Detector, Pixels
 from coloc_graph.frontend.tracks.blink_filter import BlinkFilter
-from coloc_graph.frontend.tracks.kalman import PointFilters
+from coloc_graph.frontend.tracks.kalman import PointFilters, Symmetric
 from coloc_graph.run.messages import Flag, Image
 
 Array = NDArray[np.float64]
@@ -39,6 +40,9 @@ FASTER = 2.0  # a new light's velocity is up to this times those of the lights t
 REACH_SIGMAS = 3.0  # standard deviations of a light's position that the patch holds
 MIN_PIECE = 4  # samples of a piece on which both directions of time agree
 ROUGH_SIGMA = 0.5  # px, of a candidate's approximate centre
+ROUGH: Symmetric = (ROUGH_SIGMA**2, 0.0, ROUGH_SIGMA**2)
+
+Place = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +143,20 @@ class _Live:
         self.misses = 0
 
 
+class _Near(NamedTuple):
+    """Detection near a track's prediction: squared distance, whether it jerked, and log likelihoods."""
+
+    squared: float
+    jerked: bool
+    gain: float
+    missed: float
+
+    @property
+    def worth(self) -> float:
+        """Log likelihood ratio to a missed marker and a false detection."""
+        return self.gain - self.missed
+
+
 class MarkerTracker:
     """Tracker of all blobs of one camera; `markers_of_movers` later selects the markers of robots.
 
@@ -169,14 +187,15 @@ class MarkerTracker:
         self._options = options or TrackerOptions()
         self._filters = PointFilters(self._options.acceleration, self._options.jerk, self._options.speed)
         self._growth = 0.0  # logarithm of the factor of the acceleration that was seen
-        self._moved(np.zeros(0), np.zeros(0))
+        self._moved([], [])
         self._blink = BlinkFilter(self._options.off, self._options.off_rate)
         self._live: list[_Live] = []  # in the order of the filters
         self._ended: list[_Live] = []
         self._parked: list[_Live] = []
         self._taken: list[tuple[Array, Array, float, bool]] = []
         self._searched = -math.inf  # when the full frame was searched last
-        self._images: list[tuple[float, Array, Array, Sequence[Candidate | int]]] = []  # as `_advance` took them
+        # as `_advance` took them
+        self._images: list[tuple[float, list[Place], list[Symmetric], Sequence[Candidate | int]]] = []
 
     def step(self, image: Image) -> None:
         """Take in the next image."""
@@ -186,8 +205,7 @@ class MarkerTracker:
         full = self._search_all(image.time)
         found = self._detector.find(image.pixels) if full else self._in_patches(image.pixels, dt)
         found = [one for one in found if not one.clipped]
-        uv = np.array([one.uv for one in found]).reshape(-1, 2)
-        self._advance(image.time, uv, np.broadcast_to(ROUGH_SIGMA**2 * np.eye(2), (len(uv), 2, 2)), found, births=full)
+        self._advance(image.time, [one.uv for one in found], [ROUGH] * len(found), found, births=full)
 
     def take(self, time: float, blobs: Blobs) -> None:
         """Take in the detections of the whole next image from a detector elsewhere."""
@@ -196,7 +214,9 @@ class MarkerTracker:
         numbers = range(len(self._taken), len(self._taken) + len(whole))
         saturated = (whole.flags & Flag.SATURATED) != 0
         self._taken += zip(whole.uv, whole.covariance, whole.peak.tolist(), saturated.tolist(), strict=True)
-        self._advance(time, whole.uv, whole.covariance, list(numbers), births=True)
+        places: list[Place] = [(u, v) for u, v in whole.uv.tolist()]
+        covariances: list[Symmetric] = [(xx, xy, yy) for (xx, xy), (_, yy) in whole.covariance.tolist()]
+        self._advance(time, places, covariances, list(numbers), births=True)
 
     def tracks(self) -> list[Track]:
         """Measure the samples of all tracks, ended or live, and return them, oldest first."""
@@ -209,9 +229,9 @@ class MarkerTracker:
         do.
         """
         back = MarkerTracker(self.robot, self._detector, self._options, self._size)
-        for time, uv, covariance, samples in reversed(self._images):
+        for time, places, covariances, samples in reversed(self._images):
             back._filters.predict(-time)
-            back._advance(-time, uv, covariance, samples, births=True)
+            back._advance(-time, places, covariances, samples, births=True)
         number = {_key(sample): n for n, live in enumerate(back._confirmed()) for sample in live.samples}
         pieces = [piece for live in self._confirmed() for piece in _agreeing(live, number)]
         return self._measured([piece for piece in pieces if len(piece.times) >= MIN_PIECE])
@@ -255,13 +275,14 @@ class MarkerTracker:
         """Width of the images, by that which the options are of."""
         return 1.0 if self._size is None else self._size[0] / WIDTH
 
-    def _moved(self, squared: Array, speeds: Array) -> None:
-        """Adapt to the motion of confirmed tracks: squared normalised innovations (k,), and speeds (k,) [px/s]."""
+    def _moved(self, squared: Sequence[float], speeds: Sequence[float]) -> None:
+        """Adapt to the motion of confirmed tracks: squared normalised innovations, and squared speeds [px^2/s^2]."""
         options, scale = self._options, self._scale
-        if len(squared):
-            innovation = float(np.minimum(squared, GATE).mean()) / 2
-            self._growth = float(np.clip(self._growth + ADAPTATION * (innovation - 1), 0.0, math.log(MAX_FACTOR)))
-        faster = FASTER * float(np.sqrt(np.mean(np.square(speeds)))) if len(speeds) else 0.0
+        if squared:
+            innovation = sum(min(one, GATE) for one in squared) / (2 * len(squared))
+            growth = self._growth + ADAPTATION * (innovation - 1)
+            self._growth = min(max(growth, 0.0), math.log(MAX_FACTOR))
+        faster = FASTER * math.sqrt(sum(speeds) / len(speeds)) if speeds else 0.0
         self._filters.set_motion(
             options.acceleration * scale**2 * math.exp(self._growth),
             options.jerk * scale * math.exp(self._growth / 2),
@@ -277,10 +298,14 @@ class MarkerTracker:
 
     def _in_patches(self, pixels: Pixels, dt: float) -> list[Candidate]:
         height, width = pixels.shape[:2]
-        halves = np.maximum(self._scale * self._options.patch / 2, REACH_SIGMAS * self._filters.reach(dt))
+        least = self._scale * self._options.patch / 2
         found: list[Candidate] = []
-        for centre, reach in zip(self._filters.position.tolist(), halves.tolist(), strict=True):
-            u, v, half = round(centre[0]), round(centre[1]), round(reach)
+        for point in self._filters.points:
+            u, v, half = (
+                round(point.u),
+                round(point.v),
+                round(max(least, REACH_SIGMAS * self._filters.reach(point, dt))),
+            )
             box = (max(u - half, 0), max(v - half, 0), min(u + half, width), min(v + half, height))
             if box[2] - box[0] >= 3 and box[3] - box[1] >= 3:
                 # overlapping patches see a blob twice
@@ -292,83 +317,112 @@ class MarkerTracker:
         return found
 
     def _advance(
-        self, time: float, uv: Array, covariance: Array, samples: Sequence[Candidate | int], *, births: bool
+        self,
+        time: float,
+        places: list[Place],
+        covariances: list[Symmetric],
+        samples: Sequence[Candidate | int],
+        *,
+        births: bool,
     ) -> None:
-        self._images.append((time, uv, covariance, samples))
-        places: list[tuple[float, float]] = [(u, v) for u, v in uv.tolist()]
-        free = [index for index, place in enumerate(places) if not self._is_parked(place)]
-        if len(free) < len(places):
-            uv, covariance = uv[free], covariance[free]
+        self._images.append((time, places, covariances, samples))
+        free = range(len(places))
+        if self._parked:
+            free = [index for index, place in enumerate(places) if not self._is_parked(place)]  # type: ignore[assignment]
         self._blink.predict(time)
-        tracks, found, doubtful = self._assigned(uv, covariance)
-        self._miss(time, tracks)
-        if len(tracks):
-            self._filters.update(tracks, uv[found], covariance[found])
-        for track, index in zip(tracks.tolist(), found.tolist(), strict=True):
-            self._live[track].take(time, places[free[index]], samples[free[index]])
+        assigned, doubtful = self._assigned([places[index] for index in free], [covariances[index] for index in free])
+        self._miss(time, [row for row, _ in assigned])
+        for row, column in assigned:
+            index = free[column]
+            self._filters.points[row].update(*places[index], covariances[index])
+            self._live[row].take(time, places[index], samples[index])
         if births:
-            taken = {*found.tolist(), *doubtful.tolist()}
-            new = [index for index in range(len(free)) if index not in taken]
+            taken = {column for _, column in assigned} | doubtful
+            new = [index for column, index in enumerate(free) if column not in taken]
+            for index in new:
+                self._filters.add(*places[index], covariances[index])
+                self._live.append(_Live())
+                self._live[-1].take(time, places[index], samples[index])
             if new:
-                self._filters.add(uv[new], covariance[new])
                 self._blink.add(len(new))
-                for index in new:
-                    self._live.append(_Live())
-                    self._live[-1].take(time, places[free[index]], samples[free[index]])
             self._searched = time
         self._end(time, births=births)
 
-    def _assigned(self, uv: Array, covariance: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def _assigned(
+        self, places: Sequence[Place], covariances: Sequence[Symmetric]
+    ) -> tuple[list[tuple[int, int]], set[int]]:
         """Assign detections to tracks and update the tracks' scores.
 
-        Returns tracks (k,) and their detections (k,), and detections (l,) that may be two markers in one.
+        Returns pairs of a track and its detection, and detections that may be two markers in one.
         """
-        options, n = self._options, len(self._live)
-        seen = options.detected * self._blink.on  # probability that each is seen
-        missed = np.log(1 - seen)
-        none = np.zeros(0, np.int64)
-        if not n or not len(uv):
-            for track, one in zip(self._live, missed.tolist(), strict=True):
+        options, filters = self._options, self._filters
+        seen = [options.detected * on for on in self._blink.on.tolist()]  # probability that each is seen
+        missed = [math.log(1 - one) for one in seen]
+        if not seen or not places:
+            for track, one in zip(self._live, missed, strict=True):
                 track.misses += 1
                 track.score += one
-            return none, none, none
-        squared, density, jerked = self._filters.distances(uv, covariance)
-        off = np.minimum(squared, jerked + JERK_PENALTY)
-        near = jerked < GATE
-        gain = np.log(seen / options.clutter * self._scale**2)[:, None] + density + 0.5 * (squared - off)
-        worth = np.where(near, gain - missed[:, None], 0.0)  # log ratio to a missed marker and a false detection
-        tracks, found = linear_sum_assignment(worth, maximize=True)
-        good = near[tracks, found] & (worth[tracks, found] > AMBIGUOUS)
-        tracks, found, doubtful = tracks[good], found[good], none
-        if (near.sum(axis=0) > 1).any():
-            self._cut(worth, tracks, found)
-            keep = self._apart(worth, tracks, found, near)
-            tracks, found, doubtful = tracks[keep], found[keep], found[~keep]
-        there = np.zeros(n, bool)
-        there[tracks] = True
-        gained = missed
-        gained[tracks] = gain[tracks, found]
-        for row, (one, is_seen) in enumerate(zip(gained.tolist(), there.tolist(), strict=True)):
+            return [], set()
+        near: dict[tuple[int, int], _Near] = {}
+        for row, (point, one) in enumerate(zip(filters.points, seen, strict=True)):
+            gain = math.log(one / options.clutter * self._scale**2)
+            for column, ((u, v), covariance) in enumerate(zip(places, covariances, strict=True)):
+                compared = point.compare(u, v, covariance, filters.jerk, GATE)
+                if compared is not None:
+                    squared, density, jerked = compared
+                    off = min(squared, jerked + JERK_PENALTY)
+                    near[row, column] = _Near(
+                        squared, off < squared, gain + density + 0.5 * (squared - off), missed[row]
+                    )
+        assigned, doubtful = self._most_likely(near, len(places))
+        of_track = dict(assigned)
+        for row, one in enumerate(missed):
+            is_seen = row in of_track
             if is_seen and self._live[row].confirmed and self._live[row].score < 0:
                 self._begin_anew(row)  # not seen for long enough to be anything
             track = self._live[row]
             track.misses += not is_seen
-            track.score = min(track.score + one, 2 * CONFIRMED)
+            track.score = min(track.score + (near[row, of_track[row]].gain if is_seen else one), 2 * CONFIRMED)
             track.confirmed |= track.score > CONFIRMED
-        self._filters.jerk(tracks[off[tracks, found] < squared[tracks, found]])
-        sure = np.array([self._live[row].confirmed for row in tracks.tolist()], bool)
-        speeds = np.linalg.norm(self._filters.velocity[tracks[sure]], axis=1)
-        self._moved(squared[tracks[sure], found[sure]], speeds)
-        return tracks, found, doubtful
+        squares, speeds = [], []
+        for row, column in assigned:
+            point = filters.points[row]
+            if near[row, column].jerked:
+                point.allow_jerk(filters.jerk)
+            if self._live[row].confirmed:
+                squares.append(near[row, column].squared)
+                speeds.append(point.du**2 + point.dv**2)
+        self._moved(squares, speeds)
+        return assigned, doubtful
 
-    def _miss(self, time: float, tracks: NDArray[np.int64]) -> None:
+    def _most_likely(self, near: dict[tuple[int, int], "_Near"], count: int) -> tuple[list[tuple[int, int]], set[int]]:
+        """Return the most likely assignment of `count` detections to tracks they are `near`, and what is doubtful."""
+        if len({row for row, _ in near}) == len(near) == len({column for _, column in near}):
+            return [pair for pair, one in near.items() if one.worth > AMBIGUOUS], set()
+        # log ratio to a missed marker and a false detection
+        worth, close = np.zeros((len(self._live), count)), np.zeros((len(self._live), count), bool)
+        for pair, one in near.items():
+            worth[pair], close[pair] = one.worth, True
+        tracks, found = linear_sum_assignment(worth, maximize=True)
+        good = close[tracks, found] & (worth[tracks, found] > AMBIGUOUS)
+        tracks, found = tracks[good], found[good]
+        doubtful: set[int] = set()
+        if (close.sum(axis=0) > 1).any():
+            self._cut(worth, tracks, found)
+            keep = self._apart(worth, tracks, found, close)
+            doubtful = set(found[~keep].tolist())
+            tracks, found = tracks[keep], found[keep]
+        return list(zip(tracks.tolist(), found.tolist(), strict=True)), doubtful
+
+    def _miss(self, time: float, seen: Sequence[int]) -> None:
         """Record that all but some tracks are not seen, except those that may overlap with another."""
-        seen = np.zeros(len(self._live), bool)
-        seen[tracks] = True
         self._blink.update(seen, self._options.detected)
-        for row in np.flatnonzero(~seen).tolist():
-            apart = np.abs(self._filters.position - self._filters.position[row]).max(axis=1)
-            if (apart < OVERLAP_PX).sum() == 1:  # itself
+        points = self._filters.points
+        for row in set(range(len(points))).difference(seen):
+            own = points[row]
+            if all(
+                abs(one.u - own.u) >= OVERLAP_PX or abs(one.v - own.v) >= OVERLAP_PX for one in points if one is not own
+            ):
                 self._live[row].missed.append(time)
 
     def _cut(self, worth: Array, tracks: NDArray[np.int64], found: NDArray[np.int64]) -> None:
@@ -397,21 +451,19 @@ class MarkerTracker:
         for row in np.flatnonzero(missing).tolist():
             if self._live[row].confirmed:
                 if self._blink.on[row] > 0.5:
-                    touching = (
-                        np.abs(self._filters.position[tracks] - self._filters.position[row]).max(axis=1) < OVERLAP_PX
-                    )
+                    position = self._filters.position
+                    touching = np.abs(position[tracks] - position[row]).max(axis=1) < OVERLAP_PX
                     keep &= ~(touching & near[row, found])
                 keep &= ~(worth[tracks, found] - worth[row, found] < AMBIGUOUS)
         return keep
 
     def _end(self, time: float, *, births: bool) -> None:
         """End tracks that were not seen for long, and park lights that have not moved for long."""
-        options, keep = self._options, np.ones(len(self._live), bool)
-        left = self._beyond()
+        options, keep = self._options, [True] * len(self._live)
         for row, track in enumerate(self._live):
             unseen = time - track.times[-1] if track.times else math.inf
             lost = track.misses > options.patience and unseen > options.patience_s + options.off
-            gone = lost or (track.misses and left[row])
+            gone = lost or (track.misses and self._beyond(row))
             if gone or (not track.confirmed and (track.score < 0 or track.misses > options.patience)):
                 if track.confirmed:
                     self._ended.append(track)
@@ -419,18 +471,17 @@ class MarkerTracker:
             elif births and self._still(track):
                 self._parked.append(track)
                 keep[row] = False
-        if not keep.all():
+        if not all(keep):
             self._filters.keep(keep)
-            self._blink.keep(keep)
-            self._live = [track for track, kept in zip(self._live, keep.tolist(), strict=True) if kept]
+            self._blink.keep(np.array(keep))
+            self._live = [track for track, kept in zip(self._live, keep, strict=True) if kept]
 
-    def _beyond(self) -> list[bool]:
-        """Return for each light whether it is near enough to the border to have left the image."""
+    def _beyond(self, row: int) -> bool:
+        """Return whether a light is near enough to the border to have left the image."""
         if self._size is None:
-            return [False] * len(self._live)
-        position, size = self._filters.position, np.array(self._size)
-        out = np.any((position <= RIM - 0.5) | (position >= size - RIM - 0.5), axis=1)
-        return [bool(one) for one in out]
+            return False
+        point, (width, height) = self._filters.points[row], self._size
+        return not (RIM - 0.5 < point.u < width - RIM - 0.5 and RIM - 0.5 < point.v < height - RIM - 0.5)
 
     def _still(self, track: _Live) -> bool:
         """Return whether a track has not moved for long."""
