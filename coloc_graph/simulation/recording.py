@@ -16,7 +16,7 @@ from coloc_graph.simulation.blinking import with_codes
 from coloc_graph.simulation.mess import messy_frames
 from coloc_graph.simulation.paths import Array
 from coloc_graph.simulation.planned import planned
-from coloc_graph.simulation.rig import Imperfections, reference_team, wide_team
+from coloc_graph.simulation.rig import FISHEYE_BIAS_PX, Imperfections, reference_team, wide_team
 from coloc_graph.simulation.scenarios import TeamScenario, scenario
 from coloc_graph.simulation.scenery import Scenery, frames, make_scenery
 from coloc_graph.simulation.teams import build_team_world
@@ -110,8 +110,10 @@ def simulate(
         team = with_codes(reference_team(names=what.names)) if blink else None
         world = build_team_world(what, seed=seed, points=points, imperfections=imperfections, team=team)
     else:
+        bias_px = FISHEYE_BIAS_PX if depth == "images" else 0.0
+        wide = None if fisheye_deg is None else wide_team(fisheye_deg, bias_px)
         world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps,
-                            known=known, team=None if fisheye_deg is None else wide_team(fisheye_deg))  # fmt: skip
+                            known=known, team=wide)  # fmt: skip
 
     with atomic_run(out, world.team, image_format=image_format) as writer:
         record(world, writer, depth, progress, messy=messy)

@@ -13,6 +13,7 @@ from coloc_graph.team import Camera, Floor, Markers, Mount, Ranging, Robot, Team
 MILD_LENS = (-0.10, 0.02, 5e-4, -3e-4)
 
 ANTENNA_X = -0.08  # m, place of a UWB antenna on the body: behind the camera
+FISHEYE_BIAS_PX = 0.03  # px, shared error of centres in rendered images: spots are small, and dark bodies near them
 MIN_ACROSS_DEG = 20.0  # deg, narrowest fisheye that is simulated
 MAX_ACROSS_DEG = 220.0  # deg, widest fisheye that is simulated
 FISHEYE = (-0.012, 0.003, -0.0012, 0.0001)  # k1 to k4 of the fisheye through which wide images are rendered
@@ -77,8 +78,8 @@ def reference_team(
     return Team(reference=names[0], robots=robots, floor=Floor())
 
 
-def wide_team(across_deg: float) -> Team:
-    """Return the reference team with fisheyes of 640x480 that see `across_deg` [deg] across."""
+def wide_team(across_deg: float, bias_px: float = 0.0) -> Team:
+    """Return the reference team with fisheyes of 640x480 that see `across_deg` [deg] across; `bias_px` as in it."""
     if not MIN_ACROSS_DEG <= across_deg <= MAX_ACROSS_DEG:
         raise InputError(
             f"a fisheye of {across_deg:g} deg is not simulated; give {MIN_ACROSS_DEG:g} to {MAX_ACROSS_DEG:g} deg"
@@ -89,6 +90,7 @@ def wide_team(across_deg: float) -> Team:
     camera = replace(
         team.robots[0].camera,
         model="fisheye",
+        bias_px=bias_px,
         width=width,
         height=height,
         fx=focal,

@@ -301,11 +301,8 @@ class MarkerTracker:
         least = self._scale * self._options.patch / 2
         found: list[Candidate] = []
         for point in self._filters.points:
-            u, v, half = (
-                round(point.u),
-                round(point.v),
-                round(max(least, REACH_SIGMAS * self._filters.reach(point, dt))),
-            )
+            half = round(max(least, REACH_SIGMAS * self._filters.reach(point, dt)))
+            u, v = round(point.u), round(point.v)
             box = (max(u - half, 0), max(v - half, 0), min(u + half, width), min(v + half, height))
             if box[2] - box[0] >= 3 and box[3] - box[1] >= 3:
                 # overlapping patches see a blob twice
@@ -420,9 +417,8 @@ class MarkerTracker:
         points = self._filters.points
         for row in set(range(len(points))).difference(seen):
             own = points[row]
-            if all(
-                abs(one.u - own.u) >= OVERLAP_PX or abs(one.v - own.v) >= OVERLAP_PX for one in points if one is not own
-            ):
+            beside = (max(abs(one.u - own.u), abs(one.v - own.v)) < OVERLAP_PX for one in points)
+            if sum(beside) == 1:  # itself
                 self._live[row].missed.append(time)
 
     def _cut(self, worth: Array, tracks: NDArray[np.int64], found: NDArray[np.int64]) -> None:
