@@ -177,10 +177,10 @@ def expose(field: Field, sensor: Sensor, noise: Field | None) -> Pixels:
     `noise` (height, width) is normal with variance 1; without it there is none.
     """
     if noise is None:
-        return np.asarray(cv2.add(field, 0.0, dtype=cv2.CV_8U))  # rounds, and clips to 0 and 255
+        return np.asarray(np.clip(np.rint(field), 0, 255), np.uint8)
     deviation = np.maximum(field, 0)
     deviation *= np.float32(sensor.shot_gain)
     deviation += np.float32(sensor.read_noise**2)
     np.sqrt(deviation, out=deviation)
     deviation *= noise
-    return np.asarray(cv2.add(field, deviation, dtype=cv2.CV_8U))
+    return np.asarray(cv2.add(field, deviation, dtype=cv2.CV_8U))  # rounds, and clips to 0 and 255
