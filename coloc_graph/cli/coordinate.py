@@ -63,6 +63,14 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--tls", metavar="DIR", help="folder with its certificate, from `coloc certificates`")
     command.add_argument("--exposed", action="store_true", help="accept other machines without certificates")
     command.add_argument("--resume", action="store_true", help="continue the mission in --out")
+    command.add_argument(
+        "--ros2",
+        nargs="?",
+        const="127.0.0.1",
+        metavar="ADDRESS",
+        help="publish tf, poses, paths and markers to ROS 2 on the interface with this address (default: this machine "
+        "only)",
+    )
     command.add_argument("--view", action="store_true", help="show the mission in a browser")
     command.add_argument("--port", type=int, help="port of --view (default: 8080, or the first free one after it)")
     command.add_argument("--no-browser", action="store_true", help="with --view: do not open a browser")
@@ -83,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     """Lead the team, then solve the record and print the result."""
     from pathlib import Path
 
-    from coloc_graph.cli.mission import report, watched
+    from coloc_graph.cli.mission import both, published, report, watched
     from coloc_graph.cli.running import until_signal
     from coloc_graph.errors import InputError
     from coloc_graph.online.coordinator import Coordinator
@@ -117,7 +125,8 @@ def run(args: argparse.Namespace) -> int:
     )
     out = Path(args.out)
     viewer = watched(team, args.port, browser=not args.no_browser, view=args.view)
-    with until_signal() as stop, viewer as listener:
+    with published(team, args.ros2) as ros, until_signal() as stop, viewer as shown:
+        listener = both(shown, ros)
         coordinator = Coordinator(
             team,
             out,

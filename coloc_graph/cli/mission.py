@@ -7,9 +7,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from coloc_graph.online.leap_planner import StancePlan
     from coloc_graph.online.mission import MissionStatus
     from coloc_graph.pipeline.incremental import EnteredStance
@@ -17,6 +20,8 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,57 @@ def watched(team: "Team", port: int | None, *, browser: bool, view: bool = True)
             lambda one: viewer.publish(LivePoses(one.time, one.T_world_body, one.text)),
             lambda one: viewer.publish(plan_of_row(one.as_row())) if one.promise is not None else None,
         )
+
+
+@contextmanager
+def published(team: "Team", address: str | None) -> Iterator[MissionListener]:
+    """Publish a mission to ROS 2 on an interface; yield its callbacks, which are None without an address."""
+    if address is None:
+        yield MissionListener()
+        return
+    from coloc_graph.exchange.ros_live import RosPublisher
+
+    with RosPublisher(team, address) as publisher:
+
+        def on_stance(one: "EnteredStance") -> None:
+            publisher.publish_stance(one.stance.index, _poses(one))
+
+        yield MissionListener(on_stance, lambda one: publisher.publish_poses(one.time, one.T_world_body))
+
+
+def _poses(one: "EnteredStance") -> "dict[str, tuple[float, NDArray[np.float64], NDArray[np.float64]]]":
+    """Time [UTC s], pose and covariance of each observer of a stance, and of each mover that was sighted at rest."""
+    from coloc_graph.measurements import Sighting
+
+    times = dict.fromkeys(one.stance.observers, one.stance.start)
+    times |= {seen.seen: seen.time for seen in one.measurements if isinstance(seen, Sighting)}
+    estimate = one.estimate
+    return {
+        robot: (times[robot], pose.matrix(), estimate.covariances[robot])
+        for robot, pose in estimate.poses.items()
+        if robot in times
+    }
+
+
+def both(first: MissionListener, second: MissionListener) -> MissionListener:
+    """Callbacks that call those of two listeners."""
+    return MissionListener(
+        _in_turn(first.on_stance, second.on_stance),
+        _in_turn(first.on_status, second.on_status),
+        _in_turn(first.on_plan, second.on_plan),
+    )
+
+
+def _in_turn(*callbacks: "Callable[[T], None] | None") -> "Callable[[T], None] | None":
+    given = [one for one in callbacks if one is not None]
+    if len(given) < 2:
+        return given[0] if given else None
+
+    def call(value: T) -> None:
+        for one in given:
+            one(value)
+
+    return call
 
 
 def report(folder: Path, truth_path: Path | None = None, *, stopped: bool = False) -> bool:
