@@ -26,10 +26,13 @@ from coloc_graph.backend import Estimate, PoseGraph, joint
 from coloc_graph.backend.cause import Cause
 from coloc_graph.backend.graph import StayPut
 from coloc_graph.errors import ColocError
+from coloc_graph.frontend import PairMeasurement
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.geometry.se2 import compose
 from coloc_graph.measurements import Measurement, Odometry, RelativePose, Sighting
+from coloc_graph.pipeline import batch
 from coloc_graph.pipeline.batch import Solution, SolveOptions, solve
+from coloc_graph.pipeline.clocks import CorrectedRun
 from coloc_graph.pipeline.incremental import OdometryAndSightings, measure_stance
 from coloc_graph.run import Detections, OdometrySample, Stance
 from coloc_graph.simulation import Imperfections
@@ -64,6 +67,10 @@ class Faulty:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._run, name)
+
+    def changes_view(self, stance: int) -> bool:
+        """Return whether the fault changes what cameras see in a stance."""
+        return self.fault.kind == "clock" or (self.fault.kind == "homography" and stance == self.fault.stance)
 
     def _stances(self) -> Iterator[Stance]:
         for stance in self._run.stances:
@@ -135,6 +142,7 @@ def bumped(run: MemoryRun, fault: Fault) -> MemoryRun:
     )
     moved = replace(path, times=times, knots=knots)
     made = MemoryRun(replace(world, paths={**world.paths, fault.robot: moved}, captures=captures))
+    made.bumped_before = fault.stance  # type: ignore[attr-defined]
     for robot in run.team.names:  # no wheel feels it
         made._odometry[robot] = list(run.odometry(robot))
     return made
@@ -204,12 +212,39 @@ def verdict(solution: Solution, fault: Fault) -> tuple[bool, bool]:
     return any(right in one for one in said), any(all(robot != fault.robot for _, robot in one) for one in said)
 
 
-def effect(run: Any, healthy: Estimate) -> float:
+class Measured:
+    """Measurements of the stances that no fault changes, made once for a world."""
+
+    def __init__(self) -> None:
+        self._measured: dict[int, list[PairMeasurement]] = {}
+
+    def __call__(self, run: Any, stance: Stance, options: SolveOptions) -> Iterator[PairMeasurement]:
+        """As `measure_stance`."""
+        if not seen_as_it_is(run, stance.index):
+            yield from measure_stance(run, stance, options)
+            return
+        if stance.index not in self._measured:
+            self._measured[stance.index] = list(measure_stance(run, stance, options))
+        yield from self._measured[stance.index]
+
+
+def seen_as_it_is(run: Any, stance: int) -> bool:
+    """Return whether nothing changes what cameras see in a stance, in a run or any that it is made of."""
+    while run is not None:
+        if isinstance(run, CorrectedRun) or (isinstance(run, Faulty) and run.changes_view(stance)):
+            return False
+        if isinstance(run, MemoryRun):
+            return stance < vars(run).get("bumped_before", len(run.stances))
+        run = vars(run).get("recorded", vars(run).get("_run"))
+    return False
+
+
+def effect(run: Any, healthy: Estimate, measure: Measured) -> float:
     """Largest change of a pose in its sigmas if nothing is doubted in a run; infinite where one has no pose."""
     motions = OdometryAndSightings(run.team)
     made = list[Measurement]()
     for stance in run.stances:
-        pairs = list(measure_stance(run, stance, SolveOptions().resolved()))
+        pairs = list(measure(run, stance, SolveOptions().resolved()))
         made += [one.relative_pose for one in pairs if one.relative_pose is not None]
         made += motions.of_stance(run, stance, pairs)
     far = 0.0
@@ -243,18 +278,19 @@ def healthy_world(number: int) -> list[dict[str, Any]]:
 def faulty_world(number: int, kinds: Sequence[str] = KINDS) -> list[dict[str, Any]]:
     """One fault of each kind of a world."""
     world = world_of(number)
+    batch.measure_stance = measure = Measured()  # type: ignore[assignment]
     healthy = solve(world, SolveOptions()).estimate  # type: ignore[arg-type]
-    return [faulted(world, healthy, number, kind) for kind in kinds]
+    return [faulted(world, healthy, measure, number, kind) for kind in kinds]
 
 
-def faulted(world: MemoryRun, healthy: Estimate, number: int, kind: str) -> dict[str, Any]:
+def faulted(world: MemoryRun, healthy: Estimate, measure: Measured, number: int, kind: str) -> dict[str, Any]:
     """What is said of a world with a drawn fault."""
     fault = drawn(world, kind, np.random.default_rng((number, KINDS.index(kind))))
     began = time.process_time()
     row: dict[str, Any] = {"kind": fault.kind, "world": number, "robot": fault.robot, "stance": fault.stance}
     row["size"] = round(fault.size, 3)
     faulty = bumped(world, fault) if fault.kind == "bump" else Faulty(world, fault)
-    row["effect"] = effect(faulty, healthy)
+    row["effect"] = effect(faulty, healthy, measure)
     try:
         solution = solve(faulty, SolveOptions())  # type: ignore[arg-type]
     except Exception as error:  # one failure must not end the others

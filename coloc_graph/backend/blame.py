@@ -26,7 +26,8 @@ from coloc_graph.team import Slip
 
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)  # slip that a stay-put constraint is given to test it
 MAX_FAULTS = 4  # faults that are searched for one after the other
-MAX_FITTED = 5  # causes that are fitted in each round, the likeliest
+MAX_FITTED = 6  # causes that are fitted in each round, the likeliest
+MIN_GAIN = 0.5  # part of the largest predicted decrease of chi2 from which a cause is fitted
 GROUP_PRICE = 30.0  # chi2 that several measurements must explain beyond one of them
 EQUAL_CHI2 = 9.0  # two causes explain equally well if chi2 differs by less
 SIGMAS_ALONE = 12.0  # a measurement that alone ties a pose is kept up to this: a wrong one is off by many more
@@ -142,14 +143,16 @@ def find_faults(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tup
     """
     robots = warm.robots.intersection(graph.robots) if warm else graph.robots
     faults: list[Fault] = []
+    fit: Fit | None = None
     for left in reversed(range(MAX_FAULTS + 1)):
-        rejected = [one.measurement for fault in faults for one in fault.rejections()]
-        tested = replace(graph.without(rejected), slips={**dict.fromkeys(robots, TEST_SLIP), **graph.slips})
-        fit = fit_graph(method, tested, warm.start(tested) if warm else None)
+        if fit is None:
+            rejected = [one.measurement for fault in faults for one in fault.rejections()]
+            tested = replace(graph.without(rejected), slips={**dict.fromkeys(robots, TEST_SLIP), **graph.slips})
+            fit = fit_graph(method, tested, warm.start(tested) if warm else None)
         suspects = _suspects(fit)
         if not suspects:
             return tuple(faults), graph, True
-        tried = list(_fitted(method, fit, suspects, warm)) if left else []
+        tried = list(_fitted(method, fit, suspects)) if left else []
         if not tried:
             break
         likeliest = min(tried, key=lambda one: one.cost)
@@ -162,6 +165,7 @@ def find_faults(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tup
         others = sorted((one for one in equal if one is not best), key=lambda one: one.cost)
         faults.append(_fault_of(best, others))
         graph = _with_fault(graph, best, others)
+        fit = None if others else best.fit  # the same graph again
     return tuple(faults), graph, False
 
 
@@ -216,16 +220,16 @@ def _groups(links: Iterable[Link], wrong: set[int]) -> Iterator[Cause]:
             yield Cause(tuple(driven))
 
 
-def _fitted(
-    method: Method, fit: Fit, suspects: list[tuple[Cause, Agreement]], warm: WarmStart | None
-) -> Iterator[_Tried]:
+def _fitted(method: Method, fit: Fit, suspects: list[tuple[Cause, Agreement]]) -> Iterator[_Tried]:
     """Fit the likeliest causes, each alone."""
     tied = len(fit.graph.disconnected(fit.values.keys()))
     most = 2 if len(fit.links) > ALL_TESTED else MAX_FITTED
-    for cause, tested in suspects[:most]:
+    warm = WarmStart(fit.graph, fit.values, ())
+    worth = [one for one in suspects[:most] if one[1].chi2 > MIN_GAIN * suspects[0][1].chi2]
+    for cause, tested in worth:
         freed = _without(fit.graph, cause)
         try:
-            other = fit_graph(method, freed, warm.start(freed) if warm else None)
+            other = fit_graph(method, freed, warm.start(freed))
         except EstimationError:
             continue  # without it nothing ties the robots to each other
         if len(freed.disconnected(other.values.keys())) > tied and tested.sigmas < SIGMAS_ALONE:
