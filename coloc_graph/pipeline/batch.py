@@ -16,7 +16,7 @@ from coloc_graph.frontend import PairMeasurement, UnusedSighting, describe_unuse
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.pipeline.clocks import RunClocks, clocks_of_run, contradicts, misfit
+from coloc_graph.pipeline.clocks import RunClocks, clocks_of_images_apart, clocks_of_run, contradicts, misfit
 from coloc_graph.pipeline.contents import Unused, require_applicable, unused_in, unused_ranges
 from coloc_graph.pipeline.disagreement import moves_unstated
 from coloc_graph.pipeline.explanations import (
@@ -173,6 +173,11 @@ def _in_batch(
     measured, clock_warnings = share_clock_offsets(alone, run.team.clock_sigma)
     if doubt_clocks and (found := clocks_of_run(run, measured)) is not None:
         return _best_explained(run, options, measure, found, time.perf_counter() - started)
+    if doubt_clocks and not run.team.clock_sigma and not _usable(measured):
+        apart = clocks_of_images_apart(measured)
+        if apart is not None:
+            looser = apart.corrected(run)
+            return _in_batch(looser, options, measure.of(looser), apart, time.perf_counter() - started)
     for _ in range(NOISE_ROUNDS):
         noise = belief.updated(measured)
         measured = measured_again(measured, noise.used(run.team))

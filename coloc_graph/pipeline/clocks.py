@@ -12,6 +12,8 @@ from scipy.special import chdtrc
 from coloc_graph.backend import Estimate
 from coloc_graph.frontend import PairMeasurement
 from coloc_graph.frontend.clock_evidence import ClockEvidence, Sensor, clock_evidence
+from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW
+from coloc_graph.frontend.tracks.interpolation import MAX_GAP
 from coloc_graph.pipeline.clock_model import (
     MIN_OFFSET,
     MIN_STEP,
@@ -39,12 +41,14 @@ class RunClocks:
     """Clocks of a run by sensor, as errors against the reference robot's.
 
     The corrected ones agree to `sigma` [s]; 0 of cameras that take images rarely and at once, which are paired one to
-    one. `usual` [s] is the error that most robots share.
+    one. `usual` [s] is the error that most robots share; `apart` [s] is the time between the images of two cameras that
+    show no instant in common.
     """
 
     clocks: Mapping[Sensor, SensorClock]
     sigma: float
     usual: float
+    apart: float = 0.0
 
     def of_stamps(self, evidence: ClockEvidence) -> ClockEvidence:
         """Return evidence of the run with corrected stamps as evidence of the stamps as they are."""
@@ -59,6 +63,12 @@ class RunClocks:
     def sentences(self) -> list[str]:
         """Descriptions of what was corrected."""
         said: list[str] = []
+        if self.apart:
+            said.append(
+                f"the cameras' images are {1e3 * self.apart:.0f} ms apart, and none were taken at the same instant: "
+                f"clocks are taken to differ by {1e3 * self.sigma:.0f} ms (1 sigma); take images at once, or state how "
+                "exact the clocks are as `clock_sigma` of the team"
+            )
         for robot in dict.fromkeys(robot for robot, _ in self.clocks):
             camera, wheels = self.clocks.get((robot, "camera")), self.clocks.get((robot, "wheels"))
             first = camera or wheels
@@ -104,6 +114,17 @@ def suspicious(measured: Iterable[PairMeasurement]) -> Iterator[PairMeasurement]
             unfit = h.dof > 0 and float(chdtrc(h.dof, h.chi2)) < UNFIT_P_VALUE
             if h.unusable or unfit or h.inliers < MIN_INLIERS * h.points:
                 yield one
+
+
+def clocks_of_images_apart(measured: Sequence[PairMeasurement]) -> RunClocks | None:
+    """Return clocks that differ by what lies between the images of two cameras; None where some were taken at once."""
+    nearest = []
+    for one in measured:
+        if one.seen is not None and all(one.seen):
+            times_i, times_j = (np.unique(np.concatenate([track.times for track in own])) for own in one.seen)
+            nearest.append(float(np.median(np.abs(times_j[None] - times_i[:, None]).min(axis=1))))
+    apart = max(nearest, default=0.0)
+    return RunClocks({}, apart, 0.0, apart) if PAIRING_WINDOW < apart < MAX_GAP else None
 
 
 def contradicts(estimate: Estimate) -> bool:

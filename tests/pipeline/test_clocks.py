@@ -6,11 +6,12 @@ import msgspec
 import pytest
 
 from coloc_graph.evaluation import align, evaluate
+from coloc_graph.frontend import FrontendOptions, measure_pair
 from coloc_graph.frontend.clock_evidence import ClockEvidence
 from coloc_graph.frontend.pairing.clock_offset import ClockOffset
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.clock_table import clock_table
-from coloc_graph.pipeline.clocks import run_clocks
+from coloc_graph.pipeline.clocks import clocks_of_images_apart, run_clocks
 from coloc_graph.run import Clocks, RobotClock, RunWriter, open_run, read_truth
 from coloc_graph.simulation import simulate
 
@@ -126,3 +127,13 @@ def test_the_table_shows_what_an_import_found_and_who_is_unknown(right, tmp_path
     assert (row.robot, row.offset, row.drift, row.jitter) == ("B", "-1.0000 s", "+100 ppm", "2.0 ms")
     assert row.steps.startswith("+0.500 s at") and "/B/odom (corrected)" in row.known
     assert unknown.robot == "A" and "5 ms (clock_sigma)" in unknown.known
+
+
+def test_cameras_that_take_no_images_at_once_are_taken_to_differ_by_what_lies_between(right):
+    stance = right.stances[0]
+    one = measure_pair(right, stance, *stance.observers[:2], FrontendOptions())
+    assert clocks_of_images_apart([one]) is None
+    later = [replace(track, times=track.times + 0.05) for track in one.seen[1]]
+    found = clocks_of_images_apart([replace(one, seen=(one.seen[0], later))])
+    assert found.corrected(right).team.clock_sigma == pytest.approx(0.05, abs=1e-3)
+    assert "images are 50 ms apart" in found.sentences()[0] and "`clock_sigma`" in found.sentences()[0]
