@@ -1,6 +1,8 @@
 # make demo   a virtual environment, the package, and the main job: render, solve, show
 # make test   the same environment: lint, format, types, tests
 # make test-long  the longest statistics and a whole mission: some minutes more, before a release
+# make docs   the site, from docs/: docs/_build/html/index.html; needs no network once it is installed
+# make notebooks  the notebooks, opened in the browser
 # make bench  the benchmarks behind the figures in the README; DATA=DIR for that on the stereo pairs of a chessboard,
 #             GRAPHS=DIR for those on the pose graphs sphere2500 and M3500, MRCLAM=DIR for that on an MR.CLAM dataset
 
@@ -14,7 +16,7 @@ DATA ?=
 GRAPHS ?=
 MRCLAM ?=
 
-.PHONY: demo test lint types unit bench fuzz clean
+.PHONY: demo test test-long lint types unit docs notebooks bench fuzz clean
 
 demo: $(VENV)/installed
 	$(BIN)/coloc demo --force $(ARGS)
@@ -40,6 +42,14 @@ endif
 test-long: $(VENV)/installed-dev
 	$(BIN)/pytest --numprocesses 2 --whole -m long tests
 	$(BIN)/pytest --whole tests/online/test_online.py
+
+docs: $(VENV)/installed-docs
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
+notebooks: $(VENV)/installed-notebooks
+	$(BIN)/python -m jupytext --quiet --to ipynb notebooks/*.py
+	$(BIN)/jupyter notebook notebooks
 
 bench: $(VENV)/installed-dev
 	$(BIN)/python benchmarks/single_step.py
@@ -87,9 +97,9 @@ $(VENV)/installed: $(VENV)/made pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
 	@touch $@
 
-$(VENV)/installed-dev: $(VENV)/made pyproject.toml
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+$(VENV)/installed-%: $(VENV)/made pyproject.toml
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[$*]'
 	@touch $(VENV)/installed $@
 
 clean:
-	rm -rf $(VENV) demo-out .pytest_cache .mypy_cache .ruff_cache *.egg-info
+	rm -rf $(VENV) demo-out docs/_build notebooks/*.ipynb .pytest_cache .mypy_cache .ruff_cache *.egg-info

@@ -1,4 +1,6 @@
-"""Every error a user can cause, as one small tree.
+"""Errors that a user can cause.
+
+They form one small tree::
 
     ColocError
     ├── InputError            a file or an argument is wrong

@@ -4,6 +4,7 @@ Three robots leap-frog along a line: in each stance two stand 1 m apart and meas
 past them. Run it by `python examples/own_measurements.py`.
 """
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 from coloc_graph import PoseGraph, RelativePose, Stance, smooth
@@ -23,6 +24,10 @@ for k in range(6):
     measurements.append(RelativePose(k, behind, ahead, T_behind_ahead, np.diag(SIGMAS**2)))
 
 estimate = smooth(PoseGraph("A", robots, tuple(stances), tuple(measurements)))
+fig, ax = plt.subplots(figsize=(7, 2.4))
 for robot, stance in estimate.graph.nodes:
     pose, sigma = estimate.pose(robot, stance), np.sqrt(estimate.covariance(robot, stance)[3, 3])
     print(f"{robot} at stance {stance}: x {pose.x():.3f} m, y {pose.y():.3f} m, sigma along its heading {sigma:.3f} m")
+    ax.errorbar(pose.x(), pose.y(), sigma, sigma, fmt="o", color=f"C{robots.index(robot)}", capsize=3)
+ax.set(xlabel="x [m]", ylabel="y [m]", title="Poses with 1 sigma")
+fig.savefig("own_measurements.png", dpi=100, bbox_inches="tight")

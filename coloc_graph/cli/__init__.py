@@ -19,6 +19,7 @@ from coloc_graph.cli import (
     evaluate,
     experiment,
     export,
+    fetch_example,
     import_,
     info,
     plan,
@@ -45,7 +46,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"coloc {__version__}", help="print the version")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in (
-        *(demo, team, calibrate, simulate, import_, info, solve, evaluate, view, export, experiment),
+        *(demo, fetch_example, team, calibrate, simulate, import_, info, solve, evaluate, view, export, experiment),
         *(plan, coordinate, robot, certificates),
     ):
         module.add(commands)

@@ -32,9 +32,10 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.cli.running import until_signal
     from coloc_graph.online.robot import RobotProgram
     from coloc_graph.robot_io.link.zenoh_config import tls_of
+    from coloc_graph.robot_io.service_manager import ServiceManager
     from coloc_graph.team import read_team
 
-    with until_signal() as stop:
+    with until_signal() as stop, ServiceManager() as manager:
         program = RobotProgram(
             args.name,
             read_team(args.team),
@@ -46,5 +47,6 @@ def run(args: argparse.Namespace) -> int:
             tls=tls_of(args.tls, args.name) if args.tls else None,
         )
         with program:
-            program.run(stop)
+            manager.ready()
+            program.run(stop, on_step=manager.alive)
     return 0

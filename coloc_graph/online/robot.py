@@ -155,13 +155,15 @@ class RobotProgram:
         self._halt()
         self._watcher.join(2.0)
 
-    def run(self, stop: threading.Event) -> None:
-        """Control the wheels and report, until `stop` is set."""
+    def run(self, stop: threading.Event, *, on_step: Callable[[], None] | None = None) -> None:
+        """Control the wheels and report, until `stop` is set; `on_step` is called in each step."""
         report, reopened = 0.0, 0.0
         while not stop.wait(CONTROL_PERIOD):
             if self._link.refused is not None:
                 raise RobotError(self._link.refused)
             self._roll()
+            if on_step is not None:
+                on_step()
             now = machine.monotonic()
             if self._wheels is not None and self._wheels_lost and now - reopened > REOPEN_PERIOD:
                 reopened = now

@@ -1,0 +1,60 @@
+"""Reference of the Python names, as Markdown around autodoc's directives."""
+
+import inspect
+import re
+from importlib import import_module
+
+from public_names import home_of, homes
+
+
+def module_markdown(path: str) -> str:
+    """Directives for the public names of a module that are described in its page."""
+    module = import_module(path)
+    blocks = [f".. automodule:: {path}\n   :no-members:"]
+    for name in homes()[path]:
+        value = getattr(module, name)
+        if inspect.isclass(value):
+            kind = "autoexception" if issubclass(value, BaseException) else "autoclass"
+            bases = "\n   :show-inheritance:" if kind == "autoexception" else ""
+            blocks.append(f".. {kind}:: {path}.{name}\n   :members:{bases}")
+        elif inspect.isfunction(value):
+            blocks.append(f".. autofunction:: {path}.{name}")
+        else:
+            blocks.append(f".. autodata:: {path}.{name}\n   :no-value:")
+    return "```{eval-rst}\n" + "\n\n".join(blocks) + "\n```\n"
+
+
+def top_markdown() -> str:
+    """Table of the names of `coloc_graph` itself, each with a link to its description."""
+    top = import_module("coloc_graph")
+    rows = []
+    for name in sorted(top.__all__, key=str.lower):
+        if name.startswith("_"):
+            continue
+        first = (inspect.getdoc(getattr(top, name)) or "").split("\n\n")[0]
+        role = "func" if inspect.isfunction(getattr(top, name)) else "class"
+        role = "exc" if name.endswith(("Error", "Warning")) else role
+        target = f"{{py:{role}}}`{name} <{home_of(name)}.{name}>`"
+        rows.append(f"| {target} | {markdown_of(' '.join(first.split()))} |")
+    return "| | |\n|---|---|\n" + "\n".join(rows) + "\n"
+
+
+def markdown_of(text: str) -> str:
+    """Escape what Markdown would take for a mark, outside of code."""
+    parts = re.split(r"(`[^`]*`)", text)
+    return "".join(part if part.startswith("`") else re.sub(r"([|*<>_\[\]])", r"\\\1", part) for part in parts)
+
+
+def restructured(lines: list[str]) -> None:
+    """Make a docstring safe for reStructuredText in place: `code` stays code, single marks stay what they are."""
+    for index, line in enumerate(lines):
+        parts = re.split(r"(``[^`]*``|`[^`]*`)", line)
+        made = [f"``{part.strip('`')}``" if part.startswith("`") else _escaped(part) for part in parts]
+        lines[index] = re.sub(r"(?<=\w``)(?=\w)", r"\\ ", "".join(made))
+
+
+def _escaped(text: str) -> str:
+    text = re.sub(r"(?<![\w*])(\*+)(?=\w)(?!args\b|kwargs\b|options\b)", lambda mark: "\\*" * len(mark[1]), text)
+    text = re.sub(r"(?<=\w)\*(?=\W|$)", r"\\*", text)
+    text = text.replace("|", "\\|")
+    return re.sub(r"(?<=\w)_(?=[^\w]|$)", r"\\_", text)
