@@ -146,7 +146,7 @@ def test_every_option_is_in_the_reference(reference):
         for action in one._actions:
             if isinstance(action, argparse._HelpAction) or action.help is argparse.SUPPRESS:
                 continue
-            for option in action.option_strings or [action.metavar or action.dest]:
+            for option in action.option_strings or action.choices or [action.metavar or action.dest]:
                 assert str(option) in section, f"{one.prog} {option}"
 
 

@@ -115,7 +115,15 @@ MIN_SLIP = 1e-3  # m: tighter stay-put constraints fail in some graphs of GTSAM
 
 
 class Slip(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Slip of an anchor from one stance to the next: standard deviations `sigma` [m] and `sigma_deg`."""
+    """Slip of an anchor from one stance to the next.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation of its position [m].
+    sigma_deg : float
+        Standard deviation of its rotation [deg].
+    """
 
     sigma: float
     sigma_deg: float

@@ -76,7 +76,15 @@ class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Floor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Floor that the team stands on: its standard deviations from level (tilt) and from flat (height [m])."""
+    """Floor that the team stands on.
+
+    Parameters
+    ----------
+    tilt_sigma_deg : float
+        Standard deviation of its roll and pitch from level, wherever a robot stands [deg].
+    height_sigma : float
+        Standard deviation of its height from flat [m].
+    """
 
     tilt_sigma_deg: float = 0.0
     height_sigma: float = 0.0

@@ -9,7 +9,6 @@ import msgspec
 from numpydoc.docscrape import NumpyDocString
 
 import coloc_graph.run.messages as messages
-from coloc_graph.run.schemas import *  # noqa: F403
 from coloc_graph.team import Team
 
 DEFAULTS = {msgspec.NODEFAULT, dataclasses.MISSING}
@@ -54,7 +53,7 @@ def _structs(annotation: Any, many: bool = False) -> list[tuple[type, bool]]:
 def _section(title: str, kind: type) -> str:
     described = NumpyDocString(inspect.getdoc(kind) or "")
     meaning = {}
-    for parameter in described["Parameters"]:
+    for parameter in [*described["Parameters"], *described["Attributes"]]:
         for name in parameter.name.split(", "):
             meaning[name.strip("*")] = (parameter.type, " ".join(parameter.desc))
     lines = [f"## {title}", "", _text(" ".join(described["Summary"])), ""]
@@ -62,6 +61,7 @@ def _section(title: str, kind: type) -> str:
     lines += ["| field | type | default | |", "|---|---|---|---|"]
     for name, written, default in _fields(kind):
         stated, text = meaning.get(name, ("", ""))
+        stated = stated or _written(kind.__annotations__.get(name, ""))
         lines.append(f"| `{written}` | {_text(stated)} | {default} | {_text(text)} |")
     return "\n".join([*lines, ""])
 
@@ -74,6 +74,10 @@ def _fields(kind: type) -> list[tuple[str, str, str]]:
     return [
         (field.name, field.name, _default(field.default, field.default_factory)) for field in dataclasses.fields(kind)
     ]
+
+
+def _written(annotation: Any) -> str:
+    return getattr(annotation, "__name__", None) or str(annotation)
 
 
 def _default(value: Any, factory: Any) -> str:
