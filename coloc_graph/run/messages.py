@@ -148,7 +148,17 @@ class Ranges:
 
 @dataclass(frozen=True)
 class Motion:
-    """Begin (`moving`) or end of a movement of a robot, at a time [UTC s]."""
+    """Begin or end of a movement of a robot.
+
+    Parameters
+    ----------
+    robot : str
+        The robot.
+    time : float
+        Time [UTC s].
+    moving : bool
+        True where it begins to move, False where it stands again.
+    """
 
     robot: str
     time: float
@@ -207,8 +217,20 @@ class Planes:
 class RobotClock:
     """Error of a robot's clock as it was found when the run was made; the run's stamps are corrected by it.
 
-    `offset` [s] against the other robots' clocks (positive: ahead), `drift` [s/s], `steps` (time [UTC s], change [s])
-    within the recording, `jitter` [s] of the stamps, and the measurements by which all of it is `known`.
+    Parameters
+    ----------
+    robot : str
+        The robot.
+    offset : float
+        Offset against the other robots' clocks; positive if ahead [s].
+    drift : float
+        Change of the offset in time [s/s].
+    steps : tuple of (float, float)
+        Steps within the recording: time [UTC s] and change [s].
+    jitter : float
+        Standard deviation of the stamps [s].
+    known : str
+        Measurements by which all of it is known.
     """
 
     robot: str
@@ -221,7 +243,15 @@ class RobotClock:
 
 @dataclass(frozen=True)
 class Clocks:
-    """Clocks of a run's robots, at most one message a run, at any `time` [UTC s]."""
+    """Clocks of a run's robots, at most one message a run.
+
+    Parameters
+    ----------
+    time : float
+        Any time [UTC s].
+    clocks : tuple of RobotClock
+        Clock of each robot of which something is known.
+    """
 
     time: float
     clocks: tuple[RobotClock, ...]
