@@ -24,7 +24,12 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         metavar="4|5|8|0",
         help="number of lens coefficients (default: the fewest that predict held-out images as well as more)",
     )
-    camera.add_argument("--from-camera-info", metavar="YAML", help="take the camera from this file instead of images")
+    camera.add_argument(
+        "--from-camera-info",
+        metavar="FILE",
+        help="take the camera from a file, not from images: ROS camera_info, OpenCV's YAML or XML, Kalibr's camchain",
+    )
+    camera.add_argument("--chain-camera", metavar="CAM", help="camera of a Kalibr camchain, as cam1")
     camera.add_argument("--camera-info", metavar="YAML", help="write the camera as ROS camera_info")
     camera.add_argument("--out", metavar="DIR", help="folder for calibration.json, coverage.png, residuals.png")
     _add_team(camera)

@@ -33,7 +33,7 @@ def _run(args: argparse.Namespace) -> int:
             raise InputError("--from-camera-info is a calibration already: give no images, board or --out with it")
         if not (args.team or args.camera_info):
             raise InputError("--from-camera-info needs a destination: give --team and --robot, or --camera-info")
-        camera, left_out = read_camera_info(args.from_camera_info, robot.camera if robot else None)
+        camera, left_out = read_camera_info(args.from_camera_info, robot.camera if robot else None, args.chain_camera)
         warn(left_out, kept=False)
         figures = None
     else:

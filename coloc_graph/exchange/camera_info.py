@@ -1,5 +1,7 @@
 """Read and write cameras as ROS `camera_info` YAML, as calibrators write it and as topics print it.
 
+OpenCV's calibrations (YAML, XML) and Kalibr's camchain are read as well, see `camera_formats`.
+
 Anything in it that `Camera` cannot express is refused, or reported in a warning. Numbers are read back bit for bit.
 Source: ROS `sensor_msgs/CameraInfo`, and the files of `camera_calibration_parsers`.
 """
@@ -16,6 +18,14 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
+from coloc_graph.exchange.camera_formats import (
+    OPENCV_XML,
+    OPENCV_YAML,
+    is_kalibr,
+    of_kalibr,
+    of_opencv,
+    of_opencv_xml,
+)
 from coloc_graph.input_file import decode_text, quoted, read_bytes
 from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.team import Camera
@@ -73,8 +83,10 @@ def ros_coefficients(camera: Camera) -> tuple[float, ...]:
     return camera.distortion or (0.0,) * 4 if camera.model == "fisheye" else camera.distortion
 
 
-def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Camera, tuple[str, ...]]:
-    """Read a camera from a `camera_info` YAML.
+def read_camera_info(
+    path: str | Path, base: Camera | None = None, chain_camera: str | None = None
+) -> tuple[Camera, tuple[str, ...]]:
+    """Read a camera from a `camera_info` YAML, an OpenCV calibration (YAML, XML), or a Kalibr camchain.
 
     Parameters
     ----------
@@ -82,6 +94,8 @@ def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Came
         File.
     base
         Camera that provides what such a file does not contain (fps, noise).
+    chain_camera
+        Camera of a Kalibr camchain, as `cam1`; only needed if there are several.
 
     Returns
     -------
@@ -95,7 +109,7 @@ def read_camera_info(path: str | Path, base: Camera | None = None) -> tuple[Came
         interest.
     """
     path = Path(path)
-    fields = _fields(path)
+    fields = _fields(path, chain_camera)
     width, height = (_whole(path, fields, name) for name in ("width", "height"))
     K = _numbers(path, fields, "K", (3, 3))
     D = _numbers(path, fields, "D", None).ravel()
@@ -177,9 +191,33 @@ def _text(path: Path) -> str:
     return decode_text(path, data, remedy)
 
 
-def _fields(path: Path) -> Mapping[str, Any]:
+class _OpenCvLoader(_Loader):
+    """The same for OpenCV's YAML, whose matrices have a tag of their own."""
+
+
+_OpenCvLoader.add_constructor(
+    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
+)
+
+
+def _fields(path: Path, chain_camera: str | None) -> Mapping[str, Any]:
+    """Return the fields of a `camera_info`, or those of another format under its names."""
+    text = _text(path)
+    if OPENCV_XML.match(text):
+        return of_opencv(path, of_opencv_xml(path, text))
+    if head := OPENCV_YAML.match(text):
+        return of_opencv(path, _yaml_fields(path, text[head.end() :], _OpenCvLoader))
+    fields = _yaml_fields(path, text, _Loader)
+    if is_kalibr(fields):
+        return of_kalibr(path, fields, chain_camera)
+    if chain_camera is not None:
+        raise InputError(f"{path}: is no Kalibr chain of cameras: leave out --chain-camera")
+    return fields
+
+
+def _yaml_fields(path: Path, text: str, loader: type[_Loader]) -> Mapping[str, Any]:
     try:
-        fields = next(iter(yaml.load_all(_text(path), _Loader)), None)
+        fields = next(iter(yaml.load_all(text, loader)), None)
     except RecursionError as error:
         raise InputError(f"{path}: is nested too deep; give the path of a camera_info YAML") from error
     except yaml.YAMLError as error:
