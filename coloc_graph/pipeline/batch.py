@@ -18,7 +18,6 @@ from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.clocks import RunClocks, clocks_of_images_apart, clocks_of_run, contradicts, misfit
 from coloc_graph.pipeline.contents import Unused, require_applicable, unused_in, unused_ranges
-from coloc_graph.pipeline.disagreement import moves_unstated
 from coloc_graph.pipeline.explanations import (
     implausible_planes,
     reasons,
@@ -35,6 +34,7 @@ from coloc_graph.pipeline.incremental import (
     measure_stance,
 )
 from coloc_graph.pipeline.lever_arm import LeverArm, find_lever_arms, with_lever_arms
+from coloc_graph.pipeline.moves import infer_moves, moves_unstated
 from coloc_graph.pipeline.odometry_checks import CheckedRun
 from coloc_graph.pipeline.options import METHODS, SolveOptions
 from coloc_graph.pipeline.ranges import ranges_of_run
@@ -183,6 +183,9 @@ def _in_batch(
         measured = measured_again(measured, noise.used(run.team))
     log.info("%d stances measured: %d of %d pairs usable", len(run.stances), _usable(measured), len(measured))
     _require_poses(run, options, measured)
+    moves = infer_moves(run.stances, measured) if moves_unstated(run) else None
+    if moves is not None:
+        run = moves.applied(run)
     made = time.perf_counter()
     graph, sources = _graph_of(run, options, measured, noise.used(run.team))
     _require_ties(run, graph, measured)
@@ -209,8 +212,9 @@ def _in_batch(
     estimate, left_out = _with_ranges(run, options, estimate)
     measured = tuple(replace(one, with_team=None) for one in measured)
     log.info("%s: chi2/dof %.6g/%d, %d rejected", options.method, estimate.chi2, estimate.dof, len(estimate.rejected))
-    of_clocks = [*(clocks.sentences() if clocks else ()), *clock_warnings, *map(str, arms.values())]
-    warnings = _warnings(run, options, estimate, measured, of_clocks, sources.unused)
+    said = [*(clocks.sentences() if clocks else ()), *clock_warnings, *map(str, arms.values())]
+    said += [moves.sentence()] if moves else []
+    warnings = _warnings(run, options, estimate, measured, said, sources.unused)
     missing = without_poses(run, options, estimate, measured, sources.unused)
     return _Solved(estimate, warnings, made - started, measured, without_pose=missing, noise=noise, unused=left_out)
 
@@ -334,15 +338,15 @@ def _warnings(
     options: SolveOptions,
     estimate: Estimate,
     measured: Sequence[PairMeasurement],
-    of_clocks: Sequence[str],
+    found: Sequence[str],
     unused: Sequence[UnusedSighting],
 ) -> list[str]:
     """Warnings of a run with stances."""
     return [
-        *of_clocks,
+        *found,
         *describe_unused(unused),
         *implausible_planes(run, options, measured),
-        *warnings_of_graph(estimate, diagnose(estimate.graph), measured, moves_stated=not moves_unstated(run)),
+        *warnings_of_graph(estimate, diagnose(estimate.graph), measured, run),
     ]
 
 

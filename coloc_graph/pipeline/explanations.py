@@ -10,7 +10,8 @@ from coloc_graph.backend import DisconnectedComponent, Estimate
 from coloc_graph.backend.ranging import RangingProblem
 from coloc_graph.frontend import PairMeasurement, UnusedSighting, little_in_common
 from coloc_graph.frontend.pairing.plane_check import implausible
-from coloc_graph.pipeline.disagreement import unstated_moves, worst_kinds
+from coloc_graph.pipeline.disagreement import worst_kinds
+from coloc_graph.pipeline.moves import described_bumps
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
 
@@ -111,12 +112,11 @@ def warnings_of_graph(
     estimate: Estimate,
     disconnected: Sequence[DisconnectedComponent],
     measurements: Sequence[PairMeasurement],
-    *,
-    moves_stated: bool = True,
+    run: Run | None = None,
 ) -> list[str]:
     """Warnings of an estimate of stances: unusable and rejected measurements, bumps, unlikely calibrations, chi2.
 
-    Where nobody stated who moved (not `moves_stated`) and somebody did, neither robots nor measurements are blamed.
+    With the `run`, what its wheels say of bumps is told, too.
     """
     stances = estimate.graph.by_index
     warnings = [
@@ -134,12 +134,9 @@ def warnings_of_graph(
     warnings += [f"{part} (left out of the result)" for part in disconnected[:MAX_REASONS]]
     if len(disconnected) > MAX_REASONS:
         warnings.append(f"{len(disconnected) - MAX_REASONS} more groups of poses are not tied to the reference")
-    unstated = None if moves_stated else unstated_moves(estimate.graph)
-    if unstated is None:
-        warnings += [f"the {one.measurement} was rejected: it is {one.reason}" for one in estimate.rejected]
-        warnings += [str(bump) for bump in estimate.bumped]
-    else:
-        warnings.append(unstated)
+    warnings += [f"the {one.measurement} was rejected: it is {one.reason}" for one in estimate.rejected]
+    bumped = estimate.bumped
+    warnings += map(str, bumped) if run is None else described_bumps(run, stances, bumped)
     warnings += _far(estimate)
     return [*warnings, *_unobservable(estimate), *_misfit(estimate)]
 
