@@ -2,10 +2,11 @@
 
 import logging
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 
 from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.geometry.se2 import Planar
+from coloc_graph.machine import machine
 from coloc_graph.online.leap_planner import Situation, StancePlan, StancePlanner
 from coloc_graph.pipeline.incremental import EnteredStance
 
@@ -20,7 +21,7 @@ class DecisionWorker:
 
     def __init__(self, planner: StancePlanner) -> None:
         self._planner = planner
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="planning")
+        self._thread = machine.new_worker("planning")
         self._deciding: Future[StancePlan] | None = None
         self._entered: list[tuple[EnteredStance, Mapping[str, Planar]]] = []
 

@@ -11,6 +11,9 @@ from coloc_graph.robot_io.create.physics import Body, Physics
 from coloc_graph.robot_io.create.protocol import Mode, Packet
 from coloc_graph.robot_io.create.state import CLIFFS, DROPS
 
+#: Values of packets that do not change.
+CONSTANT: dict[int, int] = {Packet.VOLTAGE: 15_400, Packet.CHARGE: 2_100, Packet.CAPACITY: 2_696}
+
 
 class Firmware:
     """A Create that obeys bytes and reports sensors; for one thread at a time.
@@ -134,18 +137,16 @@ class Firmware:
             whole = int(counted - self._asked_at[i])
             self._asked_at[i] = counted
             return whole
-        rest: dict[int, int] = {
-            Packet.MODE: int(self.mode),
-            Packet.CHARGERS: 2 * self.docked,
-            Packet.CHARGING_STATE: 2 * self.docked,
-            Packet.VOLTAGE: 15_400,
-            Packet.CHARGE: 2_100,
-            Packet.CAPACITY: 2_696,
-            Packet.REQUESTED_LEFT: round(body.wanted[0] * 1e3),
-            Packet.REQUESTED_RIGHT: round(body.wanted[1] * 1e3),
-            38: len(self.listed),
-        }
-        return rest.get(packet, 0)
+        match packet:
+            case Packet.MODE:
+                return int(self.mode)
+            case Packet.CHARGERS | Packet.CHARGING_STATE:
+                return 2 * self.docked
+            case Packet.REQUESTED_LEFT | Packet.REQUESTED_RIGHT:
+                return round(body.wanted[packet == Packet.REQUESTED_RIGHT] * 1e3)
+            case 38:
+                return len(self.listed)
+        return CONSTANT.get(packet, 0)
 
 
 def mark(marked: set[str], known: Collection[str], where: str, there: bool) -> None:

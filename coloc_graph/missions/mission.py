@@ -1,0 +1,227 @@
+"""One simulated mission of a seed, with faults, and all that is promised of it checked; `run_mission`."""
+
+import hashlib
+import json
+import logging
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+
+from coloc_graph.machine import machine
+from coloc_graph.missions.checks import Checks
+from coloc_graph.missions.faults import COORDINATOR, NETWORK, Fault, draw_faults
+from coloc_graph.missions.field import Field
+from coloc_graph.missions.network import Network
+from coloc_graph.missions.programs import Programs
+from coloc_graph.missions.scheduler import Scheduler
+from coloc_graph.missions.system import SimulatedSystem
+from coloc_graph.online.mission import MissionOptions, in_world, roles
+from coloc_graph.simulation.rig import reference_team, stated_team
+from coloc_graph.simulation.simulated_team import CLOCKS, FIELD
+from coloc_graph.team import Team
+
+FPS = 10.0  # images a second of a simulated camera
+LIMIT = 1500.0  # simulated time after which a mission must have ended [s]
+SPAN = 14.0  # time of a stance in which faults are drawn [s]
+MEMORY = "/dev/shm"  # a folder in memory, where there is one
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A mission that one seed decides.
+
+    Attributes
+    ----------
+    seed
+        Seed of all that is drawn.
+    stances
+        Number of stances.
+    faults
+        Faults that happen.
+    formation
+        "paper" or "plan"; see `MissionOptions`.
+    """
+
+    seed: int
+    stances: int = 6
+    faults: tuple[Fault, ...] = ()
+    formation: str = "paper"
+
+
+@dataclass
+class Outcome:
+    """Outcome of a simulated mission.
+
+    Attributes
+    ----------
+    scenario
+        The mission.
+    state
+        Its last state, "" if it did not end.
+    violations
+        Sentences about promises that were broken.
+    seconds
+        Simulated time [s].
+    cpu
+        Time that it took to compute [s].
+    digest
+        Hash of all files of the mission.
+    nees
+        Normalised squared errors of observers' positions and headings, and their degrees of freedom.
+    """
+
+    scenario: Scenario
+    state: str = ""
+    violations: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    cpu: float = 0.0
+    digest: str = ""
+    nees: tuple[float, int] = (0.0, 0)
+    log: list[str] = field(default_factory=list)
+
+
+def scenario_of(seed: int, stances: int = 6, formation: str = "paper", faults: int | None = None) -> Scenario:
+    """Return the mission of a seed, with faults that it draws; every fourth has none."""
+    count = (seed % 4) * 2 if faults is None else faults
+    return Scenario(seed, stances, draw_faults(seed, mission_team().names, count, SPAN * stances), formation)
+
+
+def mission_team() -> Team:
+    """Return the team of simulated missions."""
+    stated = stated_team(reference_team(), FIELD)
+    new = msgspec.structs.replace
+    robots = tuple(new(robot, camera_if_any=new(robot.camera, fps=FPS)) for robot in stated.robots)
+    return new(stated, clock_sigma=CLOCKS, robots=robots)
+
+
+def run_mission(scenario: Scenario, folder: Path | None = None) -> Outcome:
+    """Run a mission on simulated time; its files go into `folder`, into none that stays by default."""
+    if folder is None:
+        memory = MEMORY if Path(MEMORY).is_dir() else None
+        with tempfile.TemporaryDirectory(prefix="coloc-", dir=memory) as temporary:
+            return run_mission(scenario, Path(temporary))
+    began, level = time.process_time(), logging.root.manager.disable
+    scheduler = Scheduler(scenario.seed)
+    before = machine.use(SimulatedSystem(scheduler))
+    logging.disable(logging.CRITICAL)
+    try:
+        outcome = _run(scenario, scheduler, folder)
+    finally:
+        scheduler.close()
+        logging.disable(level)
+        machine.use(before)
+    outcome.cpu = time.process_time() - began
+    return outcome
+
+
+def _run(scenario: Scenario, scheduler: Scheduler, folder: Path) -> Outcome:
+    team = mission_team()
+    options = MissionOptions(
+        goals=((100.0, 0.0),),
+        stances=scenario.stances,
+        place_sigma=0.02,
+        heading_sigma_deg=0.8,
+        least_points=20,
+        speed=0.45,
+        longest=5.0,
+        formation=scenario.formation,  # type: ignore[arg-type]
+    )
+    mover, _ = roles(team, None)
+    starts, _ = in_world(team, mover, options.goals)
+    field_, network = Field(scheduler, team, starts, scenario.seed), Network(scheduler, team.names)
+    checks = Checks(scheduler, field_, network, team, mover)
+    programs = Programs(scheduler, network, field_, team, options, folder, checks.watch_coordinator, checks.take_stance)
+    checks.programs = programs
+    for name in (COORDINATOR, *team.names):
+        scheduler.call_in(scheduler.random.uniform(0.0, 0.5), lambda name=name: programs.start(name))
+    for fault in scenario.faults:
+        scheduler.call_in(fault.time, lambda fault=fault: _begin(fault, scheduler, field_, network, programs, checks))
+    _repeat(scheduler, 0.1, network.watch_silence)
+    _repeat(scheduler, 0.02, checks.look)
+    ended = scheduler.run(lambda: programs.state is not None, LIMIT)
+    outcome = Outcome(scenario, str(programs.state or ""), seconds=1e-9 * scheduler.now, log=programs.errors)
+    checks.end(folder / "mission", ended)
+    outcome.violations = checks.violations
+    outcome.nees = checks.nees
+    for process in programs.processes.values():
+        scheduler.kill(process)
+    outcome.digest = _digest(folder)
+    return outcome
+
+
+def _begin(
+    fault: Fault, scheduler: Scheduler, field_: Field, network: Network, programs: Programs, checks: Checks
+) -> None:
+    """Let a fault begin, and see to its end."""
+    if programs.state is not None:
+        return
+    where, end = fault.where, lambda: None
+    process, host = programs.processes.get(where), programs.hosts[where]
+    if fault.kind in NETWORK:
+        end = _network_fault(fault, network)
+    elif fault.kind == "kill":
+        if process is not None:
+            checks.note_kill(where)
+            scheduler.kill(process)
+        end = lambda: programs.start(where)  # noqa: E731
+    elif fault.kind == "stop" and process is not None:
+        scheduler.stop(process)
+        end = lambda: scheduler.go_on(process)  # noqa: E731
+    elif fault.kind == "hang" and where in programs.mains:
+        main = programs.mains[where]
+        main.hung = True
+        end = lambda: scheduler.unhang(main)  # noqa: E731
+    elif fault.kind in ("full", "slow"):
+        host.disk_full, host.disk_delay = fault.kind == "full", fault.amount
+
+        def end() -> None:
+            host.disk_full, host.disk_delay = False, 0.0
+
+    elif fault.kind == "jump":
+        programs.jumps[where] += round(1e9 * fault.amount)
+    elif fault.kind in ("unplug", "freeze"):
+        which = field_.unplugged if fault.kind == "unplug" else field_.frozen
+        which.add(where)
+        end = lambda: which.discard(where)  # noqa: E731
+    elif fault.kind == "push":
+        x, y, yaw = (fault.amount * scheduler.random.uniform(-1, 1) for _ in range(3))
+        field_.robots[where].body.push(x, y, 2 * yaw)
+        checks.pushed = True
+    scheduler.call_in(fault.duration, end)
+
+
+def _network_fault(fault: Fault, network: Network) -> Callable[[], None]:
+    conditions = network.conditions[fault.where]
+    if fault.kind == "cut":
+        network.cut(fault.where, True)
+        return lambda: network.cut(fault.where, False)
+    name = {"loss": "loss", "delay": "jitter", "duplication": "duplication"}[fault.kind]
+    before = type(conditions)()
+    setattr(conditions, name, fault.amount)
+    return lambda: setattr(conditions, name, getattr(before, name))
+
+
+def _repeat(scheduler: Scheduler, period: float, call: Callable[[], None]) -> None:
+    def again() -> None:
+        call()
+        scheduler.call_in(period, again)
+
+    scheduler.call_in(period, again)
+
+
+def _digest(folder: Path) -> str:
+    """Hash of all files of a folder."""
+    sum_ = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and not path.name.startswith("."):
+            sum_.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return sum_.hexdigest()
+
+
+def as_json(outcome: Outcome) -> str:
+    """Return an outcome as one line of JSON."""
+    return json.dumps(msgspec.to_builtins(outcome))
