@@ -7,6 +7,7 @@
 #             GRAPHS=DIR for those on the pose graphs sphere2500 and M3500, MRCLAM=DIR for that on an MR.CLAM dataset
 
 # make fuzz   every parser by guided fuzzing: 20,000 inputs a target; ARGS="team g2o --runs 100000" for some of them
+# make search  simulated missions with random faults, on all cores; ARGS="--missions 1000"
 
 PYTHON ?= python3
 VENV := .venv
@@ -16,7 +17,7 @@ DATA ?=
 GRAPHS ?=
 MRCLAM ?=
 
-.PHONY: demo test test-long lint types unit docs notebooks bench fuzz clean
+.PHONY: demo test test-long lint types unit docs notebooks bench fuzz search clean
 
 demo: $(VENV)/installed
 	$(BIN)/coloc demo --force $(ARGS)
@@ -85,6 +86,9 @@ endif
 fuzz: $(VENV)/installed-dev
 	$(BIN)/pip install --quiet --disable-pip-version-check 'atheris>=3'
 	$(BIN)/python -m fuzz.run $(ARGS)
+
+search: $(VENV)/installed-dev
+	$(BIN)/python -m coloc_graph.missions.search $(ARGS)
 
 $(VENV)/made:
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 15) else \

@@ -29,7 +29,7 @@ LAYERS: list[tuple[str, set[str]]] = [
     ("formats of others, plans", {"exchange", "planning"}),
     ("whole runs", {"simulation", "pipeline"}),
     ("reports and missions", {"report", "online"}),
-    ("results on disk", {"results"}),
+    ("results on disk, simulated missions", {"missions", "results"}),
     ("experiments and viewer", {"experiments", "viewer"}),
     ("commands", {"cli"}),
     ("what users import", {"__init__"}),

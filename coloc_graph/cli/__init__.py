@@ -23,6 +23,7 @@ from coloc_graph.cli import (
     import_,
     info,
     plan,
+    replay,
     robot,
     simulate,
     solve,
@@ -47,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for module in (
         *(demo, fetch_example, team, calibrate, simulate, import_, info, solve, evaluate, view, export, experiment),
-        *(plan, coordinate, robot, certificates),
+        *(plan, coordinate, robot, replay, certificates),
     ):
         module.add(commands)
     add_verbosity(top)

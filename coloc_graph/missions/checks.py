@@ -3,11 +3,12 @@
 import itertools
 import json
 import math
-from collections import defaultdict, deque
+from collections import deque
 from pathlib import Path
 
 import numpy as np
 
+from coloc_graph.geometry.se2 import Planar, compose, inverse, wrap
 from coloc_graph.missions.faults import COORDINATOR
 from coloc_graph.missions.field import Field
 from coloc_graph.missions.network import Network
@@ -15,33 +16,42 @@ from coloc_graph.missions.programs import Programs
 from coloc_graph.missions.scheduler import Scheduler
 from coloc_graph.online.coordinator import Coordinator
 from coloc_graph.online.mission_states import MissionState
+from coloc_graph.online.replay import replay
 from coloc_graph.pipeline.incremental import EnteredStance
 from coloc_graph.robot_io.create.physics import RADIUS
 from coloc_graph.robot_io.deadlines import STAND_WITHIN
+from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
 from coloc_graph.robot_io.link.messages import Status
 from coloc_graph.run import open_run
 from coloc_graph.team import Team
 
 LOST_RECORD = 0.5  # newest part of the record that a killed coordinator may lose [s]
 MARGIN = 0.02  # time between two checks of what moves [s]
+PLANAR = [2, 3, 4]  # heading, x, y in a tangent vector
+WELL_KNOWN = 1e12  # condition of a covariance above which it is none
+REPLAYED = 4  # of this number of missions one is replayed, and all those that were continued
+RESUMED = 1e-9  # difference between an estimate after a resume and an uninterrupted one [m]
 
 
 class Checks:
     """Watches a mission; `violations` are sentences about what was promised and not kept."""
 
-    def __init__(self, scheduler: Scheduler, field: Field, network: Network, team: Team, mover: str) -> None:
+    def __init__(self, scheduler: Scheduler, field: Field, network: Network, team: Team, mover: str, seed: int) -> None:
         self._scheduler, self._field, self._network, self._team, self._mover = scheduler, field, network, team, mover
+        self._seed = seed
         self.programs: Programs
         self.violations: list[str] = []
         self.pushed = False
+        self._coordinators = 0
         self.nees = (0.0, 0)
         self._lost_since: dict[str, float | None] = dict.fromkeys(team.names)
         self._numbers: dict[tuple[str, str, type], int] = {}
         self._gaps = 0
-        self._link_counts = None
+        self._link: CoordinatorLink | None = None
         self._recorded: deque[tuple[float, int]] = deque(maxlen=200)
         self._to_be_kept = 0
-        self._truth: dict[float, dict[str, tuple[float, float, float]]] = {}
+        self._origin: Planar | None = None
+        self._newest: EnteredStance | None = None
 
     def look(self) -> None:
         """Check what moves now."""
@@ -79,6 +89,7 @@ class Checks:
     def watch_coordinator(self, coordinator: Coordinator) -> None:
         """Follow the messages that a new coordinator takes in."""
         self._count_lost()
+        self._coordinators += 1
         self._numbers, self._gaps, self._link = {}, 0, coordinator.link
         self._recorded.clear()
         put = coordinator._inbox.put
@@ -97,15 +108,26 @@ class Checks:
             coordinator.link._calls[type_] = watched
 
     def take_stance(self, one: EnteredStance) -> None:
-        """Take the estimate of a stance, to compare it with the truth."""
-        poses = self._field.poses()
-        reference = one.estimate.poses
-        start = self._truth.setdefault(-1.0, poses) if False else None
-        del start
-        for name in one.stance.observers:
-            if name == self._team.reference or name not in reference:
-                continue
+        """Compare the estimate of a stance with the truth, while all robots stand."""
+        poses, reference = self._field.poses(), self._team.reference
+        if self._origin is None:
+            self._origin = poses[reference]
         self._newest = one
+        self.nees = 0.0, 0
+        for name in one.stance.observers:
+            if self.pushed or name not in one.estimate.poses or (name == reference and one.stance.index == 0):
+                continue
+            covariance = one.estimate.covariances[name][np.ix_(PLANAR, PLANAR)]
+            T = one.estimate.poses[name].matrix()
+            x, y, yaw = compose(inverse((T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0]))), self._in_world(poses[name]))
+            error = np.array([wrap(yaw), x, y])
+            if np.linalg.cond(covariance) < WELL_KNOWN:
+                self.nees = self.nees[0] + float(error @ np.linalg.solve(covariance, error)), self.nees[1] + 3
+
+    def _in_world(self, pose: Planar) -> Planar:
+        """Convert a true pose to the world of the mission: the reference's body at the beginning."""
+        assert self._origin is not None
+        return compose(inverse(self._origin), pose)
 
     def note_kill(self, where: str) -> None:
         """Note what a coordinator that is killed now has recorded."""
@@ -130,26 +152,40 @@ class Checks:
         if programs.state == MissionState.FAILED and not states[-1]["reason"]:
             self._violate("the mission failed and does not say why")
         run = open_run(folder / "run.mcap")
+        if not run.stances:
+            return
         indices = [stance.index for stance in run.stances]
         if indices != list(range(len(indices))):
             self._violate(f"the record has the stances {indices}")
-        if programs.state == MissionState.DONE and len(indices) != programs._options.stances:
+        if programs.state == MissionState.DONE and len(indices) != programs.options.stances:
             self._violate(f"the mission is done after the stances {indices}")
         if run.warnings:
             self._violate(f"the record is damaged: {run.warnings[0]}")
+        if self._coordinators > 1 or self._seed % REPLAYED == 0:
+            self._compare_replay(folder)
         seen = sum(1 for name in self._team.names for _ in run.detections(name))
         if seen < self._to_be_kept:
             self._violate(f"the record lost {self._to_be_kept - seen} images that were older than {LOST_RECORD} s")
 
+    def _compare_replay(self, folder: Path) -> None:
+        """Replay the mission, as if it had never been interrupted: it must give the same estimates, bit for bit."""
+        stances = list(replay(folder, self.programs.options.solve))
+        for one in stances:
+            if one.same is False:
+                self._violate(f"the estimate of stance {one.entered.stance.index} is another one when it is replayed")
+        newest = stances[-1].entered if stances else None
+        if self._newest is not None and newest is not None and newest.stance == self._newest.stance:
+            for name, pose in self._newest.estimate.poses.items():
+                off = np.abs(newest.estimate.poses[name].matrix() - pose.matrix()).max()
+                if off > RESUMED:
+                    self._violate(f"the pose of {name} differs by {off:.1g} from that without interruptions")
+
     def _count_lost(self) -> None:
         """Compare the gaps in what was delivered with what was counted as lost."""
-        link = getattr(self, "_link", None)
+        link = self._link
         if link is not None and link.counts.missed < self._gaps:
             self._violate(f"{self._gaps} messages are missing, {link.counts.missed} are counted as lost")
 
     def _violate(self, text: str) -> None:
         if len(self.violations) < 20:
             self.violations.append(f"{1e-9 * self._scheduler.now:.2f} s: {text}")
-
-
-_ = (defaultdict, np)

@@ -1,5 +1,6 @@
 """Robots on a floor in simulated time: wheels behind a line, and cameras that see markers; `Field`."""
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -7,7 +8,6 @@ import numpy as np
 
 from coloc_graph.errors import RobotError
 from coloc_graph.frontend.images.detection import Blobs
-from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.missions.scheduler import Process, Scheduler
 from coloc_graph.missions.watchdog import SimulatedWatchdog
@@ -18,6 +18,7 @@ from coloc_graph.robot_io.create.line import LEAVE, READ, RETURN_TIMEOUT
 from coloc_graph.robot_io.create.physics import Physics
 from coloc_graph.robot_io.create.state import STREAMED
 from coloc_graph.simulation.rig import true_team
+from coloc_graph.simulation.uneven_floor import UnevenFloor
 from coloc_graph.simulation.world import stream
 from coloc_graph.team import Camera, Team
 from coloc_graph.team.shared_view import View
@@ -51,6 +52,7 @@ class Field:
     def __init__(self, scheduler: Scheduler, team: Team, starts: Mapping[str, Planar], seed: int) -> None:
         self.scheduler, self.team = scheduler, team
         self.true_team = true_team(team, stream(seed, "team"))
+        sigma = math.radians(team.floor.tilt_sigma_deg) if team.floor else 0.0
         self.robots = {
             name: Firmware(
                 2,
@@ -60,6 +62,7 @@ class Field:
             )
             for n, name in enumerate(team.names)
         }
+        self._floor = UnevenFloor(sigma, stream(seed, "floor"))
         self.unplugged: set[str] = set()
         self.frozen: set[str] = set()
         self._rng = np.random.default_rng((seed, 7))
@@ -101,11 +104,11 @@ class Field:
     def blobs(self, robot: str, poses: Mapping[str, Planar]) -> Blobs:
         """Return the markers that a robot's camera sees of the others."""
         camera = self.true_team[robot].camera
-        view = View(camera, floor_pose(*poses[robot]) @ self._mounts[robot])
+        T_world_body = dict(zip(poses, self._floor.pose(list(poses.values())), strict=True))
+        view = View(camera, T_world_body[robot] @ self._mounts[robot])
         points = []
-        for name, pose in poses.items():
-            if name != robot and np.hypot(pose[0] - poses[robot][0], pose[1] - poses[robot][1]) < REACH:
-                T = floor_pose(*pose)
+        for name, T in T_world_body.items():
+            if name != robot and np.hypot(*(T[:2, 3] - T_world_body[robot][:2, 3])) < REACH:
                 points.append(self._markers[name] @ T[:3, :3].T + T[:3, 3])
         uv, inside = view.project(np.concatenate([np.zeros((0, 3)), *points]))
         uv = uv[inside]

@@ -8,6 +8,8 @@ import re
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from queue import Empty
 
 from coloc_graph.missions.scheduler import Process, Scheduler
 from coloc_graph.missions.system import Queue
@@ -119,7 +121,7 @@ class SimulatedSession:
         scheduler = network.scheduler
         self._inbox, self._urgent = Queue(scheduler, 0), Queue(scheduler, 0)
         for queue, name in ((self._inbox, "callbacks"), (self._urgent, "receiving")):
-            scheduler.spawn(lambda queue=queue: self._receive(queue), process, f"{name} of {process.name}")
+            scheduler.spawn(partial(self._receive, queue), process, f"{name} of {process.name}")
 
     # what programs use
 
@@ -181,12 +183,11 @@ class SimulatedSession:
         peers = [peer for peer in self._peers() if key in peer._kept]
         for peer in peers:
             link = self._link(peer)
-            link.send(lambda peer=peer, link=link: peer.send_kept(key, which, link, came), certain=True)
-            gone = lambda link=link, peer=peer: not link.holds  # noqa: E731
-            while scheduler.now < end and not gone():
+            link.send(partial(peer.send_kept, key, which, link, came), certain=True)
+            while scheduler.now < end and link.holds:
                 try:
                     data = came.get(0.1)
-                except Exception:  # nothing for a while: is the connection still there?
+                except Empty:  # nothing for a while: is the connection still there?
                     continue
                 if data is None:
                     break
@@ -255,13 +256,13 @@ class SimulatedSession:
         """Take note of the presence of somebody else."""
         for pattern, take in self._watchers:
             if pattern.fullmatch(token):
-                self._inbox.put(lambda take=take: take(token, there))
+                self._inbox.put(partial(take, token, there))
 
     def take(self, key: str, data: bytes) -> None:
         """Take a message in."""
         for pattern, take, at_once in self._subscribers:
             if pattern.fullmatch(key):
-                (self._urgent if at_once else self._inbox).put(lambda take=take: take(key, data))
+                (self._urgent if at_once else self._inbox).put(partial(take, key, data))
 
     def take_question(self, key: str, payload: bytes, reply: Callable[[bytes | None], None]) -> None:
         """Take a command in."""
@@ -275,7 +276,7 @@ class SimulatedSession:
         kept = list(self._kept.get(key, ()))
         found = kept[-1:] if which == "_max=1" else [one for one in kept if int(first) <= one[0] <= int(last)]
         for n, (_, data) in enumerate(found):
-            link.send(lambda data=data: came.put(data), certain=True, later=n * BANDWIDTH)
+            link.send(partial(came.put, data), certain=True, later=n * BANDWIDTH)
         link.send(lambda: came.put(None), certain=True, later=(len(found) + 50) * BANDWIDTH + 0.02)
 
     def _peers(self) -> "list[SimulatedSession]":
@@ -289,7 +290,7 @@ class SimulatedSession:
 
     def _send_to_peers(self, arrive: "Callable[[SimulatedSession], None]") -> None:
         for peer in self._peers():
-            self._link(peer).send(lambda peer=peer: arrive(peer))
+            self._link(peer).send(partial(arrive, peer))
 
     def _receive(self, queue: Queue) -> None:
         while True:

@@ -61,7 +61,7 @@ class Programs:
         on_stance: Callable[[EnteredStance], None],
     ) -> None:
         self._scheduler, self._network, self._field = scheduler, network, field
-        self._team, self._options, self.folder = team, options, folder
+        self._team, self.options, self.folder = team, options, folder
         self._on_coordinator, self._on_stance = on_coordinator, on_stance
         draw = scheduler.random
         self.hosts = {
@@ -128,7 +128,7 @@ class Programs:
         coordinator = Coordinator(
             self._team,
             folder,
-            self._options,
+            self.options,
             resume=(folder / "run.mcap").exists(),
             open_session=self._network.open(process, None),
             on_stance=self._on_stance,

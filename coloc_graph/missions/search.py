@@ -13,8 +13,11 @@ from dataclasses import replace
 from itertools import islice
 from multiprocessing import get_context
 
+from scipy.stats import chi2
+
 from coloc_graph.missions.mission import Outcome, Scenario, run_mission, scenario_of
 
+PROGRESS = 20  # missions between two lines of progress
 PER_PROCESS = 25  # missions that a process runs before another takes its place
 
 
@@ -67,16 +70,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     scenarios = [scenario_of(seed, options.stances, options.formation, options.faults) for seed in seeds]
     began, simulated, cpu, failed = time.monotonic(), 0.0, 0.0, []
     states: dict[str, int] = {}
+    nees, freedom = 0.0, 0
     for one in outcomes(scenarios, options.processes, options.seconds):
         simulated, cpu = simulated + one.seconds, cpu + one.cpu
         states[one.state] = states.get(one.state, 0) + 1
+        if sum(states.values()) % PROGRESS == 0:
+            print(f"{sum(states.values())} missions, {simulated:.0f} s simulated", file=sys.stderr, flush=True)
+        nees, freedom = nees + one.nees[0], freedom + one.nees[1]
         if one.violations:
             failed.append(one)
             print(f"seed {one.scenario.seed}: {one.violations[0]}", flush=True)
-    print(f"{len(scenarios)} missions, {len(failed)} break a promise; states {states}")
-    print(
-        f"{simulated:.0f} s simulated in {time.monotonic() - began:.0f} s; {simulated / max(cpu, 1e-9):.1f} a second of CPU"
-    )
+    print(f"{sum(states.values())} missions, {len(failed)} break a promise; states {states}")
+    rate, took = simulated / max(cpu, 1e-9), time.monotonic() - began
+    print(f"{simulated:.0f} s simulated in {took:.0f} s; {rate:.1f} s in a second of one core")
+    if freedom:
+        low, high = (float(chi2.ppf(p, freedom)) / freedom for p in (0.0005, 0.9995))
+        print(f"NEES per degree of freedom at the end: {nees / freedom:.3f}, in [{low:.3f}, {high:.3f}] if honest")
     for one in [] if options.no_shrink else failed[:5]:
         less = shrunk(one.scenario, one.violations[0])
         print(f"seed {less.seed}, of {len(one.scenario.faults)} faults these matter:")

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from coloc_graph.missions.scheduler import Scheduler, Task
 
-LEAST_WORK = 0.3  # least time that a worker takes for a job [s]
+MIN_WORK = 0.3  # least time that a worker takes for a job [s]
 MEAN_WORK = 0.4  # mean of the time that it takes longer [s]
 
 
@@ -273,7 +273,7 @@ class Worker(Executor):
     def _run(self) -> None:
         while not self._ended and (job := self._jobs.get()) is not None:
             done, work = job
-            self._scheduler.wait(LEAST_WORK + self._scheduler.random.expovariate(1 / MEAN_WORK))
+            self._scheduler.wait(MIN_WORK + self._scheduler.random.expovariate(1 / MEAN_WORK))
             try:
                 done.set_result(work())
             except BaseException as error:

@@ -105,6 +105,7 @@ class Coordinator:
             self._registry = RobotRegistry(
                 record, starts, lambda name: link.clocks[name].to_coordinator, epoch, self._inbox.status_times
             )
+            self._log_path = held.log_path
             self._log = undo.enter_context(MissionLog(held.log_path, self._registry.utc))
             worker = EstimationWorker(record, self._solver)
             undo.callback(worker.end)
@@ -161,7 +162,7 @@ class Coordinator:
         mission = self._mission
         self._commander.stop = stop
         if self._before is not None:
-            mission.stances += restore(self._before, self._solver, self._registry, stop)
+            mission.stances += restore(self._before, self._log_path, self._solver, self._registry, stop)
             self._log.note("resumed", stances=len(mission.stances))
         with contextlib.suppress(Stopped):
             while not mission.ended and not stop.is_set():

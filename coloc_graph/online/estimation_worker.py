@@ -9,6 +9,7 @@ from coloc_graph.backend import Bump
 from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.frontend import FrontendOptions, StanceTracks
 from coloc_graph.machine import machine
+from coloc_graph.online.record import Record
 from coloc_graph.online.visibility import Precision, precision
 from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver, measure_stance
 from coloc_graph.run import Recorded, Stance
@@ -60,8 +61,9 @@ class EstimationWorker:
         return _result(done, "judging the stance")
 
     def enter(self, stance: Stance) -> None:
-        """Measure a stance and enter it into the estimate."""
-        self._entering = self._worker.submit(self._enter, stance)
+        """Measure a stance and enter it into the estimate, from what is recorded now."""
+        record = self._record.now() if isinstance(self._record, Record) else self._record
+        self._entering = self._worker.submit(self._enter, stance, record)
 
     def entered(self) -> EnteredStance | list[Bump] | None:
         """Return the entered stance, None while it is not; or bumps of its anchors: then it has not entered."""
@@ -81,25 +83,43 @@ class EstimationWorker:
             self._tracks = stance.start, StanceTracks(self._record, stance, frontend.tracker)
         return self._tracks[1]
 
-    def _enter(self, stance: Stance) -> EnteredStance | list[Bump]:
-        noisy = Restated(self._record, self._solver.noise.used(self._record.team))  # as a logged run is measured
-        made = measure_stance(noisy, stance, self._solver.options, self._tracks_of(stance))
-        pairs = self._solver.measure(self._record, stance, made)
-        unusable = [pair.homography.unusable for pair in pairs if pair.homography.unusable]
-        if len(unusable) == len(pairs):
-            raise RobotError(f"stance {stance.index} measures nothing: {unusable[0]}")
-        try:
-            one = self._solver.enter(self._record, stance, pairs)
-        except ColocError as error:
-            raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
+    def _enter(self, stance: Stance, record: Recorded) -> EnteredStance | list[Bump]:
+        one = enter_stance(self._solver, record, stance, self._tracks_of(stance))
         gc.freeze()  # the record and the estimate stay: looking through them for garbage would hold up later stances
-        if not one.estimate.rejected and one.estimate.agreement.p_value() > CONTRADICTED:
-            return one
-        # contradicted: was an anchor pushed since the stance before?
-        bumped = [bump for bump in self._solver.estimator.bumps() if bump.stay_put.after == stance.index]
-        if bumped:
-            self._solver.withdraw()
-        return bumped or one
+        return one
+
+
+def enter_stance(
+    solver: StanceSolver, record: Recorded, stance: Stance, tracks: StanceTracks | None = None
+) -> EnteredStance | list[Bump]:
+    """Measure a stance and enter it into the estimate.
+
+    Returns
+    -------
+    EnteredStance or list of Bump
+        The entered stance; or bumps of its anchors, by which the estimate is contradicted: then it has not entered.
+
+    Raises
+    ------
+    ColocError
+        If it measures nothing, or cannot enter.
+    """
+    noisy = Restated(record, solver.noise.used(record.team))  # as a logged run is measured
+    pairs = solver.measure(record, stance, tuple(measure_stance(noisy, stance, solver.options, tracks)))
+    unusable = [pair.homography.unusable for pair in pairs if pair.homography.unusable]
+    if len(unusable) == len(pairs):
+        raise RobotError(f"stance {stance.index} measures nothing: {unusable[0]}")
+    try:
+        one = solver.enter(record, stance, pairs)
+    except ColocError as error:
+        raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
+    if not one.estimate.rejected and one.estimate.agreement.p_value() > CONTRADICTED:
+        return one
+    # contradicted: was an anchor pushed since the stance before?
+    bumped = [bump for bump in solver.estimator.bumps() if bump.stay_put.after == stance.index]
+    if bumped:
+        solver.withdraw()
+    return bumped or one
 
 
 def _result(done: "Future[T]", what: str) -> T:

@@ -5,8 +5,6 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-import numpy as np
-
 from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.machine import machine
@@ -14,6 +12,7 @@ from coloc_graph.online.bumps import displaced, pushed
 from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.decision_worker import DecisionWorker
 from coloc_graph.online.estimation_worker import EstimationWorker
+from coloc_graph.online.journal import row_of, row_of_entered
 from coloc_graph.online.leap_planner import Situation, StancePlan, StancePlanner
 from coloc_graph.online.mission import MissionOptions, roles
 from coloc_graph.online.mission_log import MissionLog
@@ -292,7 +291,9 @@ class LeapFrog:
         if attempt.complete:
             self._enter(MissionState.ESTIMATING)
             end = self._registry.record.rounded(attempt.last_image + MARGIN)
-            self._worker.enter(replace(attempt.stance, end=end, anchors=self._anchors()))
+            stance = replace(attempt.stance, end=end, anchors=self._anchors())
+            self._log.note("entering", **row_of(stance, self._registry.record.counts))
+            self._worker.enter(stance)
         elif self.states.lasted(COLLECT_TIME):
             raise RobotError(f"not all images of stance {self._index} came within {COLLECT_TIME:.0f} s")
 
@@ -309,15 +310,7 @@ class LeapFrog:
         self.latencies.append(latency)
         self._registry.follow(one)
         self._decisions.take(one, self._registry.poses())
-        self._log.note(
-            "entered",
-            stance=one.stance.index,
-            anchors=one.stance.anchors,
-            latency=round(latency, 4),
-            points=min((len(p.correspondences) for p in one.pairs if p.correspondences is not None), default=0),
-            poses={name: np.round(pose.matrix(), 12).tolist() for name, pose in one.estimate.poses.items()},
-            rejected=[str(refusal.measurement) for refusal in one.estimate.rejected],
-        )
+        self._log.note("entered", **row_of_entered(one), latency=round(latency, 4))
         if self._on_stance is not None:
             self._on_stance(one)
         self._failures, self.attempt = 0, None

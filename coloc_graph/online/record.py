@@ -2,7 +2,7 @@
 
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +19,44 @@ T = TypeVar("T", Detections, OdometrySample)
 MEMORY = 600.0  # newest part of the run that is kept in memory too [s]
 
 
-class Record:
+class _InMemory:
+    """Records in memory, read as `run.Recorded`."""
+
+    _detections: Mapping[str, list[Detections]]
+    _odometry: Mapping[str, list[OdometrySample]]
+
+    def has_detections(self, robot: str) -> bool:
+        """Return True: robots send detections."""
+        return True
+
+    def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
+        """Return the detections of a robot's camera in a time span [UTC s]."""
+        return iter(_between(self._detections.get(robot, ()), start, end))
+
+    def images(self, robot: str, start: float, end: float) -> Iterator[Image]:
+        """Return no images: they stay on the robot."""
+        return iter(())
+
+    def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
+        """Return a robot's odometry in a time span [UTC s]."""
+        return iter(_between(self._odometry.get(robot, ()), start, end))
+
+
+class Excerpt(_InMemory):
+    """Records of a mission as they were at an instant."""
+
+    def __init__(
+        self,
+        path: Path,
+        team: Team,
+        detections: Mapping[str, list[Detections]],
+        odometry: Mapping[str, list[OdometrySample]],
+    ) -> None:
+        self.path, self.team, self._detections, self._odometry = path, team, detections, odometry
+        self.planes: dict[int, Planes] = {}
+
+
+class Record(_InMemory):
     """A run that is written while it is measured, and read as `run.Recorded`; a context manager.
 
     A late sample gets the time of the last one of its kind, since time does not run backwards in a run.
@@ -32,6 +69,7 @@ class Record:
         self._detections: dict[str, list[Detections]] = defaultdict(list)
         self._odometry: dict[str, list[OdometrySample]] = defaultdict(list)
         self._moving: dict[str, tuple[bool, float]] = {}
+        self._counts = {name: [0, 0] for name in team.names}
         self._lock = machine.new_lock()
 
     def __enter__(self) -> Self:
@@ -45,6 +83,7 @@ class Record:
     def take(self, one: Detections | OdometrySample) -> Detections | OdometrySample:
         """Add a record; return it as it will be read from the run."""
         with self._lock:
+            self._counts[one.robot][isinstance(one, OdometrySample)] += 1
             if isinstance(one, Detections):
                 return self._into(self._detections[one.robot], one)
             return self._into(self._odometry[one.robot], one)
@@ -59,8 +98,22 @@ class Record:
                 self._writer.write(Motion(robot, time, moving))
 
     def complete(self, stance: Stance) -> None:
-        """Add a stance that has entered the estimate."""
+        """Add a stance that has entered the estimate; a killed process does not lose it."""
         self._writer.write(stance)
+        self._writer.flush()
+
+    @property
+    def counts(self) -> dict[str, tuple[int, int]]:
+        """Number of detections and of odometry samples of each robot, of the whole run."""
+        with self._lock:
+            return {name: tuple(self._counts[name]) for name in self.team.names}  # type: ignore[misc]
+
+    def now(self) -> "Excerpt":
+        """Return all that is in memory, as it is now."""
+        with self._lock:
+            detections = {name: list(kept) for name, kept in self._detections.items()}
+            odometry = {name: list(kept) for name, kept in self._odometry.items()}
+        return Excerpt(self.path, self.team, detections, odometry)
 
     def rounded(self, time: float) -> float:
         """Round a time [UTC s] as it will be read from the run."""
@@ -75,22 +128,6 @@ class Record:
         seen = [kept[-1].time for kept in self._detections.values() if kept]
         rolled = [kept[-1].time for kept in self._odometry.values() if kept]
         return max([*seen, *rolled], default=0.0)
-
-    def has_detections(self, robot: str) -> bool:
-        """Return True: robots send detections."""
-        return True
-
-    def detections(self, robot: str, start: float, end: float) -> Iterator[Detections]:
-        """Return the detections of a robot's camera in a time span [UTC s]."""
-        return iter(_between(self._detections[robot], start, end))
-
-    def images(self, robot: str, start: float, end: float) -> Iterator[Image]:
-        """Return no images: they stay on the robot."""
-        return iter(())
-
-    def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
-        """Return a robot's odometry in a time span [UTC s]."""
-        return iter(_between(self._odometry[robot], start, end))
 
     def _into(self, kept: list[T], one: T) -> T:
         time = max(self.rounded(one.time), kept[-1].time if kept else 0.0)

@@ -2,7 +2,9 @@
 
 import logging
 import threading
+from pathlib import Path
 
+from coloc_graph.online.journal import Journal, read_attempts
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.pipeline.incremental import StanceSolver
 from coloc_graph.run import Run, Stance
@@ -10,17 +12,19 @@ from coloc_graph.run import Run, Stance
 log = logging.getLogger(__name__)
 
 
-def restore(before: Run, solver: StanceSolver, registry: RobotRegistry, stop: threading.Event) -> list[Stance]:
-    """Enter the stances of an earlier run, and set the robots' poses; return the stances.
+def restore(
+    before: Run, log_path: Path, solver: StanceSolver, registry: RobotRegistry, stop: threading.Event
+) -> list[Stance]:
+    """Enter the stances of an earlier run as they entered then, and set the robots' poses; return the stances.
 
     Ends early when `stop` is set.
     """
     registry.restore()
     stances: list[Stance] = []
-    for stance in before.stances:
+    for _, one in Journal(before, read_attempts(log_path)).enter(solver):
         if stop.is_set():
             return stances
-        registry.follow(solver.enter(before, stance))
-        stances.append(stance)
+        registry.follow(one)
+        stances.append(one.stance)
     log.info("continues after %d stances", len(stances))
     return stances

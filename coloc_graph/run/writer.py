@@ -151,6 +151,13 @@ class RunWriter:
             if self._started:
                 self._on_disk(lambda: self._message(*self._of_team(schemas.TRUE_TEAM_TOPIC, team), self._start_ns))
 
+    def flush(self) -> None:
+        """Hand all that was written to the operating system now."""
+        with self._lock:
+            self._check_open()
+            self._on_disk(lambda: self._start(0))
+            self._on_disk(self._flush)
+
     def close(self) -> None:
         """Finish the file; afterwards nothing can be written. Closing twice does nothing."""
         self._stop.set()
