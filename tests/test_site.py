@@ -3,6 +3,7 @@
 import argparse
 import ast
 import inspect
+import json
 import re
 import sys
 from importlib import import_module, util
@@ -20,10 +21,13 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 MAX_EXAMPLE_LINES = 40
 FEWEST_EXAMPLES = 8
 FEWEST_QUESTIONS = 30
+ROUNDING = 0.25  # relative difference from the figures of docs/data-set.md above which the page is out of date
 SHELL = re.compile(r"^```sh\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 #: Examples that take more than a few seconds of CPU, and what pages that use them.
 LONG_EXAMPLES = {"best_formation", "many_runs", "two_videos", "honest_covariances"}
-LONG_PAGES = {"two-videos", "covariances", "plan"}
+LONG_PAGES = {"two-videos", "covariances", "plan", "dask"}
+#: Pages with the same first commands, which run in one folder and run these once.
+TOGETHER = {"first-result", "evo"}
 TUTORIALS = [*sorted((DOCS / "start").glob("*.md")), *sorted((DOCS / "concepts").glob("*.md"))]
 TUTORIALS += sorted((DOCS / "tutorials").glob("*.md"))
 WITH_COMMANDS = [path for path in TUTORIALS if SHELL.search(path.read_text(encoding="utf-8"))]
@@ -42,6 +46,12 @@ def reference(monkeypatch):
         sys.modules.pop(name, None)
 
 
+@pytest.fixture(scope="module")
+def shared_folder(tmp_path_factory):
+    """Folder of pages that begin alike, and the commands that were run in it."""
+    return tmp_path_factory.mktemp("pages"), set()
+
+
 @pytest.fixture
 def quiet_plots():
     matplotlib.use("agg")
@@ -50,16 +60,32 @@ def quiet_plots():
 
 
 @pytest.mark.parametrize("page", marked(WITH_COMMANDS, LONG_PAGES))
-def test_the_commands_of_a_page_run_as_they_stand(page, tmp_path, monkeypatch, capsys, quiet_plots):
+def test_the_commands_of_a_page_run_as_they_stand(page, shared_folder, tmp_path, monkeypatch, capsys, quiet_plots):
+    folder, done = shared_folder if page.stem in TOGETHER else (tmp_path, set())
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     if page.stem == "mrclam":
-        make(tmp_path / "MRCLAM_Dataset6", seconds=20.0)
-    monkeypatch.chdir(tmp_path)
-    done = set()
+        make(tmp_path / "MRCLAM_Dataset6", seconds=8.0, robots=(1, 2))
+    monkeypatch.chdir(folder)
     for block in SHELL.findall(page.read_text(encoding="utf-8")):
         for command in block.replace("\\\n", " ").splitlines():
             run_line(command, done)
     assert done
+    capsys.readouterr()
+
+
+def test_the_data_set_gives_what_its_page_says(shared_folder, monkeypatch, capsys):
+    folder, done = shared_folder
+    monkeypatch.chdir(folder)
+    first = (DOCS / "start" / "first-result.md").read_text(encoding="utf-8")
+    for command in "\n".join(SHELL.findall(first)).splitlines():
+        run_line(command, done)
+    page = (DOCS / "data-set.md").read_text(encoding="utf-8")
+    for method, result in (("chain", "chain"), ("smooth", "smooth"), ("joint", "result")):
+        row = re.search(rf"^\| [*`]+{method}`[^|]*\| ([\d.]+), ([\d.]+) % \| [^|]* \| [*]*([\d.]+) mm", page, re.M)
+        accuracy = json.loads((folder / result / "summary.json").read_text(encoding="utf-8"))["accuracy"]
+        assert 1e3 * accuracy["ate_m"] == pytest.approx(float(row[3]), rel=ROUNDING), method
+        for robot, stated in zip("AB", row.groups(), strict=False):
+            assert accuracy["length_error_percent"][robot] == pytest.approx(float(stated), rel=ROUNDING), method
     capsys.readouterr()
 
 
