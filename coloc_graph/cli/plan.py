@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.planning.mission import stances_of
     from coloc_graph.planning.plan import write_plan
     from coloc_graph.planning.prediction import Predictor
-    from coloc_graph.planning.roles import pair_of
+    from coloc_graph.planning.roles import best_roles, roles_of
     from coloc_graph.run.atomic_file import require_writable
     from coloc_graph.team import read_team
 
@@ -106,15 +106,17 @@ def run(args: argparse.Namespace) -> int:
     for name, value in (("speed", args.speed), ("fps", args.fps), ("noise", args.noise)):
         if value is not None and not 0 < value < 1e6:
             raise InputError(f"--{name} is {value}; give a number above 0")
-    pair, mover, left = pair_of(team, args.mover)
-    if left:
-        warn([f"{', '.join(left)} stay out of this plan, which is of two observers and a mover"])
-    fps = min(team[name].camera.fps for name in pair) if args.fps is None else args.fps
-    predictor = Predictor(team, fps, args.noise, odometry=not args.without_odometry, speed=args.speed)
-    if args.goal is not None:
-        return _along(args, predictor, pair, mover)
-    if args.map is not None:
+    if args.map is not None and args.goal is None:
         raise InputError("a map needs a goal on it: give --goal X,Y")
+    rates = [robot.camera.fps for robot in team.robots if robot.camera_if_any is not None]
+    fps = args.fps or min(rates, default=1.0)
+    predictor = Predictor(team, fps, args.noise, odometry=not args.without_odometry, speed=args.speed)
+    observers, mover, left = best_roles(predictor) if args.mover is None else roles_of(team, args.mover)
+    if left:
+        warn([f"{', '.join(left)} stay out of this plan"])
+    if args.goal is not None or len(observers) > 2:
+        return _along(args, predictor, observers, mover)
+    pair = observers[0], observers[1]
     search = GaitSearch(predictor, args.length, pair, mover)
     capture = PAPER_SECONDS * stances_of(PAPER, args.length) if args.time is None and args.sigma_end is None else None
     time = search.shortest(args.sigma_end) if args.sigma_end is not None else args.time
@@ -147,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _along(args: argparse.Namespace, predictor: "Predictor", pair: tuple[str, str], mover: str) -> int:
+def _along(args: argparse.Namespace, predictor: "Predictor", observers: tuple[str, ...], mover: str) -> int:
     """Plan a mission along goals by the receding horizon."""
     from dataclasses import replace
 
@@ -159,23 +161,20 @@ def _along(args: argparse.Namespace, predictor: "Predictor", pair: tuple[str, st
     from coloc_graph.planning.plan import write_plan
 
     if args.sigma_end is not None:
-        raise InputError("--sigma-end is of straight ways: leave out --goal, or give its --time")
+        raise InputError("--sigma-end is of straight ways of two observers: give --time instead")
     if not 0 < args.pace < 1e4:
         raise InputError(f"--pace is {args.pace}; give seconds of the mission a metre, above 0")
     if args.map is not None:
         predictor = replace(predictor, floor_map=read_floor_map(args.map))
-    course = Course(((0.0, 0.0), *args.goal))
+    course = Course(((0.0, 0.0), *(args.goal or [(args.length, 0.0)])))
     seconds = args.pace * course.length if args.time is None else args.time
-    horizon = Horizon(predictor, course, pair, mover, seconds, timed=True)
-    starts = {}
-    for k, name in enumerate(pair):
-        x, y, yaw = predictor.stop(horizon.gait, pair, k)
-        starts[name] = x - horizon.gait.leap / 2, y, yaw
+    horizon = Horizon(predictor, course, observers, mover, seconds, timed=True)
+    starts = horizon.starts()
     best = horizon.mission(Belief.start(predictor.team, {**starts, mover: (1.5, 0.0, 0.0)}))
     if args.json:
         print_json({"the plan": figures(horizon.gait, best)})
     else:
-        print(f"{course.length:.1f} m in {seconds / 60:.1f} min; {' and '.join(pair)} observe, {mover} moves")
+        print(f"{course.length:.1f} m in {seconds / 60:.1f} min; {', '.join(observers)} observe, {mover} moves")
         print_table(_HEADER, [_row("the plan", horizon.gait, best, predictor.fps)])
         print("leap, abreast and toe-in: those by which the rest of the way is expected to go")
     if args.poses is not None:

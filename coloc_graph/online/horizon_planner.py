@@ -68,6 +68,11 @@ class HorizonPlanner:
         gait: Gait | None = None,
     ) -> None:
         self._team, self._mover, self._observers = team, mover, observers
+        if len(observers) != 2:
+            raise InputError(
+                f"{len(observers)} observers are to leap, and online plans are made for two and a mover: leave the "
+                "others out of the team"
+            )
         fps = min(team[name].camera.fps for name in observers)
         self._predictor = Predictor(team, fps, FIRST_NOISE, speed=speed, floor_map=floor_map)
         self._left = pace * course.length
@@ -110,8 +115,9 @@ class HorizonPlanner:
         drive = np.concatenate([drive[::-1] if attempt % 2 else drive, middle])
         if attempt:
             drive = np.concatenate([middle, drive])
+        detour = self._detour(situation.poses, leap)
         promise = self._promise(decision)
-        self._plan = StancePlan(index, leap, drive, decision.stance.duration, PASSING, promise, approach)
+        self._plan = StancePlan(index, leap, drive, decision.stance.duration, PASSING, promise, approach, detour)
         return self._plan
 
     def take(self, entered: EnteredStance, poses: Mapping[str, Planar]) -> None:
@@ -168,6 +174,14 @@ class HorizonPlanner:
         if self._belief is None:
             self._belief = Belief.start(self._team, poses)
         return replace(self._belief, poses={name: poses[name] for name in self._belief.robots})
+
+    def _detour(self, poses: Mapping[str, Planar], leap: tuple[str, Planar] | None) -> tuple[tuple[float, float], ...]:
+        """Return the waypoints of an observer before its target."""
+        if leap is None:
+            return ()
+        leaper, target = leap
+        others = [poses[name][:2] for name in self._observers if name != leaper]
+        return tuple(route(poses[leaper][:2], target[:2], others, self._predictor.free)[:-1])
 
     def _approach(
         self, decision: Decision, poses: Mapping[str, Planar], leap: tuple[str, Planar] | None

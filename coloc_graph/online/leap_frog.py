@@ -190,7 +190,7 @@ class LeapFrog:
             if not arrived and not self._plan.may_leap(poses[leaper], poses[self.mover]):
                 return
             self._leap = None
-            self._commander.drive(leaper, [(x, y)], yaw, backwards=False)
+            self._commander.drive(leaper, [*self._plan.detour, (x, y)], yaw, backwards=False)
 
     def _place(self) -> None:
         self._commander.resume_drives()

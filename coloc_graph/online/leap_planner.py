@@ -57,8 +57,8 @@ class StancePlan:
         [m]; None to send it at once.
     promise
         What the stance is expected to bring; None where nothing is predicted.
-    approach
-        Waypoints (n, 2) [m] of the mover before the first one of `patrol`.
+    approach, detour
+        Waypoints (n, 2) [m] of the mover before the first one of `patrol`, and of the observer before its target.
     """
 
     index: int
@@ -68,6 +68,7 @@ class StancePlan:
     passing: float | None = None
     promise: StancePromise | None = None
     approach: tuple[tuple[float, float], ...] = ()
+    detour: tuple[tuple[float, float], ...] = ()
 
     @property
     def placing(self) -> NDArray[np.float64]:
@@ -96,10 +97,9 @@ class StancePlan:
         """Return whether the observer, where it stands, may set off while the mover is on its way to its drive."""
         if self.leap is None or self.passing is None:
             return True
-        way = [mover[:2], *self.placing.tolist()]
-        return all(
-            segment_distance(leaper[:2], self.leap[1][:2], a, b) > self.passing for a, b in itertools.pairwise(way)
-        )
+        way = itertools.pairwise([mover[:2], *self.placing.tolist()])
+        leap = itertools.pairwise([leaper[:2], *self.detour, self.leap[1][:2]])
+        return all(segment_distance(*one, *other) > self.passing for one, other in itertools.product(leap, way))
 
     def drives(self, robot: str, mover: str) -> bool:
         """Return whether a robot drives in this plan, whose mover is `mover`."""

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from coloc_graph.planning.plan import Plan
-from coloc_graph.planning.route import TO_ROBOT, TO_WALL, Free, clear_way
+from coloc_graph.planning.route import TO_ROBOT, TO_WALL, Free, clear_way, reachable
 
 TOLERANCE = 0.01  # distances are taken to be kept to this [m]
 
@@ -40,10 +40,17 @@ def conflicts(plan: Plan, free: Free | None = None) -> list[tuple[int, str]]:
         for name in stance.leapers:
             if name in before:
                 others = [place for other, place in places.items() if other != name]
-                way = [before[name], places[name]]
-                if not clear_way(way, others, free, to_robot=TO_ROBOT - TOLERANCE):
-                    found.append((k, f"{name} cannot leap in a straight line: a robot or a wall is in its way"))
+                if not _reaches(before[name], places[name], others, free):
+                    found.append((k, f"{name} cannot leap there: robots or walls are in its way"))
         if not clear_way(stance.waypoints, list(places.values()), free, to_robot=TO_ROBOT - TOLERANCE):
             found.append((k, f"the drive of {stance.mover} comes too near to a robot or a wall"))
         before = {**before, **places}
     return found
+
+
+def _reaches(
+    start: tuple[float, float], goal: tuple[float, float], others: list[tuple[float, float]], free: Free | None
+) -> bool:
+    if clear_way([start, goal], others, free, to_robot=TO_ROBOT - TOLERANCE):
+        return True
+    return bool(reachable(start, [goal], others, free)[0])

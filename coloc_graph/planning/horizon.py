@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar
+from coloc_graph.planning.beam import Node, different
 from coloc_graph.planning.belief import Belief, updated
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.drive import effective_seconds
@@ -25,11 +27,13 @@ from coloc_graph.planning.rollout import Rollout
 Array = NDArray[np.float64]
 
 DEPTH = 2  # stances that are looked ahead
-DIFFERENT = 0.15  # poses are compared one by one from this distance on, in which a radian counts as 0.5 m [m]
 BEAM = 6  # plans that are followed from one stance to the next
+MANY_BEAM = 3  # the same of more than two observers
 SHARES = (0.6, 1.0, 1.7)  # durations of a stance that are compared, relative to the pace of the mission
 PREFERRED = 1.03  # the gait's own leap is left for one that promises a variance this much smaller
 MAX_STANCE_DURATION = 60.0  # longest duration of a stance [s]
+ROW = 0.6  # distance between rows of observers at the beginning [m]
+STRAGGLE = 2.2  # an observer further behind the foremost one than this leaps next [m]
 MIN_CELLS = 3  # cells of the common view without which a stance is not planned
 MAX_STANCES = 2000
 ARRIVED = 0.1  # the goal is reached within this distance along the course [m]
@@ -37,18 +41,6 @@ ARRIVED = 0.1  # the goal is reached within this distance along the course [m]
 #: What decides between stances: the variance at the goal with the cost to go, the information gained, the size of the
 #: common view, or nothing.
 Objective = Literal["goal", "information", "view", "random"]
-
-
-@dataclass(frozen=True, eq=False)
-class _Node:
-    """A team after some planned stances: what it is believed to be, and how it came there."""
-
-    belief: Belief
-    standing: Mapping[str, Planar]
-    seconds: float
-    score: float
-    choices: tuple[tuple[str, Planar, float], ...] = ()
-    by_gait: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,15 +118,13 @@ class Horizon:
                 if not predictor.floor_map.clear(np.array([x, y]), 0.2):
                     what = "the goal" if way else "the start"
                     raise InputError(f"{what} at {x:.2f}, {y:.2f} is in a wall or beyond the map: give another one")
-        if len(self.observers) != 2:
-            raise InputError(
-                f"{len(self.observers)} observers are to leap, and plans are made for two and a mover: leave the "
-                "others out of the team"
-            )
-        self._rollout = Rollout(
-            predictor, course, (self.observers[0], self.observers[1]), mover, seconds, gait, timed=timed
-        )
-        self.gait = self._rollout.gait
+        first, *others = combinations(self.observers, 2)
+        rollout = Rollout(predictor, course, first, mover, seconds, gait, timed=timed)
+        self.gait = rollout.gait
+        self._rollouts = {frozenset(first): rollout}
+        for pair in others:
+            one = Rollout(predictor, course, pair, mover, seconds, self.gait, timed=timed)
+            self._rollouts[frozenset(pair)] = one
 
     def mission(self, belief: Belief) -> Mission:
         """Plan the whole mission of a team from where it stands, as if all went as planned.
@@ -170,9 +160,23 @@ class Horizon:
                 raise InputError(f"the goal is not reached in {MAX_STANCES} stances: give a nearer one, or more goals")
             decision = self.next(belief, left)
 
+    def starts(self) -> dict[str, Planar]:
+        """Return poses from which the observers can begin at the origin: two in the gait, the others behind them."""
+        poses = {}
+        for k, name in enumerate(self.observers):
+            x, y, yaw = self.gait.stop(k % 2)
+            row = k // 2 * max(ROW, self.gait.leap)
+            poses[name] = x - self.gait.leap / 2 - row, y, yaw - self.predictor.camera_yaw(name)
+        return poses
+
     def remaining(self, standing: Mapping[str, Planar]) -> float:
-        """Return the way that is left from the middle of the observers to the goal [m]."""
-        return self.course.length - float(np.mean([self.course.way_of(standing[name]) for name in self.observers]))
+        """Return the way that is left from the middle of the observers to the goal [m].
+
+        One that is beyond it makes up for another by half a leap at most.
+        """
+        last = self.course.length + 0.5 * self.gait.leap
+        ways = [min(self.course.way_of(standing[name]), last) for name in self.observers]
+        return self.course.length - float(np.mean(ways))
 
     def arrived(self, standing: Mapping[str, Planar]) -> bool:
         """Return whether the middle of the observers has reached the goal."""
@@ -187,7 +191,7 @@ class Horizon:
             If the observers have no common view there.
         """
         standing = {name: belief.poses[name] for name in self.observers}
-        each = self._rollout.stance_seconds(self.seconds)
+        each = self._rollout_of(belief.poses).stance_seconds(self.seconds)
         seconds = min(max(each, MIN_STANCE_DURATION), MAX_STANCE_DURATION, max(self.seconds, 1.0))
         stance, promise = best_stance(self.predictor, belief, standing, (), self.mover, seconds, self.goal)
         return Decision(stance, promise, (), reason="the first stance is where the team stands")
@@ -212,7 +216,7 @@ class Horizon:
             If no observer can leap anywhere from where it shares a view with the others.
         """
         standing = {name: belief.poses[name] for name in self.observers}
-        beam = [_Node(belief, standing, seconds, 0.0)]
+        beam = [Node(belief, standing, seconds, 0.0)]
         best = beam
         for depth in range(self.depth):
             grown = [
@@ -225,7 +229,7 @@ class Horizon:
             if not grown:
                 break
             grown.sort(key=lambda node: node.score)
-            best = beam = _different(grown)
+            best = beam = different(grown, BEAM if len(self.observers) == 2 else MANY_BEAM)
             if self.objective != "goal" or self.arrived(best[0].standing):
                 break
         if not best[0].choices:
@@ -236,14 +240,16 @@ class Horizon:
             )
         leaper, target, duration = best[0].choices[0]
         after = belief.after_leap(leaper, target, odometry=self.predictor.odometry)
-        anchors = tuple(name for name in self.observers if name != leaper)
+        anchors = self.foremost_first(belief.poses, leaper)
         placed = {name: after.poses[name] for name in (*anchors, leaper)}
         leapt = math.dist(belief.poses[leaper][:2], target[:2])
         stance, promise = best_stance(self.predictor, after, placed, anchors, self.mover, duration, self.goal, leapt)
         if self.objective != "goal":
             return Decision(stance, promise, best[0].choices)
         ahead = best[0].choices
-        reason = self._rollout.reason(promise.belief, leaper, seconds - self._spent(duration, belief, leaper, target))
+        reason = self._rollout_of(promise.belief.poses, leaper).reason(
+            promise.belief, leaper, seconds - self._spent(duration, belief, leaper, target)
+        )
         if not best[0].by_gait and len(ahead) == 1:
             reason += "; this leap promises less than the gait's own"
         return Decision(stance, promise, ahead, math.sqrt(best[0].score), reason)
@@ -258,21 +264,37 @@ class Horizon:
         x, y, _ = self.course.at(self.course.length)
         return x, y
 
-    def _expand(self, node: _Node, avoid: Sequence[Planar], *, in_lane: bool, leaper: str | None = None) -> list[_Node]:
+    def foremost_first(self, poses: Mapping[str, Planar], leaper: str) -> tuple[str, ...]:
+        """Return the observers but the one that leaps, the foremost first."""
+        others = (name for name in self.observers if name != leaper)
+        return tuple(sorted(others, key=lambda name: -self.course.way_of(poses[name])))
+
+    def _rollout_of(self, poses: Mapping[str, Planar], leaper: str | None = None) -> Rollout:
+        """Return the rest of the mission as the pair in front does it: the one that leaps, and the foremost anchor."""
+        by_way = sorted(self.observers, key=lambda name: -self.course.way_of(poses[name]))
+        leaper = by_way[0] if leaper is None else leaper
+        partner = next(name for name in by_way if name != leaper)
+        return self._rollouts[frozenset((leaper, partner))]
+
+    def _expand(self, node: Node, avoid: Sequence[Planar], *, in_lane: bool, leaper: str | None = None) -> list[Node]:
         """Find the possible next stances of a team, each with its score: the least is the best.
 
-        The one furthest behind leaps; if it cannot now, the other one. The rest of the mission goes by the gait;
+        The one furthest behind leaps, or of larger teams one of the two; if it cannot, another. The rest goes by the
+        gait;
         `in_lane` restricts them to where the gait goes on exactly.
         """
         by_way = sorted(self.observers, key=lambda name: self.course.way_of(node.standing[name]))
+        ways = [self.course.way_of(node.standing[name]) for name in by_way]
+        straggles = ways[-1] - ways[0] > STRAGGLE
         by_way = by_way[:1] if in_lane else by_way
-        for name in by_way if leaper is None else (leaper,):
-            grown = self._leaps_of(node, name, avoid, in_lane=in_lane)
-            if grown:
-                return grown
-        return []
+        grown: list[Node] = []
+        for number, name in enumerate(by_way if leaper is None else (leaper,)):
+            if grown and (number > 1 or straggles or len(self.observers) == 2):
+                break
+            grown += self._leaps_of(node, name, avoid, in_lane=in_lane)
+        return grown
 
-    def _leaps_of(self, node: _Node, leaper: str, avoid: Sequence[Planar], *, in_lane: bool) -> list[_Node]:
+    def _leaps_of(self, node: Node, leaper: str, avoid: Sequence[Planar], *, in_lane: bool) -> list[Node]:
         leaps = possible_leaps(
             node.belief, leaper, self.course, self.gait, self.observers, self.predictor, avoid, in_lane=in_lane
         )
@@ -294,7 +316,7 @@ class Horizon:
             ]
         return self._scored(node, leaps, seen, observers, self.predictor.fps * information[seen])
 
-    def _durations(self, node: _Node, leaps: Leaps, n: int) -> Array:
+    def _durations(self, node: Node, leaps: Leaps, n: int) -> Array:
         """Durations of a stance that are compared, (3,) [s]."""
         left = max(self.remaining(node.standing), ARRIVED)
         leapt = leaps.times[n] if self.timed else 0.0
@@ -308,8 +330,8 @@ class Horizon:
         return np.asarray(np.clip(share * np.array(SHARES), MIN_STANCE_DURATION, longest))
 
     def _scored(
-        self, node: _Node, leaps: Leaps, seen: NDArray[np.int64], observers: tuple[str, ...], information: Array
-    ) -> list[_Node]:
+        self, node: Node, leaps: Leaps, seen: NDArray[np.int64], observers: tuple[str, ...], information: Array
+    ) -> list[Node]:
         belief, at = node.belief, node.belief.index(leaps.leaper)
         pose = slice(at, at + 6)
         F, Q = leaps.F[seen], leaps.Q[seen]
@@ -327,11 +349,12 @@ class Horizon:
                 self._child(node, leaps, int(n), float(t[1]), float(v), C[1])
                 for n, t, v, C in zip(seen, durations, value, after, strict=True)
             ]
-        used, targets = self._rollout.rows(belief), leaps.targets[seen]
+        rollout, targets = self._rollout_of(belief.poses, leaps.leaper), leaps.targets[seen]
+        used = rollout.rows(belief)
         poses = {name: np.broadcast_to(belief.poses[name], targets.shape) for name in leaps.anchors}
         poses[leaps.leaper] = targets
         value = np.stack([
-            self._rollout.end_variance(
+            rollout.end_variance(
                 after[:, k][:, used[:, None], used],
                 poses,
                 leaps.leaper,
@@ -348,8 +371,8 @@ class Horizon:
         ]
 
     def _child(
-        self, node: _Node, leaps: Leaps, n: int, seconds: float, score: float, covariance: Array | None = None
-    ) -> _Node:
+        self, node: Node, leaps: Leaps, n: int, seconds: float, score: float, covariance: Array | None = None
+    ) -> Node:
         x, y, yaw = leaps.targets[n].tolist()
         target = x, y, yaw
         poses = {**node.belief.poses, leaps.leaper: target}
@@ -358,17 +381,4 @@ class Horizon:
         choice = leaps.leaper, target, seconds
         left = node.seconds - seconds - self.timed * float(leaps.times[n])
         standing = {**node.standing, leaps.leaper: target}
-        return _Node(belief, standing, left, score, (*node.choices, choice), bool(leaps.by_gait[n]))
-
-
-def _different(nodes: Sequence[_Node]) -> list[_Node]:
-    """Choose the best nodes whose robots stand in different poses, with the gait's own."""
-    chosen: list[_Node] = []
-    for node in nodes:
-        x, y, yaw = node.choices[-1][1]
-        others = [other.choices[-1][1] for other in chosen]
-        if node.by_gait or all(math.hypot(x - a, y - b) + 0.5 * abs(yaw - c) > DIFFERENT for a, b, c in others):
-            chosen.append(node)
-        if len(chosen) == BEAM and any(one.by_gait for one in chosen):
-            break
-    return chosen
+        return Node(belief, standing, left, score, (*node.choices, choice), bool(leaps.by_gait[n]))

@@ -14,7 +14,7 @@ from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.mission import leap_time
 from coloc_graph.planning.prediction import Predictor
-from coloc_graph.planning.route import TO_ROBOT
+from coloc_graph.planning.route import TO_ROBOT, reachable
 from coloc_graph.planning.slip import view_margin
 
 Array = NDArray[np.float64]
@@ -28,6 +28,7 @@ BEND = 0.1  # turn of the course that is a corner [rad]
 MAX_LEAP = 1.5  # advance of a target [m]
 TO_WALL = 0.25  # least distance of a robot's middle from walls [m]
 STEP = 0.1  # distance between places of a leap that are checked [m]
+MANY = 4  # observers from which on fewer targets are compared, each of which costs more
 FAILED = 0.15  # targets nearer to one that failed are avoided [m]
 
 
@@ -89,13 +90,18 @@ def possible_leaps(
         True for targets in the gait's formation alone, and, at corners, beside the course.
     """
     ways = {name: course.way_of(belief.poses[name]) for name in observers}
-    anchors = tuple(name for name in observers if name != leaper)
-    front = max(ways[name] for name in anchors)
+    anchors = tuple(sorted((name for name in observers if name != leaper), key=lambda name: -ways[name]))
+    front = ways[anchors[0]]
     targets, gains, by_gait = [], [], []
     lane = -1.0 if observers.index(leaper) % 2 else 1.0
+    if len(observers) > 2:  # beside the foremost one
+        x, y, heading = course.at(front)
+        ahead = belief.poses[anchors[0]]
+        lane = 1.0 if (ahead[1] - y) * np.cos(heading) - (ahead[0] - x) * np.sin(heading) < 0 else -1.0
     before = course.at(front)[2]
     turning = any(abs(float(wrap(course.at(front + ahead)[2] - before))) > BEND for ahead in (AHEAD, 2 * AHEAD))
-    for advance, side, width, toe, turned in product(ADVANCES, (-1.0, 1.0), WIDTHS, TOE_INS, TURNS):
+    toe_ins = TOE_INS if len(observers) < MANY else TOE_INS[:2]
+    for advance, side, width, toe, turned in product(ADVANCES, (-1.0, 1.0), WIDTHS, toe_ins, TURNS):
         way = front + min(advance * gait.leap, MAX_LEAP)
         x, y, heading = course.at(way)
         # near a corner a robot may look into it
@@ -132,16 +138,24 @@ def possible_leaps(
 
 
 def _clear(start: Array, targets: Array, others: Array, floor_map: FloorMap | None) -> NDArray[np.bool_]:
-    """Return which targets (n, 2) a robot can reach in a straight line from `start`, clear of others and walls."""
+    """Return which targets (n, 2) a robot can reach from `start`, clear of others and walls.
+
+    In a straight line, if there are such; else round what is in its way.
+    """
     longest = float(np.hypot(*(targets - start).T).max(initial=STEP))
     along = np.linspace(0.0, 1.0, int(np.ceil(longest / STEP)) + 1)[:, None]
     way = start + along * (targets - start)[:, None]
-    good = np.ones(len(targets), bool)
+    good, straight = np.ones((2, len(targets)), bool)
     for other in others:
         good &= np.hypot(*np.moveaxis(targets - other, -1, 0)) > TO_ROBOT
         # it may stand nearer already
         least = min(TO_ROBOT, float(np.hypot(*(start - other))) - 0.01)
-        good &= np.hypot(*np.moveaxis(way - other, -1, 0)).min(axis=1) > least
+        straight &= np.hypot(*np.moveaxis(way - other, -1, 0)).min(axis=1) > least
     if floor_map is not None:
-        good &= floor_map.clear(way, TO_WALL).all(axis=1) & floor_map.clear(targets, TO_WALL)
-    return np.asarray(good)
+        straight &= floor_map.clear(way, TO_WALL).all(axis=1)
+        good &= floor_map.clear(targets, TO_WALL)
+    # few are in the way of a pair; of more robots some are
+    if not (good & straight).any():
+        free = None if floor_map is None else floor_map.clear
+        straight[good] = reachable(start, targets[good], others, free)
+    return np.asarray(good & straight)

@@ -36,7 +36,7 @@ class Cells:
     Attributes
     ----------
     places
-        Places (n, 2) [m] where all cameras see all its markers at any heading, and it is clear of robots and walls.
+        Places (n, 2) [m] where two cameras see all its markers at any heading, and it is clear of robots and walls.
     information
         Information (n, d, d) of one image of each camera there.
     standing
@@ -70,7 +70,7 @@ def cells(model: StanceModel, standing: Array, margin: float, free: Free | None 
 
 
 def places_in_common_view(model: StanceModel, standing: Array, margin: float, free: Free | None = None) -> Array:
-    """Places (n, 2) [m] where all cameras see all markers of the mover at any heading, clear of robots and walls."""
+    """Places (n, 2) [m] where two cameras see all markers of the mover at any heading, clear of robots and walls."""
     xy = _grid(model, standing)
     away = np.hypot(*np.moveaxis(xy[:, None] - standing[None, :, :2], -1, 0)).min(axis=1)
     xy = xy[away > CLEARANCE]
@@ -80,7 +80,7 @@ def places_in_common_view(model: StanceModel, standing: Array, margin: float, fr
     rim = reach * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     points = np.concatenate([xy[:, None] + rim, np.full((len(xy), 4, 1), model.p_markers[0, 2])], axis=-1)
     seen = model.in_view(standing, points.reshape(-1, 3), margin).reshape(len(standing), len(xy), 4)
-    return np.asarray(xy[seen.all(axis=(0, 2))])
+    return np.asarray(xy[seen.all(axis=2).sum(axis=0) >= 2])
 
 
 def _grid(model: StanceModel, standing: Array) -> Array:
@@ -226,7 +226,7 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
     Parameters
     ----------
     model
-        The stance's robots; the first observer stands in the same place in all.
+        The stance's robots; all but the last observer stand in the same places in all.
     standing
         Poses (b, r, 3) of the observers.
     margins
@@ -239,20 +239,22 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
     tuple
         Information (b, d, d), and the number (b,) of cells of the common view.
     """
-    xy = _grid(model, standing[0])
+    xy, r = _grid(model, standing[0]), standing.shape[1]
     if free is not None:
         xy = xy[free(xy, CLEARANCE / 2)]
     reach = float(np.hypot(*model.p_markers[:, :2].T).max())
     rim = reach * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     points = np.concatenate([xy[:, None] + rim, np.full((len(xy), 4, 1), model.p_markers[0, 2])], axis=-1)
-    # the first observer is the same in all: what it does not see need not be asked of the others
-    alone = model.in_view(standing[:1], points.reshape(1, -1, 3), 0.0)[0, 0].reshape(-1, 4).all(axis=1)
+    # all but the last observer are the same in all: what none of them sees need not be asked of the last
+    alone = (
+        model.in_view(standing[:1], points.reshape(1, -1, 3), 0.0)[0, :-1].reshape(r - 1, -1, 4).all(axis=2).any(axis=0)
+    )
     xy, points = xy[alone], points[alone]
     if not len(xy):  # it looks at a wall
         return np.zeros((len(standing), model.variables, model.variables)), np.zeros(len(standing), int)
     everywhere = np.broadcast_to(points.reshape(-1, 3), (len(standing), 4 * len(xy), 3))
     seen = model.in_view(standing, everywhere, margins[:, None]).reshape(len(standing), -1, len(xy), 4)
-    common = seen.all(axis=(1, 3))
+    common = seen.all(axis=3).sum(axis=1) >= 2
     away = np.hypot(*np.moveaxis(xy[None, :, None] - standing[:, None, :, :2], -1, 0)).min(axis=2)
     common &= away > CLEARANCE
     count = common.sum(axis=1)

@@ -1,4 +1,4 @@
-"""Ways of robots clear of others and of walls: `clear_way`, `route`, `polyline_length`."""
+"""Ways of robots clear of others and of walls: `clear_way`, `route`, `reachable`, `polyline_length`."""
 
 import itertools
 from collections.abc import Callable
@@ -19,6 +19,7 @@ TO_ROBOT = 0.42  # least distance between the middles of two robots, where they 
 TO_WALL = 0.22  # least distance of a driving robot's middle from walls [m]
 STEP = 0.05  # distance between places of a way that are checked [m]
 GRID = 0.15  # distance between places through which a way round is sought [m]
+NEIGHBOURS = 6  # places of the grid to which a start or goal is joined
 ROUND = 2.5  # a way round goes this far beyond all robots [m]
 SLACK = 0.01  # a robot that stands nearer to another than it may does not come nearer than this less [m]
 
@@ -56,42 +57,68 @@ def route(
     others = np.asarray(others, float).reshape(-1, 2)
     if clear_way([start, goal], others, free, to_robot=to_robot):
         return [_pair(goal)]
-    every = np.vstack([start, goal, others])
-    low, high = every.min(axis=0) - ROUND, every.max(axis=0) + ROUND
-    x, y = (np.arange(a, b, GRID) for a, b in zip(low, high, strict=True))
-    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    clear = np.ones(places.shape[:2], bool) if free is None else free(places, TO_WALL)
-    if len(others):
-        away = np.hypot(*np.moveaxis(places[:, :, None] - others, -1, 0))
-        clear &= (away > to_robot).all(axis=-1)
-    nodes = places[clear]
-    number = np.cumsum(clear).reshape(clear.shape) - 1
-    ends, lengths = [], []
-    for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
-        a = np.s_[: -dx or None, max(-dy, 0) : -dy if dy > 0 else None]
-        b = np.s_[dx:, max(dy, 0) : dy if dy < 0 else None]
-        both = clear[a] & clear[b]
-        ends.append(np.stack([number[a][both], number[b][both]]))
-        lengths.append(np.full(int(both.sum()), GRID * np.hypot(dx, dy)))
-    # start and goal reach the places that they see
-    total = len(nodes)
-    for extra, point in enumerate((start, goal)):
-        near = np.flatnonzero(np.hypot(*(nodes - point).T) < 4 * GRID)
-        seen = [n for n in near.tolist() if clear_way([point, nodes[n]], others, free, to_robot=to_robot)]
-        ends.append(np.array([[total + extra] * len(seen), seen], int).reshape(2, -1))
-        lengths.append(np.hypot(*(nodes[seen] - point).T) if seen else np.zeros(0))
-    (i, j), w = np.hstack(ends), np.concatenate(lengths)
-    graph = coo_array((w, (i, j)), shape=(total + 2, total + 2)).tocsr()
-    distance, before = dijkstra(graph, directed=False, indices=np.array([total]), return_predecessors=True)
-    if not np.isfinite(distance[0, total + 1]):
+    roads = _Roads(start, goal[None], others, free, to_robot)
+    way = roads.way(0)
+    if way is None:
         raise InputError(
             f"there is no way for a robot from {start[0]:.1f}, {start[1]:.1f} to {goal[0]:.1f}, {goal[1]:.1f} that is "
             "clear of robots and walls: give them more room"
         )
-    at, back = total + 1, [goal]
-    while (at := int(before[0, at])) != total:
-        back.append(nodes[at])
-    return _pulled([start, *back[::-1]], others, free, to_robot)
+    return _pulled([start, *way, goal], others, free, to_robot)
+
+
+def reachable(start: ArrayLike, goals: ArrayLike, others: ArrayLike, free: Free | None = None) -> NDArray[np.bool_]:
+    """Return to which goals (n, 2) a way from `start` (2,) is clear of robots at `others` (m, 2) and of walls."""
+    goals = np.asarray(goals, float).reshape(-1, 2)
+    if not len(goals):
+        return np.zeros(0, bool)
+    others = np.asarray(others, float).reshape(-1, 2)
+    places, which = np.unique(goals.round(6), axis=0, return_inverse=True)
+    return _Roads(np.asarray(start, float), places, others, free, TO_ROBOT).reached[which.ravel()]
+
+
+class _Roads:
+    """Places of a grid that are clear, and the shortest ways from a start (2,) over them to goals (n, 2)."""
+
+    def __init__(self, start: Array, goals: Array, others: Array, free: Free | None, to_robot: float) -> None:
+        every = np.vstack([start, goals, others])
+        low, high = every.min(axis=0) - ROUND, every.max(axis=0) + ROUND
+        x, y = (np.arange(a, b, GRID) for a, b in zip(low, high, strict=True))
+        places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+        clear = np.ones(places.shape[:2], bool) if free is None else free(places, TO_WALL)
+        if len(others):
+            away = np.hypot(*np.moveaxis(places[:, :, None] - others, -1, 0))
+            clear &= (away > to_robot).all(axis=-1)
+        self._nodes = places[clear]
+        number = np.cumsum(clear).reshape(clear.shape) - 1
+        ends, lengths = [], []
+        for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            a = np.s_[: -dx or None, max(-dy, 0) : -dy if dy > 0 else None]
+            b = np.s_[dx:, max(dy, 0) : dy if dy < 0 else None]
+            both = clear[a] & clear[b]
+            ends.append(np.stack([number[a][both], number[b][both]]))
+            lengths.append(np.full(int(both.sum()), GRID * np.hypot(dx, dy)))
+        total = len(self._nodes)
+        for extra, point in enumerate((start, *goals)):  # which reach the places that they see
+            near = np.argsort(np.hypot(*(self._nodes - point).T))[:NEIGHBOURS]
+            seen = [n for n in near.tolist() if clear_way([point, self._nodes[n]], others, free, to_robot=to_robot)]
+            ends.append(np.array([[total + extra] * len(seen), seen], int).reshape(2, -1))
+            lengths.append(np.hypot(*(self._nodes[seen] - point).T) if seen else np.zeros(0))
+        (i, j), w = np.hstack(ends), np.concatenate(lengths)
+        size = total + 1 + len(goals)
+        graph = coo_array((w, (i, j)), shape=(size, size)).tocsr()
+        distance, before = dijkstra(graph, directed=False, indices=np.array([total]), return_predecessors=True)
+        self._before, self._start = before[0], total
+        self.reached: NDArray[np.bool_] = np.isfinite(distance[0, total + 1 :])
+
+    def way(self, goal: int) -> list[Array] | None:
+        """Return the places between the start and a goal; None if it is not reached."""
+        if not self.reached[goal]:
+            return None
+        at, back = self._start + 1 + goal, []
+        while (at := int(self._before[at])) != self._start:
+            back.append(self._nodes[at])
+        return back[::-1]
 
 
 def _pulled(points: list[Array], others: Array, free: Free | None, to_robot: float) -> list[tuple[float, float]]:

@@ -9,6 +9,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.planning.drive import drive_through, there_and_back
 from coloc_graph.planning.plan import Plan
 from coloc_graph.planning.slip import HEADING_SIGMA, stop_sigma
+from coloc_graph.simulation.floor_plans import FloorPlan
 from coloc_graph.simulation.paths import Array, Leg
 from coloc_graph.simulation.scenarios import Box, Pose, Scenario
 from coloc_graph.simulation.tours import Tour, both_see, no_common_view
@@ -25,6 +26,7 @@ class PlannedScenario(Scenario):
     """
 
     plan: Plan | None = None
+    floor_plan: FloorPlan | None = None
     at: tuple[dict[str, int], ...] = ()
 
     @property
@@ -76,6 +78,8 @@ class PlannedScenario(Scenario):
         for view in views:
             others = [other.T_world_camera[:2, 3] for other in views if other is not view]
             recorded &= ~hidden(view.T_world_camera[:3, 3], points, np.array(others))
+            if self.floor_plan is not None:
+                recorded &= ~self.floor_plan.blocked(view.T_world_camera[:2, 3], points).reshape(recorded.shape)
         if recorded.sum() < MIN_POINTS:
             raise no_common_view(where)
         leg = Leg(start + np.append(drive.times, stance.duration), np.vstack([drive.knots, drive.knots[-1:]]))
@@ -84,8 +88,10 @@ class PlannedScenario(Scenario):
         return Tour(leg, start + instants, recorded)
 
 
-def planned(plan: Plan, rng: np.random.Generator | None = None) -> PlannedScenario:
+def planned(plan: Plan, rng: np.random.Generator | None = None, floor_plan: FloorPlan | None = None) -> PlannedScenario:
     """Make the scenario that follows a plan; each stop is off by some centimetres and a degree.
+
+    Walls of a `floor_plan` hide what is behind them.
 
     Raises
     ------
@@ -115,5 +121,12 @@ def planned(plan: Plan, rng: np.random.Generator | None = None) -> PlannedScenar
     (mover,) = movers
     first, second = plan.observers[:2]
     return PlannedScenario(
-        "plan", tuple(poses), Box((0.0, 3.0), (-2.0, 2.0)), (first, second), mover, plan=plan, at=tuple(at)
+        "plan",
+        tuple(poses),
+        Box((0.0, 3.0), (-2.0, 2.0)),
+        (first, second),
+        mover,
+        plan=plan,
+        floor_plan=floor_plan,
+        at=tuple(at),
     )

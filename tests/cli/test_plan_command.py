@@ -77,7 +77,7 @@ def test_a_tighter_sigma_takes_a_longer_mission():
         (["--mover", "X"], "there is no robot X in the team: name one of A, B, C"),
         (["--length", "-2"], "a way of -2.0 m is none"),
         (["--map", "map.yaml"], "a map needs a goal on it"),
-        (["--goal", "2,0", "--sigma-end", "5mm"], "--sigma-end is of straight ways"),
+        (["--goal", "2,0", "--sigma-end", "5mm"], "--sigma-end is of straight ways of two observers"),
         (["--goal", "2,0", "--time", "9s"], "9 s are too short for 2.0 m: give a longer time"),
         (["--goal", "2"], "`2` is not a waypoint"),
         (["--goal", "2,0", "--map", "none.yaml"], "none.yaml"),
