@@ -14,15 +14,20 @@ from monte_carlo import over_seeds, simulated, solved
 
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.simulation import Imperfections
+from coloc_graph.simulation.uwb import with_ranged_landmarks
 
 
-def one_seed(seed: int, wrong: Imperfections, stances: int, points: int, incremental: bool) -> dict[str, list[float]]:
+def one_seed(
+    seed: int, wrong: Imperfections, stances: int, points: int, landmarks: int, incremental: bool
+) -> dict[str, list[float]]:
     """Return, without and with ranges: end position error [cm] of A and B, heading [deg], NEES, chi2/dof, seconds."""
     figures = {}
     for name, sigma in (("stances alone", 0.0), ("stances and ranges", wrong.uwb_sigma)):
         of_uwb = {"uwb_sigma": sigma} if sigma else dict.fromkeys(("uwb_sigma", "uwb_offset_sigma", "uwb_nlos"), 0.0)
         world = simulated("hallway", seed, points=points, stances=stances,
                           imperfections=Imperfections(**{**vars(wrong), **of_uwb}))  # fmt: skip
+        if sigma and landmarks:
+            world = with_ranged_landmarks(world, landmarks)
         solution, accuracy = solved(world, SolveOptions(incremental=incremental))
         rows = [row for row in accuracy.robots if row.robot != "C"]
         estimate = solution.estimate
@@ -49,6 +54,7 @@ def main() -> int:
     parser.add_argument("--uwb-nlos", type=float, default=0.05)
     parser.add_argument("--mount-sigma", type=float, default=0.0, help="tilt and roll of the mounts [deg]")
     parser.add_argument("--height-sigma", type=float, default=0.0, help="height of the mounts [m]")
+    parser.add_argument("--landmarks", type=int, default=0, help="landmarks that are ranged on the way")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--incremental", action="store_true")
     parser.add_argument("--json", action="store_true")
@@ -61,7 +67,8 @@ def main() -> int:
         uwb_nlos=args.uwb_nlos,
     )
     work = partial(
-        one_seed, wrong=wrong, stances=args.stances, points=args.points, incremental=args.incremental
+        one_seed, wrong=wrong, stances=args.stances, points=args.points, landmarks=args.landmarks,
+        incremental=args.incremental,
     )  # fmt: skip
     every = over_seeds(work, range(args.first, args.first + args.seeds), args.processes)
     table = {}

@@ -300,14 +300,14 @@ class Odometry:
 
 @dataclass(frozen=True, eq=False)
 class Range:
-    """Ranges between two robots at n instants, each at a known place in its robot's pose of a stance.
+    """Ranges of a robot or a landmark by a robot at n instants, at known places in the robots' poses of stances.
 
     Parameters
     ----------
     robot, target : str
-        Names of the robot that measured, and of the one that it measured.
+        Names of the robot that measured, and of the robot or landmark that it measured.
     stance, target_stance : int
-        Stances whose poses of the two robots they refer to.
+        Stances whose poses of the two robots they refer to; -1 of a landmark.
     time : float
         Mean time [UTC s].
     range : (n,) float
@@ -318,6 +318,8 @@ class Range:
         Covariance of the ranges [m^2], with that of the odometry that gave the places.
     samples : int
         Number of the averaged samples.
+    place : (2,) float or None
+        Of a landmark, where it is about in the robot's pose [m]: an initial value where no other measurement gives one.
     """
 
     robot: str
@@ -330,6 +332,7 @@ class Range:
     target_moved: Array
     covariance: Array
     samples: int
+    place: Array | None = None
 
     def __post_init__(self) -> None:
         _as_arrays(self, "range", "moved", "target_moved", "covariance")

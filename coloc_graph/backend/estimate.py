@@ -341,7 +341,9 @@ def make_estimate(
     disconnected = graph.disconnected(poses)
     calibration = Calibration(variables, errors, {key: covariances[key] for key in errors})
     still = {
-        name: StaticPose(poses[key], covariances[key]) for name, key in graph.pose_keys.static().items() if key in poses
+        name: StaticPose(poses[key], covariances[key], has_heading=name not in graph.ranged_points)
+        for name, key in graph.pose_keys.static().items()
+        if key in poses
     }
     here = still.pop(MAP, None)
     return Estimate(

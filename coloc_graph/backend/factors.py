@@ -23,6 +23,7 @@ from coloc_graph.team import Floor, Robot
 
 Array = NDArray[np.float64]
 
+POINT_YAW_SIGMA = 1.0  # rad: sigma of the meaningless heading of a landmark that is a point
 GAUGE_SIGMA = 1e-6  # rad, m: sigma of the prior that fixes the world frame, far below any measurement's
 MIN_FLOOR_SIGMA = 1e-5  # rad, m: sigma of a floor that is stated as exactly flat
 BODY_LENGTH = 0.05  # m: height by which an uneven floor raises a body, per rad of tilt
@@ -89,13 +90,15 @@ class Factors:
         # not Diagonal.Precisions: a sigma that is infinite cannot be read back from a serialised graph
         self._on_floor = gtsam.noiseModel.Gaussian.SqrtInformation(np.diag([0.0, 0.0, 1 / height]), False)
 
-    def dof(self, values: gtsam.Values, links: Iterable[tuple[Link, gtsam.NonlinearFactor]]) -> int:
+    def dof(self, values: gtsam.Values, links: Iterable[tuple[Link, gtsam.NonlinearFactor]], points: int = 0) -> int:
         """Return the degrees of freedom of links and their factors: rows of weight less unknowns.
+
+        `points` poses have a prior of their heading.
 
         Calibration variables have as many priors as unknowns.
         """
         poses = len(poses_in(values))
-        priors = 6 + (0 if self.floor is None else 3) * (poses - 1)
+        priors = points + 6 + (0 if self.floor is None else 3) * (poses - 1)
         return priors + round(sum(_share(link) * self.rows(link, factor) for link, factor in links)) - 6 * poses
 
     def rows(self, link: Link, factor: gtsam.NonlinearFactor) -> int:
@@ -127,6 +130,13 @@ class Factors:
             gtsam.AttitudeFactorPose3(key, _UP, self._level),
             gtsam.PoseTranslationPrior3D(key, _ORIGIN, self._on_floor),
         )
+
+    @staticmethod
+    def of_point(key: int) -> gtsam.NonlinearFactor:
+        """Return the prior of the heading of a landmark that is a point."""
+        R = np.zeros((6, 6))
+        R[2, 2] = 1 / POINT_YAW_SIGMA
+        return gtsam.PriorFactorPose3(key, gtsam.Pose3(), gtsam.noiseModel.Gaussian.SqrtInformation(R, False))
 
     def of_link(self, link: Link, i: int, j: int) -> gtsam.NonlinearFactor:
         """Return the factor of a link on the keys of its two poses and of its calibration variables."""
@@ -178,6 +188,9 @@ class Factors:
         for key in sorted(wanted - {reference}):
             for factor in self.of_pose(key):
                 factors.add(factor)
+        for name in graph.ranged_points:
+            if graph.pose_keys.static()[name] in wanted:
+                factors.add(self.of_point(graph.pose_keys.static()[name]))
         links, made = [], []
         key_of = graph.pose_keys.key
         for link in graph.links:

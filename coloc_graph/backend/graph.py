@@ -75,6 +75,12 @@ def pose_of(link: PoseLink) -> gtsam.Pose3:
     return gtsam.Pose3(link.T_i_j)
 
 
+def point_of(link: Range, T_world_robot: gtsam.Pose3) -> gtsam.Pose3:
+    """Return the initial pose of a landmark that is a point."""
+    assert link.place is not None
+    return gtsam.Pose3(gtsam.Rot3(), T_world_robot.transformFrom(np.array([*link.place, 0.0])) * [1.0, 1.0, 0.0])
+
+
 class PoseKeys:
     """GTSAM keys of each robot's pose at each stance: the robot's number and its count of moves.
 
@@ -325,6 +331,15 @@ class PoseGraph:
         vars(graph).update(nodes=self.nodes, times=self.times)
         return graph
 
+    @cached_property
+    def ranged_points(self) -> dict[str, tuple[Range, ...]]:
+        """Ranges of each landmark that has a position by them alone, and no heading."""
+        found: dict[str, list[Range]] = defaultdict(list)
+        for one in self.measurements:
+            if isinstance(one, Range) and one.place is not None and one.target not in self.sighted:
+                found[one.target].append(one)
+        return {name: tuple(every) for name, every in found.items()}
+
     def disconnected(self, known: Iterable[int]) -> tuple[Node, ...]:
         """Return the nodes whose pose is not among the `known` keys, in the order of the stances."""
         keys = set(known)
@@ -393,6 +408,8 @@ def require_ends(measured: Measurement, keys: PoseKeys, stances: Mapping[int, St
     if robot_i == robot_j:
         raise MeasurementError(f"the {measured} relates a robot to itself: name two robots")
     if isinstance(measured, Range):
+        if keys.is_static(robot_i):
+            raise MeasurementError(f"the {measured} is by a landmark: name the robot that measured")
         return
     observers = (robot_i,) if isinstance(measured, Sighting) else (robot_i, robot_j)
     for robot in observers:

@@ -89,7 +89,8 @@ def range_factor(link: Range, i: int, j: int, variables: Variables) -> BatchedFa
     sensor = variables.robot_models[link.robot].ranging
     if sensor is None:
         raise EstimationError(f"the {link} has no noise: give robot {link.robot} a [robots.ranging] in team.toml")
-    model = RangeModel(link, sensor, variables.robot_models[link.target].ranging)
+    other = variables.robot_models.get(link.target)
+    model = RangeModel(link, sensor, None if other is None else other.ranging)
     keys = variables.ranging(link.robot), None if model.antenna is None else variables.ranging(link.target)
     return BatchedFactor(FactorEvaluator(model, (i, j), keys, (SIZES[RANGING], SIZES[RANGING])))
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.factors import Factors
-from coloc_graph.backend.graph import Link, pose_of
+from coloc_graph.backend.graph import Link, point_of, pose_of
 from coloc_graph.measurements import Odometry, Range, RelativePose, Sighting
 
 Array = NDArray[np.float64]
@@ -37,6 +37,8 @@ class InsertionPlan:
         Measurements outside it: tested before insertion.
     disconnected : list of Link
         Links that nothing ties to the reference yet.
+    points : set of int
+        New poses of landmarks that have no heading.
     """
 
     start: dict[int, gtsam.Pose3]
@@ -44,6 +46,7 @@ class InsertionPlan:
     near: list[Tie]
     far: list[Tie]
     disconnected: list[Link]
+    points: set[int]
 
 
 class InsertionPlanner:
@@ -71,6 +74,7 @@ class InsertionPlanner:
         if not self._tied:
             start[self._reference] = gtsam.Pose3()
         ties: list[Tie] = []
+        points: set[int] = set()
         near: list[Tie] = []
         far: list[Tie] = []
         rough: dict[int, float] = {}  # keys with initial values by odometry alone, with its sigma
@@ -83,7 +87,12 @@ class InsertionPlanner:
                 has_i, has_j = (key in self._tied or key in start for key in (i, j))
                 if isinstance(link, Range):
                     if has_i and has_j:
-                        far.append((link, i, j))
+                        # one range leaves a new landmark open: only all of them together can be tested
+                        (near if j in points else far).append((link, i, j))
+                    elif has_i and link.place is not None:
+                        start[j] = point_of(link, self._pose_of(i, start))
+                        points.add(j)
+                        ties.append((link, i, j))
                     else:
                         still.append(link)
                     continue
@@ -110,7 +119,7 @@ class InsertionPlanner:
             if len(still) == len(left):
                 break
             left = still
-        return InsertionPlan(start, ties, near, far, left)
+        return InsertionPlan(start, ties, near, far, left, points)
 
     def _refine(
         self, T_i_j: gtsam.Pose3, i: int, j: int, start: dict[int, gtsam.Pose3], rough: dict[int, float]

@@ -102,6 +102,8 @@ class Isam2Graph:
             values.insert(key, pose)
             for factor in (self.factors_of.gauge(key),) if is_reference else self.factors_of.of_pose(key):
                 factors.add(factor)
+            if key in plan.points:
+                factors.add(self.factors_of.of_point(key))
         made = [self.factors_of.of_link(*tie) for tie in (*plan.ties, *plan.near)]
         far = {id(tie): self.factors_of.of_link(*tie) for tie in plan.far}
         links = (*plan.ties, *plan.near, *plan.far)

@@ -13,7 +13,7 @@ from coloc_graph.backend.calibration import size_of
 from coloc_graph.backend.chain import compose, spanning_tree
 from coloc_graph.backend.chi2_test import Agreement, agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
-from coloc_graph.backend.graph import Link, PoseGraph, PoseLink, pose_of
+from coloc_graph.backend.graph import Link, PoseGraph, PoseLink, point_of, pose_of
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.solver import optimise
 
@@ -58,7 +58,8 @@ class Fit:
     @cached_property
     def dof(self) -> int:
         """Degrees of freedom: rows of weight less unknowns."""
-        return self.factors_of.dof(self.values, [(link, self.factor(n)) for n, link in enumerate(self.links)])
+        points = sum(self.values.exists(self.graph.pose_keys.static()[name]) for name in self.graph.ranged_points)
+        return self.factors_of.dof(self.values, [(link, self.factor(n)) for n, link in enumerate(self.links)], points)
 
     @property
     def p_value(self) -> float:
@@ -111,6 +112,12 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
     values = gtsam.Values()
     for key, pose in compose(graph, spanning_tree(graph, graph.links), factors_of.start, expected, known).items():
         values.insert(key, pose)
+    for name, ranges in graph.ranged_points.items():
+        key = graph.pose_keys.static()[name]
+        if key in known:
+            values.insert(key, known[key])
+        elif placed := [one for one in ranges if values.exists(graph.pose_keys.key(one.ends[0]))]:
+            values.insert(key, point_of(placed[0], values.atPose3(graph.pose_keys.key(placed[0].ends[0]))))
     iterations = 0
     for left in reversed(range(MAX_ANCHORINGS)):
         factors, links, batched = factors_of.of_graph(graph, poses_in(values))

@@ -59,6 +59,7 @@ class _Ranges:
         self._two_way = np.repeat(np.array([one is not None for one in antennas], float), self._n)
         self._moved = se3_inverse(floor_pose(*np.concatenate([one.measured.moved for one in models]).T))
         self._target_moved = floor_pose(*np.concatenate([one.measured.target_moved for one in models]).T)
+        self._of_robot = np.repeat(np.array([one.measured.target_stance >= 0 for one in models]), self._n)
         self._range = np.concatenate([one.measured.range for one in models])
         self._roots = np.linalg.inv(np.linalg.cholesky(np.array([one.measured.covariance for one in models])))
 
@@ -75,7 +76,7 @@ class _Ranges:
         p_i = (R_i_j @ p_j[..., None])[..., 0] + T_i_j[:, :3, 3]
         turn = self._moved[:, :2, :3]  # into the body at each instant
         xy = (turn @ p_i[..., None])[..., 0] + self._moved[:, :2, 3]
-        found = self._sensors.expected(self._index, xy, own, np.ones(len(xy), bool))
+        found = self._sensors.expected(self._index, xy, own, self._of_robot)
         e = found.values[:, 0] + self._two_way * (self._antennas[:, 0] + other[:, 0]) - self._range
         by_p_i = found.by_xy[:, :1] @ turn
         by_i = np.concatenate([by_p_i @ hat(p_i), -by_p_i], axis=-1)

@@ -50,6 +50,8 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     uwb.add_argument("--uwb-sigma", type=float, default=0.0, help="noise of a range, m (default: 0, no ranges)")
     uwb.add_argument("--uwb-offset", type=float, default=0.0, help="offsets of the sensors (1 sigma), m (default: 0)")
     uwb.add_argument("--uwb-nlos", type=float, default=0.0, help="share without line of sight, 0 to 1 (default: 0)")
+    uwb.add_argument("--uwb-landmarks", type=int, default=0, metavar="N", help="landmarks that are ranged, unknown to "
+                     "the team (default: 0)")  # fmt: skip
 
     single = command.add_argument_group("scenarios single-step, hallway and landmarks")
     single.add_argument("-l", type=float, help="distance between the observers, m (default: 0.8; hallway 0.74)")
@@ -122,6 +124,7 @@ def run(args: argparse.Namespace) -> int:
             fps=10.0 if args.fps is None else args.fps,
             image_format=args.image_format or "jpeg",
             messy=args.messy,
+            uwb_landmarks=args.uwb_landmarks,
             fisheye_deg=args.fisheye,
             progress=report,
         )

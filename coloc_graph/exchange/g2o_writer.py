@@ -36,7 +36,8 @@ def write_g2o(estimate: Estimate, path: Path) -> None:
             key = graph.key(robot, stance)
             poses[key] = T
             names.setdefault(key, []).append(f"{robot}@{stance}")
-    still = estimate.landmarks if estimate.map is None else {**estimate.landmarks, MAP: estimate.map}
+    still = {name: one for name, one in estimate.landmarks.items() if one.has_heading}
+    still = still if estimate.map is None else {**still, MAP: estimate.map}
     for name, placed in still.items():
         key = graph.pose_keys.static()[name]
         poses[key], names[key] = placed.T_world_body.matrix(), ["the map" if name == MAP else f"landmark {name}"]

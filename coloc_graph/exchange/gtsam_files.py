@@ -12,7 +12,7 @@ from pathlib import Path
 import gtsam
 
 from coloc_graph.backend import Estimate
-from coloc_graph.backend.calibration import CLOCKS, MARKERS, MOUNT, PLANE
+from coloc_graph.backend.calibration import CLOCKS, MARKERS, MOUNT, PLANE, RANGING
 from coloc_graph.backend.factors import GAUGE_SIGMA, Factors, calibrations_in, poses_in
 from coloc_graph.backend.landmarks import MAP
 from coloc_graph.errors import InputError
@@ -24,6 +24,7 @@ CALIBRATIONS = {
     MOUNT: "mount errors: height [m], tilt, roll [rad]",
     MARKERS: "marker errors: span (relative), height [m]",
     CLOCKS: "clock offset error [s]",
+    RANGING: "range sensor errors: offset [m], scale, bearing [rad], x, y [m], depth, offset of robots [m]",
     PLANE: "stated plane errors: normal [rad, rad], distance (relative)",
 }
 
@@ -88,7 +89,7 @@ def _keys(estimate: Estimate) -> str:
         rows.writerow([key, "pose", " ".join(names[key])])
     for key in calibrations_in(estimate.values):
         kind, variables = gtsam.mrsymbolChr(key), estimate.calibration.variables
-        of = variables.owner(key) if variables is not None and kind in (MOUNT, MARKERS) else ""
+        of = variables.owner(key) if variables is not None and kind in (MOUNT, MARKERS, RANGING) else ""
         if kind in (CLOCKS, PLANE):
             first, second = graph.robots[gtsam.mrsymbolLabel(key) - 1], gtsam.mrsymbolIndex(key)
             of = f"{first} {graph.robots[second - 1]}" if kind == CLOCKS else f"{first}@{second}"

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.frontend.odometry import WheelTrack
-from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.frontend.ranged_landmarks import Located, locate
+from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.measurements import Range
 from coloc_graph.run import Ranges
 from coloc_graph.team import Ranging, Team
@@ -18,6 +19,7 @@ Index = NDArray[np.int64]
 
 WINDOW = 2.0  # s of samples that are averaged while a robot drives; at 0.2 m/s the geometry hardly changes in them
 OUTLIER_SIGMAS = 3.5  # standard deviations from the median of its window above which a sample is left out
+MIN_SAMPLES = 4  # samples of a window, of fewer an outlier cannot be told
 MIN_NOISE_SAMPLES = 50  # samples from which on their own scatter says how noisy they are
 MAD = 1.4826  # standard deviation of a normal distribution by the median of absolute deviations
 
@@ -84,7 +86,7 @@ def ranges_of_stances(
     team
         The team; robots that measure have a `Ranging`.
     standing
-        By robot, the intervals in which it has a pose, in the order of time.
+        By robot, the intervals in which it has a pose, in the order of time; by landmark, one without end.
     wheels
         By robot, its wheel odometry from one to the next; robots without any are used while they stand.
     recorded
@@ -110,10 +112,7 @@ def ranges_of_stances(
             for target, distance in zip(one.targets, one.range.tolist(), strict=True):
                 by_target[target].append((one.time, distance))
         for target, samples in by_target.items():
-            if target not in team.names:
-                unused["landmarks are not located by ranges in a run with stances"] += len(samples)
-            else:
-                made += _links_of_pair(team, (robot, target), standing, wheels, np.array(samples), unused)
+            made += _links_of_pair(team, (robot, target), standing, wheels, np.array(samples), unused)
     noise = _noise_factors(made)
     shares = Counter(node for one in made for node in one.driven)
     return StanceRanges(tuple(one.measured(noise[one.robot], shares, wheels) for one in made), unused)
@@ -158,9 +157,10 @@ class _Link:
                 # odometry between the stances is in the graph, too
                 C[np.ix_(driven, driven)] += (1 + shares[name, standing.stance]) * along @ along.T
         i, j = self.standing
+        place = None if j.stance >= 0 else (se3_inverse(i.T_world_body) @ j.T_world_body)[:2, 3]
         return Range(
             self.robot, self.target, i.stance, j.stance, float(self.times.mean()), self.range, *self.moved, C,
-            len(self.residuals),
+            len(self.residuals), place,
         )  # fmt: skip
 
 
@@ -214,7 +214,8 @@ def _windows(
     ranges: Array,
     unused: Counter[str],
 ) -> Iterable[_Link]:
-    sensor, other = team[pair[0]].ranging, team[pair[1]].ranging
+    sensor = team[pair[0]].ranging
+    other = team[pair[1]].ranging if pair[1] in team.names else None
     assert sensor is not None
     antennas = [(sensor.x, sensor.y), (other.x, other.y) if sensor.two_way and other is not None else (0.0, 0.0)]
     at, turned = [], []
@@ -238,7 +239,10 @@ def _windows(
     for index in np.split(order, first[1:]):
         median = float(np.median(off[index]))
         kept = index[np.abs(off[index] - median) < OUTLIER_SIGMAS * sigmas[index]]
-        if len(kept) * 2 < len(index) or not len(kept):
+        if len(index) < MIN_SAMPLES:
+            unused["they are too few at a time to tell which have no line of sight"] += len(index)
+            continue
+        if len(kept) * 2 < len(index):
             unused["they scatter more than the stated noise explains"] += len(index)
             continue
         if len(kept) < len(index):
@@ -293,3 +297,34 @@ def merged(parts: Iterable[StanceRanges]) -> StanceRanges:
         ranges += one.ranges
         unused.update(one.unused)
     return StanceRanges(tuple(ranges), unused)
+
+
+def locate_landmarks(
+    team: Team,
+    standing: Mapping[str, Sequence[Standing]],
+    wheels: Mapping[str, WheelTrack],
+    recorded: Mapping[str, Sequence[Ranges]],
+) -> dict[str, Located]:
+    """Locate the landmarks that were ranged, from the places of robots; arguments as of `ranges_of_stances`."""
+    found: dict[str, list[Array]] = defaultdict(list)
+    for number, (robot, records) in enumerate(recorded.items()):
+        sensor = team[robot].ranging
+        times = np.array([one.time for one in records])
+        if sensor is None or not len(times) or not standing.get(robot):
+            continue
+        places = _places(standing[robot], wheels.get(robot), times)
+        T = np.array([one.T_world_body for one in standing[robot]])[places.row] @ floor_pose(*places.moved.T)
+        antennas = (T @ np.array([sensor.x, sensor.y, 0.0, 1.0]))[:, :2]
+        landmarks = {one.name for one in team.landmarks}
+        for n, one in enumerate(records):
+            for target, distance in zip(one.targets, one.range.tolist(), strict=True):
+                if places.known[n] and target in landmarks:
+                    reading = (distance - sensor.offset) / sensor.scale
+                    row = (*antennas[n], reading, number, sensor.range_sigma, sensor.offset_sigma)
+                    found[target].append(np.array(row))
+    located = {}
+    for name, rows in found.items():
+        x, y, distance, who, sigma, offset_sigma = np.array(rows).T
+        places_of = np.stack([x, y], axis=1)
+        located[name] = locate(places_of, distance, who.astype(int).tolist(), sigma.max(), offset_sigma.max())
+    return located

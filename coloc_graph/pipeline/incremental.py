@@ -34,7 +34,7 @@ from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.measurements import Drive, Measurement, Sighting
 from coloc_graph.pipeline.clocks import CorrectedRun, RunClocks, run_clocks, stance_evidence
 from coloc_graph.pipeline.options import SolveOptions
-from coloc_graph.pipeline.ranges import instants_in, place_ranges, standing_of
+from coloc_graph.pipeline.ranges import instants_in, of_targets, place_ranges, standing_of
 from coloc_graph.run import OdometrySample, Ranges, Recorded, Run, Stance
 from coloc_graph.run.recorded import Restated
 from coloc_graph.team import Team
@@ -208,6 +208,8 @@ class StanceSolver:
         self._ranges: dict[int, StanceRanges] = {}  # by the stance with which they came
         self._instants: dict[tuple[str, int], float] = {}  # when moving robots were sighted
         self._posed: dict[int, tuple[str, ...]] = {}  # robots that have a pose, by stance
+        self._history: list[tuple[Stance, dict[str, list[Ranges]]]] = []  # ranges of landmarks that are not located
+        self._unlocated = StanceRanges((), {})
         self._measuring = 0.0
 
     def measure(
@@ -300,18 +302,24 @@ class StanceSolver:
         self._posed[stance.index] = tuple(said.poses)
         if not any(recorded.values()):
             return said
-        stances = [stance] if before is None else [before, stance]
-        poses: dict[int, dict[str, Any]] = {stance.index: {name: T.matrix() for name, T in said.poses.items()}}
-        if before is not None:
-            poses[before.index] = {
-                robot: self.estimator.pose(robot, before.index).matrix() for robot in self._posed.get(before.index, ())
-            }
-        standing = standing_of(stances, poses, self._instants)
-        begin, end = stances[0].start, stance.end
-        wheels = {
-            robot: list(run.odometry(robot, begin, end)) if self.options.odometry else [] for robot in self.team.names
-        }
-        found = place_ranges(self.team, standing, wheels, recorded, stances)
+        known = {name: one.T_world_body.matrix() for name, one in self.estimator.static_poses().items()}
+        names = {one.name for one in self.team.landmarks} - known.keys()
+        self._history.append((stance, {robot: of_targets(each, names) for robot, each in recorded.items()}))
+        del self._history[: -self.estimator.lag]
+        others = {*self.team.names, *known}
+        here = {robot: of_targets(each, others) for robot, each in recorded.items()}
+        found = self._placed(run, [stance] if before is None else [before, stance], here, known)
+        if names and any(one for _, each in self._history for one in each.values()):
+            earlier = {robot: [one for _, each in self._history for one in each[robot]] for robot in recorded}
+            late = self._placed(run, [one for one, _ in self._history], earlier, {})
+            new = {one.target for one in late.ranges}
+            self._unlocated = late if not new else StanceRanges((), {})
+            if new:  # now that it is located, all ranges of it count
+                found = merged([found, late])
+                self._history = [
+                    (one, {robot: of_targets(every, names - new) for robot, every in each.items()})
+                    for one, each in self._history
+                ]
         self._ranges[stance.index] = found
         if not found.ranges:
             return said
@@ -324,10 +332,29 @@ class StanceSolver:
             landmarks=said.landmarks,
         )
 
+    def _placed(
+        self,
+        run: Recorded,
+        stances: Sequence[Stance],
+        recorded: Mapping[str, Sequence[Ranges]],
+        landmarks: Mapping[str, Any],
+    ) -> StanceRanges:
+        """Average the ranges of some stances at the present poses."""
+        poses = {
+            one.index: {robot: self.estimator.pose(robot, one.index).matrix() for robot in self._posed[one.index]}
+            for one in stances
+        }
+        begin, end = stances[0].start, stances[-1].end
+        wheels = {
+            robot: list(run.odometry(robot, begin, end)) if self.options.odometry else [] for robot in self.team.names
+        }
+        standing = standing_of(stances, poses, self._instants)
+        return place_ranges(self.team, standing, wheels, recorded, stances, landmarks)
+
     @property
     def unused_ranges(self) -> Mapping[str, int]:
         """Number of samples of ranges that are not used, by reason."""
-        return merged(self._ranges.values()).unused
+        return merged([*self._ranges.values(), self._unlocated]).unused
 
     def _as_corrected(self, run: Any) -> Any:
         return run if self.clocks is None or isinstance(run, CorrectedRun) else self.clocks.corrected(run)
@@ -344,6 +371,7 @@ class StanceSolver:
         if self.team.floor is not None:
             self._motions.withdraw()
         self._ranges.pop(index, None)
+        self._history = [one for one in self._history if one[0].index != index]
         self.measured = tuple(one for one in self.measured if one.homography.stance != index)
         self.seconds.pop()
 

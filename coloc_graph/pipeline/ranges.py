@@ -1,15 +1,17 @@
 """Ranges of a run with stances, placed by an estimate of the stances alone."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from typing import Any
 
 import numpy as np
 
 from coloc_graph.backend import Estimate
 from coloc_graph.backend.graph import PoseKeys
+from coloc_graph.backend.landmarks import ALWAYS
 from coloc_graph.frontend import WheelTrack
-from coloc_graph.frontend.stance_ranges import StanceRanges, Standing, ranges_of_stances
+from coloc_graph.frontend.stance_ranges import StanceRanges, Standing, locate_landmarks, ranges_of_stances
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Sighting
 from coloc_graph.run import OdometrySample, Ranges, Run, Stance
 from coloc_graph.team import Team
@@ -35,7 +37,8 @@ def ranges_of_run(run: Run, estimate: Estimate, *, odometry: bool) -> StanceRang
     standing = standing_of(graph.stances, poses, graph.times)
     wheels = {robot: list(run.odometry(robot)) if odometry else [] for robot in run.team.names}
     recorded = {robot: list(run.ranges(robot)) for robot in run.team.names}
-    return place_ranges(run.team, standing, wheels, recorded, graph.stances)
+    landmarks = {name: one.T_world_body.matrix() for name, one in estimate.landmarks.items()}
+    return place_ranges(run.team, standing, wheels, recorded, graph.stances, landmarks)
 
 
 def standing_of(
@@ -75,8 +78,12 @@ def place_ranges(
     odometry: Mapping[str, Sequence[OdometrySample]],
     recorded: Mapping[str, Sequence[Ranges]],
     stances: Sequence[Stance],
+    landmarks: Mapping[str, Any],
 ) -> StanceRanges:
-    """Average the ranges between robots from the first of some stances to the last; count all others."""
+    """Average the ranges from the first of some stances to the last; count all others.
+
+    `landmarks` are the known T_world_landmark (4, 4), by name; others are located by their ranges.
+    """
     unused: Counter[str] = Counter()
     within: dict[str, list[Ranges]] = {}
     for robot, records in recorded.items():
@@ -85,9 +92,32 @@ def place_ranges(
         within[robot] = [one for one in records if stances[0].start <= one.time <= stances[-1].end]
         unused["they are from before the first stance, or after the last"] += _count(records) - _count(within[robot])
     wheels = {robot: WheelTrack(robot, samples) for robot, samples in odometry.items()}
+    known = {name: T for name, T in landmarks.items() if T is not None}
+    recorded_of = Counter(target for records in within.values() for one in records for target in one.targets)
+    new = {one.name for one in team.landmarks if one.name in recorded_of} - known.keys()
+    for name, located in locate_landmarks(team, standing, wheels, within).items() if new else ():
+        if name in new and located.position is not None:
+            known[name] = floor_pose(located.position[0], located.position[1], 0.0)
+        elif name in new:
+            unused[f"{name} is not located: {located.why}"] += recorded_of[name]
+    standing = {**standing, **{name: [Standing(ALWAYS, -np.inf, np.inf, T)] for name, T in known.items()}}
+    kept = {*team.names, *known}
+    within = {robot: of_targets(records, kept) for robot, records in within.items()}
     found = ranges_of_stances(team, standing, wheels, within)
     unused.update(found.unused)
     return StanceRanges(found.ranges, {why: count for why, count in unused.items() if count})
+
+
+def of_targets(records: Iterable[Ranges], names: Set[str]) -> list[Ranges]:
+    """Return the records of some targets, without the ranges of others."""
+    found = []
+    for one in records:
+        kept = [n for n, name in enumerate(one.targets) if name in names]
+        if len(kept) == len(one.targets):
+            found.append(one)
+        elif kept:
+            found.append(Ranges(one.robot, one.time, tuple(one.targets[n] for n in kept), one.range[kept]))
+    return found
 
 
 def _count(records: Iterable[Ranges]) -> int:

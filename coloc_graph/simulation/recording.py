@@ -21,7 +21,7 @@ from coloc_graph.simulation.scenarios import TeamScenario, scenario
 from coloc_graph.simulation.scenery import Scenery, frames, make_scenery
 from coloc_graph.simulation.teams import build_team_world
 from coloc_graph.simulation.tracks import observe
-from coloc_graph.simulation.uwb import uwb_ranges
+from coloc_graph.simulation.uwb import uwb_ranges, with_ranged_landmarks
 from coloc_graph.simulation.wheels import Odometry, move_times, odometry
 from coloc_graph.simulation.world import EPOCH, Capture, Depth, World, build_world, stream
 from coloc_graph.team import Team
@@ -67,6 +67,7 @@ def simulate(
     image_format: ImageFormat = "jpeg",
     messy: bool = False,
     fisheye_deg: float | None = None,
+    uwb_landmarks: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> World:
     """Simulate a scenario (`single-step`, `six-step`, `hallway`, `team`, `landmarks`), written as a run to `out`.
@@ -76,8 +77,9 @@ def simulate(
     fisheyes of `fisheye_deg` [deg] across where it is given. `l` [m] and
     `theta_deg` are single-step's; `robots`, how many move `at_once`, and whether they `blink` and markers have no names
     (2000 points then) are team's; `length` [m] in all, in how many `laps`, with a landmark every so many metres, and
-    whether the team is told where these are (`known`), are landmarks'. `gait` is the formation of hallway and
-    landmarks; the hallway follows a `plan` instead, at `fps`, with the points that its drives bring. `progress` is
+    whether the team is told where these are (`known`), are landmarks'; `uwb_landmarks` are ranged and not seen. `gait`
+    is the formation of hallway and landmarks; the hallway follows a `plan` instead, at `fps`, with the points that its
+    drives bring. `progress` is
     called with the stances done and their number. The same arguments give the same bytes. Returns what was true.
     Raises `InputError`, and leaves no file, where an argument is wrong or the pair has no common view.
     """
@@ -114,6 +116,10 @@ def simulate(
         wide = None if fisheye_deg is None else wide_team(fisheye_deg, bias_px)
         world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps,
                             known=known, team=wide)  # fmt: skip
+    if uwb_landmarks:
+        if world.imperfections.uwb_sigma == 0:
+            raise InputError("`uwb_landmarks` are ranged: give `uwb_sigma` too")
+        world = with_ranged_landmarks(world, uwb_landmarks)
 
     with atomic_run(out, world.team, image_format=image_format) as writer:
         record(world, writer, depth, progress, messy=messy)

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import json
 
 import gtsam
 import msgspec
@@ -16,11 +17,12 @@ from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import read_g2o
 from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.frontend import WheelTrack
+from coloc_graph.frontend.ranged_landmarks import locate
 from coloc_graph.measurements import Range
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.explanations import warnings_of_graph
 from coloc_graph.results.measurement_table import measurement_table
-from coloc_graph.run import OdometrySample, Ranges, open_run, read_true_team
+from coloc_graph.run import OdometrySample, Ranges, open_run, read_true_team, read_truth
 from coloc_graph.simulation import Imperfections, simulate
 from coloc_graph.simulation.uwb import NLOS_EXCESS
 from coloc_graph.team import Ranging
@@ -144,12 +146,65 @@ def test_a_blocked_pair_is_an_outlier_with_a_reason(mixed, copied, tmp_path):
     assert [str(one.measurement)[:15] for one in live.rejected] == ["range of B by A"]
 
 
+@pytest.fixture(scope="module")
+def with_landmarks(tmp_path_factory):
+    """A hallway of 6 stances with ranges between robots and to four landmarks."""
+    path = tmp_path_factory.mktemp("landmarks") / "landmarks.mcap"
+    simulate("hallway", path, stances=6, seed=4, points=60, imperfections=WRONG, uwb_landmarks=4)
+    return path
+
+
+@pytest.mark.parametrize("incremental", [False, True])
+def test_landmarks_are_located_by_ranges_on_the_way(with_landmarks, incremental):
+    run = open_run(with_landmarks)
+    found = solve(run, SolveOptions(incremental=incremental))
+    true = read_true_team(with_landmarks)
+    start = read_truth(with_landmarks)["A"].T_world_body[0]
+    assert set(found.estimate.landmarks) == {"U1", "U2", "U3", "U4"}
+    for one in true.landmarks:
+        here = np.linalg.inv(start) @ [*one.position, 0.0, 1.0]
+        located = found.estimate.landmarks[one.name]
+        assert not located.has_heading
+        off, C = np.array(located.planar[:2]) - here[:2], located.covariance_xy_yaw[:2, :2]
+        assert off @ np.linalg.solve(C, off) < 20.0 and np.sqrt(np.trace(C)) < 0.3
+    assert not [one for one in found.unused if "is not located" in one.reason]
+    ranges = ranges_of(found.estimate)
+    assert {one.target for one in ranges} == {"B", "C", *found.estimate.landmarks}
+    assert 0.6 < found.estimate.chi2 / found.estimate.dof < 1.4
+
+
+def test_a_landmark_that_could_be_on_either_side_of_the_way_is_named(rng):
+    x = np.linspace(0, 3, 60)
+    places = np.column_stack([x, np.zeros(60)])
+    for y, why in ((1.0, "mirrored"), (0.0, None)):
+        ranges = np.hypot(x - 1.2, y) + 0.02 * rng.standard_normal(60)
+        located = locate(places, ranges, [0] * 60, 0.02, 0.0)
+        assert (why is None and located.position is not None) or why in located.why
+    aside = places + np.column_stack([np.zeros(60), 0.7 * (np.arange(60) % 2)])
+    ranges = np.hypot(*(aside - [1.2, 2.0]).T) + 0.02 * rng.standard_normal(60)
+    ranges[::9] += rng.exponential(1.0, len(ranges[::9]))
+    np.testing.assert_allclose(locate(aside, ranges, [0] * 60, 0.02, 0.0).position, [1.2, 2.0], atol=0.1)
+    assert "too close" in locate(places[:3], ranges[:3], [0] * 3, 0.02, 0.0).why
+
+
 def test_exports_hold_ranges_or_say_what_is_missing(solution, tmp_path):
     dot = to_dot(solution.estimate.graph)
     assert dot.count('color="#999999"') == len(ranges_of(solution.estimate))
     write_g2o(solution.estimate, tmp_path / "graph.g2o")
     assert f"# left out: {len(ranges_of(solution.estimate))} ranges" in (tmp_path / "graph.g2o").read_text()
     assert len(read_g2o(tmp_path / "graph.g2o").ends)
+
+
+def test_the_command_writes_every_part_of_a_result_with_ranges(with_landmarks, tmp_path, capsys):
+    out = tmp_path / "result"
+    assert main(["solve", str(with_landmarks), "--out", str(out)]) == 0
+    counts = json.loads((out / "summary.json").read_text())["measurements"]["kinds"]
+    assert counts["range"]["used"] > 20
+    for kind in ("g2o", "gtsam", "dot", "pyfg", "jrl"):
+        assert main(["export", kind, str(out), "--out", str(tmp_path / f"graph.{kind}")]) == 0
+    assert "range sensor errors" in (tmp_path / "graph.gtsam" / "keys.csv").read_text()
+    assert main(["view", str(out), "--export", str(tmp_path / "page.html")]) == 0
+    capsys.readouterr()
 
 
 def test_checkpoints_keep_ranges(solution, tmp_path):
