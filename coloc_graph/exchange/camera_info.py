@@ -195,9 +195,11 @@ class _OpenCvLoader(_Loader):
     """The same for OpenCV's YAML, whose matrices have a tag of their own."""
 
 
-_OpenCvLoader.add_constructor(
-    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
-)
+def _mapping(loader: Any, node: Any) -> Any:
+    return loader.construct_mapping(node, deep=True)
+
+
+_OpenCvLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", _mapping)
 
 
 def _fields(path: Path, chain_camera: str | None) -> Mapping[str, Any]:
