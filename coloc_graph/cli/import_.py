@@ -14,6 +14,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     tracks.add_argument("tracks", metavar="TRACKS.csv", help="marker centres [px]")
     tracks.add_argument("--planes", metavar="PLANES.csv", help="marker planes: stance,robot,nx,ny,nz,d")
     tracks.add_argument("--moves", metavar="MOVES.csv", help="robots that moved before a stance: stance,robot")
+    tracks.add_argument("--ranges", metavar="RANGES.csv", help="ranges between robots: time,robot,target,range")
     add_out(tracks)
     tracks.set_defaults(run=run_tracks)
     mrclam = kinds.add_parser("mrclam", help="import a UTIAS MR.CLAM dataset: ranges and bearings, odometry, truth")
@@ -91,7 +92,13 @@ def run_tracks(args: argparse.Namespace) -> int:
     require_run_place(args.out, force=args.force)
     with progress("rows imported") as report:
         summary = import_tracks(
-            args.team, args.tracks, args.out, planes_path=args.planes, moves_path=args.moves, progress=report
+            args.team,
+            args.tracks,
+            args.out,
+            planes_path=args.planes,
+            moves_path=args.moves,
+            ranges_path=args.ranges,
+            progress=report,
         )
     warn(summary.warnings, kept=False)
     rows, stances = counted(summary.rows, "row"), counted(summary.stances, "stance")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import TracksError
 from coloc_graph.exchange.csv_table import Table, first, read_table
+from coloc_graph.exchange.ranges_csv import read_ranges
 from coloc_graph.run import Detections, Motion, Planes, RunWriter, Stance, atomic_run
 from coloc_graph.run.schemas import to_ns, to_seconds
 from coloc_graph.team import Team, read_team
@@ -56,6 +57,7 @@ def import_tracks(
     *,
     planes_path: str | Path | None = None,
     moves_path: str | Path | None = None,
+    ranges_path: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ImportSummary:
     """Write a run from a team.toml and marker tracks in a CSV file.
@@ -79,6 +81,8 @@ def import_tracks(
     moves_path
         CSV with stance, robot: the robot moved since the stance before; other observers stayed put. By default all
         observers are taken to have stayed put, with a warning.
+    ranges_path
+        CSV of `read_ranges`: ranges between robots, or to landmarks.
     progress
         Called with (rows written, their number).
 
@@ -90,7 +94,7 @@ def import_tracks(
         The run cannot be written.
     """
     tracks_path, out = Path(tracks_path), Path(out)
-    _require_other_file(out, team_path, tracks_path, planes_path, moves_path)
+    _require_other_file(out, team_path, tracks_path, planes_path, moves_path, ranges_path)
     team = read_team(team_path)
     tracks = _read_tracks(tracks_path, team)
     observers = _observers(tracks, team)
@@ -99,7 +103,10 @@ def import_tracks(
     stances = _stances(tracks, team, observers, moved)
     _require_planes(tracks_path, stances, planes)
 
+    ranges = [] if ranges_path is None else read_ranges(ranges_path, team, stances[0].start, stances[-1].end)
     with atomic_run(out, team) as writer:
+        for one in ranges:
+            writer.write(one)
         _write(writer, tracks, stances, planes, moved, progress)
     return ImportSummary(
         stances=len(stances),

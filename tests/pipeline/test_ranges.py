@@ -25,7 +25,7 @@ from coloc_graph.results.measurement_table import measurement_table
 from coloc_graph.run import OdometrySample, Ranges, open_run, read_true_team, read_truth
 from coloc_graph.simulation import Imperfections, simulate
 from coloc_graph.simulation.uwb import NLOS_EXCESS
-from coloc_graph.team import Ranging
+from coloc_graph.team import Ranging, write_team
 
 WRONG = Imperfections(uwb_sigma=0.05, uwb_offset_sigma=0.1, uwb_nlos=0.05)
 
@@ -287,6 +287,46 @@ def test_ranges_without_bearings_and_without_stances_are_refused(mixed, copied, 
     error = capsys.readouterr().err
     assert "mirrored" in error and len(error.splitlines()) == 1
     assert not (tmp_path / "result").exists()
+
+
+@pytest.fixture
+def tracked(short, tmp_path):
+    """The files of `coloc import tracks`: a team with range sensors, and tracks."""
+    run = open_run(short)
+    robots = tuple(msgspec.structs.replace(one, ranging=Ranging(range_sigma=0.05, two_way=True))
+                   for one in run.team.robots)  # fmt: skip
+    write_team(msgspec.structs.replace(run.team, robots=robots), tmp_path / "team.toml")
+    rows = [
+        f"{stance.index},{one.time!r},{robot},{marker},{u!r},{v!r}"
+        for stance in run.stances for robot in stance.observers
+        for one in run.detections(robot, stance.start, stance.end)
+        for marker, (u, v) in zip(one.markers, one.uv.tolist(), strict=True)
+    ]  # fmt: skip
+    (tmp_path / "tracks.csv").write_text("stance,time,robot,marker,u,v\n" + "\n".join(rows))
+    return tmp_path, run.stances
+
+
+def test_ranges_come_from_a_csv(tracked, capsys):
+    folder, stances = tracked
+    times = np.linspace(stances[0].start + 1, stances[0].end - 1, 20).tolist()
+    (folder / "ranges.csv").write_text("time,robot,target,range\n" + "\n".join(f"{t!r},A,B,0.75" for t in times))
+    command = ["import", "tracks", str(folder / "team.toml"), str(folder / "tracks.csv"), "--ranges"]
+    assert main([*command, str(folder / "ranges.csv"), "--out", str(folder / "run.mcap")]) == 0
+    assert [one.targets for one in open_run(folder / "run.mcap").ranges("A")] == [("B",)] * 20
+    capsys.readouterr()
+    for row, why in (
+        (f"{times[0]},A,A,1.0", "A ranges itself"),
+        (f"{times[0]},A,X,1.0", "neither a robot nor a landmark"),
+        (f"{times[0]},X,A,1.0", "not in the team"),
+        (f"{times[0]},A,B,-1.0", "give metres above 0"),
+        (f"{times[0]},A,B,nan", "remove rows that were not measured"),
+        ("7.0,A,B,1.0", "no range is of the run's time"),
+    ):
+        (folder / "bad.csv").write_text(f"time,robot,target,range\n{row}")
+        assert main([*command, str(folder / "bad.csv"), "--out", str(folder / "bad.mcap")]) == 2
+        error = capsys.readouterr().err
+        assert why in error and len(error.splitlines()) == 1
+        assert not (folder / "bad.mcap").exists()
 
 
 def test_errors_of_places_by_odometry_have_their_stated_covariance(rng):
