@@ -1,5 +1,6 @@
 """Track the markers of one stance in the observers' cameras, and provide the marker plane of each."""
 
+import heapq
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -100,6 +101,7 @@ class StanceTracks:
                 self._by_hue.setdefault(markers.hue_deg, []).append(name)
         self._trackers: dict[str, dict[float | None, MarkerTracker]] = {}
         self._taken: dict[str, int] = defaultdict(int)
+        self._followed: dict[str, float] = {}  # up to when the images of a robot were followed [UTC s]
         self._made: dict[str, tuple[float, list[Track]]] = {}
         self._standing: dict[str, list[Track]] = {}
         self._landmarks = {landmark.name for landmark in run.team.landmarks}
@@ -149,6 +151,7 @@ class StanceTracks:
     def all(self, end: float) -> dict[str, list[Track]]:
         """Tracks of all observers up to a time [UTC s]; none for a camera that is not above the marker plane."""
         found: dict[str, list[Track]] = {}
+        self._follow([robot for robot in self.stance.observers if not self.run.has_detections(robot)], end)
         for robot in self.stance.observers:
             try:
                 found[robot] = self.of(robot, end)
@@ -172,7 +175,7 @@ class StanceTracks:
         return SeenLandmarks(self._named_landmarks.get(robot, []))
 
     def _of(self, robot: str, end: float) -> list[Track]:
-        run, stance, camera = self.run, self.stance, self.run.team[robot].camera
+        run, stance = self.run, self.stance
         if run.has_detections(robot):
             seen = list(run.detections(robot, stance.start, end))
             if all(marker for one in seen for marker in one.markers):
@@ -190,25 +193,36 @@ class StanceTracks:
                 trackers[None].take(one.time, Blobs(one.uv, one.covariance, one.flags, one.peak, one.area))
             self._taken[robot] = len(seen)
         else:
-            by_hue = self._by_hue or {None: []}
-            trackers = self._trackers.setdefault(robot, {hue: self._tracker(robot, own) for hue, own in by_hue.items()})
-            watch = self._watches.get(robot)
-            if watch is None and self._landmarks:
-                watch = self._watches[robot] = LandmarkWatch(run.team[robot], run.team, stance.movers)
-            for number, image in enumerate(run.images(robot, stance.start, end)):
-                if image.pixels.shape[:2] != (camera.height, camera.width):
-                    raise InputError(
-                        f"{run.path}: stance {stance.index}: the images of {robot} are {image.pixels.shape[1]} x "
-                        f"{image.pixels.shape[0]} pixels and its camera is {camera.width} x {camera.height} in the "
-                        "team: correct the camera, and its calibration"
-                    )
-                if number >= self._taken[robot]:
-                    for tracker in trackers.values():
-                        tracker.step(image)
-                    if watch is not None:
-                        watch.look(image)
-                    self._taken[robot] = number + 1
+            self._follow([robot], end)
+            trackers = self._trackers[robot]
         return self._bound(robot, {hue: tracker.tracks() for hue, tracker in trackers.items()})
+
+    def _follow(self, robots: Sequence[str], end: float) -> None:
+        """Follow lights through the images of robots up to a time [UTC s], in one pass through their file."""
+        run, stance = self.run, self.stance
+        for robot in robots:
+            by_hue = self._by_hue or {None: []}
+            self._trackers.setdefault(robot, {hue: self._tracker(robot, own) for hue, own in by_hue.items()})
+            if robot not in self._watches and self._landmarks:
+                self._watches[robot] = LandmarkWatch(run.team[robot], run.team, stance.movers)
+        number = dict.fromkeys(robots, 0)
+        streams = [run.images(robot, stance.start, end) for robot in robots if self._followed.get(robot) != end]
+        for image in heapq.merge(*streams, key=lambda one: one.time):
+            robot, camera = image.robot, run.team[image.robot].camera
+            if image.pixels.shape[:2] != (camera.height, camera.width):
+                raise InputError(
+                    f"{run.path}: stance {stance.index}: the images of {robot} are {image.pixels.shape[1]} x "
+                    f"{image.pixels.shape[0]} pixels and its camera is {camera.width} x {camera.height} in the "
+                    "team: correct the camera, and its calibration"
+                )
+            number[robot] += 1
+            if number[robot] > self._taken[robot]:
+                for tracker in self._trackers[robot].values():
+                    tracker.step(image)
+                if robot in self._watches:
+                    self._watches[robot].look(image)
+                self._taken[robot] = number[robot]
+        self._followed.update(dict.fromkeys(robots, end))
 
     def _bound(self, robot: str, by_hue: Mapping[float | None, list[Track]]) -> list[Track]:
         """Return the tracks of movers' markers of an observer, by colour, with the robot or body of each."""

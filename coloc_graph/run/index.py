@@ -8,7 +8,7 @@ import struct
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -36,6 +36,14 @@ FOOTER_HEAD = HEAD.pack(Opcode.FOOTER, 20)
 FOOTER_SIZE = len(FOOTER_HEAD) + 20
 
 
+class KeptChunk(NamedTuple):
+    """Messages of a decompressed chunk by channel, their number, and their size [bytes]."""
+
+    by_channel: dict[int, list[Message]]
+    count: int
+    size: int
+
+
 @dataclass(frozen=True)
 class Index:
     """Index of an MCAP file.
@@ -53,7 +61,7 @@ class Index:
     lost : int or None
         Bytes at the end that could not be read; None of a whole file.
     newest : dict
-        Cache of decompressed chunks: messages by channel, by the chunk's offset.
+        Cache of decompressed chunks by their offsets.
     """
 
     path: Path
@@ -61,7 +69,7 @@ class Index:
     chunks: tuple[ChunkInfo, ...]
     channels: dict[int, ChannelInfo]
     lost: int | None
-    newest: dict[int, dict[int, list[Message]]] = field(default_factory=dict, repr=False, compare=False)
+    newest: dict[int, KeptChunk] = field(default_factory=dict, repr=False, compare=False)
 
 
 def is_mcap(path: Path) -> bool:

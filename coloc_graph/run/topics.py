@@ -9,7 +9,7 @@ from coloc_graph.errors import RunError
 from coloc_graph.run import schemas
 from coloc_graph.run.chunks import ChunkInfo, Message, damaged, messages
 from coloc_graph.run.decode import MalformedError
-from coloc_graph.run.index import Index
+from coloc_graph.run.index import Index, KeptChunk
 
 T = TypeVar("T")
 
@@ -79,10 +79,10 @@ def _messages(index: Index, topic: str, channels: Collection[int], chunks: Itera
     try:
         with index.path.open("rb") as file:
             for chunk in chunks:
-                by_channel = index.newest.get(chunk.offset)
-                if by_channel is None:
-                    by_channel = _keep(index, chunk, messages(index.path, file, chunk))
-                found = [one for channel in channels for one in by_channel.get(channel, ())]
+                kept = index.newest.get(chunk.offset)
+                if kept is None:
+                    kept = _keep(index, chunk, messages(index.path, file, chunk))
+                found = [one for channel in channels for one in kept.by_channel.get(channel, ())]
                 if len(found) != sum(chunk.counts.get(channel, 0) for channel in channels):
                     raise damaged(index.path, chunk.offset, f"not as many messages of {topic} as its index says")
                 if len(channels) > 1:
@@ -92,23 +92,24 @@ def _messages(index: Index, topic: str, channels: Collection[int], chunks: Itera
         raise RunError(f"{index.path}: cannot be read ({error.strerror}); check the disk") from error
 
 
-def _keep(index: Index, chunk: ChunkInfo, read: Iterable[Message]) -> dict[int, list[Message]]:
+def _keep(index: Index, chunk: ChunkInfo, read: Iterable[Message]) -> KeptChunk:
     """Put the messages of a chunk, by channel, into the cache: of a stance each robot's topics are read."""
     by_channel: dict[int, list[Message]] = {}
-    for one in read:
+    count = 0
+    for count, one in enumerate(read, start=1):
         by_channel.setdefault(one.channel, []).append(one)
-    index.newest[chunk.offset] = by_channel
+    index.newest[chunk.offset] = kept = KeptChunk(by_channel, count, chunk.size)
     while len(index.newest) > 1 and _too_much(index.newest):
         index.newest.pop(next(iter(index.newest)), None)
-    return by_channel
+    return kept
 
 
-def _too_much(newest: dict[int, dict[int, list[Message]]]) -> bool:
+def _too_much(newest: dict[int, KeptChunk]) -> bool:
     """Return whether the cached chunks are too many, or too large."""
-    kept = [every for by_channel in tuple(newest.values()) if (every := tuple(by_channel.values()))]
-    messages_kept = sum(len(each) for every in kept for each in every)
-    bytes_kept = sum(memoryview(every[0][0].data.obj).nbytes for every in kept)  # all are views of one chunk
-    return len(newest) > KEPT_CHUNKS or messages_kept > KEPT_MESSAGES or bytes_kept > KEPT_BYTES
+    if len(newest) > KEPT_CHUNKS:
+        return True
+    kept = tuple(newest.values())
+    return sum(one.count for one in kept) > KEPT_MESSAGES or sum(one.size for one in kept) > KEPT_BYTES
 
 
 def decoded(index: Index, items: tuple[str, Iterator[Item]], decoder: Callable[[Item], T]) -> Iterator[T]:
