@@ -163,6 +163,8 @@ class _Seen:
     def cameras(self) -> tuple[Camera, Camera]:
         """Cameras of both observers, fisheyes as views of the marker plane."""
         one, other = self.team[self.robot_i], self.team[self.robot_j]
+        if one.camera.model == other.camera.model == "pinhole":
+            return one.camera, other.camera
         down = other.mount.R_body_camera.T @ np.array([0.0, 0.0, -1.0])
         return view_of_plane(one.camera, self.plane.N), view_of_plane(other.camera, down)
 

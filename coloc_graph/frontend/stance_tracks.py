@@ -15,6 +15,7 @@ from coloc_graph.frontend.homography.plane import plane_from_mount
 from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.images.detection import Blobs, detector_for
 from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks
+from coloc_graph.frontend.pairing.correspondence import STILL
 from coloc_graph.frontend.tracks.blink_codes import BlinkCodes
 from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers, merge_named
 from coloc_graph.frontend.tracks.rigid_path import RigidPath
@@ -195,7 +196,9 @@ class StanceTracks:
         else:
             self._follow([robot], end)
             trackers = self._trackers[robot]
-        return self._bound(robot, {hue: tracker.tracks() for hue, tracker in trackers.items()})
+        # blink codes are read from pieces of tracks, too
+        least = STILL if self._codes(self.stance.movers) is None else 0.0
+        return self._bound(robot, {hue: tracker.tracks(least) for hue, tracker in trackers.items()})
 
     def _follow(self, robots: Sequence[str], end: float) -> None:
         """Follow lights through the images of robots up to a time [UTC s], in one pass through their file."""

@@ -171,13 +171,19 @@ class Detector:
                 window = _window(own, light.shape)
                 # any other light there?
                 around = light[window[1] : window[3], window[0] : window[2]]
-                group = [own]
+                group: list[tuple[int, int, int, int]] = []
                 touched = False
                 if max(width, height) <= MAX_LED_SIZE and np.count_nonzero(around > level) > pixels:
                     if everything is None:
                         everything = _components(light, level)
                     group, touched = _deblending_group(own, [tuple(blob) for blob, _ in everything], light.shape)
-                found.append(_cut(light, group, (u0, v0), (u, v), pixels, level, clipped, touched))
+                if len(group) < 2:
+                    corner = window[0] + u0, window[1] + v0
+                    box_in_window = left - window[0], top - window[1], width, height
+                    one = Candidate((u, v), pixels, around.copy(), corner, box_in_window, level, clipped, (), touched)
+                    found.append(one)
+                else:
+                    found.append(_cut(light, group, (u0, v0), (u, v), pixels, level, clipped, touched))
         return found
 
     def measure(self, candidates: Sequence[Candidate]) -> tuple[Blobs, NDArray[np.bool_]]:

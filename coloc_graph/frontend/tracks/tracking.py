@@ -38,6 +38,7 @@ ADAPTATION = 0.05  # of the logarithm of the acceleration, an image, by the mean
 MAX_FACTOR = 100.0  # by which the acceleration may grow
 FASTER = 2.0  # a new light's velocity is up to this times those of the lights that are tracked
 REACH_SIGMAS = 3.0  # standard deviations of a light's position that the patch holds
+ROUGH_EXTENT = 2.0  # px by which an extent of approximate centres may be too small
 MIN_PIECE = 4  # samples of a piece on which both directions of time agree
 ROUGH_SIGMA = 0.5  # px, of a candidate's approximate centre
 ROUGH: Symmetric = (ROUGH_SIGMA**2, 0.0, ROUGH_SIGMA**2)
@@ -136,6 +137,12 @@ class _Live:
     score: float = 0.0
     confirmed: bool = False
 
+    @property
+    def extent(self) -> float:
+        """Diagonal of the bounding box of the approximate centres [px]."""
+        u, v = zip(*self.uv, strict=True)
+        return math.hypot(max(u) - min(u), max(v) - min(v))
+
     def take(self, time: float, place: tuple[float, float], sample: Candidate | int) -> None:
         self.times.append(time)
         self.uv.append(place)
@@ -218,9 +225,12 @@ class MarkerTracker:
         covariances: list[Symmetric] = [(xx, xy, yy) for (xx, xy), (_, yy) in whole.covariance.tolist()]
         self._advance(time, places, covariances, list(numbers), births=True)
 
-    def tracks(self) -> list[Track]:
-        """Measure the samples of all tracks, ended or live, and return them, oldest first."""
-        return self._measured(self._confirmed())
+    def tracks(self, least: float = 0.0) -> list[Track]:
+        """Measure the samples of all tracks, ended or live, and return them, oldest first.
+
+        Lights at rest, whose bounding box has a diagonal of less than `least` [px], are neither measured nor returned.
+        """
+        return self._measured([live for live in self._confirmed() if live.extent >= least - ROUGH_EXTENT])
 
     def checked_tracks(self) -> list[Track]:
         """Return the tracks as far as they go on alike forward and backward in time, cut where they do not.
