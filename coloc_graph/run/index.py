@@ -40,7 +40,7 @@ class KeptChunk(NamedTuple):
     """Messages of a decompressed chunk by channel, their number, and their size [bytes]."""
 
     by_channel: dict[int, list[Message]]
-    count: int
+    number: int
     size: int
 
 

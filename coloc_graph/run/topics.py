@@ -109,7 +109,7 @@ def _too_much(newest: dict[int, KeptChunk]) -> bool:
     if len(newest) > KEPT_CHUNKS:
         return True
     kept = tuple(newest.values())
-    return sum(one.count for one in kept) > KEPT_MESSAGES or sum(one.size for one in kept) > KEPT_BYTES
+    return sum(one.number for one in kept) > KEPT_MESSAGES or sum(one.size for one in kept) > KEPT_BYTES
 
 
 def decoded(index: Index, items: tuple[str, Iterator[Item]], decoder: Callable[[Item], T]) -> Iterator[T]:
