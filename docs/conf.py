@@ -12,7 +12,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "site"), str(HERE.parent)]
 os.environ.setdefault("MPLBACKEND", "agg")
 
-from api_pages import module_markdown, restructured, top_markdown  # noqa: E402
+from api_pages import describe_constant, module_markdown, restructured, top_markdown  # noqa: E402
 from command_pages import commands_markdown  # noqa: E402
 from field_pages import records_markdown, team_markdown  # noqa: E402
 from pygments.lexers.special import TextLexer  # noqa: E402
@@ -80,6 +80,13 @@ def is_plain_field(app: Sphinx, what: str, name: str, value: object, skip: bool,
     return True if what == "class" and (not described or isinstance(value, MemberDescriptorType)) else None
 
 
+def mend_docstring(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
+    """Make a docstring safe for reStructuredText, and describe constants by their comment."""
+    if what in ("data", "module") and isinstance(value, tuple | int | float | str | frozenset | dict):
+        describe_constant(name, value, lines)
+    restructured(lines)
+
+
 def make_scene(app: Sphinx) -> None:
     """Simulate, solve and export the run that the page of the viewer's scene shows, unless it is there."""
     from coloc_graph.cli import main
@@ -107,4 +114,4 @@ def setup(app: Sphinx) -> None:
     app.connect("builder-inited", make_scene)
     app.connect("source-read", fill)
     app.connect("autodoc-skip-member", is_plain_field)
-    app.connect("autodoc-process-docstring", lambda *args: restructured(args[-1]), priority=100)
+    app.connect("autodoc-process-docstring", mend_docstring, priority=100)

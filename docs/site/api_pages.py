@@ -2,7 +2,9 @@
 
 import inspect
 import re
+import sys
 from importlib import import_module
+from pathlib import Path
 
 from public_names import home_of, homes
 
@@ -43,6 +45,25 @@ def markdown_of(text: str) -> str:
     """Escape what Markdown would take for a mark, outside of code."""
     parts = re.split(r"(`[^`]*`)", text)
     return "".join(part if part.startswith("`") else re.sub(r"([|*<>_\[\]])", r"\\\1", part) for part in parts)
+
+
+def describe_constant(name: str, value: object, lines: list[str]) -> None:
+    """Replace the description of a constant's type, which autodoc takes, by its comment in the source and its value."""
+    if lines and (type(value).__doc__ or "").strip().startswith(lines[0].strip()):
+        word = name.rpartition(".")[2]
+        files = (getattr(module, "__file__", None) for key, module in sorted(sys.modules.items()) if _ours(key))
+        texts = (Path(file).read_text(encoding="utf-8") for file in files if file)
+        found = (re.search(rf"^{word}\b[^\n]*?  # (.+)$", text, re.MULTILINE) for text in texts)
+        comment = next((match[1] for match in found if match), "")
+        shown = repr(value)
+        lines[:] = [
+            *([f"{comment}.", ""] if comment else []),
+            *([f"Value: ``{shown}``", ""] if len(shown) < 200 else []),
+        ]
+
+
+def _ours(module: str) -> bool:
+    return module.split(".")[0] == "coloc_graph"
 
 
 def restructured(lines: list[str]) -> None:
