@@ -202,3 +202,27 @@ def test_an_unsupported_python_or_system_is_told_in_words_before_anything_is_ins
 
 def test_the_drawing_of_the_architecture_is_up_to_date():
     assert DRAWING.read_text(encoding="utf-8") == drawing(), "run python scripts/architecture.py"
+
+
+@pytest.mark.parametrize("url", ["https://example.org/team/coloc", ""])
+def test_links_of_the_package_page_lead_to_the_repository_or_are_text(url, monkeypatch):
+    given = {}
+    monkeypatch.setattr("setuptools.setup", given.update)
+    monkeypatch.setenv("PROJECT_URL", url)
+    monkeypatch.chdir(ROOT)
+    runpy.run_path(str(ROOT / "setup.py"), run_name="__main__")
+    page, links = given["long_description"], given["project_urls"]
+    targets = re.findall(r"\]\(([^)\s]+)\)", page)
+    assert targets and all("://" in target for target in targets)
+    assert any(target.startswith(f"{url}/blob/main/docs/") for target in targets) == bool(url)
+    assert all(link.startswith(url) for link in links.values()) and bool(links) == bool(url)
+
+
+def test_the_source_distribution_has_every_folder():
+    manifest = (ROOT / "MANIFEST.in").read_text(encoding="utf-8")
+    named = set(re.findall(r"[\w.-]+", manifest)) | {"coloc_graph"}
+    here = {path for path in ROOT.iterdir() if path.is_dir() and not path.is_symlink()}
+    made = {".git", ".venv", "build", "dist", "demo-out", "htmlcov"}
+    folders = {path.name for path in here} - made
+    missing = {name for name in folders if not name.startswith((".", "__")) and not name.endswith(".egg-info")} - named
+    assert not missing, f"MANIFEST.in leaves out {missing}"

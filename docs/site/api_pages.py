@@ -8,6 +8,8 @@ from pathlib import Path
 
 from public_names import home_of, homes
 
+MAX_SHOWN = 200  # characters of a constant's value that are shown
+
 
 def module_markdown(path: str) -> str:
     """Directives for the public names of a module that are described in its page."""
@@ -55,11 +57,8 @@ def describe_constant(name: str, value: object, lines: list[str]) -> None:
         texts = (Path(file).read_text(encoding="utf-8") for file in files if file)
         found = (re.search(rf"^{word}\b[^\n]*?  # (.+)$", text, re.MULTILINE) for text in texts)
         comment = next((match[1] for match in found if match), "")
-        shown = repr(value)
-        lines[:] = [
-            *([f"{comment}.", ""] if comment else []),
-            *([f"Value: ``{shown}``", ""] if len(shown) < 200 else []),
-        ]
+        shown = f"Value: ``{value!r}``" if len(repr(value)) < MAX_SHOWN else ""
+        lines[:] = [part for text in (f"{comment}." if comment else "", shown) if text for part in (text, "")]
 
 
 def _ours(module: str) -> bool:
