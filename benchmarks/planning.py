@@ -2,6 +2,9 @@
 
     python benchmarks/planning.py [--seeds 40]           a straight 7.2 m at depth tracks, equal images in all
     python benchmarks/planning.py --images 8             the same from rendered images
+    python benchmarks/planning.py --on L --seconds 5     on with walls: L, U, pillars, rooms
+    python benchmarks/planning.py --safety 1000 --on L   how near robots come to each other and to walls
+    python benchmarks/planning.py --length 21.5          a longer way
     python benchmarks/planning.py --fps 30 --seconds 1.67  as many images, and less time to drive
 
 The mover drives its way at 0.2 m/s, robots hide what is behind them, and stop where their leaps slip to (1 cm and
@@ -35,8 +38,10 @@ from coloc_graph.planning.horizon import Horizon, Objective
 from coloc_graph.planning.mission import Mission, leap_frog, stances_of
 from coloc_graph.planning.plan import Plan
 from coloc_graph.planning.prediction import Predictor
+from coloc_graph.planning.slip import stop_sigma
 from coloc_graph.run import atomic_run, open_run
 from coloc_graph.simulation import Imperfections, World, build_world, record, reference_team
+from coloc_graph.simulation.floor_plans import FLOOR_PLANS, FloorPlan
 from coloc_graph.simulation.planned import planned
 from coloc_graph.simulation.rig import stated_team
 from coloc_graph.simulation.world import stream
@@ -47,6 +52,7 @@ PAIR = "A", "B"
 MOVER = "C"
 LENGTH = 7.2  # m
 BOOTSTRAPS = 2000
+RADIUS = 0.17  # of a Create [m]
 
 
 @dataclass(frozen=True)
@@ -63,23 +69,32 @@ class Outcome:
     failed: str = ""
 
 
-def missions(team: Team, fps: float, seconds: float, only: Sequence[str]) -> dict[str, Mission]:
+def missions(
+    team: Team, fps: float, seconds: float, only: Sequence[str], length: float, floor_plan: FloorPlan | None
+) -> dict[str, Mission]:
     """Plans of all baselines, with as many images as the paper's formation takes in stances of these `seconds`."""
-    predictor = Predictor(team, fps)
-    capture = seconds * stances_of(PAPER, LENGTH)
-    search = GaitSearch(predictor, LENGTH, PAIR, MOVER)
+    predictor = Predictor(team, fps, floor_map=None if floor_plan is None else floor_plan.floor_map())
+    goals = ((length, 0.0),) if floor_plan is None else floor_plan.goals
+    course = Course(((0.0, 0.0), *goals))
+    capture = seconds * stances_of(PAPER, course.length)
+    search = GaitSearch(predictor if floor_plan is None else Predictor(team, fps), course.length, PAIR, MOVER)
     ranked = search.ranked(capture=capture)
 
     def fixed(gait: Gait) -> Mission:
-        each = capture / stances_of(gait, LENGTH)
-        return leap_frog(predictor, gait, LENGTH, each, PAIR, MOVER, designed=False)
+        each = capture / stances_of(gait, length)
+        return leap_frog(predictor, gait, length, each, PAIR, MOVER, designed=False)
 
     def horizon(objective: Objective, start: Gait) -> Mission:
-        course = Course(((0.0, 0.0), (LENGTH, 0.0)))
-        planner = Horizon(predictor, course, PAIR, MOVER, capture, objective=objective)
+        planner = Horizon(predictor, course, PAIR, MOVER, capture, objective=objective, gait=ranked[0][0].gait)
         poses = {"A": start.stop(0), "B": start.stop(1), MOVER: (1.5, 0.0, 0.0)}
+        if floor_plan is not None:
+            poses = {**planner.starts(), MOVER: (1.5, 0.0, 0.0)}
         return planner.mission(Belief.start(team, poses))
 
+    if floor_plan is not None:
+        # a fixed gait knows no corners: the best one's leaps are those of b5 and of the horizon
+        objectives: dict[str, Objective] = {"b3": "information", "b4": "view", "b5": "random", "horizon": "goal"}
+        return {name: horizon(one, PAPER) for name, one in objectives.items() if name in only or not only}
     by_patrol = [fixed(one.gait) for one, _ in ranked[:12]]
     best, by_gait = search.planned(ranked)
     made = {
@@ -96,10 +111,10 @@ def missions(team: Team, fps: float, seconds: float, only: Sequence[str]) -> dic
     return {name: plan() for name, plan in made.items() if name in only or not only}
 
 
-def outcome(seed: int, plan: Plan, fps: float, depth: str) -> Outcome:
+def outcome(seed: int, plan: Plan, fps: float, depth: str, floor_plan: FloorPlan | None = None) -> Outcome:
     """Simulate a seed that follows a plan, solve it and compare with its truth."""
     try:
-        scenario = planned(plan, stream(seed, "formation"))
+        scenario = planned(plan, stream(seed, "formation"), floor_plan)
         world = build_world(scenario, seed=seed, fps=fps, imperfections=WRONG, depth=depth)  # type: ignore[arg-type]
         solution = solved(world, SolveOptions("joint"))[0] if depth == "tracks" else from_images(world)
     except ColocError as error:
@@ -142,14 +157,72 @@ def ratio(outcomes: Sequence[Outcome], base: Sequence[Outcome], what: str) -> tu
     return float(np.sqrt(squares[:, 0].sum() / squares[:, 1].sum())), float(low), float(high)
 
 
-def table(seeds: Sequence[int], fps: float, seconds: float, depth: str, only: Sequence[str]) -> dict[str, object]:
-    """Run all plans over the seeds and print a row each."""
+def safety(mission: Mission, draws: int, floor_plan: FloorPlan | None) -> str:
+    """Least distances, over draws of where robots stop, of middles of robots and from walls; in one line.
+
+    Checked on places every 2 cm of each leap and drive, against the walls' rectangles, not the map of the planner.
+    """
+    rng = np.random.default_rng(0)
+    to_robot, to_wall, collisions = math.inf, math.inf, 0
+    for _ in range(draws):
+        stood: dict[str, np.ndarray] = {}
+        touched = False
+        for stance in mission.plan.stances:
+            places = {}
+            for name, pose in stance.standing.items():
+                if name in stance.anchors:
+                    places[name] = stood[name]
+                    continue
+                leapt = math.dist(pose[:2], stood[name]) if name in stood else 0.0
+                places[name] = np.array(pose[:2]) + rng.standard_normal(2) * float(stop_sigma(leapt))
+            ways = {name: dense([stood.get(name, place), place]) for name, place in places.items()}
+            ways[stance.mover] = dense(stance.waypoints)
+            for name, way in ways.items():
+                others = [place for other, place in places.items() if other != name]
+                near = min(float(np.hypot(*(way - other).T).min()) for other in others)
+                walled = math.inf if floor_plan is None else float(floor_plan.distance(way).min())
+                to_robot, to_wall = min(to_robot, near), min(to_wall, walled)
+                touched |= near < 2 * RADIUS or walled < RADIUS
+            stood = places
+        collisions += touched
+    return (
+        f"{collisions} of {draws} missions with a collision; least distance of two middles {to_robot:.3f} m, "
+        f"of a middle from a wall {to_wall:.3f} m (robots have a radius of {RADIUS} m)"
+    )
+
+
+def dense(points: Sequence[Sequence[float]]) -> np.ndarray:
+    """Places every 2 cm of a polyline."""
+    at = np.asarray(points, float)
+    far = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(at, axis=0).T))])
+    along = np.linspace(0.0, far[-1], max(int(far[-1] / 0.02), 1) + 1)
+    return np.column_stack([np.interp(along, far, column) for column in at.T])
+
+
+def table(
+    seeds: Sequence[int],
+    fps: float,
+    seconds: float,
+    depth: str,
+    only: Sequence[str],
+    *,
+    length: float = LENGTH,
+    floor_plan: FloorPlan | None = None,
+    draws: int = 0,
+) -> dict[str, object]:
+    """Run all plans over the seeds and print a row each; with `draws` print how near robots come instead."""
     team = stated_team(reference_team(), WRONG)
-    made = missions(team, fps, seconds, only)
-    found: dict[str, object] = {}
+    made = missions(team, fps, seconds, only, length, floor_plan)
+    if draws:
+        found = {name: safety(mission, draws, floor_plan) for name, mission in made.items()}
+        for name, text in found.items():
+            print(f"{name:8} {text}", flush=True)
+        return dict(found)
+    rows: dict[str, object] = {}
     base: list[Outcome] | None = None
     for name, mission in made.items():
-        runs = over_seeds(partial(outcome, plan=mission.plan, fps=fps, depth=depth), seeds)
+        one = partial(outcome, plan=mission.plan, fps=fps, depth=depth, floor_plan=floor_plan)
+        runs = over_seeds(one, seeds)
         base = runs if base is None else base
         end, heading = ratio(runs, base, "end"), ratio(runs, base, "heading")
         realised = rms(runs, "end")
@@ -167,7 +240,7 @@ def table(seeds: Sequence[int], fps: float, seconds: float, depth: str, only: Se
             "void": sum(one.void for one in runs) / sum(one.stances for one in runs),
             "failed": [one.failed for one in runs if one.failed],
         }
-        found[name] = row
+        rows[name] = row
         print(
             f"{name:8} {row['stances']:3} stances {row['images']:5} images {mission.duration:4.0f} s  end "
             f"{row['end_mm']:5.1f} mm (promised {row['promised_mm']:5.1f}, ratio {row['promised_over_realised']:.2f})  "
@@ -177,7 +250,7 @@ def table(seeds: Sequence[int], fps: float, seconds: float, depth: str, only: Se
             + (f"  failed {len(row['failed'])}: {row['failed'][0]}" if row["failed"] else ""),
             flush=True,
         )
-    return found
+    return rows
 
 
 def main() -> int:
@@ -188,11 +261,23 @@ def main() -> int:
     parser.add_argument("--images", type=int, metavar="SEEDS")
     parser.add_argument("--fps", type=float, default=10.0)
     parser.add_argument("--seconds", type=float, default=5.0, help="duration of a stance of b0")
+    parser.add_argument("--length", type=float, default=LENGTH, help="length of the way [m]")
+    parser.add_argument("--on", choices=FLOOR_PLANS, help="floor with walls")
+    parser.add_argument("--safety", type=int, default=0, metavar="DRAWS")
     parser.add_argument("--only", nargs="*", default=[])
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
     depth, seeds = ("images", args.images) if args.images else ("tracks", args.seeds)
-    found = table(range(args.first, args.first + seeds), args.fps, args.seconds, depth, args.only)
+    found = table(
+        range(args.first, args.first + seeds),
+        args.fps,
+        args.seconds,
+        depth,
+        args.only,
+        length=args.length,
+        floor_plan=None if args.on is None else FLOOR_PLANS[args.on],
+        draws=args.safety,
+    )
     if args.json:
         args.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
     return 0

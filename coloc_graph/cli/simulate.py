@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from coloc_graph.planning.formation import Gait
 
 #: Scenarios with a gait, and the leap of each [m].
-GAITS = {"hallway": 0.185, "landmarks": 0.25}
+GAITS = {"hallway": 0.185, "six-step": 0.185, "landmarks": 0.25, "team": 0.45}
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -53,11 +53,14 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     uwb.add_argument("--uwb-landmarks", type=int, default=0, metavar="N", help="landmarks that are ranged, unknown to "
                      "the team (default: 0)")  # fmt: skip
 
-    single = command.add_argument_group("scenarios single-step, hallway and landmarks")
+    single = command.add_argument_group("formation, or a plan instead")
     single.add_argument("-l", type=float, help="distance between the observers, m (default: 0.8; hallway 0.74)")
     single.add_argument("--theta", type=float, help="angle between the observers, deg (default: 35; hallway 34)")
-    single.add_argument("--leap", type=float, help="advance of the team a stance, m (default: 0.185; landmarks 0.25)")
-    single.add_argument("--plan", metavar="CSV", help="hallway: follow a plan that `coloc plan --poses` wrote")
+    single.add_argument(
+        "--leap", type=float, help="advance a stance, m (default: 0.185; landmarks 0.25; rows of team 0.45)"
+    )
+    single.add_argument("--plan", metavar="CSV", help="follow a plan that `coloc plan --poses` wrote")
+    single.add_argument("--team", metavar="TEAM.toml", help="with --plan: its robots (default: those of the reference)")
 
     team = command.add_argument_group("scenario team")
     team.add_argument("--robots", type=int, help="number of robots (default: 10)")
@@ -82,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.errors import InputError
     from coloc_graph.planning.plan import read_plan
     from coloc_graph.simulation import Imperfections, simulate
+    from coloc_graph.team import read_team
 
     require_run_place(args.out, force=args.force)
     other = {"tracks": ("fps", "image_format"), "images": ("noise",)}[args.depth]
@@ -114,6 +118,7 @@ def run(args: argparse.Namespace) -> int:
             theta_deg=args.theta if args.scenario not in GAITS else None,
             gait=gait_of(args),
             plan=None if args.plan is None else read_plan(args.plan),
+            team=None if args.team is None else read_team(args.team),
             robots=args.robots,
             at_once=args.at_once,
             length=args.length,
@@ -139,12 +144,13 @@ def gait_of(args: argparse.Namespace) -> "Gait | None":
 
     if args.scenario not in GAITS:
         if args.leap is not None:
-            raise InputError(f"--leap belongs to hallway and landmarks, not to {args.scenario}; leave it out")
+            raise InputError(f"{args.scenario} has no leap: leave --leap out")
         return None
     given = {"l": args.l, "theta_deg": args.theta, "leap": args.leap}
     if all(value is None for value in given.values()):
         return None
     leap = GAITS[args.scenario] if args.leap is None else args.leap
     # without a distance the lanes stay where they are
-    apart = math.hypot(leap, 0.72) if args.l is None else args.l
+    lanes = 0.8 if args.scenario == "team" else 0.72
+    apart = math.hypot(leap, lanes) if args.l is None else args.l
     return Gait.of_paper(apart, 34.0 if args.theta is None else args.theta, leap)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.simulation.paths import tilt_rotation
-from coloc_graph.simulation.scenarios import CourseScenario, Pose, Scenario
+from coloc_graph.simulation.scenarios import Pose, Scenario
 from coloc_graph.team import Landmark, Markers, Tag, Team
 from coloc_graph.team.shared_view import View
 
@@ -29,7 +29,7 @@ ASIDE = math.radians(70.0)  # rad, largest angle to the direction it faces
 
 def with_landmarks(team: Team, scenario: Scenario, *, tags: bool) -> Team:
     """The team with the scenario's landmarks, surveyed: on a map that is the floor, with tolerances."""
-    if not isinstance(scenario, CourseScenario):
+    if not scenario.landmarks:
         return team
     return replace(team, landmarks=tuple(_landmark(n, pose, tags) for n, pose in enumerate(scenario.landmarks, 1)))
 

@@ -12,7 +12,7 @@ from coloc_graph.planning.slip import HEADING_SIGMA, stop_sigma
 from coloc_graph.simulation.floor_plans import FloorPlan
 from coloc_graph.simulation.paths import Array, Leg
 from coloc_graph.simulation.scenarios import Box, Pose, Scenario
-from coloc_graph.simulation.tours import Tour, both_see, no_common_view
+from coloc_graph.simulation.tours import Tour, no_common_view, sees
 from coloc_graph.team.shared_view import View, hidden
 
 MIN_POINTS = 6  # correspondences without which a stance has no homography
@@ -56,13 +56,13 @@ class PlannedScenario(Scenario):
         x, y, _ = np.mean([self.poses[n] for n in self.at[k].values()], axis=0)
         return float(x), float(y)
 
-    def tour(self, k: int, views: tuple[View, View], markers: Array, fps: float, start: float, where: str) -> Tour:
+    def tour(self, k: int, views: tuple[View, ...], markers: Array, fps: float, start: float, where: str) -> Tour:
         """Drive through the plan's waypoints for as long as it says, with captures at `fps` [1/s].
 
         Raises
         ------
         InputError
-            If both cameras see too little of the mover on the way.
+            If no two cameras see enough of the mover on the way.
         """
         assert self.plan is not None
         stance = self.plan.stances[k]
@@ -74,33 +74,42 @@ class PlannedScenario(Scenario):
         mx, my = markers[:, 0], markers[:, 1]
         places = np.stack([x[:, None] + c * mx - s * my, y[:, None] + s * mx + c * my], axis=-1)
         points = np.concatenate([places, np.full((*places.shape[:2], 1), markers[0, 2])], axis=-1)
-        recorded = both_see(views, points)
-        for view in views:
+        by_view = np.empty((len(views), *points.shape[:2]), bool)
+        for n, view in enumerate(views):
+            by_view[n] = sees(view, points)
             others = [other.T_world_camera[:2, 3] for other in views if other is not view]
-            recorded &= ~hidden(view.T_world_camera[:3, 3], points, np.array(others))
+            by_view[n] &= ~hidden(view.T_world_camera[:3, 3], points, np.array(others))
             if self.floor_plan is not None:
-                recorded &= ~self.floor_plan.blocked(view.T_world_camera[:2, 3], points).reshape(recorded.shape)
+                by_view[n] &= ~self.floor_plan.blocked(view.T_world_camera[:2, 3], points)
+        # what one camera alone sees is seen with no other
+        recorded = by_view.sum(axis=0) >= 2
+        by_view &= recorded
         if recorded.sum() < MIN_POINTS:
             raise no_common_view(where)
         leg = Leg(start + np.append(drive.times, stance.duration), np.vstack([drive.knots, drive.knots[-1:]]))
         if drive.times[-1] > stance.duration:
             leg = Leg(start + drive.times, drive.knots).cut(stance.duration)
-        return Tour(leg, start + instants, recorded)
+        return Tour(leg, start + instants, recorded, by_view)
 
 
-def planned(plan: Plan, rng: np.random.Generator | None = None, floor_plan: FloorPlan | None = None) -> PlannedScenario:
+def planned(
+    plan: Plan,
+    rng: np.random.Generator | None = None,
+    floor_plan: FloorPlan | None = None,
+    landmarks: tuple[Pose, ...] = (),
+) -> PlannedScenario:
     """Make the scenario that follows a plan; each stop is off by some centimetres and a degree.
 
-    Walls of a `floor_plan` hide what is behind them.
+    Walls of a `floor_plan` hide what is behind them; `landmarks` are the poses of landmarks.
 
     Raises
     ------
     InputError
-        If a stance of the plan has other than two observers, or the mover changes.
+        If the mover of the plan changes.
     """
     movers = {stance.mover for stance in plan.stances}
-    if len(movers) > 1 or any(len(stance.standing) != 2 for stance in plan.stances):
-        raise InputError("a simulated plan needs two observers in each stance, and one mover in all: give such a plan")
+    if len(movers) > 1:
+        raise InputError(f"a simulated plan has one mover, not {', '.join(sorted(movers))}: give such a plan")
     rng = np.random.default_rng(0) if rng is None else rng
     poses: list[Pose] = []
     at: list[dict[str, int]] = []
@@ -128,5 +137,6 @@ def planned(plan: Plan, rng: np.random.Generator | None = None, floor_plan: Floo
         mover,
         plan=plan,
         floor_plan=floor_plan,
+        landmarks=landmarks,
         at=tuple(at),
     )

@@ -68,20 +68,20 @@ def simulate(
     messy: bool = False,
     fisheye_deg: float | None = None,
     uwb_landmarks: int = 0,
+    team: Team | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> World:
     """Simulate a scenario (`single-step`, `six-step`, `hallway`, `team`, `landmarks`), written as a run to `out`.
 
-    `points` correspondences a stance (250 for single-step and for images, else 100), two from each frame at
-    depth images, which `messy` makes of a world of glare, mirrors, flicker and a person in the way. Cameras are
-    fisheyes of `fisheye_deg` [deg] across where it is given. `l` [m] and
-    `theta_deg` are single-step's; `robots`, how many move `at_once`, and whether they `blink` and markers have no names
-    (2000 points then) are team's; `length` [m] in all, in how many `laps`, with a landmark every so many metres, and
-    whether the team is told where these are (`known`), are landmarks'; `uwb_landmarks` are ranged and not seen. `gait`
-    is the formation of hallway and landmarks; the hallway follows a `plan` instead, at `fps`, with the points that its
-    drives bring. `progress` is
-    called with the stances done and their number. The same arguments give the same bytes. Returns what was true.
-    Raises `InputError`, and leaves no file, where an argument is wrong or the pair has no common view.
+    `points` correspondences a stance (250 for single-step and for images, else 100), two from each frame at depth
+    images, which `messy` makes of a world of glare, mirrors, flicker and a person in the way. Cameras are fisheyes of
+    `fisheye_deg` [deg] across where it is given. `l` [m] and `theta_deg` are single-step's; `robots`, how many move
+    `at_once`, and whether they `blink` and markers have no names (2000 points then) are team's; `length` [m] in all, in
+    how many `laps`, with a landmark every so many metres, and whether the team is told where these are (`known`), are
+    landmarks'; `uwb_landmarks` are ranged and not seen. `gait` is the formation; a `plan` is followed instead, at
+    `fps`, by a `team` (default: the reference's robots), with the points that its drives bring. `progress` is called
+    with the stances done and their number. The same arguments give the same bytes. Returns what was true. Raises
+    `InputError`, and leaves no file, where an argument is wrong or the pair has no common view.
     """
     if depth not in get_args(Depth):
         raise InputError(f"`depth` is {depth!r}; use tracks or images")
@@ -95,13 +95,19 @@ def simulate(
         raise InputError(f"`image_format` is {image_format!r}; use jpeg, png or raw")
     if seed < 0:
         raise InputError(f"`seed` is {seed}; give a whole number that is not negative")
-    if plan is not None and (scenario_name != "hallway" or stances is not None or points is not None or gait):
-        raise InputError("a plan is followed by the hallway, and has its own stances, points and gait: leave these out")
+    given = (stances, points, gait, robots, at_once, l, theta_deg)
+    if plan is not None and (any(one is not None for one in given) or blink):
+        raise InputError("a plan has its own robots, stances, points and gait: leave these out")
+    if team is not None and plan is None:
+        raise InputError("a team of your own follows a plan: give one, too")
     rng = stream(seed, "formation")
-    what = planned(plan, rng) if plan is not None else scenario(
+    what = scenario(
         scenario_name, stances=stances, l=l, theta_deg=theta_deg, robots=robots, at_once=at_once,
         length=length, landmark_every=landmark_every, laps=laps, rng=rng, gait=gait,
     )  # fmt: skip
+    if plan is not None:
+        what = planned(plan, stream(seed, "formation"), landmarks=what.landmarks)
+        team = team or _reference_of(plan)
     if points is None:
         points = 250 if depth == "images" or scenario_name == "single-step" else 2000 if blink else 100
     if isinstance(what, TeamScenario):
@@ -109,13 +115,15 @@ def simulate(
             raise InputError("the scenario team has tracks and no images: leave out `depth`")
         if fisheye_deg is not None:
             raise InputError("the scenario team has pinhole cameras: leave out `fisheye_deg`")
-        team = with_codes(reference_team(names=what.names)) if blink else None
-        world = build_team_world(what, seed=seed, points=points, imperfections=imperfections, team=team)
+        coded = with_codes(reference_team(names=what.names)) if blink else None
+        world = build_team_world(what, seed=seed, points=points, imperfections=imperfections, team=coded)
     else:
         bias_px = FISHEYE_BIAS_PX if depth == "images" else 0.0
-        wide = None if fisheye_deg is None else wide_team(fisheye_deg, bias_px)
+        if fisheye_deg is not None and team is not None:
+            raise InputError("`fisheye_deg` is of the reference's robots: leave it out with a team of your own")
+        team = team if fisheye_deg is None else wide_team(fisheye_deg, bias_px)
         world = build_world(what, depth=depth, seed=seed, points=points, imperfections=imperfections, fps=fps,
-                            known=known, team=wide)  # fmt: skip
+                            known=known, team=team)  # fmt: skip
     if uwb_landmarks:
         if world.imperfections.uwb_sigma == 0:
             raise InputError("`uwb_landmarks` are ranged: give `uwb_sigma` too")
@@ -124,6 +132,12 @@ def simulate(
     with atomic_run(out, world.team, image_format=image_format) as writer:
         record(world, writer, depth, progress, messy=messy)
     return world
+
+
+def _reference_of(plan: Plan) -> Team | None:
+    """Return robots of the reference rig with the names of a plan; None for its own A, B and C."""
+    names = {*plan.observers, *(stance.mover for stance in plan.stances)}
+    return None if names <= {"A", "B", "C"} else reference_team(names=tuple(sorted(names)))
 
 
 def record(

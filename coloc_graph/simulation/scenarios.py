@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,7 @@ from coloc_graph.planning.formation import PAPER, Gait
 #: x [m], y [m], yaw [rad] of a body on the floor.
 Pose = tuple[float, float, float]
 
-LANE = 0.8  # m, distance between the lanes of a team
-ROW = 0.45  # m, distance between robots of one lane
+TEAM_GAIT = Gait(leap=0.45, abreast=0.8, toe_in_deg=17.0)  # rows and lanes of a team
 
 COURSE_GAIT = Gait(leap=0.25)  # formation on a course
 CORNER = 1.2  # m, radius of the corners of a course
@@ -36,9 +35,10 @@ class Box:
 class Scenario:
     """A leap-frog: `poses[k]` is where robot `pair[k % 2]` stands; in stance k, poses k and k+1 are taken.
 
-    Robot `pair[(k + 1) % 2]` drives from `poses[k-1]` to `poses[k+1]` between stances k-1 and k, and `mover`
-    drives about during the stances. `box` is where its markers are spread. If it `meanders`, it drives one curve in a
-    stance, as on a mission; otherwise to poses drawn one by one, as in the single steps of the paper.
+    Robot `pair[(k + 1) % 2]` drives from `poses[k-1]` to `poses[k+1]` between stances k-1 and k, and `mover` drives
+    about during the stances. `landmarks` are the poses of landmarks, facing the team. `box` is where its markers are
+    spread. If it `meanders`, it drives one curve in a stance, as on a mission; otherwise to poses drawn one by one, as
+    in the single steps of the paper.
     """
 
     name: str
@@ -47,6 +47,7 @@ class Scenario:
     pair: tuple[str, str] = ("A", "B")
     mover: str = "C"
     meanders: bool = False
+    landmarks: tuple[Pose, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.poses) < 2:
@@ -128,13 +129,9 @@ class TeamScenario(Scenario):
 
 @dataclass(frozen=True)
 class CourseScenario(Scenario):
-    """Leap-frog round a course.
-
-    `headings[k]` is the team's direction in stance k [rad]; `landmarks` are the poses of landmarks, facing the team.
-    """
+    """Leap-frog round a course; `headings[k]` is the team's direction in stance k [rad]."""
 
     headings: tuple[float, ...] = ()
-    landmarks: tuple[Pose, ...] = ()
 
     def heading(self, k: int) -> float:
         """Heading of the team in stance k [rad]; its box lies ahead."""
@@ -152,10 +149,12 @@ def single_step(l: float = 0.8, theta_deg: float = 35.0) -> Scenario:  # noqa: E
     return Scenario("single-step", poses, Box((0.2, 2.5), (-1.5, 1.5)))
 
 
-def six_step(stances: int = 6) -> Scenario:
-    """Table I: the standing points a to g at the paper's own distances, at most 6 stances."""
+def six_step(stances: int = 6, rng: np.random.Generator | None = None, gait: Gait | None = None) -> Scenario:
+    """Table I: the standing points a to g at the paper's own distances, or those of a `gait`, at most 6 stances."""
     if not 1 <= stances <= 6:
         raise InputError(f"six-step has 1 to 6 stances, not {stances}; use the hallway for more")
+    if gait is not None:
+        return replace(hallway(stances, rng, gait), name="six-step", meanders=False)
     places = (
         (0.0, 0.0), (-0.0127, -0.7713), (0.3622, 0.0), (0.3496, -0.7828), (0.7401, 0.0076),
         (0.7262, -0.7970), (1.0971, 0.0211),
@@ -193,12 +192,18 @@ def hallway(stances: int | None = None, rng: np.random.Generator | None = None, 
 
 
 def team_of(
-    robots: int = 10, at_once: int | None = None, stances: int = 30, rng: np.random.Generator | None = None
+    robots: int = 10,
+    at_once: int | None = None,
+    stances: int = 30,
+    rng: np.random.Generator | None = None,
+    gait: Gait | None = None,
 ) -> TeamScenario:
     """Team of `robots` in lanes, of which `at_once` (by default a quarter) move at a time.
 
-    Each stop has errors of some centimetres and degrees.
+    Each stop has errors of some centimetres and degrees. The leap of a `gait` is the distance between robots of one
+    lane, and its toe-in that of teams in two lanes.
     """
+    gait = TEAM_GAIT if gait is None else gait
     at_once = max(robots // 4, 1) if at_once is None else at_once
     if not 3 <= robots <= 255:
         raise InputError(f"a team has 3 to 255 robots, not {robots}")
@@ -210,10 +215,10 @@ def team_of(
     n = np.arange((stances - 1) * at_once + robots)
     lanes = max(2, round(1.2 * math.sqrt(robots)))
     lane, row = n % lanes, n // lanes
-    y = (lane - (lanes - 1) / 2) * LANE
-    yaw = -np.sign(y) * HALF_ANGLE * (lanes == 2)  # two lanes look to each other, more look ahead
+    y = (lane - (lanes - 1) / 2) * gait.abreast
+    yaw = -np.sign(y) * np.radians(gait.toe_in_deg) * (lanes == 2)  # two lanes look to each other, more look ahead
     off = rng.standard_normal((len(n), 3)) * (0.02, 0.02, np.deg2rad(2.0))
-    poses = np.stack([ROW * row + ROW / 2 * (lane % 2), y, yaw], axis=1) + off
+    poses = np.stack([gait.leap * row + gait.leap / 2 * (lane % 2), y, yaw], axis=1) + off
     names = tuple(chr(ord("A") + k) if robots <= 26 else f"R{k:02}" for k in range(robots))
     places = tuple((float(x), float(y), float(w)) for x, y, w in poses)
     return TeamScenario("team", places, Box((0.7, 2.1), (-0.7, 0.7)), names=names, at_once=at_once)
@@ -300,8 +305,8 @@ def scenario(
         raise InputError(f"`length`, `landmark_every` and `laps` belong to landmarks, not to {name}; leave them out")
     if name != "single-step" and (l is not None or theta_deg is not None):
         raise InputError(f"`l` and `theta_deg` belong to single-step, not to {name}; give {name} a `gait`, if any")
-    if name not in ("hallway", "landmarks") and gait is not None:
-        raise InputError(f"a gait belongs to hallway and landmarks, not to {name}; leave it out")
+    if name == "single-step" and gait is not None:
+        raise InputError("single-step has no leap: give it `l` and `theta_deg` instead of a gait")
     if name != "team" and (robots is not None or at_once is not None):
         raise InputError(f"`robots` and `at_once` belong to team, not to {name}; leave them out")
     if name == "single-step":
@@ -309,11 +314,11 @@ def scenario(
             raise InputError(f"single-step has one stance, not {stances}; leave `stances` out, or use the hallway")
         return single_step(0.8 if l is None else l, 35.0 if theta_deg is None else theta_deg)
     if name == "six-step":
-        return six_step(6 if stances is None else stances)
+        return six_step(6 if stances is None else stances, rng, gait)
     if name == "hallway":
         return hallway(stances, rng, PAPER if gait is None else gait)
     if name == "team":
-        return team_of(10 if robots is None else robots, at_once, 30 if stances is None else stances, rng)
+        return team_of(10 if robots is None else robots, at_once, 30 if stances is None else stances, rng, gait)
     if name == "landmarks":
         if stances is not None:
             raise InputError("the scenario landmarks is as long as its `length` [m]; give that instead of `stances`")

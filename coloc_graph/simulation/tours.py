@@ -30,11 +30,15 @@ FAR_IN_HASTE = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Tour:
-    """A drive of the mover, the instants (n,) [s] of captures, and which markers (n, m) to record."""
+    """A drive of the mover, the instants (n,) [s] of captures, and which markers (n, m) to record.
+
+    `by_view` (r, n, m) says so of each camera, where they do not all see the same.
+    """
 
     leg: Leg
     instants: Array
     recorded: NDArray[np.bool_]
+    by_view: NDArray[np.bool_] | None = None
 
 
 def no_common_view(where: str) -> InputError:
@@ -129,6 +133,11 @@ def _draw(
 def both_see(views: tuple[View, View], points_world: Array) -> NDArray[np.bool_]:
     """Mask (...) of the points (..., 3) [world, m] in view of both cameras."""
     return views[0].sees(points_world, TRACK_MARGIN) & views[1].sees(points_world, TRACK_MARGIN)
+
+
+def sees(view: View, points_world: Array) -> NDArray[np.bool_]:
+    """Mask (...) of the points (..., 3) [world, m] in a view."""
+    return view.sees(points_world, TRACK_MARGIN)
 
 
 def _short_order(poses: Array) -> tuple[NDArray[np.int64], Array]:

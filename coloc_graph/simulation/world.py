@@ -210,17 +210,16 @@ class _Builder:
             T_world_landmark=self.T_world_landmark,
         )
 
-    def _views(self, k: int) -> tuple[View, View]:
-        first, second = (
+    def _views(self, k: int) -> tuple[View, ...]:
+        return tuple(
             View(
                 self.true[robot].camera,
                 standing_pose(self.scenario.poses[n], self.tilts[n]) @ self.true[robot].mount.T_body_camera,
             )
             for robot, n in self.scenario.standing(k).items()
         )
-        return first, second
 
-    def _tour(self, k: int, views: tuple[View, View], start: float) -> Tour:
+    def _tour(self, k: int, views: tuple[View, ...], start: float) -> Tour:
         markers = self.true[self.scenario.mover].markers
         if markers is None:
             raise InputError(f"robot `{self.scenario.mover}` moves but has no markers; give it [robots.markers]")
@@ -229,16 +228,18 @@ class _Builder:
             # drawn where the team goes along x, and turned back
             T_world_ahead = turned_about(middle, heading)
             T_ahead_world = turned_about(middle, -heading)
-            first, second = (View(view.camera, T_ahead_world @ view.T_world_camera) for view in views)
-            return _turned(self._drawn_tour(k, (first, second), start), T_world_ahead, heading)
+            turned = tuple(View(view.camera, T_ahead_world @ view.T_world_camera) for view in views)
+            return _turned(self._drawn_tour(k, turned, start), T_world_ahead, heading)
         return self._drawn_tour(k, views, start)
 
-    def _drawn_tour(self, k: int, views: tuple[View, View], start: float) -> Tour:
+    def _drawn_tour(self, k: int, views: tuple[View, ...], start: float) -> Tour:
         markers = self.true[self.scenario.mover].markers
         assert markers is not None
         where, rng, middle = f"stance {k}", stream(self.seed, "tour", k), self.scenario.middle(k)
         if isinstance(self.scenario, PlannedScenario):
             return self.scenario.tour(k, views, markers.p_body, self.fps, start, where)
+        first, second = views
+        views = first, second
         if self.depth == "images":
             frames = max(self.points // 2, 1)
             return patrol(views, markers.p_body, middle, frames, self.fps, start, rng, where, self.stopping)
@@ -275,17 +276,18 @@ class _Builder:
     @staticmethod
     def _shifted(tour: Tour, by: float) -> Tour:
         leg = type(tour.leg)(tour.leg.times + by, tour.leg.knots)
-        return Tour(leg, tour.instants + by, tour.recorded)
+        return replace(tour, leg=leg, instants=tour.instants + by)
 
-    def _captures(self, k: int, tour: Tour, views: tuple[View, View], stated: Team) -> tuple[Capture, ...]:
+    def _captures(self, k: int, tour: Tour, views: tuple[View, ...], stated: Team) -> tuple[Capture, ...]:
         rng, out = stream(self.seed, "clock", k), []
-        for robot, view in zip(self.scenario.observers(k), views, strict=True):
+        for n, (robot, view) in enumerate(zip(self.scenario.observers(k), views, strict=True)):
             jitter = self.imperfections.time_jitter * rng.standard_normal(len(tour.instants))
             order = np.argsort(tour.instants + jitter)
             times = (tour.instants + jitter)[order]
             stamps = stamp(robot, stated, self.imperfections, times)
             still = in_view(view, self.true, self.T_world_landmark)
-            recorded = np.hstack([tour.recorded[order], np.ones((len(order), self._lights(still)), bool)])
+            mine = tour.recorded if tour.by_view is None else tour.by_view[n]
+            recorded = np.hstack([mine[order], np.ones((len(order), self._lights(still)), bool)])
             out.append(Capture(robot, view, times, stamps, recorded, still))
         return tuple(out)
 

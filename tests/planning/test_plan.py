@@ -8,8 +8,10 @@ from coloc_graph.errors import InputError
 from coloc_graph.planning.drive import drive_through, there_and_back
 from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.plan import Plan, PlannedStance, read_plan, write_plan
-from coloc_graph.simulation import build_world
+from coloc_graph.run import open_run
+from coloc_graph.simulation import build_world, reference_team
 from coloc_graph.simulation.planned import planned
+from coloc_graph.team import write_team
 from coloc_graph.team.shared_view import hidden
 
 GAIT = Gait(0.8, 0.6, 10.0)
@@ -109,5 +111,36 @@ def test_simulate_takes_a_gait_and_a_plan(tmp_path, capsys):
     run = tmp_path / "run.mcap"
     assert main(["simulate", "hallway", "-l", "1.2", "--stances", "2", "--out", str(run)]) == 0
     assert main(["simulate", "hallway", "--plan", str(tmp_path / "plan.csv"), "--out", str(tmp_path / "p.mcap")]) == 0
-    assert main(["simulate", "six-step", "--leap", "1", "--out", str(tmp_path / "q.mcap")]) == 2
-    assert "--leap belongs to hallway and landmarks" in capsys.readouterr().err
+    for name, *more in (
+        ("six-step",),
+        ("landmarks", "--length", "10", "--laps", "1"),
+        ("team", "--robots", "4", "--stances", "2"),
+    ):
+        arguments = ["simulate", name, *more, "--leap", "0.5", "-l", "0.9", "--out", str(tmp_path / f"{name}.mcap")]
+        assert main(arguments) == 0
+    for name in ("six-step", "single-step", "landmarks", "team"):
+        out = str(tmp_path / f"{name} planned.mcap")
+        assert main(["simulate", name, "--plan", str(tmp_path / "plan.csv"), "--out", out]) == 0
+    assert open_run(out).team.names == ("A", "B", "C")
+    assert [landmark.name for landmark in open_run(tmp_path / "landmarks planned.mcap").team.landmarks]
+    capsys.readouterr()
+    assert main(["simulate", "single-step", "--leap", "1", "--out", str(tmp_path / "q.mcap")]) == 2
+    assert "single-step has no leap" in capsys.readouterr().err
+    both = ["--plan", str(tmp_path / "plan.csv"), "--stances", "3"]
+    assert main(["simulate", "hallway", *both, "--out", str(tmp_path / "q.mcap")]) == 2
+    assert "a plan has its own robots, stances, points and gait" in capsys.readouterr().err
+
+
+def test_a_plan_of_four_robots_is_simulated_with_the_robots_of_its_team(tmp_path):
+    team = reference_team(names=("A", "B", "C", "D"))
+    places = {"A": (0.0, 0.3, -0.3), "B": (0.0, -0.3, 0.3), "C": (-0.7, 0.3, 3.1)}  # C looks away
+    drive = ((1.0, 0.0), (1.8, 0.3), (1.8, -0.3))
+    plan = Plan((PlannedStance(places, (), "D", drive, 8.0),))
+    world = build_world(planned(plan), team=team, fps=10.0)
+    by_robot = {capture.robot: capture.recorded.sum() for capture in world.captures[0]}
+    assert by_robot["A"] > 50 and by_robot["B"] > 50 and by_robot["C"] == 0
+    write_plan(plan, tmp_path / "plan.csv")
+    write_team(team, tmp_path / "team.toml")
+    arguments = ["simulate", "hallway", "--plan", str(tmp_path / "plan.csv"), "--out", str(tmp_path / "run.mcap")]
+    assert main([*arguments, "--team", str(tmp_path / "team.toml")]) == 0
+    assert open_run(tmp_path / "run.mcap").stances[0].observers == ("A", "B", "C")
