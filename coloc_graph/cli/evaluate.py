@@ -11,6 +11,9 @@ if TYPE_CHECKING:
 #: As in coloc_graph.evaluation, which is too heavy for --help.
 ALIGNMENTS = ("reference", "team", "robot", "none")
 
+#: Largest difference of the stamps of two poses that evo associates by default [s].
+EVO_DIFFERENCE = 0.01
+
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command and its arguments."""
@@ -41,6 +44,15 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "--pairs-from-truth", action="store_true", help="measure the distances of the RPE along the true path"
     )
     command.add_argument(
+        "--nearest",
+        type=_seconds,
+        nargs="?",
+        const=EVO_DIFFERENCE,
+        metavar="S",
+        help="compare with the true pose of the nearest stamp within S seconds, as evo does, instead of interpolating "
+        f"(default: {EVO_DIFFERENCE})",
+    )
+    command.add_argument(
         "--max-gap", type=_seconds, metavar="S", help="longest gap over which truth is interpolated [s] (default: 0.25)"
     )
     command.add_argument("--plot", metavar="FILE|DIR", help="draw one picture (.png, .svg, .pdf), or a folder of three")
@@ -61,6 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
     from coloc_graph.cli.accuracy import print_accuracy, print_errors, print_promised
     from coloc_graph.cli.printing import print_json, warn
+    from coloc_graph.errors import InputError
     from coloc_graph.evaluation import RPE_DISTANCES, accuracy_json
 
     if args.plot:
@@ -70,6 +83,10 @@ def run(args: argparse.Namespace) -> int:
     comparison = _comparison(args)
     if args.robots:
         comparison = comparison.only([robot for robot in args.robots.split(",") if robot])
+    if args.nearest is not None:
+        if args.max_gap is not None:
+            raise InputError("--max-gap is of interpolation, which --nearest replaces: give one of the two")
+        comparison = replace(comparison, nearest=args.nearest)
     if args.max_gap is not None:
         comparison = replace(comparison, max_gap=args.max_gap)
     accuracy, true = comparison.compare(args.rpe or RPE_DISTANCES, "truth" if args.pairs_from_truth else "estimate")

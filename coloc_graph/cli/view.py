@@ -28,25 +28,32 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--no-browser", action="store_true", help="do not open a browser")
     command.add_argument("--dark", action="store_true", help="use dark colours")
     command.add_argument("--export", metavar="HTML", help="write a web page that needs no server, and end")
-    command.add_argument("--png", metavar="PNG", help="write a picture, and end; needs Chromium")
+    command.add_argument("--png", metavar="PNG", help="write a picture with legend and scale, and end; needs Chromium")
+    command.add_argument("--video", metavar="MP4", help="write a film of all stances, and end; needs Chromium")
     add_force(command)
     command.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Make the scene and show or write it."""
-    from coloc_graph.cli.printing import warn
+    from pathlib import Path
+
+    from coloc_graph.cli.printing import progress, warn
+    from coloc_graph.errors import InputError
     from coloc_graph.run.atomic_file import require_writable
     from coloc_graph.viewer import Viewer
     from coloc_graph.viewer.access import is_loopback
     from coloc_graph.viewer.browser import require_browser, write_png
     from coloc_graph.viewer.notes import missing_parts
+    from coloc_graph.viewer.video import SUFFIX, write_video
 
-    writes = bool(args.export or args.png)
-    for out in (args.export, args.png):
+    writes = bool(args.export or args.png or args.video)
+    for out in (args.export, args.png, args.video):
         if out:
             require_writable(out, force=args.force)
-    if args.png:
+    if args.video and Path(args.video).suffix.lower() != SUFFIX:
+        raise InputError(f"{args.video} is not the name of a film: give one that ends in {SUFFIX}")
+    if args.png or args.video:
         require_browser()
     host, port = ("127.0.0.1", 0) if writes else (args.host, args.port)
     with take_port(port, host) as listener:  # before the work
@@ -61,6 +68,10 @@ def run(args: argparse.Namespace) -> int:
             if args.png:
                 write_png(viewer, args.png)
                 print(args.png)
+            if args.video:
+                with progress("frames rendered") as report:
+                    write_video(viewer, args.video, progress=report)
+                print(args.video)
             if not writes:
                 show(viewer, browser=not args.no_browser)
     return 0

@@ -7,7 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.evaluation.truth import MAX_TRUTH_GAP, first_with_truth, require_truth, true_poses, with_truth
+from coloc_graph.evaluation.truth import (
+    MAX_TRUTH_GAP,
+    first_with_truth,
+    nearest_true_poses,
+    require_truth,
+    true_poses,
+    with_truth,
+)
 from coloc_graph.geometry.lie import closest_rotation, floor_pose, se3, se3_inverse, yaw
 from coloc_graph.geometry.trajectory import Trajectory
 
@@ -44,6 +51,7 @@ def align(
     on_floor: bool,
     alignment: Alignment = "reference",
     max_gap: float = MAX_TRUTH_GAP,
+    nearest: float | None = None,
 ) -> dict[str, Array]:
     """Return the true poses at the times of an estimate, in the estimate's world.
 
@@ -59,6 +67,8 @@ def align(
         Kind of alignment.
     max_gap : float
         Longest gap over which truth is interpolated [s].
+    nearest : float or None
+        Take the true pose with the nearest stamp within this time [s], as evo does, instead of interpolating.
 
     Returns
     -------
@@ -70,7 +80,10 @@ def align(
     InputError
         No pose has truth, or the alignment is undetermined.
     """
-    at = {robot: true_poses(truth, one, max_gap) for robot, one in estimated.items()}
+    at = {
+        robot: true_poses(truth, one, max_gap) if nearest is None else nearest_true_poses(truth, one, nearest)
+        for robot, one in estimated.items()
+    }
     require_truth(truth, estimated, at)
     if alignment == "none":
         return at

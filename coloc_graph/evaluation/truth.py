@@ -59,6 +59,53 @@ def true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, max_gap: 
     return T_world_body
 
 
+def nearest_true_poses(truth: Mapping[str, Trajectory], estimated: Trajectory, max_difference: float) -> Array:
+    """Return the true poses with the nearest stamps, as evo associates trajectories.
+
+    Parameters
+    ----------
+    truth : mapping of str to Trajectory
+        True poses by robot.
+    estimated : Trajectory
+        Estimated poses of one robot.
+    max_difference : float
+        Largest difference of two stamps [s].
+
+    Returns
+    -------
+    (n, 4, 4) float
+        True poses; NaN where none is near in time.
+
+    Notes
+    -----
+    As in evo's `sync.associate_trajectories`, each pose of the shorter trajectory gets the nearest one of the longer.
+    Where several true poses fall to one estimated pose, evo counts that pose several times, and here the nearest of
+    them counts once.
+    """
+    times, true = estimated.times, truth.get(estimated.robot)
+    found = np.full((len(times), 4, 4), np.nan)
+    if true is None or not len(true) or not len(times):
+        return found
+    if len(true) >= len(times):
+        index = nearest_index(true.times, times)
+        near = np.abs(true.times[index] - times) <= max_difference
+        found[near] = true.T_world_body[index[near]]
+        return found
+    index = nearest_index(times, true.times)
+    off = np.abs(times[index] - true.times)
+    for number in np.argsort(-off, kind="stable"):  # the nearest is written last
+        if off[number] <= max_difference:
+            found[index[number]] = true.T_world_body[number]
+    return found
+
+
+def nearest_index(times: Array, at: Array) -> NDArray[np.intp]:
+    """Return the indices of the times (n,), ascending, that are nearest to others (m,); the earlier of two as near."""
+    after = np.searchsorted(times, at).clip(max=len(times) - 1)
+    before = (after - 1).clip(min=0)
+    return np.where(np.abs(times[before] - at) <= np.abs(times[after] - at), before, after)
+
+
 def with_truth(true: Array) -> NDArray[np.bool_]:
     """Return where poses (n, 4, 4) have truth (are finite), (n,)."""
     return np.asarray(np.isfinite(true).all(axis=(1, 2)))

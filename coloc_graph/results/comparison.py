@@ -40,6 +40,8 @@ class Comparison:
         The robots stand on the plane z = 0 of both worlds.
     max_gap : float
         Longest gap over which truth is interpolated [s].
+    nearest : float or None
+        Compare with the true pose of the nearest stamp within this time [s] instead.
     """
 
     estimated: Mapping[str, Trajectory]
@@ -48,6 +50,7 @@ class Comparison:
     reference: str | None
     on_floor: bool
     max_gap: float = MAX_TRUTH_GAP
+    nearest: float | None = None
 
     def only(self, robots: Sequence[str]) -> "Comparison":
         """Return the comparison of these robots alone; `InputError` for one that the estimate does not hold."""
@@ -67,6 +70,7 @@ class Comparison:
             on_floor=self.on_floor,
             alignment=self.alignment,
             max_gap=self.max_gap,
+            nearest=self.nearest,
         )
         accuracy = evaluate(
             self.estimated,

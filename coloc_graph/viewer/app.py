@@ -8,7 +8,7 @@ import viser
 
 from coloc_graph.viewer.details import Picked
 from coloc_graph.viewer.export import page_of
-from coloc_graph.viewer.frame import Frame, pick
+from coloc_graph.viewer.frame import Frame, ViewState, pick
 from coloc_graph.viewer.inbox import Inbox
 from coloc_graph.viewer.live import LivePoses, LiveStance
 from coloc_graph.viewer.panel import Panel, set_value
@@ -133,6 +133,24 @@ class Viewer:
     def frame_cpu_seconds(self) -> float:
         """CPU time that the last frame took [s]."""
         return self._renderer.frame_cpu_seconds
+
+    def go_to(self, time: float) -> None:
+        """Show an instant [s], between stances too."""
+        self._inbox.request("time", time)
+
+    @property
+    def state(self) -> ViewState:
+        """State of the controls."""
+        return self._renderer.state(rests=True)
+
+    @property
+    def caption(self) -> str:
+        """Title of the scene, with the stance that is shown and its time since the first."""
+        frame, scene = self.frame, self.scene
+        if frame is None or frame.row < 0:
+            return scene.title
+        since = scene.middle(frame.row) - scene.middle(0)
+        return f"{scene.title}: stance {scene.stances[frame.row].index}, {since:.0f} s"
 
     def wait_closed(self) -> None:
         """Wait until the viewer is closed by another thread, or interrupted by Ctrl-C, which ends the wait silently."""

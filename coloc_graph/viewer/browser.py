@@ -1,4 +1,4 @@
-"""Rendering of the viewer to a PNG, by a browser of this machine without a window."""
+"""Rendering of the viewer to pictures, by a browser of this machine without a window."""
 
 import base64
 import json
@@ -16,7 +16,9 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
 from coloc_graph.errors import InputError
+from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.viewer.app import Viewer
+from coloc_graph.viewer.overlay import caption_script, overlay_script
 from coloc_graph.viewer.panel import WIDTH
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -27,8 +29,11 @@ ARGUMENTS = (
 )  # fmt: skip
 # true once the page has drawn its floor; by viser's own names
 DRAWN = "window.__viserMutable?.nodeRefFromName?.['/floor'] != null"
+QUALITY = 95  # of JPEGs, percent
 SETTLED = 2.0  # s without a change until a picture is taken: fonts and textures load late, without notice
 BESIDE = WIDTH + 8  # px beside the scene for the panel, which is cut off
+# resolves when the page has drawn twice after what it was sent; its messages come a few at a time
+AFTER_DRAWING = "new Promise(r => setTimeout(() => requestAnimationFrame(() => requestAnimationFrame(r)), 60))"
 _HIDE = (
     "document.head.appendChild(Object.assign(document.createElement('style'), "
     "{textContent: '.mantine-Notifications-root{display:none!important}'}))"
@@ -52,36 +57,69 @@ def require_browser() -> str:
 
 
 def write_png(viewer: Viewer, path: str | Path, size: tuple[int, int] = (1280, 720), timeout: float = 120.0) -> None:
-    """Render the viewer to a PNG of this width and height [px], from the initial camera.
+    """Render the viewer to a PNG of this width and height [px], with legend and scale, from the initial camera.
 
     Raises
     ------
     InputError
         There is no browser, or it takes longer than `timeout` [s].
     """
+    with rendered(viewer, size, timeout) as page:
+        picture = page.settled()
+    try:
+        write_atomically(Path(path), picture)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}); give another path") from error
+
+
+class RenderedPage:
+    """The viewer in a browser without a window."""
+
+    def __init__(self, page: Connection, size: tuple[int, int], until: float) -> None:
+        self._page, self._until = page, until
+        width, height = size
+        self._picture = {"format": "png", "clip": {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}}
+
+    def evaluate(self, script: str) -> Any:
+        """Run JavaScript, wait for its promise if it returns one, and return its value."""
+        parameters = {"expression": script, "awaitPromise": True}
+        return _call(self._page, "Runtime.evaluate", parameters, self._until)["result"].get("value")
+
+    def settled(self) -> bytes:
+        """Return a picture that equals the two before it, as PNG."""
+        return _settled(self._page, self._picture, self._until)
+
+    def drawn(self) -> bytes:
+        """Return a picture of what the page has been sent, as JPEG."""
+        self.evaluate(AFTER_DRAWING)
+        parameters = self._picture | {"format": "jpeg", "quality": QUALITY, "optimizeForSpeed": True}
+        return base64.b64decode(_call(self._page, "Page.captureScreenshot", parameters, self._until)["data"])
+
+
+@contextmanager
+def rendered(viewer: Viewer, size: tuple[int, int], timeout: float) -> Iterator[RenderedPage]:
+    """Yield the viewer in a browser, with legend and scale; `InputError` where it fails or takes too long."""
     browser = require_browser()
     until = time.monotonic() + timeout
     try:
-        with _page(browser, until) as page:
+        with _page(browser, until) as connection:
             width, height = size
+            page = RenderedPage(connection, size, until)
             view = {"width": width + BESIDE, "height": height, "deviceScaleFactor": 1, "mobile": False}
-            _call(page, "Emulation.setDeviceMetricsOverride", view, until)
-            _call(page, "Page.navigate", {"url": f"{viewer.url}/?fixedDpr=1"}, until)
-            while not _call(page, "Runtime.evaluate", {"expression": DRAWN}, until)["result"].get("value"):
+            _call(connection, "Emulation.setDeviceMetricsOverride", view, until)
+            _call(connection, "Page.navigate", {"url": f"{viewer.url}/?fixedDpr=1"}, until)
+            while not page.evaluate(DRAWN):
                 time.sleep(0.2)
-            _call(page, "Runtime.evaluate", {"expression": _HIDE}, until)
+            page.evaluate(_HIDE)
             while not viewer.server.get_clients():
                 _require_time(until)
                 time.sleep(0.1)
             viewer.wait_idle(max(until - time.monotonic(), 0.1))
-            clip = {"x": 0, "y": 0, "width": width, "height": height, "scale": 1}
-            picture = _settled(page, {"format": "png", "clip": clip}, until)
+            page.evaluate(overlay_script(viewer.scene, viewer.state, size))
+            page.evaluate(caption_script(viewer.caption))
+            yield page
     except (TimeoutError, OSError, ValueError, KeyError) as error:
         raise InputError(f"{browser} renders no picture ({error}); write a page with --export instead") from error
-    try:
-        Path(path).write_bytes(picture)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written ({error.strerror}); give another path") from error
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from coloc_graph.errors import InputError
 from coloc_graph.evaluation import PLANAR, RobotAccuracy, Spread, align, evaluate, nees_of, true_poses
+from coloc_graph.evaluation.truth import nearest_true_poses
 from coloc_graph.geometry.lie import floor_pose, rotation_x, se3, so3_exp
 from coloc_graph.geometry.trajectory import Trajectory
 
@@ -264,3 +265,26 @@ def test_poses_outside_of_the_truth_are_left_out_and_counted(team):
     # what is wrong where there is no truth counts nowhere
     assert accuracy.robots[1].translation == Spread(*[pytest.approx(0.01)] * 4)
     assert accuracy.end_position_error == pytest.approx(0.01) and accuracy.robots[0].ate == 0
+
+
+def test_the_nearest_stamp_is_taken_as_evo_takes_it():
+    """A robot at 0.2 m/s with truth every 0.1 s: up to 1 cm beside where it was, and nothing beyond 0.01 s."""
+
+    def straight(times):
+        poses = np.tile(np.eye(4), (len(times), 1, 1))
+        poses[:, 0, 3] = 0.2 * np.asarray(times)
+        return Trajectory("A", np.asarray(times, float), poses)
+
+    truth = {"A": straight(np.arange(0, 10, 0.1))}
+    asked = straight([0.951, 1.0, 1.049, 1.052, 9.5, 9.6, 30.0])
+    found = nearest_true_poses(truth, asked, 0.06)[:, 0, 3]
+    np.testing.assert_allclose(found, [0.2, 0.2, 0.2, 0.22, 1.9, 1.92, np.nan], atol=1e-9)
+    assert np.isnan(nearest_true_poses(truth, asked, 0.01)[[0, 2, 3], 0, 3]).all()
+    # of the shorter trajectory each pose has a partner, as evo's are
+    few = {"A": straight([1.0, 1.004, 2.0])}
+    found = nearest_true_poses(few, straight(np.arange(0, 3, 0.01)), 0.01)[:, 0, 3]
+    assert np.flatnonzero(np.isfinite(found)).tolist() == [100, 200]
+    assert found[100] == 0.2
+    two = {"A": straight([0.951, 1.0])}
+    true = align(two, truth, on_floor=False, alignment="none", nearest=0.06)
+    assert evaluate(two, true, on_floor=False, alignment="none").ate == pytest.approx(0.2 * 0.049 / 2**0.5)

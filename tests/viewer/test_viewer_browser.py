@@ -7,14 +7,16 @@ import threading
 import time
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import viser
 from browser import browser, client_of, page_of, pixel_of, place_of, until  # noqa: F401  fixtures
 
 from coloc_graph.backend import replay
+from coloc_graph.cli import main
 from coloc_graph.geometry.lie import floor_pose
-from coloc_graph.viewer import LivePoses, LiveStance, Viewer, empty_scene, scene_of_result, scene_of_solution
+from coloc_graph.viewer import LivePoses, LiveStance, Viewer, empty_scene, scene_of_result, scene_of_solution, video
 from coloc_graph.viewer.panel import NOT_FOLLOWED, set_value
 
 pytestmark = pytest.mark.slow
@@ -244,3 +246,28 @@ def test_a_page_opens_from_its_file_and_plays(scene, page_of, tmp_path):
     assert until(lambda: stands_at(0))  # back to the first, where all is hidden and made anew
     visible = "name => window.__viserMutable.nodeRefFromName[name].visible"
     assert until(lambda: page.evaluate(visible, "/robots/A") and page.evaluate(visible, "/floor"))
+
+
+def test_a_film_moves_from_stance_to_stance(result, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(video, "STANCE_FRAMES", 1)
+    monkeypatch.setattr(video, "MAX_STANCES", 2)
+    path = tmp_path / "film.mp4"
+    assert main(["view", str(result), "--video", str(path)]) == 0
+    assert capsys.readouterr().out == f"{path}\n"
+    film = cv2.VideoCapture(str(path))
+    frames = []
+    while (read := film.read())[0]:
+        frames.append(read[1])
+    assert len(frames) == 2 + video.HELD_FRAMES and frames[0].shape == (720, 1280, 3)
+    assert film.get(cv2.CAP_PROP_FPS) == video.FPS
+    differing = (np.abs(frames[0].astype(int) - frames[1]).max(axis=2) > 30).mean()
+    assert 0.005 < differing < 0.5  # robots and their edges, not the floor
+    assert np.ptp(frames[1][-160:, :300]) > 100  # the legend
+
+
+def test_a_film_that_cannot_be_is_refused_before_the_work(result, tmp_path, capsys):
+    assert main(["view", str(result), "--video", str(tmp_path / "film.avi")]) == 2
+    assert "is not the name of a film: give one that ends in .mp4" in capsys.readouterr().err
+    (tmp_path / "film.mp4").touch()
+    assert main(["view", str(result), "--video", str(tmp_path / "film.mp4")]) == 2
+    assert "exists; replace it with --force" in capsys.readouterr().err

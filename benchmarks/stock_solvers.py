@@ -1,0 +1,105 @@
+"""Our graphs in GTSAM's own optimiser: by how much its poses and sigmas differ from ours.
+
+    python benchmarks/stock_solvers.py [--stances 40]
+
+Of each run `graph.g2o` is read by GTSAM's readG2o, and `coloc export gtsam` by a program that imports nothing of
+coloc-graph; both begin at perturbed poses.
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from coloc_graph import SolveOptions, open_run, solve
+from coloc_graph.exchange.g2o_writer import write_g2o
+from coloc_graph.exchange.gtsam_files import unpack_gtsam, write_gtsam
+from coloc_graph.simulation import Imperfections, simulate
+
+STARTS = np.array([0.01, 0.01, 0.02, 0.05, 0.05, 0.02])  # rad, m: sigmas of the errors of the initial poses
+WRONG = Imperfections(mount_sigma_deg=1.0, height_sigma=5e-3, span_sigma=1e-4, floor_sigma_deg=0.1)
+
+#: Runs in GTSAM's own process: `out.npz` of keys, poses, and covariances, from the files of one folder.
+BARE = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import numpy as np
+import solve
+graph, values, names = solve.load()
+found, iterations = solve.solve(graph, solve.perturbed(values, names, 0.05))
+covariances = solve.covariances(graph, found)
+keys = [key for key, (kind, _) in names.items() if kind == "pose"]
+assert "coloc_graph" not in sys.modules and iterations > 0
+np.savez(sys.argv[2], keys=np.array(keys, np.uint64), T=[found.atPose3(key).matrix() for key in keys],
+         C=[covariances[key] for key in keys], iterations=iterations)
+"""
+
+
+def runs(stances: int):
+    """Yield names and arguments of `simulate`."""
+    yield "hallway, tracks", ("hallway",), {"stances": stances}
+    yield "hallway, images", ("hallway",), {"stances": min(stances, 10), "depth": "images"}
+    yield "landmarks", ("landmarks",), {"stances": stances}
+    yield "team of 6", ("team",), {"robots": 6, "stances": min(stances, 12)}
+
+
+def of_g2o(estimate, folder: Path) -> tuple[int, float]:
+    """Iterations of a stock optimiser on graph.g2o, and the largest distance of its poses from ours [m]."""
+    write_g2o(estimate, folder / "graph.g2o")
+    factors, values = gtsam.readG2o(str(folder / "graph.g2o"), True)
+    factors.add(gtsam.PriorFactorPose3(0, values.atPose3(0), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    rng, start, keys = np.random.default_rng(0), gtsam.Values(), list(values.keys())
+    for key in keys:
+        start.insert(key, values.atPose3(key).retract((key != 0) * STARTS * rng.normal(size=6)))
+    optimiser = gtsam.LevenbergMarquardtOptimizer(factors, start)
+    found = optimiser.optimize()
+    gtsam.Marginals(factors, found)
+    off = [np.linalg.norm(found.atPose3(key).translation() - values.atPose3(key).translation()) for key in keys]
+    return optimiser.iterations(), max(off)
+
+
+def of_factors(estimate, folder: Path) -> tuple[int, float, float]:
+    """Iterations of the script on the exported factors, and its largest differences in sigmas, and of sigmas."""
+    write_gtsam(estimate, folder / "factors.zip")
+    unpack_gtsam(folder / "factors.zip", folder / "factors")
+    subprocess.run([sys.executable, "-c", BARE, folder / "factors", folder / "out.npz"], check=True, cwd=folder)
+    out = np.load(folder / "out.npz")
+    places, off, ratio = {int(key): n for n, key in enumerate(out["keys"])}, 0.0, 0.0
+    for robot, one in estimate.trajectories.items():
+        for stance, T, C in zip(one.stances, one.T_world_body, one.covariances, strict=True):
+            n = places[estimate.graph.key(robot, int(stance))]
+            sigmas = np.sqrt(C.diagonal())
+            off = max(off, np.abs(gtsam.Pose3(T).localCoordinates(gtsam.Pose3(out["T"][n])) / sigmas).max())
+            ratio = max(ratio, np.abs(np.sqrt(out["C"][n].diagonal()) / sigmas - 1).max())
+    return int(out["iterations"]), float(off), float(ratio)
+
+
+def main() -> None:
+    """Measure and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--stances", type=int, default=40, help="number of stances (default: 40)")
+    args = parser.parse_args()
+    print("| run | method | g2o: iterations | off by | factors: iterations | off by | sigmas differ by |")
+    print("|---|---|---|---|---|---|---|")
+    for name, scenario, more in runs(args.stances):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "run.mcap"
+            simulate(*scenario, path, seed=1, imperfections=WRONG, **more)
+            for method in ("joint", "smooth"):
+                place = Path(folder) / method
+                place.mkdir()
+                estimate = solve(open_run(path), SolveOptions(method=method)).estimate
+                steps, metres = of_g2o(estimate, place)
+                iterations, off, ratio = of_factors(estimate, place)
+                print(
+                    f"| {name} | {method} | {steps} | {1e3 * metres:.4f} mm | {iterations} | {off:.5f} sigma "
+                    f"| {100 * ratio:.4f} % |", flush=True,
+                )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
