@@ -1,4 +1,4 @@
-"""coloc solve RUN|FOLDER|GRAPH.g2o --out DIR."""
+"""coloc solve RUN|FOLDER|GRAPH.g2o|GRAPH.pyfg --out DIR."""
 
 import argparse
 import sys
@@ -30,7 +30,9 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "report, to a folder.",
     )
     command.add_argument(
-        "run_path", metavar="RUN|FOLDER|GRAPH", help="run (.mcap), folder of runs, or pose graph (.g2o)"
+        "run_path",
+        metavar="RUN|FOLDER|GRAPH",
+        help="run (.mcap), folder of runs, pose graph (.g2o) or range graph (.pyfg, .jrl)",
     )
     command.add_argument("--out", required=True, metavar="DIR", help="folder for the result, or for those of all runs")
     add_force(command)
@@ -89,6 +91,10 @@ def run(args: argparse.Namespace) -> int:
         from coloc_graph.cli.solve_graph import solve_graph
 
         return solve_graph(args)
+    if Path(args.run_path).suffix.lower() in (".pyfg", ".jrl"):
+        from coloc_graph.cli.solve_graph import solve_ranges
+
+        return solve_ranges(args)
     from coloc_graph.cli.view import take_port
 
     with take_port(args.port) if args.view else nullcontext() as listener:  # before the work, not after it

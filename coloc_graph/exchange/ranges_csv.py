@@ -47,9 +47,7 @@ def read_ranges(path: str | Path, team: Team, start: float, end: float) -> list[
         if team.robots[robot].ranging is None:
             raise table.error(row, f"the team states no noise of {team.names[robot]}'s ranges; add [robots.ranging]")
     if (wrong := first(ranges <= 0)) is not None:
-        raise table.error(
-            wrong, f"`range` is {ranges[wrong]:g}; give metres above 0, and leave out what was not measured"
-        )
+        raise table.error(wrong, f"`range` is {ranges[wrong]:g}; give metres above 0, or leave it out")
     if len(table) and not ((times >= start) & (times <= end)).any():
         raise TracksError(
             f"{path}: no range is of the run's time, {start:.3f} to {end:.3f} s; give UTC seconds by the robots' clocks"
