@@ -1,4 +1,4 @@
-"""Calibration boards: chessboards, which must be seen whole, and ChArUco boards, of which a part suffices."""
+"""Calibration boards: chessboards and planes of LEDs, seen whole, and ChArUco boards, of which a part suffices."""
 
 import re
 from dataclasses import dataclass
@@ -19,15 +19,17 @@ class Board:
     Attributes
     ----------
     columns, rows
-        Inner corners of a chessboard, squares of a ChArUco board.
+        Inner corners of a chessboard, squares of a ChArUco board, LEDs.
     square
-        Side of a square [m].
+        Side of a square, or distance between two LEDs [m].
     dictionary
         ArUco dictionary of a ChArUco board, such as "4X4_50"; None for a chessboard.
     marker
         Side of a marker of a ChArUco board [m].
     legacy
         True for the ChArUco pattern of OpenCV before 4.6.
+    leds
+        True for a plane of LEDs.
     """
 
     columns: int
@@ -36,6 +38,7 @@ class Board:
     dictionary: str | None = None
     marker: float | None = None
     legacy: bool = False
+    leds: bool = False
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -51,12 +54,16 @@ class Board:
 
     def __str__(self) -> str:
         size = f"{self.columns}x{self.rows}"
+        if self.leds:
+            return f"a plane of {size} LEDs"
         if self.dictionary is None:
             return f"a chessboard of {size} inner corners"
         return f"a ChArUco board of {size} squares with markers of DICT_{self.dictionary}"
 
 
-def make_board(size: str, square: float, dictionary: str | None = None, marker: float | None = None) -> Board:
+def make_board(
+    size: str, square: float, dictionary: str | None = None, marker: float | None = None, *, leds: bool = False
+) -> Board:
     """Make a board from its size.
 
     Parameters
@@ -67,6 +74,8 @@ def make_board(size: str, square: float, dictionary: str | None = None, marker: 
         Side of a square [m].
     dictionary, marker
         ArUco dictionary and side of a marker [m] of a ChArUco board.
+    leds
+        True for a plane of LEDs.
 
     Raises
     ------
@@ -84,7 +93,9 @@ def make_board(size: str, square: float, dictionary: str | None = None, marker: 
     if dictionary is None:
         if marker is not None:
             raise InputError("--marker applies to a ChArUco board: give its dictionary with --charuco, or omit it")
-        return Board(columns, rows, square)
+        return Board(columns, rows, square, leds=leds)
+    if leds:
+        raise InputError("--leds is a plane of LEDs, and --charuco another board: give one of them")
     if marker is None or not 0 < marker < square:
         raise InputError(
             f"a ChArUco board needs --marker, the side of a marker in metres, shorter than that of a square ({square})"

@@ -1,6 +1,6 @@
 """Bundle adjustment of intrinsics and board poses, with the pose of each image eliminated.
 
-Intrinsics are one vector: fx, fy, cx, cy [px], then OpenCV's k1, k2, p1, p2[, k3[, k4, k5, k6]]. A board's pose is its
+Intrinsics are one vector, see `projection`. A board's pose is its
 rotation vector [rad] and translation [m] in the camera frame, (6,), as in OpenCV.
 """
 
@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.calibration.corners import View
+from coloc_graph.calibration.projection import Model, pose_by_rays, project
 from coloc_graph.errors import EstimationError
+from coloc_graph.team import fisheye
 
 Array = NDArray[np.float64]
-MAX_STEPS = 60
+MAX_STEPS = 300
 # the next step would move no parameter by a thousandth of its standard deviation
 CONVERGED = 1e-11  # relative decrease of the sum of squares by a step below which the search ends
 INITIAL_DAMPING = 1e-9  # small: valleys are shallow (focal length: 1e-6 of the curvature) and starts are good
@@ -38,6 +40,8 @@ class Bundle:
         Information of the intrinsics for corner noise of 1 px, with the poses eliminated, (p, p).
     influence
         Gradient of each image on the intrinsics, (images, p), which sums to zero at the optimum.
+    model
+        Lens model.
     """
 
     intrinsics: Array
@@ -45,6 +49,7 @@ class Bundle:
     residuals: tuple[Array, ...]
     information: Array
     influence: Array
+    model: Model = "pinhole"
 
     @property
     def rms(self) -> float:
@@ -58,15 +63,12 @@ def rms(residuals: Sequence[Array]) -> float:
     return float(np.sqrt((every**2).sum() / len(every)))
 
 
-def project(intrinsics: Array, pose: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Project points (n, 3) to pixels (n, 2), with derivatives by intrinsics (2n, p) and by pose (2n, 6)."""
-    K = np.array([[intrinsics[0], 0, intrinsics[2]], [0, intrinsics[1], intrinsics[3]], [0, 0, 1.0]])
-    uv, J = cv2.projectPoints(points[:, None], pose[:3], pose[3:], K, intrinsics[4:] if len(intrinsics) > 4 else None)
-    return np.asarray(uv.reshape(-1, 2)), np.asarray(J[:, 6 : 6 + len(intrinsics)]), np.asarray(J[:, :6])
-
-
-def start_pose(view: View, intrinsics: Array) -> Array:
+def start_pose(view: View, intrinsics: Array, model: Model = "pinhole") -> Array:
     """Initial pose (6,) of a board under known intrinsics, for `adjust_pose`."""
+    if model == "fisheye":
+        rays = fisheye.rays_of(tuple(intrinsics[4:].tolist()), (view.uv - intrinsics[2:4]) / intrinsics[:2])
+        seen = np.isfinite(rays).all(axis=1)
+        return pose_by_rays(rays[seen], view.points[seen])
     K = np.array([[intrinsics[0], 0, intrinsics[2]], [0, intrinsics[1], intrinsics[3]], [0, 0, 1.0]])
     # centred and scaled to unit size, as IPPE requires
     middle, size = view.points.mean(axis=0), np.abs(view.points).max()
@@ -77,7 +79,7 @@ def start_pose(view: View, intrinsics: Array) -> Array:
     return np.concatenate([rotation.ravel(), size * translation.ravel() - R @ middle])
 
 
-def adjust(views: Sequence[View], intrinsics: Array, poses: Array) -> Bundle:
+def adjust(views: Sequence[View], intrinsics: Array, poses: Array, model: Model = "pinhole") -> Bundle:
     """Adjust intrinsics and board poses by Levenberg-Marquardt.
 
     Parameters
@@ -86,6 +88,8 @@ def adjust(views: Sequence[View], intrinsics: Array, poses: Array) -> Bundle:
         Boards in images.
     intrinsics, poses
         Start, (p,) and (images, 6).
+    model
+        Lens model.
 
     Raises
     ------
@@ -93,14 +97,14 @@ def adjust(views: Sequence[View], intrinsics: Array, poses: Array) -> Bundle:
         The images do not determine the intrinsics.
     """
     intrinsics, poses = np.array(intrinsics, float), np.array(poses, float)
-    damping, at = INITIAL_DAMPING, _linearise(views, intrinsics, poses)
+    damping, at = INITIAL_DAMPING, _linearise(views, intrinsics, poses, model)
     for _ in range(MAX_STEPS):
         try:
             step = _step(at, damping)
-            moved = _linearise(views, intrinsics + step[0], poses + step[1])
+            moved = _linearise(views, intrinsics + step[0], poses + step[1], model)
         except np.linalg.LinAlgError:
             moved = None
-        if moved is not None and moved.cost <= at.cost:
+        if moved is not None and moved.cost <= at.cost:  # NaN is not
             done = at.cost - moved.cost <= CONVERGED * max(at.cost, 1e-12)
             intrinsics, poses, at, damping = intrinsics + step[0], poses + step[1], moved, damping / 100
             if done:
@@ -113,21 +117,21 @@ def adjust(views: Sequence[View], intrinsics: Array, poses: Array) -> Bundle:
         S, influence = _reduced(at, 0.0)
     except np.linalg.LinAlgError as error:
         raise EstimationError(UNDETERMINED) from error
-    return Bundle(intrinsics, poses, at.residuals, S, influence)
+    return Bundle(intrinsics, poses, at.residuals, S, influence, model)
 
 
-def adjust_pose(view: View, intrinsics: Array, pose: Array) -> tuple[Array, Array, Array]:
+def adjust_pose(view: View, intrinsics: Array, pose: Array, model: Model = "pinhole") -> tuple[Array, Array, Array]:
     """Adjust the pose of one board under known intrinsics.
 
     Returns its pose (6,), residuals (n, 2) [px], and information (6, 6) for corner noise of 1 px.
     """
     pose, damping = np.array(pose, float), INITIAL_DAMPING
-    uv, _, B = project(intrinsics, pose, view.points)
+    uv, _, B = project(intrinsics, pose, view.points, model)
     r = view.uv - uv
     for _ in range(MAX_STEPS):
         N = B.T @ B
         step = np.linalg.solve(N + damping * np.diag(np.diag(N)), B.T @ r.ravel())
-        uv, _, moved_B = project(intrinsics, pose + step, view.points)
+        uv, _, moved_B = project(intrinsics, pose + step, view.points, model)
         moved = view.uv - uv
         gain = float((r**2).sum() - (moved**2).sum())
         if gain >= 0:
@@ -154,10 +158,10 @@ class _Linear:
     b: Array
 
 
-def _linearise(views: Sequence[View], intrinsics: Array, poses: Array) -> _Linear:
+def _linearise(views: Sequence[View], intrinsics: Array, poses: Array, model: Model) -> _Linear:
     residuals, parts = [], []
     for view, pose in zip(views, poses, strict=True):
-        uv, A, B = project(intrinsics, pose, view.points)
+        uv, A, B = project(intrinsics, pose, view.points, model)
         r = view.uv - uv
         residuals.append(r)
         r = r.ravel()

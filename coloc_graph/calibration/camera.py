@@ -12,15 +12,18 @@ from numpy.typing import NDArray
 from coloc_graph.calibration.board import Board
 from coloc_graph.calibration.bundle import Bundle, adjust, adjust_pose, rms, start_pose
 from coloc_graph.calibration.corners import View, Views, neighbours
-from coloc_graph.calibration.lens import LENS_NAMES, folds, ray_sigmas
+from coloc_graph.calibration.lens import FISHEYE_NAMES, LENS_NAMES, folds, ray_sigmas
 from coloc_graph.calibration.lens_choice import Trial, choose_lens
+from coloc_graph.calibration.projection import Model
 from coloc_graph.calibration.residuals import fitted_directions, noise_and_shared
-from coloc_graph.errors import DegenerateGeometry, InputError
+from coloc_graph.errors import DegenerateGeometry, EstimationError, InputError
 from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
 
-LENSES = (0, 4, 5, 8)  # numbers of lens coefficients tried: none; k1, k2, p1, p2; k3 too; rational
+#: Numbers of lens coefficients tried, by model: none; k1, k2, p1, p2; k3 too; rational. Of a fisheye none, or k1 to k4.
+LENSES: dict[Model, tuple[int, ...]] = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
+ANGLES_TRIED = (60.0, 90.0, 120.0, 150.0, 180.0, 220.0)  # deg across, with which a fisheye's calibration begins
 MIN_IMAGES = 6
 MAX_PARTS = 40  # parts into which images are divided for the jackknife
 OUTLIER = 3.0  # ratio of an image's RMS to the median above which it shows another board, or one that moved or is bent
@@ -95,7 +98,8 @@ class CameraCalibration:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of the covariances."""
-        return LENS_NAMES[: len(self.covariance)]
+        names = FISHEYE_NAMES if self.camera.model == "fisheye" else LENS_NAMES
+        return names[: len(self.covariance)]
 
     @property
     def sigmas(self) -> Array:
@@ -113,6 +117,7 @@ def calibrate_camera(
     board: Board,
     coefficients: int | None = None,
     progress: Callable[[int, int], None] | None = None,
+    model: Model = "pinhole",
 ) -> CameraCalibration:
     """Calibrate a camera by least squares, with the fewest lens coefficients that suffice.
 
@@ -127,6 +132,8 @@ def calibrate_camera(
         better than fewer do, by more than the standard error.
     progress
         Called with (done, total).
+    model
+        Lens model; a fisheye has 0 or 4 coefficients.
 
     Returns
     -------
@@ -145,7 +152,10 @@ def calibrate_camera(
             f"{board} is in {len(seen.views)} of {seen.images} images, but at least {MIN_IMAGES} are needed: "
             "take more, 20 are good, with the board tilted and in all parts of the image"
         )
-    start = _start(seen, 4 if coefficients is None else coefficients)
+    wanted = LENSES[model] if coefficients is None else (coefficients,)
+    if not set(wanted) <= set(LENSES[model]):
+        raise InputError(f"a {model} has no {coefficients} lens coefficients; give {_listed(LENSES[model])}")
+    start = _fisheye_start(seen) if model == "fisheye" else _start(seen, 4 if coefficients is None else coefficients)
     kept, bundle, rejected = _without_outliers(seen, board, start)
     views = Views(seen.width, seen.height, tuple(kept), seen.missed)
     place = places(kept, board.square)
@@ -156,10 +166,9 @@ def calibrate_camera(
             "move the board between images"
         )
     _require_known(bundle, _independent(bundle))
-    wanted = LENSES if coefficients is None else (coefficients,)
     fit, trials = choose_lens(views, bundle, place % MAX_PARTS, wanted, progress)
     best, covariance = fit.bundle, fit.covariance
-    fold = folds(best.intrinsics, seen.width, seen.height)
+    fold = folds(best.intrinsics, seen.width, seen.height, model)
     if fold:
         raise DegenerateGeometry(
             f"the images do not determine {len(best.intrinsics) - 4} lens coefficients, since with them the lens "
@@ -167,7 +176,8 @@ def calibrate_camera(
         )
     _require_known(best, covariance)
     noise, shared = noise_and_shared(kept, best.residuals, fitted_directions(kept, best), board.square)
-    lens = float(np.sqrt(np.mean(ray_sigmas(best.intrinsics, covariance, np.concatenate([v.uv for v in kept])) ** 2)))
+    uv = np.concatenate([v.uv for v in kept])
+    lens = float(np.sqrt(np.mean(ray_sigmas(best.intrinsics, covariance, uv, model=model) ** 2)))
     fx, fy, cx, cy = best.intrinsics[:4].tolist()
     camera = Camera(
         width=seen.width,
@@ -176,6 +186,7 @@ def calibrate_camera(
         fy=fy,
         cx=cx,
         cy=cy,
+        model=model,
         distortion=tuple(best.intrinsics[4:].tolist()),
         noise_px=max(noise, 1e-6),
         bias_px=math.hypot(shared, lens),
@@ -245,6 +256,31 @@ def _start(seen: Views, coefficients: int) -> Bundle:
     return adjust(seen.views, intrinsics, poses)
 
 
+def _fisheye_start(seen: Views) -> Bundle:
+    """Start with equidistant lenses of several focal lengths, each adjusted to convergence, and take the best."""
+    found: Bundle | None = None
+    for angle in np.deg2rad(ANGLES_TRIED):
+        focal = seen.width / angle
+        intrinsics = np.array([focal, focal, (seen.width - 1) / 2, (seen.height - 1) / 2, 0.0, 0.0, 0.0, 0.0])
+        try:
+            with np.errstate(all="ignore"):
+                starts = [start_pose(view, intrinsics, "fisheye") for view in seen.views]
+                pairs = zip(seen.views, starts, strict=True)
+                poses = np.array([adjust_pose(view, intrinsics, start, "fisheye")[0] for view, start in pairs])
+                bundle = adjust(seen.views, intrinsics, poses, "fisheye")
+        except (np.linalg.LinAlgError, EstimationError):
+            continue
+        if np.isfinite(bundle.rms) and (found is None or bundle.rms < found.rms):
+            found = bundle
+    if found is None:
+        raise DegenerateGeometry(_undetermined("no fisheye fits them"))
+    return found
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return " or ".join(map(str, numbers))
+
+
 def _without_outliers(seen: Views, board: Board, bundle: Bundle) -> tuple[list[View], Bundle, list[ImageFit]]:
     """Reject images one by one, the worst first, with a new adjustment of the others each time."""
     kept, out = list(seen.views), []
@@ -259,11 +295,12 @@ def _without_outliers(seen: Views, board: Board, bundle: Bundle) -> tuple[list[V
                 f"{len(out)} of {len(seen.views)} images contradict the others ({', '.join(v.name for v in out[:3])}"
                 f"{', ...' if len(out) > 3 else ''}): check that all show the same flat board, {board}, and are sharp"
             )
-        bundle = adjust(kept, bundle.intrinsics, np.delete(bundle.poses, worst, axis=0))
+        bundle = adjust(kept, bundle.intrinsics, np.delete(bundle.poses, worst, axis=0), bundle.model)
     usual = float(np.median(off))
     rejected = []
     for view in out:
-        pose, r, _ = adjust_pose(view, bundle.intrinsics, start_pose(view, bundle.intrinsics))
+        start = start_pose(view, bundle.intrinsics, bundle.model)
+        pose, r, _ = adjust_pose(view, bundle.intrinsics, start, bundle.model)
         why = (
             f"its corners have an RMS error of {rms([r]):.2f} px, others have {usual:.2f} px: "
             "it shows another board, or one that moved or is not flat"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.calibration.board import Board, charuco_board
+from coloc_graph.calibration.led_grid import ordered_grid
 from coloc_graph.errors import InputError
 from coloc_graph.image_file import image_paths as image_paths
 from coloc_graph.image_file import range_of, read_image, to_8_bits, to_grey
@@ -49,7 +50,10 @@ class Views:
 
 
 def find_boards(
-    paths: Sequence[Path], board: Board, progress: Callable[[int, int], None] | None = None
+    paths: Sequence[Path],
+    board: Board,
+    progress: Callable[[int, int], None] | None = None,
+    lights: Callable[[Image], Array] | None = None,
 ) -> tuple[Views, Board]:
     """Find a board in images.
 
@@ -61,6 +65,8 @@ def find_boards(
         The board.
     progress
         Called with (done, total).
+    lights
+        Detector of the centres (n, 2) [px] of all LEDs in a grey image, for a plane of LEDs.
 
     Returns
     -------
@@ -84,7 +90,7 @@ def find_boards(
     for candidate in (board, replace(board, legacy=True)) if board.dictionary else (board,):
         views, missed = [], []
         for done, (path, image) in enumerate(images, start=1):
-            view = find_board(image, candidate, str(path))
+            view = find_board(image, candidate, str(path), lights)
             if view is None:
                 missed.append(str(path))
             else:
@@ -99,8 +105,14 @@ def find_boards(
     )
 
 
-def find_board(image: Image, board: Board, name: str = "") -> View | None:
+def find_board(
+    image: Image, board: Board, name: str = "", lights: Callable[[Image], Array] | None = None
+) -> View | None:
     """Find the board in one grey image; None if it is not seen."""
+    if board.leds:
+        assert lights is not None
+        ordered = ordered_grid(lights(image), board.columns, board.rows)
+        return None if ordered is None else View(name, board.points, ordered)
     if board.dictionary is None:
         size = board.grid
         found, seen = cv2.findChessboardCorners(
@@ -142,6 +154,8 @@ def _refined(image: Image, points: Array, uv: NDArray[np.float32], square: float
 
 def _remedy(images: Sequence[Image], board: Board) -> str:
     """Return a remedy for a board that is not found: another size that is seen, or general advice."""
+    if board.leds:
+        return "count the LEDs in a row and in a column, show all of them, and no other light"
     for other in _others(board):
         if any(find_board(image, other) is not None for image in images):
             counted = "inner corners, not squares" if board.dictionary is None else "squares, columns first"

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.calibration.bundle import project
+from coloc_graph.calibration.projection import Model, project
 from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
@@ -11,11 +11,14 @@ Array = NDArray[np.float64]
 LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
-def camera_of(intrinsics: Array, width: int, height: int) -> Camera:
+FISHEYE_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+
+
+def camera_of(intrinsics: Array, width: int, height: int, model: Model = "pinhole") -> Camera:
     """Make a camera from intrinsics (p,): fx, fy, cx, cy and the lens coefficients."""
     fx, fy, cx, cy = intrinsics[:4].tolist()
     lens = tuple(intrinsics[4:].tolist())
-    return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=lens)
+    return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, model=model, distortion=lens)
 
 
 def pixel_grid(width: int, height: int, columns: int, rows: int) -> Array:
@@ -25,13 +28,15 @@ def pixel_grid(width: int, height: int, columns: int, rows: int) -> Array:
     return np.stack(np.meshgrid(u, v), axis=-1)
 
 
-def folds(intrinsics: Array, width: int, height: int) -> str | None:
+def folds(intrinsics: Array, width: int, height: int, model: Model = "pinhole") -> str | None:
     """Explain in words why a lens model is not invertible over the whole image, or return None."""
     if (intrinsics[:2] <= 0).any():
         return "has a focal length that is not positive"
-    camera = camera_of(intrinsics, width, height)
+    camera = camera_of(intrinsics, width, height, model)
     if (radius := camera.fold_radius()) is not None:
         return f"folds the image {radius:.0f} px from its middle: not every pixel has one ray"
+    if model == "fisheye":
+        return None  # pixels beyond its image circle have no ray
     corners = pixel_grid(width, height, 33, 33).reshape(-1, 2)
     x = camera.normalise(corners)
     if not np.isfinite(x).all():
@@ -42,7 +47,9 @@ def folds(intrinsics: Array, width: int, height: int) -> str | None:
     return None
 
 
-def ray_sigmas(intrinsics: Array, covariance: Array, uv: Array, at: Array | None = None) -> Array:
+def ray_sigmas(
+    intrinsics: Array, covariance: Array, uv: Array, at: Array | None = None, model: Model = "pinhole"
+) -> Array:
     """Standard deviations (m,) of rays, for each axis [px].
 
     A small rotation of the camera compensates a part of an error in the intrinsics: the best rotation over the pixels
@@ -56,6 +63,8 @@ def ray_sigmas(intrinsics: Array, covariance: Array, uv: Array, at: Array | None
         Pixels of the rays, (n, 2).
     at
         Pixels of other rays to evaluate, (m, 2).
+    model
+        Lens model.
 
     Returns
     -------
@@ -63,7 +72,7 @@ def ray_sigmas(intrinsics: Array, covariance: Array, uv: Array, at: Array | None
         Standard deviations, infinite for pixels without a ray in the model.
     """
     size = np.concatenate([uv, uv if at is None else at]).max(axis=0) + 2
-    camera = camera_of(intrinsics, int(size[0]), int(size[1]))
+    camera = camera_of(intrinsics, int(size[0]), int(size[1]), model)
     A, B = _of_rays(camera, intrinsics, uv)
     turn = np.linalg.lstsq(B, A, rcond=None)[0]
     if at is not None:
@@ -75,6 +84,5 @@ def ray_sigmas(intrinsics: Array, covariance: Array, uv: Array, at: Array | None
 
 def _of_rays(camera: Camera, intrinsics: Array, uv: Array) -> tuple[Array, Array]:
     """Derivatives of pixels by intrinsics (2m, p) and by a rotation (2m, 3), at the rays of pixels (m, 2)."""
-    x = camera.normalise(uv)
-    _, A, B = project(intrinsics, np.array([1e-12, 0, 0, 0, 0, 0.0]), np.column_stack([x, np.ones(len(x))]))
+    _, A, B = project(intrinsics, np.array([1e-12, 0, 0, 0, 0, 0.0]), camera.rays(uv), camera.model)
     return A, B[:, :3]

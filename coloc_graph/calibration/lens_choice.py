@@ -84,8 +84,8 @@ def choose_lens(
     unusable: dict[int, tuple[float, str]] = {}
     best = wanted[0]
     for done, coefficients in enumerate(wanted):
-        bundle = adjust(views.views, _resized(start.intrinsics, coefficients), start.poses)
-        fold = folds(bundle.intrinsics, views.width, views.height)
+        bundle = adjust(views.views, _resized(start.intrinsics, coefficients), start.poses, start.model)
+        fold = folds(bundle.intrinsics, views.width, views.height, bundle.model)
         if fold and coefficients != wanted[0]:
             unusable[coefficients] = bundle.rms, f"the lens {fold}"
         else:
@@ -121,8 +121,10 @@ def _held_out(views: Views, bundle: Bundle, parts: NDArray[np.int64]) -> Fit:
     for part in range(int(parts.max()) + 1):
         here = parts == part
         others = [view for view, held in zip(views.views, here, strict=True) if not held]
-        intrinsics = adjust(others, bundle.intrinsics, bundle.poses[~here]).intrinsics
-        residuals = [adjust_pose(views.views[i], intrinsics, bundle.poses[i])[1] for i in np.flatnonzero(here)]
+        intrinsics = adjust(others, bundle.intrinsics, bundle.poses[~here], bundle.model).intrinsics
+        residuals = [
+            adjust_pose(views.views[i], intrinsics, bundle.poses[i], bundle.model)[1] for i in np.flatnonzero(here)
+        ]
         without.append(intrinsics)
         squares.append(rms(residuals) ** 2)
     return Fit(bundle, np.array(without), np.array(squares))

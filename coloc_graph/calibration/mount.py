@@ -14,9 +14,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from coloc_graph.calibration.bundle import adjust_pose, project, rms, start_pose
+from coloc_graph.calibration.bundle import adjust_pose, rms, start_pose
 from coloc_graph.calibration.corners import View
 from coloc_graph.calibration.fusion import Estimates, disagreement, fuse, fuse_scaled
+from coloc_graph.calibration.projection import Model, project
 from coloc_graph.calibration.residuals import noise_and_shared
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.geometry.lie import so3_exp
@@ -135,7 +136,7 @@ def calibrate_mount(
             f"the calibration has {len(shared)} parameters, but the robot's camera has {len(intrinsics)}: "
             "write the camera of this calibration into the team first"
         )
-    fitted = [_fit(view, intrinsics, thickness) for view in views]
+    fitted = [_fit(view, intrinsics, thickness, camera.model) for view in views]
     sound, rejected = _rejected_by_corners(fitted)
     noise, counted = _noise([views[i] for i in sound], [fitted[i] for i in sound], square)
     uneven = np.zeros(3) if floor is None else np.array([floor.height_sigma, *[math.radians(floor.tilt_sigma_deg)] * 2])
@@ -207,9 +208,9 @@ class _Fit:
     directions: Array
 
 
-def _fit(view: View, intrinsics: Array, thickness: float) -> _Fit:
+def _fit(view: View, intrinsics: Array, thickness: float, model: Model) -> _Fit:
     try:
-        pose, residuals, information = adjust_pose(view, intrinsics, start_pose(view, intrinsics))
+        pose, residuals, information = adjust_pose(view, intrinsics, start_pose(view, intrinsics, model), model)
         R, t, middle = so3_exp(pose[:3]), pose[3:], view.points.mean(axis=0)
         value = _height_tilt_roll(R, t, thickness)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -227,7 +228,7 @@ def _fit(view: View, intrinsics: Array, thickness: float) -> _Fit:
         return _height_tilt_roll(turned, t + (R - turned) @ middle + off[0] * R[:, 2], thickness)
 
     by_pose = _derivative(where_pose_is_off, 6)
-    _, A, B = project(intrinsics, pose, view.points)
+    _, A, B = project(intrinsics, pose, view.points, model)
     return _Fit(
         value,
         by_pose @ np.linalg.solve(information, by_pose.T),

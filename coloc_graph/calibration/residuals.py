@@ -6,8 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.calibration.bundle import Bundle, project
+from coloc_graph.calibration.bundle import Bundle
 from coloc_graph.calibration.corners import View, neighbours
+from coloc_graph.calibration.projection import project
 
 Array = NDArray[np.float64]
 
@@ -58,7 +59,7 @@ def fitted_directions(views: Sequence[View], bundle: Bundle) -> list[Array]:
     """Directions (2n, 6 + p) in which poses and intrinsics absorb each image's residuals."""
     directions = []
     for view, pose in zip(views, bundle.poses, strict=True):
-        _, A, B = project(bundle.intrinsics, pose, view.points)
+        _, A, B = project(bundle.intrinsics, pose, view.points, bundle.model)
         Q = np.linalg.qr(B)[0]
         A = A - Q @ (Q.T @ A)
         # all images share the intrinsics, which absorb a part of each image's residuals

@@ -12,7 +12,7 @@ from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.team import Camera, Mount, Team, parse_team
 
 #: Fields that a calibration replaces.
-CAMERA_FIELDS = ("width", "height", "fx", "fy", "cx", "cy", "distortion", "noise_px", "bias_px")
+CAMERA_FIELDS = ("width", "height", "fx", "fy", "cx", "cy", "model", "distortion", "noise_px", "bias_px")
 MOUNT_FIELDS = ("height", "tilt_deg", "roll_deg", "height_sigma", "tilt_sigma_deg", "roll_sigma_deg")
 
 

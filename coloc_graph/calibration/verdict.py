@@ -84,7 +84,7 @@ def verdict(calibration: CameraCalibration) -> tuple[str, ...]:
     elif bare:
         said.append(f"the {_listed(bare)} of the image {_is(bare)} not covered: hold the board there")
     grid = pixel_grid(used.width, used.height, 3 * CELLS, 3 * CELLS).reshape(-1, 2)
-    sigmas = ray_sigmas(calibration.bundle.intrinsics, calibration.covariance, uv, grid)
+    sigmas = ray_sigmas(calibration.bundle.intrinsics, calibration.covariance, uv, grid, calibration.camera.model)
     worst = int(sigmas.argmax())
     if sigmas[worst] > MAX_RAY_SIGMA:
         row, column = np.array(np.unravel_index(worst, (3 * CELLS, 3 * CELLS))) // CELLS

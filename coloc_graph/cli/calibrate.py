@@ -25,6 +25,10 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         help="number of lens coefficients (default: the fewest that predict held-out images as well as more)",
     )
     camera.add_argument(
+        "--model", choices=("pinhole", "fisheye"), default="pinhole",
+        help="lens model; fisheye is OpenCV's, ROS's equidistant, for wide lenses (default: pinhole)",
+    )  # fmt: skip
+    camera.add_argument(
         "--from-camera-info",
         metavar="FILE",
         help="take the camera from a file, not from images: ROS camera_info, OpenCV's YAML or XML, Kalibr's camchain",
@@ -60,6 +64,11 @@ def _add_images(command: argparse.ArgumentParser, *, needed: bool) -> None:
     )
     command.add_argument("--square", type=float, required=needed, metavar="M", help="side of a square [m]")
     command.add_argument("--charuco", metavar="DICT", help="dictionary of a ChArUco board, such as 4X4_50")
+    command.add_argument(
+        "--leds",
+        action="store_true",
+        help="the board is a plane of LEDs; --board counts LEDs, --square is their distance",
+    )
     command.add_argument("--marker", type=float, metavar="M", help="side of a marker of a ChArUco board [m]")
 
 

@@ -75,7 +75,7 @@ def _calibrated(args: argparse.Namespace) -> "CameraCalibration":
 
     seen, board = seen_in(args)
     with progress("lens models tried") as report:
-        return calibrate_camera(seen, board, args.distortion, report)
+        return calibrate_camera(seen, board, args.distortion, report, args.model)
 
 
 def _warn_of_images(calibration: "CameraCalibration") -> None:

@@ -38,11 +38,12 @@ def seen_in(args: argparse.Namespace) -> "tuple[Views, Board]":
     """Return the boards found in the images, and the board."""
     from coloc_graph.calibration import find_boards, image_paths, make_board
     from coloc_graph.cli.printing import progress
+    from coloc_graph.frontend import detect_leds
 
-    board = make_board(args.board, args.square, args.charuco, args.marker)
+    board = make_board(args.board, args.square, args.charuco, args.marker, leds=args.leds)
     paths = image_paths(args.images)
     with progress("images searched") as report:
-        return find_boards(paths, board, report)
+        return find_boards(paths, board, report, lambda image: detect_leds(image).uv)
 
 
 def say_written(args: argparse.Namespace) -> None:

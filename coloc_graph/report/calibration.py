@@ -52,7 +52,9 @@ def coverage_figure(calibration: CameraCalibration) -> Figure:
     _of_image(seen, calibration, f"Coverage by corners ({images})")
 
     grid = pixel_grid(used.width, used.height, 2 * columns, 2 * rows)
-    sigmas = ray_sigmas(calibration.bundle.intrinsics, calibration.covariance, uv, grid.reshape(-1, 2))
+    sigmas = ray_sigmas(
+        calibration.bundle.intrinsics, calibration.covariance, uv, grid.reshape(-1, 2), calibration.camera.model
+    )
     sigmas = sigmas.reshape(grid.shape[:2])
     top = float(np.nanpercentile(sigmas[np.isfinite(sigmas)], 99)) if np.isfinite(sigmas).any() else 1.0
     map_ = known.imshow(sigmas, extent=extent, cmap="viridis_r", vmin=0, vmax=max(top, 1e-6), aspect="equal")

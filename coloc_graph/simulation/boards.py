@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.calibration.board import Board, charuco_board
 from coloc_graph.calibration.corners import View, Views
-from coloc_graph.geometry.lie import rotation_x, rotation_y, rotation_z, se3
+from coloc_graph.geometry.lie import rotation_x, rotation_y, rotation_z, se3, so3_exp
 from coloc_graph.team import Camera, Floor, Mount
 
 Array = NDArray[np.float64]
@@ -36,12 +36,27 @@ def held_poses(
         tilt, turn, roll = np.deg2rad(rng.uniform(-tilt_deg, tilt_deg, 2)), rng.uniform(-0.5, 0.5), rng.uniform()
         R = rotation_x(tilt[0]) @ rotation_y(tilt[1]) @ rotation_z(turn + np.pi * (roll < 0.2))
         z = camera.fx * width / (camera.width * rng.uniform(0.33, 0.75))
-        off = reach * rng.uniform(-0.5, 0.5, 2) * (camera.width / camera.fx, camera.height / camera.fy)
-        T = se3(R, [*(z * off), z] - R @ middle)
+        off = reach * rng.uniform(-0.5, 0.5, 2)
+        if camera.model == "fisheye":  # facing the camera from anywhere in its view
+            (ray,) = camera.rays([off * (camera.width, camera.height) + (camera.cx, camera.cy)])
+            if np.isnan(ray).any():
+                continue
+            R = _toward(ray) @ R
+            T = se3(R, z * ray - R @ middle)
+        else:
+            off = off * (camera.width / camera.fx, camera.height / camera.fy)
+            T = se3(R, [*(z * off), z] - R @ middle)
         _, inside = camera.project(_outline(board) @ R.T + T[:3, 3])
         if inside.all():
             poses.append(T)
     return np.array(poses)
+
+
+def _toward(ray: Array) -> Array:
+    """Rotation (3, 3) by the smallest angle that turns the optical axis to a unit ray (3,)."""
+    axis = np.cross([0.0, 0.0, 1.0], ray)
+    sine = float(np.linalg.norm(axis))
+    return so3_exp(axis / max(sine, 1e-12) * np.arctan2(sine, ray[2]))
 
 
 def floor_poses(
@@ -97,7 +112,7 @@ def render_boards(
     picture = board_picture(board)
     v, u = np.mgrid[0 : RAYS * camera.height, 0 : RAYS * camera.width]
     pixels = (np.stack([u, v], axis=-1).reshape(-1, 2) + 0.5) / RAYS - 0.5
-    rays = np.column_stack([camera.normalise(pixels), np.ones(len(pixels))])
+    rays = camera.rays(pixels)
     images = []
     for T in poses:
         # the ray meets the board's plane at s ray = R p + t with p_z = 0
@@ -108,7 +123,7 @@ def render_boards(
             p = origin + s[:, None] * directions
         # a square's edges lie between pixels
         at = (p[:, :2] / board.square + MARGIN + 1) * PER_SQUARE - 0.5
-        at = np.where((s > 0)[:, None], at, -1).clip(-1, max(picture.shape))
+        at = np.where((s > 0)[:, None] & np.isfinite(at), at, -1).clip(-1, max(picture.shape))
         at = at.astype(np.float32).reshape(RAYS * camera.height, RAYS * camera.width, 2)
         drawn = cv2.remap(
             picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=SURROUNDINGS
