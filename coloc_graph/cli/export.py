@@ -31,7 +31,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "result", metavar="DIR", help="result of `coloc solve`; pyfg, jrl: or a graph (.pyfg, .jrl, .g2o)"
     )
     command.add_argument("--out", required=True, metavar="PATH", help="file to write; for tum and gtsam a folder")
-    command.add_argument("--truth", action="store_true", help="tum: export the truth of the run, not the estimate")
+    command.add_argument("--truth", action="store_true", help="tum: the truth of the run, not the estimate; ros2: both")
     command.add_argument("--layout", action="store_true", help="foxglove: write a layout (.json) beside the file, too")
     command.add_argument("--run", dest="run_path", metavar="RUN", help="the result's run, if it has moved")
     add_force(command)
@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
         require_replaceable_folder(out, FOLDERS[args.format], force=args.force)
     elif os.path.lexists(out):
         require_writable(out, force=args.force)
-    if args.truth and args.format != "tum":
-        raise InputError(f"--truth applies to tum, not to {args.format}: leave it out")
+    if args.truth and args.format not in ("tum", "ros2"):
+        raise InputError(f"--truth applies to tum and ros2, not to {args.format}: leave it out")
     if args.layout and args.format != "foxglove":
         raise InputError(f"--layout applies to foxglove, not to {args.format}: leave it out")
     if args.format in ("pyfg", "jrl"):
@@ -62,17 +62,23 @@ def run(args: argparse.Namespace) -> int:
     if Path(args.result).suffix in (".pyfg", ".jrl", ".g2o") and Path(args.result).is_file():
         raise InputError(f"{args.result} is exported to pyfg or jrl only: give the result of `coloc solve`")
     result = read_result(args.result)
-    if args.truth:
+    if args.truth and args.format == "tum":
         return _truth(result, args.run_path, out)
     if args.format == "foxglove":
         return _foxglove(result, args.run_path, out, layout=args.layout, force=args.force)
     if args.format == "ros2":
         from coloc_graph.exchange.ros_export import write_ros2
+        from coloc_graph.results.aligned_truth import aligned_truth
 
         if out.suffix != ".mcap":
             raise InputError(f"{out} is not the name of a ROS 2 bag: give one that ends in .mcap")
         out.parent.mkdir(parents=True, exist_ok=True)
-        poses = write_ros2(result.trajectories, result.team, out)
+        truth = None
+        if args.truth:
+            truth = aligned_truth(result, path := Path(args.run_path or result.run_path))
+            if not truth:
+                raise InputError(f"{path}: the run holds no truth to export; leave --truth out")
+        poses = write_ros2(result.trajectories, result.team, out, truth)
         print(f"wrote {out}: {poses} poses of {len(result.trajectories)} robots")
         return 0
     files = {"tum": "trajectories", "gtsam": GTSAM_FACTORS, "g2o": "graph.g2o", "dot": "graph.dot"}

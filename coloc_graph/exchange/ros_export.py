@@ -34,7 +34,9 @@ VERSION: Literal[8] = 8
 FOREVER = divmod(2**63 - 1, 1_000_000_000)
 
 
-def write_ros2(trajectories: Mapping[str, Trajectory], team: Team, path: str | Path) -> int:
+def write_ros2(
+    trajectories: Mapping[str, Trajectory], team: Team, path: str | Path, truth: Mapping[str, Array] | None = None
+) -> int:
     """Write the poses T_world_body of a team as a ROS 2 bag.
 
     Parameters
@@ -45,6 +47,8 @@ def write_ros2(trajectories: Mapping[str, Trajectory], team: Team, path: str | P
         The team.
     path
         Bag to write (.mcap); it appears complete or not at all, and the same input gives the same bytes.
+    truth
+        True poses (n, 4, 4) by robot, at the times of its trajectory, NaN where there is none.
 
     Returns
     -------
@@ -62,7 +66,8 @@ def write_ros2(trajectories: Mapping[str, Trajectory], team: Team, path: str | P
     -----
     /tf_static has <robot>/camera (optical axes) in <robot>/base_link; /tf has <robot>/base_link in `world` at each
     pose; /<robot>/pose is a PoseWithCovarianceStamped with the covariance of x, y, z and of rotations about the world's
-    axes; /<robot>/path is a nav_msgs/Path of all poses at the time of the first.
+    axes; /<robot>/path is a nav_msgs/Path of all poses at the time of the first. Truth is truth/<robot>/base_link in
+    /tf, and the PoseStamped /<robot>/truth.
     """
     path = Path(path)
     trajectories = {robot: one for robot, one in trajectories.items() if len(one)}
@@ -72,6 +77,8 @@ def write_ros2(trajectories: Mapping[str, Trajectory], team: Team, path: str | P
     messages = [new.mounts(trajectories, team)]
     for robot, trajectory in trajectories.items():
         messages += new.of_robot(robot, trajectory)
+        if truth is not None and robot in truth:
+            messages += new.of_truth(robot, trajectory, truth[robot])
     with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
         _write(Path(folder) / "bag", new.store, sorted(messages, key=lambda one: one.ns))
         (Path(folder) / "bag" / "bag.mcap").replace(path)
@@ -122,6 +129,15 @@ class _Messages:
             known = self._new("geometry_msgs/msg/PoseWithCovariance", pose=one.pose, covariance=covariance.ravel())
             content = self._new(POSE_WITH_COVARIANCE, header=one.header, pose=known)
             yield _Message(f"/{robot}/pose", ns, POSE_WITH_COVARIANCE, content)
+
+    def of_truth(self, robot: str, trajectory: Trajectory, true: Array) -> Iterator[_Message]:
+        """True poses of a robot, and their tf."""
+        for time, T in zip(trajectory.times.tolist(), true, strict=True):
+            if np.isfinite(T).all():
+                ns = to_ns(time)
+                transform = self._transform(ns, WORLD, f"truth/{robot}/base_link", T)
+                yield _Message("/tf", ns, TF, self._new(TF, transforms=[transform]))
+                yield _Message(f"/{robot}/truth", ns, POSE, self._stamped(ns, T))
 
     def _new(self, kind: str, **fields: Any) -> Any:
         return self.store.types[kind](**fields)

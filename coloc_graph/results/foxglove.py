@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import ColocError
-from coloc_graph.evaluation import align, usual_alignment
 from coloc_graph.exchange.foxglove_export import DrawnEdge, write_foxglove
 from coloc_graph.exchange.landmarks import read_landmarks
+from coloc_graph.results.aligned_truth import aligned_truth
 from coloc_graph.results.folder import LANDMARKS, MEASUREMENTS, Result
 from coloc_graph.results.measurement_table import read_measurements
-from coloc_graph.run import open_run, read_truth
+from coloc_graph.run import open_run
 
 Array = NDArray[np.float64]
 
@@ -27,11 +27,7 @@ def export_foxglove(result: Result, out: Path, run_path: Path | None = None) -> 
         result.require_run(path)
         run = open_run(path)
         detections = [run.detections(robot) for robot in run.team.names if run.has_detections(robot)]
-        true = read_truth(path, result.trajectories)
-        if true:
-            reference, on_floor = result.config.team.reference, result.config.team.floor is not None
-            how = "none" if result.on_map else usual_alignment(result.trajectories, true, reference)
-            truth = align(result.trajectories, true, reference, on_floor=on_floor, alignment=how)
+        truth = aligned_truth(result, path)
     except ColocError as why:
         warnings.append(f"exported without truth or without detections: {why}")
     messages = write_foxglove(

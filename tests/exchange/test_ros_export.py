@@ -16,7 +16,7 @@ from coloc_graph.exchange.ros_poses import T_of, ros_covariance
 from coloc_graph.geometry.lie import se3_exp, so3_exp, so3_log
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.results.folder import read_result
-from coloc_graph.results.writer import write_result
+from coloc_graph.results.writer import assess, write_result
 from coloc_graph.run.schemas import to_ns
 from coloc_graph.team import write_team
 
@@ -166,7 +166,7 @@ def test_nothing_is_exported_of_nothing_and_nothing_half(short_solution, tmp_pat
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("bag", "is not the name of a ROS 2 bag: give one that ends in"), ("result.mcap", "exists; give")],
+    [("bag", "is not the name of a ROS 2 bag: give one that ends in"), ("result.mcap", "exists; replace it with --force")],
 )
 def test_where_it_cannot_go_is_told(bag, result, tmp_path, capsys, name, words):
     (tmp_path / "result.mcap").write_bytes(b"mine")
@@ -187,3 +187,21 @@ def test_cameras_are_as_the_estimate_found_them_or_else_as_they_were_stated(shor
     (copy / "config.toml").write_text("[options]\n")
     assert main(["export", "ros2", str(copy), "--out", str(tmp_path / "x.mcap")]) == 2
     assert "config.toml: Expected `object`, got `null`; solve the run again" in capsys.readouterr().err
+
+
+def test_truth_is_exported_in_the_world_of_the_estimate(result, short, tmp_path, short_solution):
+    path = tmp_path / "truth.mcap"
+    assert main(["export", "ros2", str(result), "--out", str(path), "--truth", "--run", str(short)]) == 0
+    true = assess(short_solution)[1]
+    with AnyReader([path]) as reader:
+        found = [reader.deserialize(data, one.msgtype) for one, _, data in reader.messages() if one.topic == "/C/truth"]
+        frames = {
+            transform.child_frame_id
+            for one, _, data in reader.messages()
+            if one.topic == "/tf"
+            for transform in reader.deserialize(data, one.msgtype).transforms
+        }
+    poses = [T_of(one.pose.position, one.pose.orientation) for one in found]
+    np.testing.assert_allclose(poses, true["C"], atol=1e-9)
+    assert {f"truth/{robot}/base_link" for robot in true} <= frames
+    assert {one.header.frame_id for one in found} == {"world"}
