@@ -1,6 +1,6 @@
 """Our graphs in GTSAM's own optimiser: by how much its poses and sigmas differ from ours.
 
-    python benchmarks/stock_solvers.py [--stances 40]
+    python benchmarks/stock_solvers.py [--stances 40] [--only NAME]
 
 Of each run `graph.g2o` is read by GTSAM's readG2o, and `coloc export gtsam` by a program that imports nothing of
 coloc-graph; both begin at perturbed poses.
@@ -82,10 +82,13 @@ def main() -> None:
     """Measure and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--stances", type=int, default=40, help="number of stances (default: 40)")
+    parser.add_argument("--only", metavar="NAME", help="measure this run only, as `landmarks` (default: all)")
     args = parser.parse_args()
     print("| run | method | g2o: iterations | off by | factors: iterations | off by | sigmas differ by |")
     print("|---|---|---|---|---|---|---|")
     for name, scenario, more in runs(args.stances):
+        if args.only not in (None, name):
+            continue
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "run.mcap"
             simulate(*scenario, path, seed=1, imperfections=WRONG, **more)

@@ -166,7 +166,7 @@ def test_nothing_is_exported_of_nothing_and_nothing_half(short_solution, tmp_pat
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("bag", "is not the name of a ROS 2 bag: give one that ends in"), ("result.mcap", "exists; replace it with --force")],
+    [("bag", "is not the name of a ROS 2 bag: give one that ends in"), ("result.mcap", "exists; replace it")],
 )
 def test_where_it_cannot_go_is_told(bag, result, tmp_path, capsys, name, words):
     (tmp_path / "result.mcap").write_bytes(b"mine")
