@@ -136,7 +136,7 @@ def detector(*_: Any) -> Callable[[Glimpse], Blobs]:
 
 
 class _FieldCamera:
-    """A camera's device; frames come at its rate, if not exactly."""
+    """A camera's device; all cameras expose together, but for the scheduler's lateness."""
 
     def __init__(self, field: Field, robot: str, name: str, camera: Camera, clock: Clock) -> None:
         self._field, self._robot, self._name, self._clock = field, robot, name, clock
@@ -148,7 +148,8 @@ class _FieldCamera:
         if self._robot in self._field.frozen:
             wait(WAIT)
             return None
-        wait(self._period - DELIVERY)
+        now = 1e-9 * self._field.scheduler.now
+        wait((math.floor(now / self._period) + 1) * self._period - now)
         stamp, glimpse = self._clock(), Glimpse(self._field, self._robot, self._shape)
         wait(DELIVERY)
         pixels: Any = glimpse
