@@ -10,7 +10,9 @@ import time
 import uuid
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import IO, Any, BinaryIO, Protocol, TextIO, TypeVar
+
+F = TypeVar("F", int, IO[str], IO[bytes], BinaryIO, TextIO)
 
 
 class System(Protocol):
@@ -52,7 +54,7 @@ class System(Protocol):
     def use_disk(self) -> None:
         """Wait, or raise `OSError`, before a file is written, where the disk is slow or full."""
 
-    def opened(self, descriptor: int) -> None:
+    def opened(self, file: "int | IO[Any]") -> None:
         """Take note of an open file of this process."""
 
 
@@ -86,7 +88,7 @@ class OperatingSystem:
     def use_disk(self) -> None:
         """Do nothing: the real disk refuses by itself."""
 
-    def opened(self, descriptor: int) -> None:
+    def opened(self, file: "int | IO[Any]") -> None:
         """Do nothing: the operating system closes the files of a process that ends."""
 
 
@@ -153,10 +155,10 @@ class Machine:
         """Say that a file is about to be written. Raises `OSError` if a simulated disk refuses."""
         self._system.use_disk()
 
-    def opened(self, descriptor: int) -> int:
-        """Say that a file was opened; return its descriptor. A simulated process that is killed loses it."""
-        self._system.opened(descriptor)
-        return descriptor
+    def opened(self, file: F) -> F:
+        """Say that a file was opened; return it. A simulated process that is killed loses it."""
+        self._system.opened(file)
+        return file
 
 
 machine = Machine()

@@ -4,11 +4,12 @@ A task is a greenlet. It runs until it waits; then simulated time goes on to the
 one seed draws how late each task wakes and where it is interrupted, so that one seed is one interleaving.
 """
 
+import contextlib
 import heapq
 import os
 import random
 from collections.abc import Callable
-from typing import Any
+from typing import IO, Any
 
 from greenlet import GreenletExit, getcurrent, greenlet
 
@@ -49,6 +50,36 @@ class Host:
         return now + self.ahead + round(self.drift * now)
 
 
+class OpenFile:
+    """A file that a process has opened, by its descriptor or as Python has it."""
+
+    def __init__(self, file: "int | IO[Any]") -> None:
+        self._file, self._descriptor = file, file if isinstance(file, int) else file.fileno()
+        self._identity = self._found()
+
+    def _found(self) -> tuple[int, int] | None:
+        with contextlib.suppress(OSError):
+            found = os.fstat(self._descriptor)
+            return found.st_dev, found.st_ino
+        return None
+
+    def lose(self) -> None:
+        """Close it as the system does when a process is killed: what Python holds back goes nowhere, locks go."""
+        if self._found() == self._identity is not None:  # the descriptor is not of another file by now
+            nowhere = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
+            os.dup2(nowhere, self._descriptor, inheritable=False)
+            os.close(nowhere)
+            self._identity = self._found()
+
+    def close(self) -> None:
+        """Close it, if it is open."""
+        if not isinstance(self._file, int):
+            with contextlib.suppress(OSError, ValueError):
+                self._file.close()
+        elif self._found() == self._identity is not None:
+            os.close(self._descriptor)
+
+
 class Process:
     """A simulated process of a host: tasks that are stopped, continued and killed together."""
 
@@ -56,7 +87,7 @@ class Process:
         self.name, self.host = name, host
         self.alive, self.stopped = True, False
         self.held_up: list[Task] = []
-        self.descriptors: dict[int, tuple[int, int]] = {}  # files that were opened: device and inode
+        self.files: list[OpenFile] = []
         self.at_end: list[Callable[[], None]] = []
 
 
@@ -98,11 +129,17 @@ class Scheduler:
     def close(self) -> None:
         """End all tasks: from now on whoever waits is ended."""
         self._closed = True
+        for process in {id(task.process): task.process for task in self.tasks}.values():
+            self.kill(process)
         for task in self.tasks:
             self.current = task
             if task.greenlet and not task.ended:
                 task.greenlet.throw(GreenletExit)
         self.current = None
+        for task in self.tasks:
+            for file in task.process.files:
+                file.close()
+            task.process.files.clear()
 
     def spawn(self, work: Callable[[], object], process: Process, name: str) -> Task:
         """Start a task."""
@@ -180,8 +217,8 @@ class Scheduler:
         if not process.alive:
             return
         process.alive = False
-        for descriptor, file in process.descriptors.items():
-            close_silently(descriptor, file)
+        for file in process.files:
+            file.lose()
         for call in process.at_end:
             call()
 
@@ -216,18 +253,3 @@ class Scheduler:
     def _push(self, time: int, what: Any, turn: int) -> None:
         self._number += 1
         heapq.heappush(self._due, (time, self._number, what, turn))
-
-
-def close_silently(descriptor: int, file: tuple[int, int]) -> None:
-    """Close a file as the system does when a process is killed: what Python holds back goes nowhere, locks go.
-
-    Nothing is done if the descriptor is of another file by now.
-    """
-    try:
-        found = os.fstat(descriptor)
-    except OSError:
-        return
-    if (found.st_dev, found.st_ino) == file:
-        nowhere = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
-        os.dup2(nowhere, descriptor, inheritable=False)
-        os.close(nowhere)

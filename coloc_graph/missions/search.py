@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from coloc_graph.missions.mission import Outcome, Scenario, run_mission, scenario_of
 
-PROGRESS = 20  # missions between two lines of progress
+PROGRESS = 5  # missions between two lines of progress
 PER_PROCESS = 25  # missions that a process runs before another takes its place
 
 

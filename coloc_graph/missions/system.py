@@ -1,14 +1,13 @@
 """Clocks, threads, locks and queues of a simulated computer, as `machine.System` has them; `SimulatedSystem`."""
 
 import errno
-import os
 import queue
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
-from typing import Any, Self
+from typing import IO, Any, Self
 
-from coloc_graph.missions.scheduler import Scheduler, Task
+from coloc_graph.missions.scheduler import OpenFile, Scheduler, Task
 
 MIN_WORK = 0.3  # least time that a worker takes for a job [s]
 MEAN_WORK = 0.4  # mean of the time that it takes longer [s]
@@ -72,11 +71,10 @@ class SimulatedSystem:
         if host.disk_full:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    def opened(self, descriptor: int) -> None:
+    def opened(self, file: "int | IO[Any]") -> None:
         """Note an open file of the process."""
         assert self._scheduler.current is not None
-        found = os.fstat(descriptor)
-        self._scheduler.current.process.descriptors[descriptor] = found.st_dev, found.st_ino
+        self._scheduler.current.process.files.append(OpenFile(file))
 
 
 class _Waiters:

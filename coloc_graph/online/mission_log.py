@@ -6,6 +6,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from coloc_graph.errors import RunError
 from coloc_graph.machine import machine
 
 
@@ -21,13 +22,25 @@ class MissionLog:
     """
 
     def __init__(self, path: Path, now: Callable[[], float]) -> None:
-        self._file, self._now = path.open("a", encoding="utf-8"), now
+        self._path, self._now = path, now
+        self._file = machine.opened(path.open("a", encoding="utf-8"))
 
     def note(self, what: str, **more: object) -> None:
-        """Add a line, which a killed coordinator leaves behind complete."""
-        machine.use_disk()
-        self._file.write(json.dumps({"time": self._now(), "what": what, **more}) + "\n")
-        self._file.flush()
+        """Add a line, which a killed coordinator leaves behind complete.
+
+        Raises
+        ------
+        RunError
+            If the disk refuses.
+        """
+        try:
+            machine.use_disk()
+            self._file.write(json.dumps({"time": self._now(), "what": what, **more}) + "\n")
+            self._file.flush()
+        except OSError as error:
+            raise RunError(
+                f"{self._path}: cannot be written ({error.strerror}); check the folder and the space on the disk"
+            ) from error
 
     def __enter__(self) -> Self:
         return self

@@ -179,10 +179,11 @@ class RunWriter:
             self._output = OutputLock(self.path)
         if self.path.is_symlink():
             raise RunError(f"{self.path}: is a link; give the path of the file itself")
-        file = machine.opened(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666))
+        file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         if stat.S_ISREG(os.fstat(file).st_mode):
             os.ftruncate(file, 0)
-        return os.fdopen(file, "wb")
+        opened: BinaryIO = os.fdopen(file, "wb")
+        return machine.opened(opened)
 
     def _release(self) -> None:
         if self._output is not None:
