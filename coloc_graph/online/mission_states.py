@@ -90,3 +90,15 @@ def as_dot() -> str:
     going = [state for state in NEXT_STATES if NEXT_STATES[state]]
     lines += [f'  "{state}" -> "{MissionState.FAILED}" [style=dotted];' for state in going]
     return "\n".join([*lines, "}"])
+
+
+def as_mermaid() -> str:
+    """Draw the states as a Mermaid diagram."""
+
+    def name(state: MissionState) -> str:
+        return state.replace(" ", "_")
+
+    lines = ["stateDiagram-v2", f"  [*] --> {name(MissionState.GATHERING)}"]
+    lines += [f"  {name(state)} --> {name(after)}" for state, follows in NEXT_STATES.items() for after in follows]
+    lines += [f"  {name(state)} --> {name(MissionState.FAILED)}" for state in NEXT_STATES if NEXT_STATES[state]]
+    return "\n".join(lines)

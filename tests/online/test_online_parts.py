@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from coloc_graph.geometry.se2 import compose, inverse
 from coloc_graph.online.encoder_log import Counted, EncoderLog, way_since
 from coloc_graph.online.estimation_worker import EstimationWorker
 from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Formation
-from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateMachine, as_dot
+from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateMachine, as_dot, as_mermaid
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_restart import DROVE, STOOD, JoinedOdometry
 from coloc_graph.online.pose_tracker import PoseTracker
@@ -406,6 +407,8 @@ def test_states_follow_each_other_as_drawn():
     drawn = as_dot()
     assert all(f'"{state}"' in drawn for state in MissionState)
     assert drawn.count("->") == sum(map(len, NEXT_STATES.values())) + len(MissionState) - 2
+    page = Path(__file__).parents[2] / "docs" / "missions.md"
+    assert as_mermaid() in page.read_text(encoding="utf-8")  # the page draws the present table
     reached = {MissionState.GATHERING}
     for _ in MissionState:
         reached |= {after for state in reached for after in NEXT_STATES[state]}
