@@ -38,6 +38,7 @@ from coloc_graph.planning.horizon import Horizon, Objective
 from coloc_graph.planning.mission import Mission, leap_frog, stances_of
 from coloc_graph.planning.plan import Plan
 from coloc_graph.planning.prediction import Predictor
+from coloc_graph.planning.route import route
 from coloc_graph.planning.slip import stop_sigma
 from coloc_graph.run import atomic_run, open_run
 from coloc_graph.simulation import Imperfections, World, build_world, record, reference_team
@@ -160,13 +161,15 @@ def ratio(outcomes: Sequence[Outcome], base: Sequence[Outcome], what: str) -> tu
 def safety(mission: Mission, draws: int, floor_plan: FloorPlan | None) -> str:
     """Least distances, over draws of where robots stop, of middles of robots and from walls; in one line.
 
-    Checked on places every 2 cm of each leap and drive, against the walls' rectangles, not the map of the planner.
+    Leaps, drives, and the mover's way from one drive to the next, at places every 2 cm, against the walls' rectangles,
+    not the map of the planner.
     """
     rng = np.random.default_rng(0)
+    free = None if floor_plan is None else floor_plan.floor_map().clear
     to_robot, to_wall, collisions = math.inf, math.inf, 0
     for _ in range(draws):
         stood: dict[str, np.ndarray] = {}
-        touched = False
+        touched, last = False, mission.plan.stances[0].waypoints[0]
         for stance in mission.plan.stances:
             places = {}
             for name, pose in stance.standing.items():
@@ -175,8 +178,21 @@ def safety(mission: Mission, draws: int, floor_plan: FloorPlan | None) -> str:
                     continue
                 leapt = math.dist(pose[:2], stood[name]) if name in stood else 0.0
                 places[name] = np.array(pose[:2]) + rng.standard_normal(2) * float(stop_sigma(leapt))
-            ways = {name: dense([stood.get(name, place), place]) for name, place in places.items()}
+            ways = {}
+            for name, place in places.items():
+                others = [one for other, one in places.items() if other != name]
+                start = stood.get(name, place)
+                ways[name] = dense([start, *route(start, place, others, free)] if name in stood else [place, place])
             ways[stance.mover] = dense(stance.waypoints)
+            if stood:  # it drives to there while the observers still stand where they did
+                before = list(stood.values())
+                approach = dense([last, *route(last, stance.waypoints[0], before, free)])
+                near = min(float(np.hypot(*(approach - other).T).min()) for other in before)
+                to_robot, touched = min(to_robot, near), touched or near < 2 * RADIUS
+                if floor_plan is not None:
+                    walled = float(floor_plan.distance(approach).min())
+                    to_wall, touched = min(to_wall, walled), touched or walled < RADIUS
+            last = stance.waypoints[-1]
             for name, way in ways.items():
                 others = [place for other, place in places.items() if other != name]
                 near = min(float(np.hypot(*(way - other).T).min()) for other in others)
