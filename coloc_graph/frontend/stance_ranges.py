@@ -18,10 +18,9 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 WINDOW = 2.0  # s of samples that are averaged while a robot drives; at 0.2 m/s the geometry hardly changes in them
-OUTLIER_SIGMAS = 3.5  # standard deviations from the median of its window above which a sample is left out
+OUTLIER_SIGMAS = 3.0  # standard deviations from the median of its window above which a sample is left out
 MIN_SAMPLES = 4  # samples of a window, of fewer an outlier cannot be told
 MIN_NOISE_SAMPLES = 50  # samples from which on their own scatter says how noisy they are
-MAD = 1.4826  # standard deviation of a normal distribution by the median of absolute deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +284,8 @@ def _noise_factors(links: Iterable[_Link]) -> dict[str, float]:
     factors = {}
     for robot, parts in found.items():
         scatter = np.concatenate(parts)
-        factors[robot] = MAD * float(np.median(np.abs(scatter))) if len(scatter) >= MIN_NOISE_SAMPLES else 1.0
+        # not by the median: it would not see ranges without line of sight that are too short to be told
+        factors[robot] = float(np.sqrt((scatter**2).mean())) if len(scatter) >= MIN_NOISE_SAMPLES else 1.0
     return factors
 
 

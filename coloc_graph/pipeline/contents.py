@@ -27,7 +27,8 @@ class Unused:
     Parameters
     ----------
     kind : str
-        The topic's kind (`ranges`, `odometry`, `image`, `detections`), `stances`, `planes` or `landmarks`.
+        The topic's kind (`ranges`, `odometry`, `image`, `detections`), `stances`, `planes`, `landmarks`, or
+        `tolerances` of mounts.
     count : int
         Number of messages; of landmarks, how many the team has.
     what : str
@@ -117,6 +118,12 @@ def _beside_stances(run: Run, options: SolveOptions) -> Iterable[Unused]:
     else:
         without = (one.name for one in run.team.robots if one.ranging is None)
         found += [_unused(run, "ranges", [name], f"the team states no [robots.ranging] of {name}") for name in without]
+    if options.method != "joint":
+        mounts = ((one.name, one.mount_if_any) for one in run.team.robots)
+        loose = [name for name, mount in mounts if mount and (mount.yaw_sigma_deg or mount.position_sigma)]
+        if loose:
+            what = f"tolerances of yaw and position of the camera of {_joined(loose)}"
+            found.append(Unused("tolerances", len(loose), what, f"`{options.method}` takes them as exact; use `joint`"))
     detected = [robot for robot in names if run.has_detections(robot)]
     found.append(_unused(run, "image", detected, "their markers are recorded as detections"))
     if options.method == "chain":

@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import msgspec
 import numpy as np
 import pytest
 from mrclam_folder import make
@@ -67,6 +68,21 @@ def test_odometry_that_a_method_or_a_team_cannot_use_is_named(short, tmp_path, c
     assert unused.kind == "odometry" and unused.count == sum(run.topics[f"/{name}/odometry"] for name in "ABC")
     assert "odometry samples not used" in str(unused)
     assert not unused_in(run, SolveOptions("smooth"))
+
+
+def test_tolerances_that_only_a_joint_estimate_uses_are_named(short, tmp_path, copied):
+    team = open_run(short).team
+    robots = tuple(
+        msgspec.structs.replace(one, mount_if_any=msgspec.structs.replace(one.mount, yaw_sigma_deg=1.0))
+        if one.name in "AB" else one
+        for one in team.robots
+    )  # fmt: skip
+    run = open_run(copied(short, tmp_path / "yaw.mcap", team=msgspec.structs.replace(team, robots=robots)))
+    (unused,) = unused_in(run, SolveOptions("smooth"))
+    assert str(unused) == (
+        "tolerances of yaw and position of the camera of A and B not used: `smooth` takes them as exact; use `joint`"
+    )
+    assert not unused_in(run)
 
 
 def test_stances_of_one_observer_do_not_hide_ranges(ranging, tmp_path, copied):

@@ -18,6 +18,7 @@ from coloc_graph.exchange.g2o import read_g2o
 from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.frontend import WheelTrack
 from coloc_graph.frontend.ranged_landmarks import locate
+from coloc_graph.frontend.stance_ranges import OUTLIER_SIGMAS
 from coloc_graph.measurements import Range
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.explanations import warnings_of_graph
@@ -94,7 +95,7 @@ def test_stances_and_ranges_are_one_estimate_and_offsets_calibrate(mixed, soluti
     outside = left_out.pop("they are from before the first stance, or after the last", 0)
     assert used + sum(left_out.values()) == recorded and outside < 0.05 * recorded
     # 5 % have no line of sight; those that are too long by less than noise are not told from the others
-    told = np.exp(-3.5 * WRONG.uwb_sigma / NLOS_EXCESS)
+    told = np.exp(-OUTLIER_SIGMAS * WRONG.uwb_sigma / NLOS_EXCESS)
     assert left_out["they are outliers among those next to them"] == pytest.approx(0.05 * told * recorded, rel=0.4)
     assert solution.counts["range"].used >= 0.9 * len(ranges) > 10
     true = read_true_team(mixed)
