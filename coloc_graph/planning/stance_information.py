@@ -16,7 +16,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.geometry.lie import floor_pose, hat
 from coloc_graph.planning.belief import MOUNT, OBSERVER, POSE
 from coloc_graph.planning.floor_map import FloorMap
-from coloc_graph.team import Team
+from coloc_graph.team import Team, fisheye
 from coloc_graph.team.shared_view import hidden
 
 Array = NDArray[np.float64]
@@ -206,6 +206,11 @@ class StanceModel:
         project = np.zeros((*p.shape[:-1], 2, 3))
         project[..., 0, 0] = project[..., 1, 1] = 1 / z
         project[..., 0, 2], project[..., 1, 2] = -p[..., 0] / z**2, -p[..., 1] / z**2
+        for k, camera in enumerate(self._cameras):
+            if camera.model == "fisheye":
+                own = p[..., k, :, :, :]
+                by_point = fisheye.derivative(camera.distortion, own.reshape(-1, 3))
+                project[..., k, :, :, :, :] = by_point.reshape(*own.shape[:-1], 2, 3)
         project *= self._scale[:, None, None]
         to_world = project @ R.mT[..., None, None, :, :]  # by the marker in the world, (..., r, n, m, 2, 3)
         by_camera = np.concatenate([project @ hat(p), -project], axis=-1)

@@ -18,7 +18,7 @@ from coloc_graph.planning.prediction import Predictor
 from coloc_graph.run import atomic_run, open_run
 from coloc_graph.simulation import Imperfections, build_world, record, reference_team
 from coloc_graph.simulation.planned import planned
-from coloc_graph.simulation.rig import stated_team
+from coloc_graph.simulation.rig import stated_team, wide_team
 from coloc_graph.simulation.world import stream
 
 FIELD = Imperfections(mount_sigma_deg=1.0, height_sigma=0.005, span_sigma=1e-4, floor_sigma_deg=0.1)
@@ -134,3 +134,17 @@ def test_a_team_without_a_floor_is_refused():
     team = reference_team()
     with pytest.raises(InputError, match=r"\[floor\]"):
         Belief.start(type(team)(reference="A", robots=team.robots), {"A": (0.0, 0.0, 0.0)})
+
+
+def test_the_promised_sigmas_of_fisheyes_are_those_that_the_estimator_states(tmp_path):
+    plan = straight_plan(3, Gait(0.8, 0.6, 10.0), 16.0)
+    world = build_world(
+        planned(plan, stream(1, "formation")), seed=1, imperfections=FIELD, team=wide_team(160.0)
+    )  # fmt: skip
+    with atomic_run(tmp_path / "wide.mcap", world.team) as writer:
+        record(world, writer, "tracks")
+    estimate = solve(open_run(tmp_path / "wide.mcap"), SolveOptions("joint", odometry=False)).estimate
+    end = predicted(plan, world.team, odometry=False)[-1].belief
+    for robot in ("A", "B"):
+        C = estimate.trajectories[robot].covariances[-1]
+        assert end.position_sigma([robot]) == pytest.approx(math.sqrt(np.trace(C[3:5, 3:5])), rel=0.15)
