@@ -107,6 +107,7 @@ class RobotProgram:
         self._still_since: int | None = clock()
         self._odometry, self._frame = JoinedOdometry(), self.session
         self._opening = False
+        self._crowded = False  # True once an image had more lights than are measured
         self._encoder_log = EncoderLog(Path(folder) / f"{name}.wheels.json")
         self._pose = (0.0, 0.0, 0.0)
         self._wheels_fault: str | None = None
@@ -229,6 +230,7 @@ class RobotProgram:
             self._wheels_fault = wheels.fault
             self._tell("recovered", "the line to the wheels is back")
         self._opening = False
+        self._crowded = False  # True once an image had more lights than are measured
 
     def _go_on_counting(self) -> None:
         """Join the odometry of a newly opened line to what was counted before, also by an earlier program."""
@@ -312,6 +314,13 @@ class RobotProgram:
     def _see(self, frame: Frame) -> None:
         """Send and record the markers in an image."""
         blobs, stamp = self._detect(frame.pixels), frame.stamp_ns
+        if blobs.left_out and not self._crowded:
+            self._crowded = True
+            self._tell(
+                "lights",
+                f"an image has {blobs.left_out} lights more than are measured, and the smallest are left out: darken "
+                "the room, or lower exposure and gain",
+            )
         seen = Detections(
             self.name, self._utc(stamp), blobs.uv, blobs.covariance, ("",) * len(blobs.uv),
             blobs.flags, blobs.peak, blobs.area,

@@ -277,3 +277,15 @@ def test_a_grey_image_holds_no_hue_and_white_leds_are_found_in_colour():
     assert len(detect_hue(image[..., 0], hue_deg=120)) == 0
     assert len(detect_hue(image, hue_deg=120)) == 0
     assert detect_leds(image).uv == pytest.approx(np.array([(80.2, 60.4)]), abs=0.1)
+
+
+def test_an_image_of_very_many_lights_is_measured_in_part_and_says_so():
+    places = np.stack(np.meshgrid(np.arange(20.0), np.arange(15.0)), -1).reshape(-1, 2) * 14 + 12
+    radius = np.where(np.arange(300) < 200, 2.2, 1.2)
+    rng = np.random.default_rng(0)
+    image = render(spots(places, radius, 220.0), size=(320, 240), background=12.0, sensor=Sensor(), rng=rng)
+    blobs = detect_leds(image)
+    assert (len(blobs), blobs.left_out) == (200, 100)
+    assert blobs.uv[:, 1].max() < places[200:, 1].max() - 10  # the large ones are measured
+    few = detect_leds(image[:, :100])
+    assert few.left_out == 0

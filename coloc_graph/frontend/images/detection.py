@@ -6,7 +6,7 @@ covariances and flags (`Flag`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import cv2
@@ -32,24 +32,30 @@ MAX_PADDED_PIXELS = 1 << 16  # windows are padded to a larger size while all tog
 MAX_DEBLENDING_WINDOW = 31  # px, side of the largest window in which blobs are deblended
 MAX_LED_SIZE = 14  # px, of a blob that is deblended; larger ones are lamps
 MIN_CONTRAST = 4.0  # of a blob's peak, in standard deviations of the noise around it
+MAX_LIGHTS = 200  # lights of an image that are measured, the largest ones
 DIP = 0.8  # brightness between two spots, as a share of the darker one, below which they count as two
 
 
 @dataclass(frozen=True, eq=False)
 class Blobs:
-    """Blobs of one image: `uv` (n, 2) [px], `covariance` (n, 2, 2) [px^2], `flags`, `peak`, `area` (n,)."""
+    """Blobs of one image: `uv` (n, 2) [px], `covariance` (n, 2, 2) [px^2], `flags`, `peak`, `area` (n,).
+
+    `left_out` lights of the image were not measured, since it has more than `MAX_LIGHTS`.
+    """
 
     uv: Array
     covariance: Array
     flags: NDArray[np.uint8]
     peak: Array
     area: Array
+    left_out: int = 0
 
     def __len__(self) -> int:
         return len(self.uv)
 
     def __getitem__(self, which: NDArray[np.bool_]) -> "Blobs":
-        return Blobs(*(getattr(self, name)[which] for name in ("uv", "covariance", "flags", "peak", "area")))
+        columns = (getattr(self, name)[which] for name in ("uv", "covariance", "flags", "peak", "area"))
+        return Blobs(*columns, left_out=self.left_out)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -121,11 +127,12 @@ class Detector:
 
     def __call__(self, image: Pixels, box: Box | None = None) -> Blobs:
         """Detect and measure the blobs of an image, or those with their centre in `box`."""
-        blobs, real = self.measure(self.find(image, box))
+        found, left_out = self._found(image, box)
+        blobs, real = self.measure(found)
         if box is not None:
             u, v = blobs.uv.T
             real &= (u >= box[0] - 0.5) & (v >= box[1] - 0.5) & (u < box[2] - 0.5) & (v < box[3] - 0.5)
-        return blobs[real]
+        return replace(blobs[real], left_out=left_out)
 
     def light(self, part: Pixels) -> NDArray[np.uint8] | NDArray[np.float32]:
         """Return the light of markers in a part of an image, (h, w) [grey levels]: brightness, or chroma of the hue."""
@@ -140,7 +147,11 @@ class Detector:
         return np.where(off <= self.tolerance_deg, chroma, 0.0).astype(np.float32)
 
     def find(self, image: Pixels, box: Box | None = None) -> list[Candidate]:
-        """Find the candidates in an image, or those whose centre lies within a pixel of `box`."""
+        """Find the candidates in an image, or those whose centre lies within a pixel of `box`; `MAX_LIGHTS` at most."""
+        return self._found(image, box)[0]
+
+    def _found(self, image: Pixels, box: Box | None = None) -> tuple[list[Candidate], int]:
+        """Find the candidates as `find` does, and count those that are left out."""
         u0, v0 = (max(box[0] - BORDER, 0), max(box[1] - BORDER, 0)) if box else (0, 0)
         light = self.light(image[v0 : box[3] + BORDER, u0 : box[2] + BORDER] if box else image)
         t = self.threshold
@@ -158,13 +169,17 @@ class Detector:
         if box is not None and any(_cut_off(blob, area, light.shape) for blob, _ in blobs):
             area = (0, 0, light.shape[1], light.shape[0])
             blobs = _components(light, level)
+        every = blobs if area == (0, 0, light.shape[1], light.shape[0]) else None
+        blobs = [one for one in blobs if t.min_area <= one[0][4] <= t.max_area]
+        left_out = max(len(blobs) - MAX_LIGHTS, 0)
+        if left_out:
+            blobs = sorted(blobs, key=lambda one: -one[0][4])[:MAX_LIGHTS]
         found = []
-        everything: list[tuple[list[int], list[float]]] | None = None
         for (left, top, width, height, pixels), (x, y) in blobs:
             left, top = left + area[0], top + area[1]
             u, v = x + area[0] + u0, y + area[1] + v0
             inside = box is None or (box[0] - 1 <= u < box[2] + 1 and box[1] - 1 <= v < box[3] + 1)
-            if inside and t.min_area <= pixels <= t.max_area:
+            if inside:
                 clipped = left + u0 <= 0 or top + v0 <= 0
                 clipped |= left + u0 + width >= image.shape[1] or top + v0 + height >= image.shape[0]
                 own = (left, top, width, height)
@@ -174,9 +189,8 @@ class Detector:
                 group: list[tuple[int, int, int, int]] = []
                 touched = False
                 if max(width, height) <= MAX_LED_SIZE and np.count_nonzero(around > level) > pixels:
-                    if everything is None:
-                        everything = _components(light, level)
-                    group, touched = _deblending_group(own, [tuple(blob) for blob, _ in everything], light.shape)
+                    every = _components(light, level) if every is None else every
+                    group, touched = _deblending_group(own, [tuple(blob) for blob, _ in every], light.shape)
                 if len(group) < 2:
                     corner = window[0] + u0, window[1] + v0
                     box_in_window = left - window[0], top - window[1], width, height
@@ -184,7 +198,7 @@ class Detector:
                     found.append(one)
                 else:
                     found.append(_cut(light, group, (u0, v0), (u, v), pixels, level, clipped, touched))
-        return found
+        return found, left_out
 
     def measure(self, candidates: Sequence[Candidate]) -> tuple[Blobs, NDArray[np.bool_]]:
         """Measure candidates.
