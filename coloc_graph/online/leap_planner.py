@@ -28,7 +28,7 @@ class StancePromise:
     points
         Expected number of correspondences.
     end_sigma
-        Expected sigma of the last positions, and of the last headings at an arm of 2 m, together [m].
+        Expected sigma of the last positions, and of the last headings at an arm of 4 m, together [m].
     reason
         What decided, in one line for people.
     """

@@ -16,7 +16,7 @@ from coloc_graph.planning.prediction import Predictor
 
 Array = NDArray[np.float64]
 
-HEADING_ARM = 2.0  # a last heading counts as what it displaces at this distance [m]
+HEADING_ARM = 4.0  # a last heading counts as what it displaces at this distance [m]
 SECONDS = tuple(0.5 * 1.3**n for n in range(20))  # durations of a stance for which the rest is computed [s]
 
 
