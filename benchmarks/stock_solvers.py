@@ -43,7 +43,7 @@ def runs(stances: int):
     """Yield names and arguments of `simulate`."""
     yield "hallway, tracks", ("hallway",), {"stances": stances}
     yield "hallway, images", ("hallway",), {"stances": min(stances, 10), "depth": "images"}
-    yield "landmarks", ("landmarks",), {"stances": stances}
+    yield "landmarks", ("landmarks",), {"length": max(0.25 * stances, 12.0), "laps": 1}
     yield "team of 6", ("team",), {"robots": 6, "stances": min(stances, 12)}
 
 

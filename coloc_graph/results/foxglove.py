@@ -18,6 +18,8 @@ from coloc_graph.run import open_run
 
 Array = NDArray[np.float64]
 
+NO_INDEX = -1  # of a landmark, which has one pose
+
 
 def export_foxglove(result: Result, out: Path, run_path: Path | None = None) -> tuple[int, list[str]]:
     """Write a result as an MCAP file for Foxglove; return the number of messages, and warnings of what it lacks."""
@@ -43,13 +45,17 @@ def export_foxglove(result: Result, out: Path, run_path: Path | None = None) -> 
 
 
 def _edges(result: Result) -> Iterator[DrawnEdge]:
-    """Yield the used measurements between robots that have a pose at both ends."""
+    """Yield the used measurements between robots that have a pose at both ends, and ranges to landmarks."""
     at: dict[tuple[str, int], tuple[float, ...]] = {}
     for robot, one in result.trajectories.items():
-        for stance, T in zip([] if one.stances is None else one.stances.tolist(), one.T_world_body, strict=False):
-            at[robot, stance] = tuple(T[:3, 3].tolist())
-    for row in read_measurements(result.path / MEASUREMENTS, ("homography", "sighting", "odometry")):
-        if row["used"] == "yes" and row["index_i"] and row["index_j"]:
-            ends = [at.get((row[f"robot_{end}"], int(row[f"index_{end}"]))) for end in "ij"]
+        # of a ranging run poses are numbered as its keyframes
+        numbers = range(len(one)) if one.stances is None else one.stances.tolist()
+        for number, T in zip(numbers, one.T_world_body, strict=True):
+            at[robot, number] = tuple(T[:3, 3].tolist())
+    for landmark in read_landmarks(result.path / LANDMARKS):
+        at[landmark.name, NO_INDEX] = (landmark.x, landmark.y, 0.0)
+    for row in read_measurements(result.path / MEASUREMENTS, ("homography", "sighting", "odometry", "range")):
+        if row["used"] == "yes" and row["index_i"] and (row["index_j"] or row["kind"] == "range"):
+            ends = [at.get((row[f"robot_{end}"], int(row[f"index_{end}"] or NO_INDEX))) for end in "ij"]
             if ends[0] is not None and ends[1] is not None:
                 yield DrawnEdge(ends[0], ends[1], float(row["residual"]) if row["residual"] else math.nan)

@@ -3,6 +3,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 from mrclam_folder import DELAY, DEPTH, LANDMARKS, ROBOT_OFFSET, SCALE, TURN_SCALE, make
 from msgspec.structs import replace as with_fields
 
@@ -395,6 +397,12 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     assert main(["export", "g2o", str(out), "--out", str(tmp_path / "x.g2o")]) == 2
     assert "is the result of a ranging run, whose measurements are not exported to g2o" in capsys.readouterr().err
     assert main(["export", "ros2", str(out), "--out", str(tmp_path / "x.mcap")]) == 0
+    assert main(["export", "foxglove", str(out), "--out", str(tmp_path / "f.mcap")]) == 0
+    with (tmp_path / "f.mcap").open("rb") as file:
+        scenes = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(topics=["/scene"])
+        lines = [one for *_, scene in scenes for one in scene.entities if one.id == "measurements"]
+    drawn = sum(len(line.points) for one in lines for line in one.lines) / 2
+    assert drawn == summary["measurements"]["used"]  # each range, to a robot or a landmark
     landmarks = (out / "landmarks.csv").read_text().splitlines()
     assert (
         landmarks[0].startswith("name,x,y,yaw_deg,x_sigma,y_sigma")
@@ -405,7 +413,7 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     page = tmp_path / "page.html"
     assert main(["view", str(out), "--export", str(page)]) == 0 and page.stat().st_size > 100_000
     (out / "measurements.csv").write_text("\n".join([*rows[:9], rows[9].replace(rows[9].split(",")[3], "soon")]) + "\n")
-    assert main(["view", str(out), "--export", str(page)]) == 2
+    assert main(["view", str(out), "--export", str(page), "--force"]) == 2
     assert "measurements.csv is damaged" in capsys.readouterr().err
 
 
