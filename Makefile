@@ -40,7 +40,7 @@ unit: $(VENV)/installed-dev
 	$(BIN)/pytest $(ARGS)
 endif
 
-test-long: $(VENV)/installed-dev
+test-long: $(VENV)/installed-dev $(VENV)/installed-docs
 	$(BIN)/pytest --numprocesses 2 --whole -m long tests
 	$(BIN)/pytest --whole tests/online/test_online.py
 

@@ -70,8 +70,18 @@ def fill(app: Sphinx, name: str, source: list[str]) -> None:
     for index, line in enumerate(lines):
         if line.startswith(MARKER):
             word = line.removeprefix(MARKER).removesuffix(" -->")
-            lines[index] = module_markdown(word) if word.startswith("coloc_graph.") else GENERATED[word]()
+            if word == "scene":
+                lines[index] = scene_markdown(name)
+            else:
+                lines[index] = module_markdown(word) if word.startswith("coloc_graph.") else GENERATED[word]()
     source[0] = "\n".join(lines) + "\n"
+
+
+def scene_markdown(page: str) -> str:
+    """Frame with the viewer's scene, seen from a page."""
+    source = "../" * page.count("/") + SCENE.name
+    frame = f'<iframe class="scene" src="{source}" title="The viewer\'s scene of a solved run" loading="lazy"></iframe>'
+    return f"```{{raw}} html\n{frame}\n```\n"
 
 
 def is_plain_field(app: Sphinx, what: str, name: str, value: object, skip: bool, options: object) -> bool | None:

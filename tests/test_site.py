@@ -177,8 +177,6 @@ def test_every_option_is_in_the_reference(reference):
 
 
 def test_every_field_of_a_team_and_of_a_record_is_described(reference):
-    if util.find_spec("numpydoc") is None:
-        pytest.skip("numpydoc is not installed: pip install '.[docs]'")
     pages = reference("field_pages")
     for text in (pages.team_markdown(), pages.records_markdown()):
         rows = re.findall(r"^\| `(\w+)` \| (.*?) \| .*? \| (.*) \|$", text, re.MULTILINE)
