@@ -13,9 +13,12 @@ from coloc_graph.backend.estimate import Estimate, make_estimate
 from coloc_graph.backend.factors import GAUGE_SIGMA, link_covariance
 from coloc_graph.backend.graph import Link, PoseGraph, PoseLink, StayPut, pose_of
 from coloc_graph.errors import EstimationError
-from coloc_graph.measurements import Range, RelativePose
+from coloc_graph.measurements import Odometry, Range, RelativePose
 
 Array = NDArray[np.float64]
+
+
+AVOIDED = 1e9  # m^2, length added to links that are taken only where no others lead
 
 
 class Step(NamedTuple):
@@ -62,10 +65,11 @@ def chain(graph: PoseGraph) -> Estimate:
     return make_estimate("chain", graph, values, covariances)
 
 
-def spanning_tree(graph: PoseGraph, links: Sequence[Link]) -> list[Step]:
+def spanning_tree(graph: PoseGraph, links: Sequence[Link], *, odometry_last: bool = False) -> list[Step]:
     """Return the shortest paths from the reference to every pose that links tie to it, nearer poses first (Dijkstra).
 
     The length of a link is its variance: of the translation, and of the heading at one metre. Ranges place nothing.
+    With `odometry_last` it leads only to poses that nothing else leads to.
     """
     tying = [link for link in links if not isinstance(link, Range)]
     neighbours: dict[int, list[tuple[int, int, bool]]] = defaultdict(list)
@@ -76,7 +80,8 @@ def spanning_tree(graph: PoseGraph, links: Sequence[Link]) -> list[Step]:
         neighbours[j].append((i, index, False))
         C = link_covariance(link)
         diagonal = C.diagonal()
-        lengths.append(float(diagonal[-3:].sum() + diagonal[2] if len(C) == 6 else diagonal.sum()))
+        length = float(diagonal[-3:].sum() + diagonal[2] if len(C) == 6 else diagonal.sum())
+        lengths.append(length + AVOIDED * (odometry_last and isinstance(link, Odometry)))
     steps: list[Step] = []
     reached: set[int] = set()
     waiting: list[tuple[float, int, int, int, bool]] = [(0.0, -1, -1, graph.reference_key, True)]

@@ -1,7 +1,7 @@
 """Optimum of a graph: initial values, and, of a joint estimate, the mounts first."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import gtsam
 import numpy as np
@@ -104,27 +104,39 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
     def errors(key: int) -> Array:
         return mounts.get(key, factors_of.nominal(key))
 
+    @cache
     def expected(link: PoseLink) -> gtsam.Pose3:
         i, j = map(graph.pose_keys.key, link.ends)
         return factors_of.expected(link, i, j, errors) if mounts else pose_of(link)
 
     known = {} if start is None else {key: start.atPose3(key) for key in poses_in(start)}
-    values = gtsam.Values()
-    for key, pose in compose(graph, spanning_tree(graph, graph.links), factors_of.start, expected, known).items():
-        values.insert(key, pose)
-    for name, ranges in graph.ranged_points.items():
-        key = graph.pose_keys.static()[name]
-        if key in known:
-            values.insert(key, known[key])
-        elif placed := [one for one in ranges if values.exists(graph.pose_keys.key(one.ends[0]))]:
-            values.insert(key, point_of(placed[0], values.atPose3(graph.pose_keys.key(placed[0].ends[0]))))
+
+    def composed(*, odometry_last: bool) -> gtsam.Values:
+        steps, values = spanning_tree(graph, graph.links, odometry_last=odometry_last), gtsam.Values()
+        for key, pose in compose(graph, steps, factors_of.start, expected, known).items():
+            values.insert(key, pose)
+        for name, ranges in graph.ranged_points.items():
+            key = graph.pose_keys.static()[name]
+            if key in known:
+                values.insert(key, known[key])
+            elif placed := [one for one in ranges if values.exists(graph.pose_keys.key(one.ends[0]))]:
+                values.insert(key, point_of(placed[0], values.atPose3(graph.pose_keys.key(placed[0].ends[0]))))
+        return values
+
+    values = composed(odometry_last=False)
+    # two robots that are composed each by its own odometry end far apart after hundreds of stances
+    others = composed(odometry_last=True) if mounts and not known else None
     iterations = 0
     for left in reversed(range(MAX_ANCHORINGS)):
         factors, links, batched = factors_of.of_graph(graph, poses_in(values))
         for key in map(int, factors.keyVector()):
-            if not values.exists(key):
-                values.insert(key, errors(key))
+            for one in (values,) if others is None else (values, others):
+                if not one.exists(key):
+                    one.insert(key, errors(key))
         with batched:
+            if others is not None and factors.error(others) < factors.error(values):
+                values = others
+            others = None
             values, used = optimise(factors, values, roughly_first=len(graph.robots) >= MANY_ROBOTS)
         iterations += used
         # spans are linearised at the mounts known before: once more where the estimate is elsewhere
