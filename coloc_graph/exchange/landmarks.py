@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -13,6 +14,7 @@ from coloc_graph.backend import Estimate
 from coloc_graph.backend.landmarks import StaticPose
 from coloc_graph.errors import InputError
 from coloc_graph.input_file import read_text
+from coloc_graph.measurements import Range, Sighting
 
 REMEDY = "solve the run again"  # of a file that is damaged
 
@@ -46,8 +48,10 @@ def landmark_rows(estimate: Estimate) -> list[LandmarkRow]:
     if estimate.is_ranging:
         counts, found = estimate.ranging.counts, estimate.calibration.landmarks
         return [row_of(name, one, name not in found, counts[name]) for name, one in estimate.landmarks.items()]
-    used, on_map = estimate.graph.without(one.measurement for one in estimate.rejected).sighted, _on_map(estimate)
-    return [row_of(name, one, name in on_map, len(used.get(name, ()))) for name, one in estimate.landmarks.items()]
+    used, on_map = estimate.graph.without(one.measurement for one in estimate.rejected), _on_map(estimate)
+    count = Counter(one.seen for one in used.measurements if isinstance(one, Sighting))
+    count.update(one.target for one in used.measurements if isinstance(one, Range))
+    return [row_of(name, one, name in on_map, count[name]) for name, one in estimate.landmarks.items()]
 
 
 def map_row(estimate: Estimate) -> LandmarkRow | None:

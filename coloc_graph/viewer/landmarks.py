@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from coloc_graph.exchange.landmarks import LandmarkRow
-from coloc_graph.measurements import Sighting
+from coloc_graph.measurements import Range, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.team import Landmark, Team
 from coloc_graph.viewer.links import links_of
@@ -48,12 +48,9 @@ def landmarks_in(
 
 
 def sighted_in(measurements: Iterable[object], landmarks: Mapping[str, object]) -> list[tuple[str, int, str]]:
-    """Return the sightings of landmarks among measurements: (observer, stance, landmark)."""
-    return [
-        (one.observer, one.stance, one.seen)
-        for one in measurements
-        if isinstance(one, Sighting) and one.seen in landmarks
-    ]
+    """Return the sightings and ranges of landmarks among measurements: (observer, stance, landmark)."""
+    found = ((one.ends[0], one.ends[1][0]) for one in measurements if isinstance(one, Sighting | Range))
+    return [(robot, stance, name) for (robot, stance), name in found if name in landmarks]
 
 
 def landmark_of(team: Team | None, name: str) -> Landmark | None:

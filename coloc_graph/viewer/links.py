@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from coloc_graph.frontend import WheelTrack
-from coloc_graph.measurements import Measurement, Node, Odometry, Sighting
+from coloc_graph.measurements import Measurement, Node, Odometry, Range, Sighting
 from coloc_graph.run import Run, Stance
 from coloc_graph.viewer.scene import Links
 
@@ -13,9 +13,9 @@ from coloc_graph.viewer.scene import Links
 def links_in(
     measurements: Iterable[Measurement], robots: Sequence[str], stances: Sequence[Stance]
 ) -> tuple[Links, Links]:
-    """Return the links of measurements: sightings, and odometry."""
+    """Return the links of measurements: sightings with ranges, and odometry."""
     every = list(measurements)
-    sightings, odometry = ([m.ends for m in every if isinstance(m, kind)] for kind in (Sighting, Odometry))
+    sightings, odometry = ([m.ends for m in every if isinstance(m, kind)] for kind in (Sighting | Range, Odometry))
     return links_of(sightings, robots, stances), links_of(odometry, robots, stances)
 
 

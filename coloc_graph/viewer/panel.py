@@ -56,7 +56,9 @@ class Panel:
             self.markers = gui.add_checkbox(
                 "Markers", True, hint="trajectories of the markers, as observed and as estimated"
             )
-            self.sightings = gui.add_checkbox("Sightings", False, hint="robots and landmarks seen by observers")
+            self.sightings = gui.add_checkbox(
+                "Sightings", False, hint="robots and landmarks seen by observers, or ranged"
+            )
             self.odometry = gui.add_checkbox("Odometry", False, hint="wheel odometry from pose to pose")
             self.plans = gui.add_checkbox(
                 "Plans", True, hint="planned stances: promised ellipses dashed, footprints and drive of the next one",
@@ -242,7 +244,7 @@ def legend(scene: Scene) -> str:
         "trajectories: thick: estimate, pale: other methods (chained: dashed), black or white: truth",
         "ring: pose kept from one stance to the next; bold ring: anchor of this stance",
         "ellipses, wedges: covariance of position and heading, as large as the slider says",
-        f'<span style="color:{_hex(palette.SIGHTING)}">&#8212; sightings</span>, '
+        f'<span style="color:{_hex(palette.SIGHTING)}">&#8212; sightings and ranges</span>, '
         f'<span style="color:{_hex(palette.ODOMETRY)}">&#8212; odometry</span> (where switched on)',
     ]
     if len(scene.landmarks):

@@ -156,14 +156,15 @@ def scene_of_result(path: str | Path, run_path: str | Path | None = None) -> Sce
     names = {row.name for row in landmarks}
     with _damage_named(table):
         edges = _edges_on_disk(table, robots, stances)
-        ends = {kind: _ends_on_disk(table, kind) for kind in ("sighting", "odometry")}
-    sighted = [(a[0], a[1], b[0]) for a, b in ends["sighting"] if b[0] in names]
+        ends = {kind: _ends_on_disk(table, kind) for kind in ("sighting", "range", "odometry")}
+    seen = [*ends["sighting"], *ends["range"]]
+    sighted = [(a[0], a[1], b[0]) for a, b in seen if b[0] in names]
     return Scene(
         robots=robots,
         stances=stances,
         layers=(layer_of(name, robots, stances, result.trajectories), *true),
         edges=edges,
-        sightings=links_of(ends["sighting"], robots, stances),
+        sightings=links_of(seen, robots, stances),
         odometry=links_of(ends["odometry"], robots, stances),
         stayed=stayed(robots, stances, _anchored(stances, result.summary.get("bumped", []))),
         team=run.team,

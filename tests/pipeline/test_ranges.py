@@ -27,6 +27,7 @@ from coloc_graph.run import OdometrySample, Ranges, open_run, read_true_team, re
 from coloc_graph.simulation import Imperfections, simulate
 from coloc_graph.simulation.uwb import NLOS_EXCESS
 from coloc_graph.team import Ranging, write_team
+from coloc_graph.viewer import scene_of_result
 
 WRONG = Imperfections(uwb_sigma=0.05, uwb_offset_sigma=0.1, uwb_nlos=0.05)
 
@@ -203,6 +204,13 @@ def test_the_command_writes_every_part_of_a_result_with_ranges(with_landmarks, t
     assert counts["range"]["used"] > 20
     for kind in ("g2o", "gtsam", "dot", "pyfg", "jrl"):
         assert main(["export", kind, str(out), "--out", str(tmp_path / f"graph.{kind}")]) == 0
+    rows = list(csv.DictReader((out / "landmarks.csv").read_text().splitlines()))
+    assert all(int(row["measurements"]) > 5 and row["yaw_deg"] in ("", "nan") for row in rows)
+    scene = scene_of_result(out)
+    drawn = sum(kind == "range" for kind in (row["kind"] for row in csv.DictReader(
+        (out / "measurements.csv").read_text().splitlines()) if row["used"] == "yes"))  # fmt: skip
+    of_landmarks = len(scene.landmarks.sightings)
+    assert of_landmarks > 20 and len(scene.sightings) + of_landmarks >= drawn
     assert "range sensor errors" in (tmp_path / "graph.gtsam" / "keys.csv").read_text()
     assert main(["view", str(out), "--export", str(tmp_path / "page.html")]) == 0
     capsys.readouterr()
