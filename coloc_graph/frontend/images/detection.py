@@ -54,8 +54,9 @@ class Blobs:
         return len(self.uv)
 
     def __getitem__(self, which: NDArray[np.bool_]) -> "Blobs":
-        columns = (getattr(self, name)[which] for name in ("uv", "covariance", "flags", "peak", "area"))
-        return Blobs(*columns, left_out=self.left_out)
+        return Blobs(
+            self.uv[which], self.covariance[which], self.flags[which], self.peak[which], self.area[which], self.left_out
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
