@@ -123,7 +123,7 @@ def described_bumps(run: Recorded, stances: Mapping[int, Stance], bumps: Sequenc
 
 
 def _by_wheels(run: Recorded, stances: Mapping[int, Stance], bump: Bump) -> str:
-    """What the wheels of a bumped anchor say of the time between the two stances; empty where they say nothing."""
+    """Movement of a bumped anchor by its wheels in the time between the two stances; empty where they say nothing."""
     stay = bump.stay_put
     wheels = WheelTrack(stay.robot, list(run.odometry(stay.robot)))
     if len(wheels) < 2:
