@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 from coloc_graph.backend import Bump
+from coloc_graph.backend.cause import or_else
 from coloc_graph.geometry.se2 import Planar, compose, wrap
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.visibility import InView
@@ -15,7 +16,7 @@ def pushed(registry: RobotRegistry, bumps: Iterable[Bump]) -> Iterator[tuple[str
         T, robot = bump.T_before_after, bump.stay_put.robot
         by = T.x(), T.y(), T.rotation().yaw()
         registry.displace(robot, compose(registry[robot].tracker.pose(), by))
-        yield robot, bump.description
+        yield robot, f"{bump.description}{or_else(bump.alternative)}"
 
 
 def displaced(registry: RobotRegistry, view: InView, mover: Planar) -> Iterator[tuple[str, str]]:

@@ -1,22 +1,26 @@
 """From a run to an estimate, whatever the run holds: `solve`. Stances as in sections III and IV of the paper."""
 
 import logging
-import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from coloc_graph.backend import Estimate, PoseGraph, chain, diagnose, joint, smooth
 from coloc_graph.backend.planar import Latest, optimise_keyframes
-from coloc_graph.backend.shared_noise import SharedNoise, learn_shared_noise, shared_part
 from coloc_graph.errors import EstimationError
 from coloc_graph.frontend import PairMeasurement, UnusedSighting, describe_unused, share_clock_offsets
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.pipeline.clocks import RunClocks, clocks_of_images_apart, clocks_of_run, contradicts, misfit
+from coloc_graph.pipeline.clocks import (
+    RunClocks,
+    clocks_instead,
+    clocks_of_images_apart,
+    clocks_of_run,
+    contradicts,
+    misfit,
+    unknown_clocks,
+)
 from coloc_graph.pipeline.contents import Unused, require_applicable, unused_in, unused_ranges
 from coloc_graph.pipeline.explanations import (
     implausible_planes,
@@ -38,6 +42,7 @@ from coloc_graph.pipeline.moves import infer_moves, moves_unstated
 from coloc_graph.pipeline.odometry_checks import CheckedRun
 from coloc_graph.pipeline.options import METHODS, SolveOptions
 from coloc_graph.pipeline.ranges import ranges_of_run
+from coloc_graph.pipeline.shared_errors import shared_noise_of
 from coloc_graph.pipeline.solution import Solution
 from coloc_graph.run import Run, Stance
 from coloc_graph.run.recorded import Restated
@@ -49,9 +54,9 @@ log = logging.getLogger(__name__)
 
 NOISE_ROUNDS = 2  # of learning the noise and measuring again: which points are inliers depends on it
 
-MIN_SHARED = 0.02  # part of homographies' covariance by shared errors below which their size is not looked for
+FEW_STANCES = 4  # stances below which an offset of clocks may pass for another fault
 
-UNEXPLAINED = 2.0  # chi2/dof from which on a few wrong measurements are not the cause
+MAX_MISFIT = 2.0  # misfit of an estimate from which on clocks are doubted in any case
 
 BATCH = {"chain": chain, "smooth": smooth, "joint": joint}
 
@@ -125,7 +130,9 @@ def solve(
         options = options.resolved()
         measure = _Counted(run, options, progress)
         solved = (
-            _by_stance(run, options, measure, on_update) if options.incremental else _in_batch(run, options, measure)
+            _by_stance(run, options, measure, on_update)
+            if options.incremental
+            else _or_by_clocks(run, options, measure, _in_batch(run, options, measure))
         )
     return Solution(
         run=recorded,
@@ -199,7 +206,7 @@ def _in_batch(
     if options.method != "chain":
         arms, estimate = find_lever_arms(estimate, BATCH[options.method])
     if options.method == "joint":
-        shared = _shared_noise(estimate, noise)
+        shared = shared_noise_of(estimate, noise)
         noisier = noise if shared is None else noise.with_bias(shared.size, shared.factor)
         again = measured if shared is None else measured_again(measured, noisier.used(run.team))
         # errors so large that a pair tells nothing any more are none of the cameras'
@@ -252,6 +259,29 @@ def _best_explained(run: Run, options: SolveOptions, measure: "_Counted", clocks
     return min(corrected, plain, key=lambda one: misfit(one.estimate))
 
 
+def _or_by_clocks(run: Run, options: SolveOptions, measure: "_Counted", plain: _Solved) -> _Solved:
+    """Solve with unknown clocks where that explains contradictions at least as well.
+
+    A constant offset shows in every stance: of longer runs only those are doubted that no other cause explains.
+    """
+    estimate = plain.estimate
+    short = len(run.stances) < FEW_STANCES and contradicts(estimate)
+    loose = unknown_clocks(run) if short or misfit(estimate) > MAX_MISFIT else None
+    if loose is None:
+        return plain
+    looser = loose.corrected(run)
+    try:
+        solved = _in_batch(looser, options, measure.of(looser), loose, plain.seconds_frontend)
+    except EstimationError:
+        return plain
+    said = clocks_instead(run, estimate, solved.estimate)
+    if said is None:
+        return plain
+    if _usable(solved.measured) < _usable(plain.measured):  # too far off to be searched for
+        return replace(plain, warnings=[said, *plain.warnings])
+    return replace(solved, warnings=[said, *solved.warnings])
+
+
 def _graph_of(
     run: Run, options: SolveOptions, measured: Sequence[PairMeasurement], team: Team
 ) -> tuple[PoseGraph, OdometryAndSightings]:
@@ -265,22 +295,6 @@ def _graph_of(
             motions += sources.of_stance(Restated(run, team), stance, pairs)
     graph = PoseGraph.of(run.team, run.stances, [*poses, *motions])
     return replace(graph, robot_models=options.robot_models(run.team) or graph.robot_models), sources
-
-
-def _shared_noise(estimate: Estimate, noise: NoiseBelief) -> SharedNoise | None:
-    """The size of shared errors relative to that of an estimate's measurements; None where they hardly count."""
-    factor = float(np.median(noise.bias_factor))
-    explained = estimate.chi2 < UNEXPLAINED * estimate.dof
-    used = estimate.graph
-    if explained:
-        used = used.without(one.measurement for one in estimate.rejected)
-    # else the rejected ones do not explain it: noise is the likelier cause of all of it
-    if estimate.dof <= 0 or (explained and shared_part(used) < MIN_SHARED):
-        return None
-    # the measurements were made with what is expected of the prior, which is more than its median
-    expected = math.exp(math.log(factor) ** 2)
-    learnt = learn_shared_noise(used, estimate.values, factor, 1 / expected)
-    return replace(learnt, size=learnt.size * expected)
 
 
 def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: OnUpdate | None) -> _Solved:

@@ -10,8 +10,10 @@ import numpy as np
 from scipy.special import chdtrc
 
 from coloc_graph.backend import Estimate
+from coloc_graph.backend.blame import EQUAL_CHI2
 from coloc_graph.frontend import PairMeasurement
 from coloc_graph.frontend.clock_evidence import ClockEvidence, Sensor, clock_evidence
+from coloc_graph.frontend.pairing.clock_offset import MAX_CLOCK_SIGMA
 from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW
 from coloc_graph.frontend.tracks.interpolation import MAX_GAP
 from coloc_graph.pipeline.clock_model import (
@@ -125,6 +127,35 @@ def clocks_of_images_apart(measured: Sequence[PairMeasurement]) -> RunClocks | N
             nearest.append(float(np.median(np.abs(times_j[None] - times_i[:, None]).min(axis=1))))
     apart = max(nearest, default=0.0)
     return RunClocks({}, apart, 0.0, apart) if PAIRING_WINDOW < apart < MAX_GAP else None
+
+
+def unknown_clocks(run: Any) -> RunClocks | None:
+    """Return clocks of which nothing is known, for a run whose team states that they agree; None for any other run."""
+    cameras = [robot.name for robot in run.team.robots if robot.camera_if_any]
+    return None if run.team.clock_sigma or len(cameras) < 2 else RunClocks({}, MAX_CLOCK_SIGMA, 0.0)
+
+
+def implausibility(estimate: Estimate) -> float:
+    """Chi2 above its expected value, and a price for each rejection and bump."""
+    return estimate.chi2 - estimate.dof + REJECTION_PRICE * (len(estimate.rejected) + len(estimate.bumped))
+
+
+def clocks_instead(run: Any, plain: Estimate, loose: Estimate) -> str | None:
+    """Weigh the estimate with unknown clocks against another; the sentence on it, None where it explains less."""
+    gain = implausibility(plain) - implausibility(loose) - REJECTION_PRICE
+    if gain < -EQUAL_CHI2:
+        return None
+    cameras = [f"{robot.name}'s clock" for robot in run.team.robots if robot.camera_if_any]
+    said = (
+        f"{' or '.join(cameras)} is off: with unknown clocks the measurements agree (chi2/dof "
+        f"{loose.chi2 / max(loose.dof, 1):.1f})"
+    )
+    if gain < EQUAL_CHI2:
+        others = [one.description for one in plain.bumped] + [
+            f"the {one.measurement} is wrong" for one in plain.rejected
+        ]
+        said += f"; or else {', and '.join(others)}: both explain the measurements equally well" if others else ""
+    return f"{said}; synchronise the robots' computers, or let the mover stop and go, which shows the offset"
 
 
 def contradicts(estimate: Estimate) -> bool:

@@ -4,14 +4,18 @@ from dataclasses import replace
 
 import msgspec
 import pytest
+from teams import graph_of_team, team_of
 
+from coloc_graph.backend import smooth
 from coloc_graph.evaluation import align, evaluate
 from coloc_graph.frontend import FrontendOptions, measure_pair
 from coloc_graph.frontend.clock_evidence import ClockEvidence
 from coloc_graph.frontend.pairing.clock_offset import ClockOffset
+from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.measurements import Odometry
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.clock_table import clock_table
-from coloc_graph.pipeline.clocks import clocks_of_images_apart, run_clocks
+from coloc_graph.pipeline.clocks import clocks_instead, clocks_of_images_apart, run_clocks, unknown_clocks
 from coloc_graph.run import Clocks, RobotClock, RunWriter, open_run, read_truth
 from coloc_graph.simulation import simulate
 
@@ -137,3 +141,18 @@ def test_cameras_that_take_no_images_at_once_are_taken_to_differ_by_what_lies_be
     found = clocks_of_images_apart([replace(one, seen=(one.seen[0], later))])
     assert found.corrected(right).team.clock_sigma == pytest.approx(0.05, abs=1e-3)
     assert "images are 50 ms apart" in found.sentences()[0] and "`clock_sigma`" in found.sentences()[0]
+
+
+def test_unknown_clocks_are_weighed_against_other_causes(right):
+    team = team_of(3, 4, 2)
+    (way, *_) = [m for m in team.measurements if isinstance(m, Odometry)]
+    bad = replace(way, T_before_after=way.T_before_after @ floor_pose(0.3, 0.2, 0.0))
+    healthy = smooth(graph_of_team(team))
+    plain = smooth(graph_of_team(team, [bad if m is way else m for m in team.measurements]))
+    assert plain.rejected or plain.bumped
+    said = clocks_instead(right, plain, healthy)
+    assert "A's clock or B's clock" in said and "or else" in said and "equally well" in said
+    assert clocks_instead(right, healthy, plain) is None
+    contradictory = replace(plain, chi2=plain.chi2 + 1000)
+    assert "or else" not in clocks_instead(right, contradictory, healthy)
+    assert unknown_clocks(right).corrected(right).team.clock_sigma == pytest.approx(0.25)
