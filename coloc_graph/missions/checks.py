@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from coloc_graph.errors import ColocError
 from coloc_graph.geometry.se2 import Planar, compose, inverse, wrap
 from coloc_graph.missions.faults import COORDINATOR
 from coloc_graph.missions.field import Field
@@ -49,7 +50,6 @@ class Checks:
         self._gaps = 0
         self._link: CoordinatorLink | None = None
         self._recorded: deque[tuple[float, int]] = deque(maxlen=200)
-        self._to_be_kept = 0
         self._origin: Planar | None = None
         self._newest: EnteredStance | None = None
 
@@ -129,11 +129,21 @@ class Checks:
         assert self._origin is not None
         return compose(inverse(self._origin), pose)
 
-    def note_kill(self, where: str) -> None:
-        """Note what a coordinator that is killed now has recorded."""
-        if where == COORDINATOR and self._recorded:
-            before = [n for t, n in self._recorded if t <= 1e-9 * self._scheduler.now - LOST_RECORD - MARGIN]
-            self._to_be_kept = max(self._to_be_kept, before[-1] if before else 0)
+    def look_at_record(self, folder: Path) -> None:
+        """Check that the record of a coordinator that was killed now has all but the newest images."""
+        path, now = folder / "run.mcap", 1e-9 * self._scheduler.now
+        before = [n for t, n in self._recorded if t <= now - LOST_RECORD - MARGIN]
+        self._recorded.clear()
+        if not before:
+            return
+        try:
+            run = open_run(path)
+            kept = sum(1 for name in self._team.names for _ in run.detections(name))
+        except ColocError as error:
+            self._violate(f"the record of a killed coordinator cannot be read: {error}")
+            return
+        if kept < before[-1]:
+            self._violate(f"a killed coordinator lost {before[-1] - kept} images older than {LOST_RECORD} s")
 
     def end(self, folder: Path, ended: bool) -> None:
         """Check what the mission left behind."""
@@ -163,9 +173,6 @@ class Checks:
             self._violate(f"the record is damaged: {run.warnings[0]}")
         if self._coordinators > 1 or self._seed % REPLAYED == 0:
             self._compare_replay(folder)
-        seen = sum(1 for name in self._team.names for _ in run.detections(name))
-        if seen < self._to_be_kept:
-            self._violate(f"the record lost {self._to_be_kept - seen} images that were older than {LOST_RECORD} s")
 
     def _compare_replay(self, folder: Path) -> None:
         """Replay the mission, as if it had never been interrupted: it must give the same estimates, bit for bit."""

@@ -168,8 +168,9 @@ def _begin(
         end = _network_fault(fault, network)
     elif fault.kind == "kill":
         if process is not None:
-            checks.note_kill(where)
             scheduler.kill(process)
+            if where == COORDINATOR:
+                checks.look_at_record(programs.folder / "mission")
         end = lambda: programs.start(where)  # noqa: E731
     elif fault.kind == "stop" and process is not None:
         scheduler.stop(process)
