@@ -297,7 +297,7 @@ def test_an_edge_is_measured_again_and_decomposed_both_ways(scene, solutions):
 def test_points_warped_by_the_homography_are_where_the_other_camera_sees_them(scene):
     found = inspect.examine(scene, 1).measured
     cameras = [scene.team[robot].camera for robot in (found.homography.robot_i, found.homography.robot_j)]
-    warped = inspect.warp(found.homography.H_j_i, cameras[0].normalise(found.correspondences.uv_i), cameras[1])
+    warped = inspect.warp(found.homography.H_j_i, cameras[0].rays(found.correspondences.uv_i), cameras[1])
     assert np.median(np.linalg.norm(warped - found.correspondences.uv_j, axis=1)) < 1.0  # 0.3 px of noise in both
 
 
