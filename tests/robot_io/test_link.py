@@ -580,8 +580,11 @@ def test_certificates_are_made_once_for_their_owner_alone(tmp_path, capsys):
         assert stat.S_IMODE((folder / f"{name}.key").stat().st_mode) == 0o600
     before = (folder / "ca.key").read_bytes()
     assert main(["certificates", str(folder), str(tmp_path / "team.toml")]) == 2
-    assert "exists already and is not replaced" in capsys.readouterr().err
+    assert "exists; replace it and all others with --force" in capsys.readouterr().err
     assert (folder / "ca.key").read_bytes() == before
+    assert main(["certificates", str(folder), str(tmp_path / "team.toml"), "--force"]) == 0
+    assert (folder / "ca.key").read_bytes() != before
+    assert stat.S_IMODE((folder / "ca.key").stat().st_mode) == 0o600
     with pytest.raises(InputError, match="a robot cannot be called `coordinator`"):
         make_certificates(tmp_path / "other", ["A", "coordinator"])
     with pytest.raises(InputError, match=r"D\.pem does not exist: make certificates"):
