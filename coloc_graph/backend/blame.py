@@ -101,6 +101,8 @@ class Fault:
                 f"{or_else(self.alternative)}: both explain the measurements equally well; "
                 f"check {to_check(self.cause, *self.alternative)}"
             )
+        elif isinstance(self.cause.links[0], Odometry):
+            reason += f"; check {self.cause.check}"
         return tuple(
             Rejection(link, reason, self.sigmas, self.alternative)
             for link in self.cause.links

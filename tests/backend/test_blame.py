@@ -87,6 +87,7 @@ def test_in_a_run_of_two_stances_wrong_odometry_is_rejected_and_the_covariance_h
     named = [one.measurement for one in estimate.rejected]
     named += [link for bump in estimate.bumped for cause in bump.alternative for link in cause.links]
     assert bad in named
+    assert all(f"the wheels and clock of {bad.robot}" in one.reason for one in estimate.rejected)
     assert estimate.chi2 < 3 * max(estimate.dof, 1)
     assert all(planar_nees(estimate, team, node) < 30 for node in team.T_world_body)
 
