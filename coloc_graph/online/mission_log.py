@@ -1,5 +1,6 @@
 """The log of a mission: its states and events, one JSON object a line; `MissionLog`."""
 
+import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -48,4 +49,5 @@ class MissionLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        with contextlib.suppress(OSError):  # a full disk was reported by `note`
+            self._file.close()

@@ -14,6 +14,7 @@ from coloc_graph.geometry.se2 import compose, inverse
 from coloc_graph.online.encoder_log import Counted, EncoderLog, way_since
 from coloc_graph.online.estimation_worker import EstimationWorker
 from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Formation
+from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateMachine, as_dot, as_mermaid
 from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_restart import DROVE, STOOD, JoinedOdometry
@@ -413,3 +414,8 @@ def test_states_follow_each_other_as_drawn():
     for _ in MissionState:
         reached |= {after for state in reached for after in NEXT_STATES[state]}
     assert reached == set(MissionState) - {MissionState.FAILED}
+
+
+def test_a_log_on_a_full_disk_is_an_error_in_a_sentence():
+    with MissionLog(Path("/dev/full"), lambda: 0.0) as log, pytest.raises(RunError, match="full: cannot be written"):
+        log.note("state")
