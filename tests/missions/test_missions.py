@@ -25,7 +25,7 @@ def test_promises_hold_whatever_happens(seed):
 
 #: Faults of a mission in whose midst they happen, by what they are about.
 DIRECTED = {
-    "the coordinator is killed twice": [Fault(9.0, "kill", COORDINATOR, 1.0), Fault(16.0, "kill", COORDINATOR, 2.0)],
+    "the coordinator is killed twice": [Fault(9.0, "kill", COORDINATOR, 1.0), Fault(22.5, "kill", COORDINATOR, 2.0)],
     "the mover's program is killed": [Fault(7.6, "kill", "C", 1.5)],
     "all links are cut": [Fault(7.6, "cut", name, 3.0) for name in "ABC"],
     "processes are stopped": [Fault(7.6, "stop", "C", 1.0), Fault(12.0, "stop", COORDINATOR, 3.0)],
