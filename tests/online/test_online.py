@@ -15,7 +15,7 @@ from coloc_graph.run import open_run
 from coloc_graph.simulation.simulated_team import field_team
 
 #: How many stances, or with --whole, and before which an anchor is pushed then.
-STANCES = 4
+STANCES = 3
 WHOLE = 12
 PUSHED = 5
 #: What a wheel may turn on for after what let it go was cut off [s].
@@ -34,16 +34,16 @@ def mission(tmp_path_factory, request):
             m.wait_for(stance, "capturing")
             m.wait_moving()
 
-        in_mid_stance(1)
+        in_mid_stance(0)
         m.field.kill("C")
         m.time_to_stand("a robot's program is gone")
         m.field.start("C")
-        in_mid_stance(2)
+        in_mid_stance(1)
         m.relay.cut()
         m.time_to_stand("the link is cut")
         time.sleep(3.0)
         m.relay.mend()
-        in_mid_stance(3)
+        in_mid_stance(2)
         time.sleep(1.5)
         m.killed_at = time.time()
         m.coordinator.kill()
@@ -93,9 +93,9 @@ def test_the_mission_ends_by_itself_with_every_stance_once(mission):
 
 
 def test_what_happened_is_named(mission):
-    assert "C is not there" in reasons(mission, 1)
-    assert "not there" in reasons(mission, 2) or "has sent nothing" in reasons(mission, 2)
-    assert any(row["what"] == "resumed" and row["stances"] == 3 for row in mission.rows)
+    assert "C is not there" in reasons(mission, 0)
+    assert "not there" in reasons(mission, 1) or "has sent nothing" in reasons(mission, 1)
+    assert any(row["what"] == "resumed" and row["stances"] == 2 for row in mission.rows)
     if mission.stances < WHOLE:
         return
     assert f"robot {mission.pushed} was bumped between stances {PUSHED - 1} and {PUSHED}" in reasons(mission, PUSHED)
@@ -112,7 +112,7 @@ def test_wheels_stand_soon_after_they_are_let_go(mission):
 
 def test_a_killed_coordinator_s_record_misses_half_a_second_at_most(mission):
     cut_off = open_run(mission.folder / "mission" / "run.1.mcap")
-    assert len(cut_off.stances) == 3
+    assert len(cut_off.stances) == 2
     last = max(one.time for robot in "AB" for one in cut_off.detections(robot))
     assert mission.killed_at - last < 0.5 + 0.2  # and the image before that
     goes_on = open_run(mission.folder / "mission" / "run.mcap")
