@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.estimate import Rejection
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError
 from coloc_graph.input_file import read_bytes
@@ -88,6 +89,12 @@ class _Format(msgspec.Struct):
 
 class _File(_Format):
     checkpoint: Checkpoint
+
+
+def base_of(stances: tuple[Stance, ...], measurements: Measurements, rejected: Mapping[int, Rejection]) -> Base:
+    """Return the base of stances and measurements; `rejected` are the outliers, by the identity of the measurement."""
+    numbers = {id(one): number for number, one in enumerate(measurements)}
+    return Base(stances, measurements, {numbers[key]: one.reason for key, one in rejected.items()})
 
 
 def write(saved: Checkpoint, path: Path) -> None:

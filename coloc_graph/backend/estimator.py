@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from coloc_graph.backend import checkpoint
 from coloc_graph.backend.batch import find_bumps, joint, smooth
 from coloc_graph.backend.calibration import Variables
-from coloc_graph.backend.checkpoint import Base, Entry, WaitingStance
+from coloc_graph.backend.checkpoint import Base, Entry, WaitingStance, base_of
 from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
 from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate, rejection_of
 from coloc_graph.backend.factors import Factors, Method, require_robot_models
@@ -45,13 +45,6 @@ Array = NDArray[np.float64]
 def _rejection(link: Link, off: Agreement) -> Rejection:
     assert isinstance(link, RelativePose | Sighting | Range)
     return rejection_of(link, off)
-
-
-def _base(
-    stances: tuple[Stance, ...], measurements: tuple[Measurement, ...], rejected: Mapping[int, Rejection]
-) -> Base:
-    numbers = {id(one): number for number, one in enumerate(measurements)}
-    return Base(stances, measurements, {numbers[key]: one.reason for key, one in rejected.items()})
 
 
 class Estimator:
@@ -384,7 +377,7 @@ class Estimator:
         measurements = tuple(one for one in self._log if id(one) not in gone)
         rejected = {key: one for key, one in self._rejected.items() if key not in gone}
         self._changed = True
-        self._begin(_base(stances, measurements, rejected))
+        self._begin(base_of(stances, measurements, rejected))
         again = [
             m for m in (one.measurement for key, one in rejected.items() if key in suspected) if isinstance(m, Link)
         ]
@@ -392,7 +385,7 @@ class Estimator:
             found = {id(one.measurement): one for one in self._update(self._plan([*self._disconnected, *again]))[0]}
             left = {key: one for key, one in rejected.items() if key not in suspected} | found
             # anew, so that nothing depends on the order in which they were tried
-            self._begin(_base(stances, measurements, left))
+            self._begin(base_of(stances, measurements, left))
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint atomically, from which `resume` continues."""
@@ -426,7 +419,7 @@ class Estimator:
         before = next(reversed(self._stances.values()), None)
         if any(map(self._is_marginalised, taken)):
             self._changed = True
-            self._begin(_base(self.stances, self.measurements, self._rejected))
+            self._begin(base_of(self.stances, self.measurements, self._rejected))
         links: list[Link] = [*self._disconnected, *taken, *self._new_map_positions(taken)]
         if stance is not None:
             if before is not None:

@@ -24,12 +24,7 @@ from coloc_graph.frontend.homography.plane_view import (
 )
 from coloc_graph.frontend.homography.refinement import Criterion
 from coloc_graph.frontend.landmarks import SeenLandmarks
-from coloc_graph.frontend.pairing.clock_offset import (
-    ClockOffset,
-    find_offset,
-    fit_at_offset,
-    require_searchable,
-)
+from coloc_graph.frontend.pairing.clock_offset import ClockOffset, find_offset, fit_at_offset, require_searchable
 from coloc_graph.frontend.pairing.correspondence import (
     PAIRING_WINDOW,
     Correspondences,

@@ -1,5 +1,6 @@
 """From a run to an estimate, whatever the run holds: `solve`. Stances as in sections III and IV of the paper."""
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -184,7 +185,8 @@ def _in_batch(
         apart = clocks_of_images_apart(measured)
         if apart is not None:
             looser = apart.corrected(run)
-            return _in_batch(looser, options, measure.of(looser), apart, time.perf_counter() - started)
+            with contextlib.suppress(EstimationError):  # what is wrong with the run as it is says more
+                return _in_batch(looser, options, measure.of(looser), apart, time.perf_counter() - started)
     for _ in range(NOISE_ROUNDS):
         noise = belief.updated(measured)
         measured = measured_again(measured, noise.used(run.team))

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("default")
 
 
 def test_there_is_one_for_each_experiment():
-    assert [path.stem for path in NOTEBOOKS] == [*EXPERIMENTS, *TUTORIALS]
+    assert [path.stem for path in NOTEBOOKS] == sorted([*EXPERIMENTS, *TUTORIALS])
 
 
 @pytest.mark.parametrize(

@@ -133,7 +133,7 @@ def test_a_stance_that_is_withdrawn_takes_what_it_taught_with_it(hallway):
 
 def test_a_shared_error_with_which_a_pair_would_tell_nothing_is_not_taken(hallway, monkeypatch):
     before = solve(open_run(hallway))
-    monkeypatch.setattr("coloc_graph.pipeline.batch._shared_noise", lambda *_: SharedNoise(1e4, 1.5))
+    monkeypatch.setattr("coloc_graph.pipeline.batch.shared_noise_of", lambda *_: SharedNoise(1e4, 1.5))
     after = solve(open_run(hallway))
     assert after.count.used == before.count.used
     np.testing.assert_allclose(after.estimate.chi2, before.estimate.chi2, rtol=0.1)

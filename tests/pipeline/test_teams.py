@@ -98,6 +98,7 @@ def test_a_team_is_solved_and_its_covariances_are_believable(ten):
 def test_many_robots_come_out_the_same_though_most_of_the_way_is_by_cholesky(ten, monkeypatch):
     graph = solve(ten, SolveOptions()).estimate.graph
     by_qr = joint(graph)
+    monkeypatch.setattr("coloc_graph.backend.solver._gauss_newton", lambda *_: None)  # as where it diverges
     taken = []
     genuine = gtsam.LevenbergMarquardtParams.setLinearSolverType
     monkeypatch.setattr(
