@@ -59,7 +59,7 @@ class Checks:
         moving = {name for name in self._team.names if self._field.fastest(name) > 0}
         for name in self._team.names:
             since = self._lost_since[name]
-            if self._alive(name):
+            if self._alive(name) or name in self._field.unplugged:  # nobody stops a Create without its line
                 self._lost_since[name] = None
             elif since is None:
                 self._lost_since[name] = now
@@ -97,7 +97,8 @@ class Checks:
         def watched(robot: str, message: object) -> None:
             if not isinstance(message, (bool, Status)):
                 key = robot, message.session, type(message)  # type: ignore[attr-defined]
-                before, number = self._numbers.get(key, -1), message.number  # type: ignore[attr-defined]
+                number = message.number  # type: ignore[attr-defined]
+                before = self._numbers.get(key, number - 1)  # earlier ones came before this was watched
                 if number <= before:
                     self._violate(f"{type(message).__name__} {number} of {robot} came after {before}")
                 self._gaps += number - before - 1

@@ -89,6 +89,8 @@ def read_attempts(path: Path) -> list[Attempt]:
                 if row["what"] == "entering":
                     stance = msgspec.convert(row["begun"], Stance)
                     attempts.append(Attempt(stance, msgspec.convert(row["recorded"], dict[str, tuple[int, int]])))
+                elif row["what"] == "resumed" and attempts and attempts[-1].stance.index >= row["stances"]:
+                    attempts.pop()  # the coordinator ended before this one was decided
                 elif row["what"] == "entered" and attempts and attempts[-1].stance.index == row["stance"]:
                     last = attempts[-1]
                     attempts[-1] = Attempt(last.stance, last.recorded, str(row.get("digest", "")))

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-from coloc_graph.errors import ColocError, RobotError
+from coloc_graph.errors import ColocError, RobotError, RunError
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.machine import machine
 from coloc_graph.online.bumps import displaced, pushed
@@ -116,6 +116,8 @@ class LeapFrog:
         ------
         Stopped
             If the mission is told to stop while it waits for a robot's answer.
+        RunError
+            If the disk refuses the record or the log.
         """
         try:
             trouble = self._trouble()
@@ -123,7 +125,7 @@ class LeapFrog:
                 self._steps[self.states.now]()
             else:
                 self._void(trouble)
-        except Stopped:
+        except (Stopped, RunError):  # a record or a log that cannot be written ends the mission
             raise
         except ColocError as error:
             self._void(str(error))

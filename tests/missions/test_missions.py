@@ -43,3 +43,13 @@ DIRECTED = {
 def test_promises_hold_when(what):
     outcome = run_mission(Scenario(5, 2, tuple(DIRECTED[what])))
     assert outcome.state == "done" and not outcome.violations, (outcome.violations, outcome.log)
+
+
+#: Missions in which `make search` found a fault: a full disk while all were told to hold, and amid an estimate.
+FOUND = (5040, 5023)
+
+
+@pytest.mark.parametrize("seed", FOUND)
+def test_what_a_search_has_found_stays_mended(seed):
+    outcome = run_mission(scenario_of(seed, 3, faults=6))
+    assert outcome.state == "done" and not outcome.violations, outcome.violations
