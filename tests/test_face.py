@@ -28,9 +28,10 @@ def test_the_package_offers_its_names_and_loads_nothing_for_them():
         coloc_graph.nothing  # noqa: B018
 
 
-def test_an_example_solves_measurements_of_its_own():
+def test_an_example_solves_measurements_of_its_own(tmp_path):
     example = Path(__file__).parents[1] / "examples" / "own_measurements.py"
-    shown = subprocess.run([sys.executable, example], capture_output=True, text=True, check=True).stdout.splitlines()
+    command = [sys.executable, example]
+    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.splitlines()
     assert len(shown) == 12 and shown[0].startswith("A at stance 0: x 0.000 m")
     assert shown[-1].startswith("A at stance 5: x 5.9")
 
