@@ -135,8 +135,9 @@ class Viewer:
         return self._renderer.frame_cpu_seconds
 
     def go_to(self, time: float) -> None:
-        """Show an instant [s], between stances too."""
-        self._inbox.request("time", time)
+        """Show an instant [s] of the scene's clock, between stances too."""
+        # the panel's time is since the first stance
+        self._inbox.request("time", time - float(self.scene.starts[0]))
 
     @property
     def state(self) -> ViewState:
