@@ -131,7 +131,7 @@ def test_the_record_solved_offline_is_what_was_known_online(mission):
         assert poses.keys() == one.estimate.poses.keys()
         for robot, pose in one.estimate.poses.items():
             if one.stance.index < PUSHED:
-                assert np.abs(pose.matrix() - poses[robot]).max() < 1e-6
+                assert np.abs(pose.matrix() - poses[robot]).max() < 1e-5
                 continue
             # once a stance was taken out, ISAM2 has linearised it elsewhere: far below what is not known
             off = gtsam.Pose3(np.array(poses[robot])).localCoordinates(pose)[[2, 3, 4]]

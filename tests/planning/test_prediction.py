@@ -56,6 +56,7 @@ def test_the_promised_sigmas_are_those_that_the_estimator_states(tmp_path, gait,
     assert np.mean([promise.points for promise in promises]) == pytest.approx(np.mean(counts), rel=0.1)
 
 
+@pytest.mark.long
 def test_the_promised_sigma_is_the_spread_of_errors(tmp_path):
     plan = straight_plan(2, Gait(0.7, 0.6, 10.0), 6.0)
     squares = []

@@ -118,7 +118,7 @@ def test_a_robot_that_is_dragged_onto_another_is_named(editor):
         assert until(lambda: any(sentence in note for note in viewer.scene.notes), 10)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_robot_is_dragged_in_a_browser(editor, page_of):
     with Viewer(editor.scene, port=0) as viewer:
         editor.attach(viewer)
