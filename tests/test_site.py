@@ -73,6 +73,7 @@ def test_the_commands_of_a_page_run_as_they_stand(page, shared_folder, tmp_path,
     capsys.readouterr()
 
 
+@pytest.mark.long
 def test_the_data_set_gives_what_its_page_says(shared_folder, monkeypatch, capsys):
     folder, done = shared_folder
     monkeypatch.chdir(folder)

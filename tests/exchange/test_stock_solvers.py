@@ -20,7 +20,7 @@ from coloc_graph.simulation import Imperfections, simulate
 STARTS = np.array([0.01, 0.01, 0.02, 0.05, 0.05, 0.02])  # rad, m: errors of the initial poses
 
 
-@pytest.fixture(scope="module", params=["level", "uneven", "team"])
+@pytest.fixture(scope="module", params=["level", "uneven", pytest.param("team", marks=pytest.mark.long)])
 def run(request, tmp_path_factory):
     path = tmp_path_factory.mktemp("runs") / f"{request.param}.mcap"
     scenario = "team" if request.param == "team" else "hallway"
