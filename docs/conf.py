@@ -27,6 +27,7 @@ author = "The coloc-graph authors"
 copyright = "The coloc-graph authors; BSD 3-Clause"
 release = version = __version__
 
+suppress_warnings = ["misc.highlighting_failure"]  # mermaid, which repositories draw and Pygments does not know
 extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc", "sphinx.ext.intersphinx"]
 exclude_patterns = ["_build", "site"]
 source_suffix = {".md": "markdown"}
