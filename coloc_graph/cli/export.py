@@ -99,8 +99,14 @@ def run(args: argparse.Namespace) -> int:
         unpack_gtsam(source, out)
     else:
         write_atomically(out, source.read_bytes())
-    print(f"wrote {out}")
+    print(f"wrote {out}{_left_out(source) if args.format == 'g2o' else ''}")
     return 0
+
+
+def _left_out(pose_graph: Path) -> str:
+    """Return what a result's graph.g2o does not hold, as it says itself; "" where it holds all."""
+    lines = pose_graph.read_text(encoding="utf-8").splitlines()
+    return "".join(f"; {line.removeprefix('# ')}" for line in lines if line.startswith("# left out: "))
 
 
 def _range_graph(args: argparse.Namespace, out: Path) -> int:
@@ -127,8 +133,9 @@ def _range_graph(args: argparse.Namespace, out: Path) -> int:
             if one.stances is not None
             for stance, time in zip(one.stances, one.times, strict=True)
         }
-        graph, letters = of_pose_graph(read_g2o(result.path / "graph.g2o"), times)
-        robots = "; robots " + ", ".join(f"{letter} = {robot}" for robot, letter in letters.items())
+        poses = result.path / "graph.g2o"
+        graph, letters = of_pose_graph(read_g2o(poses), times)
+        robots = "; robots " + ", ".join(f"{letter} = {robot}" for robot, letter in letters.items()) + _left_out(poses)
     out.parent.mkdir(parents=True, exist_ok=True)
     WRITERS[args.format](graph, out)
     relative = f"{len(graph.relatives)} relative poses and positions"

@@ -54,7 +54,7 @@ def write_g2o(estimate: Estimate, path: Path) -> None:
         if graph.key(stay.robot, stay.after) in ids
     ]
     if ranges := sum(isinstance(one, Range) for one in graph.measurements):
-        lines.append(f"# left out: {ranges} ranges, which g2o cannot express; the poses are those with them")
+        lines.append(f"# left out: {ranges} ranges, which a pose graph cannot express; the poses are those with them")
     try:
         edges = relative_edges(estimate)
     except EstimationError as why:

@@ -203,7 +203,11 @@ def test_the_command_writes_every_part_of_a_result_with_ranges(with_landmarks, t
     counts = json.loads((out / "summary.json").read_text())["measurements"]["kinds"]
     assert counts["range"]["used"] > 20
     for kind in ("g2o", "gtsam", "dot", "pyfg", "jrl"):
+        capsys.readouterr()
         assert main(["export", kind, str(out), "--out", str(tmp_path / f"graph.{kind}")]) == 0
+        assert ("ranges, which a pose graph cannot express" in capsys.readouterr().out) == (
+            kind in ("g2o", "pyfg", "jrl")
+        )
     rows = list(csv.DictReader((out / "landmarks.csv").read_text().splitlines()))
     assert all(int(row["measurements"]) > 5 and row["yaw_deg"] in ("", "nan") for row in rows)
     scene = scene_of_result(out)
