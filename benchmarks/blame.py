@@ -269,14 +269,14 @@ def world_of(seed: int) -> MemoryRun:
 
 
 def healthy_world(number: int) -> list[dict[str, Any]]:
-    """What is said of a world without a fault."""
+    """Solve a world without a fault, and return its accusations and warnings as one row."""
     solution = solve(world_of(number), SolveOptions())  # type: ignore[arg-type]
     said = [sorted(one) for one in accusations(solution)]
     return [{"kind": "healthy", "world": number, "said": said, "innocent": bool(said), "warnings": solution.warnings}]
 
 
 def faulty_world(number: int, kinds: Sequence[str] = KINDS) -> list[dict[str, Any]]:
-    """One fault of each kind of a world."""
+    """Return one row for each kind of fault, drawn in the same world."""
     world = world_of(number)
     batch.measure_stance = measure = Measured()  # type: ignore[assignment]
     healthy = solve(world, SolveOptions()).estimate  # type: ignore[arg-type]
@@ -284,7 +284,7 @@ def faulty_world(number: int, kinds: Sequence[str] = KINDS) -> list[dict[str, An
 
 
 def faulted(world: MemoryRun, healthy: Estimate, measure: Measured, number: int, kind: str) -> dict[str, Any]:
-    """What is said of a world with a drawn fault."""
+    """Solve a world with a drawn fault, and return its accusations, the verdict and the fault's effect as a row."""
     fault = drawn(world, kind, np.random.default_rng((number, KINDS.index(kind))))
     began = time.process_time()
     row: dict[str, Any] = {"kind": fault.kind, "world": number, "robot": fault.robot, "stance": fault.stance}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from coloc_graph.backend import Estimator
+from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Odometry, Sighting
 from coloc_graph.pipeline.batch import solve
@@ -104,6 +105,16 @@ def test_a_stance_is_withdrawn_and_comes_again(graph):
     estimator.add(stance, taken, after=graph.stances[-2].index)
     off = np.asarray(expected.localCoordinates(estimator.pose("A")))
     assert np.sqrt(off @ np.linalg.solve(estimator.covariance("A"), off) / 6) < 0.1
+
+
+def test_two_robots_are_composed_by_what_ties_them_before_each_by_its_own_odometry(graph):
+    def by_odometry(**options):
+        return [step.to for step in spanning_tree(graph, graph.links, **options) if isinstance(step.link, Odometry)]
+
+    others = [link for link in graph.links if not isinstance(link, Odometry)]
+    reached = {step.to for step in spanning_tree(graph, others)}
+    assert not reached & set(by_odometry(odometry_last=True))
+    assert reached & set(by_odometry())
 
 
 def test_a_lag_of_nothing_is_refused(graph):
