@@ -440,6 +440,14 @@ def test_live_poses_that_cannot_be_shown_are_named_and_the_others_shown(short_so
         assert shows(viewer, "A", (1.0, 0.0, 0.0)) and viewer.notifications == {words}
 
 
+def test_an_instant_is_of_the_scenes_clock_whenever_its_first_stance_begins(scene):
+    late = replace(scene, stances=tuple(replace(s, start=s.start + 1e9, end=s.end + 1e9) for s in scene.stances))
+    with Viewer(late, port=0) as viewer:
+        for row in (0, 2, 1):
+            viewer.go_to(late.middle(row))
+            assert viewer.wait_idle() and viewer.frame.row == row
+
+
 def test_an_arrow_key_that_moves_the_slider_which_has_the_focus_steps_once(scene):
     """A browser sends both what the slider is and the command that is bound to the key."""
     with Viewer(scene, port=0) as viewer:
