@@ -26,6 +26,7 @@ from coloc_graph.exchange.camera_formats import (
     of_opencv,
     of_opencv_xml,
 )
+from coloc_graph.exchange.image_region import ImageRegion, image_region
 from coloc_graph.input_file import decode_text, quoted, read_bytes
 from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.team import Camera
@@ -100,13 +101,13 @@ def read_camera_info(
     Returns
     -------
     tuple
-        The camera, and warnings on ignored fields.
+        The camera of the images, of their region of interest and binning, and warnings on these and on ignored fields.
 
     Raises
     ------
     InputError
-        The file is not a `camera_info`, or describes an unknown lens model, skewed pixels, binned images or a region of
-        interest.
+        The file is not a `camera_info`, or describes an unknown lens model, skewed pixels, or a region of interest
+        beyond the image.
     """
     path = Path(path)
     fields = _fields(path, chain_camera)
@@ -136,7 +137,12 @@ def read_camera_info(
             f"{path}: the camera matrix is [fx {K[0, 1]:g} cx; {K[1, 0]:g} fy cy; ...], and a pinhole without skew has "
             "zeros there and 0 0 1 below; calibrate the camera anew without skew"
         )
-    _require_whole_image(path, fields, width, height)
+    said = _left_out(path, fields, K)
+    region = _region(path, fields, (width, height))
+    if (region.width, region.height) != (width, height) or region.binning != (1, 1):
+        said.append(f"{path}: the camera is that of a region of the {width} x {height} px it states: {region}")
+    width, height = region.size
+    K = region.intrinsics(K)
     values: dict[str, Any] = {
         "width": width,
         "height": height,
@@ -156,7 +162,7 @@ def read_camera_info(
             f"{path}: its lens model folds {radius:.0f} px from the middle of the image, beyond which pixels have no "
             "ray; calibrate the camera again, with corners out to the image's border"
         )
-    return camera, _left_out(path, fields, K)
+    return camera, tuple(said)
 
 
 def _matrix(values: Any) -> dict[str, Any]:
@@ -271,27 +277,18 @@ def _numbers(path: Path, fields: Mapping[str, Any], name: str, shape: tuple[int,
     return numbers.reshape(shape) if shape is not None else numbers
 
 
-def _require_whole_image(path: Path, fields: Mapping[str, Any], width: int, height: int) -> None:
-    """Raise `InputError` for binned images and regions of interest, whose pixels are not those of K."""
-    for name in ("binning_x", "binning_y"):
-        if fields.get(name, 0) not in (0, 1):
-            raise InputError(
-                f"{path}: `{name}` is {quoted(fields[name])}: the images are binned, and the matrix is that of "
-                "the whole ones; calibrate the camera with images as they are used"
-            )
+def _region(path: Path, fields: Mapping[str, Any], size: tuple[int, int]) -> ImageRegion:
     roi = fields.get("roi") or {}
     if not isinstance(roi, dict):
         raise InputError(f"{path}: `roi` is {quoted(roi)}; give x_offset, y_offset, width and height, or leave it out")
-    part = tuple(roi.get(name, 0) for name in ("x_offset", "y_offset", "width", "height"))
-    if part not in ((0, 0, 0, 0), (0, 0, width, height)):
-        x, y, w, h = map(quoted, part)
-        raise InputError(
-            f"{path}: `roi` is a part of the image, {w} x {h} at ({x}, {y}); "
-            "calibrate the camera with images as they are used"
-        )
+    part = [roi.get(name, 0) for name in ("x_offset", "y_offset", "width", "height")]
+    try:
+        return image_region(size, part, [fields.get(name, 0) for name in ("binning_x", "binning_y")])
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
-def _left_out(path: Path, fields: Mapping[str, Any], K: Any) -> tuple[str, ...]:
+def _left_out(path: Path, fields: Mapping[str, Any], K: Any) -> list[str]:
     said = []
     if any(name in fields for name in NAMES["R"]):
         R = _numbers(path, fields, "R", (3, 3))
@@ -308,4 +305,4 @@ def _left_out(path: Path, fields: Mapping[str, Any], K: Any) -> tuple[str, ...]:
                 f"{path}: `projection_matrix` is ignored: it is of rectified images, and these are as the camera "
                 "takes them"
             )
-    return tuple(said)
+    return said

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.exchange.camera_info import FISHEYES, MODELS
+from coloc_graph.exchange.image_region import image_region
 from coloc_graph.exchange.ros_bag import COMPRESSED_IMAGE, Bag, BagMessage
 from coloc_graph.image_file import decode_image, to_8_bits
 from coloc_graph.input_file import quoted
@@ -102,17 +103,19 @@ def _require_size(bag: Bag, message: BagMessage, shape: tuple[int, ...], camera:
         raise bag.error(
             message,
             f"has {shape[1]} x {shape[0]} pixels, and the camera is {camera.width} x {camera.height}: give its "
-            "`camera_info`, or correct the camera in the team, and its calibration",
+            "`camera_info` (with its `roi` and binning), or correct the camera in the team, and its calibration",
         )
 
 
 def camera_of(bag: Bag, message: BagMessage, stated: Camera, *, rectified: bool) -> Camera:
     """Convert a sensor_msgs/CameraInfo, with missing fields from `stated`; rectified images have camera P, undistorted.
 
+    A region of interest and binning are applied: the camera is that of the images.
+
     Raises
     ------
     BagError
-        The lens model, region of interest or binning is not supported, or the camera is not calibrated.
+        The lens model is not supported, the region is not within the image, or the camera is not calibrated.
     """
     found = bag.decode(message)
     K, D = _numbers(found, "k"), _numbers(found, "d")
@@ -126,11 +129,6 @@ def camera_of(bag: Bag, message: BagMessage, stated: Camera, *, rectified: bool)
             "rational_polynomial or equidistant, or "
             "import rectified images with `rectified = true`",
         )
-    roi = found.roi
-    if (roi.x_offset, roi.y_offset) != (0, 0) or (roi.width, roi.height) not in ((0, 0), (found.width, found.height)):
-        raise bag.error(message, "has a region of interest, which is not read; record whole images")
-    if max(found.binning_x, found.binning_y) > 1:
-        raise bag.error(message, "has binning, which is not read; calibrate at the size of the images")
     wide = not rectified and found.distortion_model in FISHEYES
     sizes = (0, 4) if wide else (0, 4, 5, 8)
     D = D[: next((n for n in sizes if not any(D[n:])), len(D))]
@@ -140,11 +138,17 @@ def camera_of(bag: Bag, message: BagMessage, stated: Camera, *, rectified: bool)
         raise bag.error(
             message, f"has {len(D)} coefficients of distortion; what is read is up to OpenCV's first {sizes[-1]}"
         )
+    roi = [int(getattr(found.roi, name)) for name in ("x_offset", "y_offset", "width", "height")]
+    try:
+        region = image_region((int(found.width), int(found.height)), roi, (int(found.binning_x), int(found.binning_y)))
+    except ValueError as error:
+        raise bag.error(message, str(error)) from error
+    (width, height), K = region.size, region.intrinsics(np.reshape(K, (3, 3))).ravel().tolist()
     try:
         camera = msgspec.structs.replace(
             stated,
-            width=int(found.width),
-            height=int(found.height),
+            width=width,
+            height=height,
             fx=float(K[0]),
             fy=float(K[4]),
             cx=float(K[2]),

@@ -1,5 +1,7 @@
 """camera_info YAML: to the bit there and back; what our camera cannot say is refused, or a warning."""
 
+import re
+
 import numpy as np
 import pytest
 import yaml
@@ -96,8 +98,10 @@ def test_what_is_of_rectified_images_is_left_out_with_a_warning(read):
     ("d: [-0.34, ", "d: [0.1, -0.34, 0.1, ", "`plumb_bob` has 0 or 4 or 5 coefficients (zeros"),
     ("plumb_bob", "''", "`` has 0 coefficients"),
     ("d: [-0.34, 0.11,", "d: [-1.5, 0.0,", "its lens model folds 135 px from the middle of the image"),
-    ("binning_x: 0", "binning_x: 2", "`binning_x` is 2: the images are binned"),
-    ("height: 0, width: 0", "height: 100, width: 200", "`roi` is a part of the image, 200 x 100 at (0, 0)"),
+    ("binning_x: 0", "binning_x: 641", "bins 641 x 1 px to one, and its images are 640 x 480"),
+    ("height: 0, width: 0", "height: 481, width: 20", "`roi` of 20 x 481 px at (0, 0), and the full image is"),
+    ("x_offset: 0", "x_offset: 9", "`roi` of 0 x 0 px at (9, 0)"),
+    ("x_offset: 0", "x_offset: -9", "`roi.x_offset` -9; give a whole number from 0 to 65535"),
     ("k: [430.2, 0.0,", "k: [430.2, 1.5,", "without skew"),
     ("k: [430.2,", "k: [0.0,", "is not calibrated"),
     ("k: [430.2,", "k: [-430.2,", "`fx` is -430.2"),
@@ -116,13 +120,31 @@ def test_what_is_of_rectified_images_is_left_out_with_a_warning(read):
     ("width: 640", "a: &a [1]\nwidth: *a", "line 5: is not YAML that is read (`it has an alias, which is not read`)"),
     ("width: 640", f"width: {'[' * 20_000}", "is nested too deep"),
     ("k: [430.2,", f"k: [{'1' * 400},", "not a list of numbers"),
-    ("binning_x: 0", "binning_x: [1, 2]", "`binning_x` is a list of 2"),
+    ("binning_x: 0", "binning_x: [1, 2]", "has `binning_x` a list of 2"),
 ])  # fmt: skip
 def test_what_our_camera_cannot_say_is_refused(read, old, new, says):
     assert old in MESSAGE
     with pytest.raises(InputError) as error:
         read(MESSAGE.replace(old, new))
     assert says in str(error.value) and "camera.yaml" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_region_of_interest_that_is_binned_is_the_camera_of_its_images(read):
+    """A spot of the full image, its region cut out and each two by three px averaged, is where the camera has it."""
+    full, _ = read(MESSAGE)
+    region = "roi: {x_offset: 100, y_offset: 60, height: 301, width: 400}"
+    text = MESSAGE.replace("binning_x: 0\nbinning_y: 0", "binning_x: 2\nbinning_y: 3")
+    binned, (said,) = read(re.sub("roi: .*", region, text))
+    assert (binned.width, binned.height) == (200, 100) and binned.distortion == full.distortion
+    # by hand: (306.7 - 100 - 0.5) / 2 and (227.2 - 60 - 1) / 3
+    assert np.allclose((binned.fx, binned.fy, binned.cx, binned.cy), (215.1, 143.5, 103.1, 55.4))
+    assert "of a region of the 640 x 480 px it states: 400 x 301 px at (100, 60), binned to 200 x 100" in said
+    u, v = full.project((0.1, 0.05, 1.0))[0]
+    y, x = np.mgrid[:480, :640]
+    image = np.exp(-((x - u) ** 2 + (y - v) ** 2) / 50)[60:360, 100:500].reshape(100, 3, 200, 2).mean(axis=(1, 3))
+    y, x = np.mgrid[:100, :200]
+    centre = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
+    assert np.allclose(binned.project((0.1, 0.05, 1.0))[0], centre, atol=1e-3)
 
 
 @pytest.mark.parametrize(("old", "new", "distortion"), [

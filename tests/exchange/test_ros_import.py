@@ -385,8 +385,7 @@ def test_a_camera_in_the_bag_is_that_of_the_run_and_what_the_team_says_otherwise
             {"model": "kannala"},
             "has the lens model `kannala`; calibrate with plumb_bob, rational_polynomial or equidistant",
         ),
-        ({"roi": (2, 0, 4, 4)}, "has a region of interest"),
-        ({"binning": 2}, "has binning"),
+        ({"roi": (2, 0, 4, 8)}, r"has a `roi` of 8 x 4 px at \(2, 0\), and the full image is 8 x 6"),
         ({"D": [0.1] * 14}, "has 14 coefficients of distortion"),
         ({"D": [np.nan] * 5}, "of a camera that is not calibrated"),
     ],
@@ -405,6 +404,7 @@ def test_cameras_as_ros_says_them(tmp_path):
         camera_info("/c", T0, CAMERA, D=[0.5] * 5, P=P, roi=(0, 0, 6, 8)),
         camera_info("/d", T0, CAMERA, D=[], model=""),
         camera_info("/e", T0, CAMERA, D=[0.1, 0.02, 0.003, 0.0004], model="equidistant"),
+        camera_info("/f", T0, CAMERA, roi=(2, 1, 4, 6), binning=2),  # y, x, height, width in ROS's order
     ]
     found = {}
     for kind in ("ros1", "mcap"):
@@ -416,6 +416,8 @@ def test_cameras_as_ros_says_them(tmp_path):
         c = found["/c"]
         assert (c.fx, c.fy, c.cx, c.cy, c.distortion) == (20.0, 21.0, 4.0, 3.0, ())
         assert found["/d"] == CAMERA
+        f = found["/f"]
+        assert (f.width, f.height, f.fx, f.fy, f.cx, f.cy) == (3, 2, 5.0, 5.0, 0.5, 0.5)
         assert (found["/e"].model, found["/e"].distortion) == ("fisheye", (0.1, 0.02, 0.003, 0.0004))
 
 
