@@ -48,18 +48,18 @@ def uncalibrated(run: Run) -> Run:
 
 def filtered(run: Run, between_robots: bool, at: Mapping[str, Trajectory]) -> tuple[dict[str, Trajectory], float]:
     """Run the EKF; return its estimates at the instants of other trajectories, and its time [s]."""
-    drive = keyframes_of(run, between_robots=between_robots)
+    keyframes = keyframes_of(run, between_robots=between_robots)
     started = time.process_time()
-    found = filter_forward(run.team, drive)
+    found = filter_forward(run.team, keyframes)
     seconds = time.process_time() - started
     out = {}
-    for n, name in enumerate(drive.robots):
-        wanted = np.isin(drive.times[n], at[name].times) & np.isfinite(found.poses[n][:, 0])
+    for n, name in enumerate(keyframes.robots):
+        wanted = np.isin(keyframes.times[n], at[name].times) & np.isfinite(found.poses[n][:, 0])
         poses, C = found.poses[n][wanted], found.covariances[n][wanted].copy()
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         R = np.zeros((len(poses), 3, 3))
         R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = c, s, -s, c, 1.0
-        out[name] = trajectory(name, drive.times[n][wanted], poses, R @ C @ R.mT)
+        out[name] = trajectory(name, keyframes.times[n][wanted], poses, R @ C @ R.mT)
     return out, seconds
 
 

@@ -432,7 +432,7 @@ class RangeBearing:
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class Keyframes:
     """Keyframes of a team with their odometry and measurements.
 
     Parameters
@@ -458,4 +458,4 @@ class Drive:
 
     def __repr__(self) -> str:
         counts = f"{sum(map(len, self.times))} keyframes, {len(self.measured)} measurements"
-        return f"Drive({len(self.robots)} robots, {len(self.landmarks)} landmarks, {counts})"
+        return f"Keyframes({len(self.robots)} robots, {len(self.landmarks)} landmarks, {counts})"

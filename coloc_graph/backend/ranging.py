@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.measurements import Drive, Node, RangeBearing
+from coloc_graph.measurements import Keyframes, Node, RangeBearing
 
 Array = NDArray[np.float64]
 
@@ -18,7 +18,7 @@ class RangingProblem:
 
     Parameters
     ----------
-    keyframes : Drive
+    keyframes : Keyframes
         Keyframes, steps between them, and ranges and bearings.
     numbers : mapping of str to (n,) int
         By robot, the keyframe of each pose of its trajectory.
@@ -32,7 +32,7 @@ class RangingProblem:
         The world is the map of the landmarks; otherwise it is the first robot's first pose.
     """
 
-    keyframes: Drive
+    keyframes: Keyframes
     numbers: Mapping[str, NDArray[np.int64]]
     residuals: Array
     outliers: NDArray[np.bool_]

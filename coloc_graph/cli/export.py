@@ -57,11 +57,15 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--truth applies to tum and ros2, not to {args.format}: leave it out")
     if args.layout and args.format != "foxglove":
         raise InputError(f"--layout applies to foxglove, not to {args.format}: leave it out")
-    if args.format in ("pyfg", "jrl"):
+    if args.format in ("pyfg", "jrl") and Path(args.result).is_file():
         return _range_graph(args, out)
     if Path(args.result).suffix in (".pyfg", ".jrl", ".g2o") and Path(args.result).is_file():
         raise InputError(f"{args.result} is exported to pyfg or jrl only: give the result of `coloc solve`")
     result = read_result(args.result)
+    if result.is_ranging and args.format in ("g2o", "gtsam", "dot", "pyfg", "jrl"):
+        return _ranging(result, args.format, out)
+    if args.format in ("pyfg", "jrl"):
+        return _range_graph(args, out, result)
     if args.truth and args.format == "tum":
         return _truth(result, args.run_path, out)
     if args.format == "foxglove":
@@ -83,11 +87,6 @@ def run(args: argparse.Namespace) -> int:
         return 0
     files = {"tum": "trajectories", "gtsam": GTSAM_FACTORS, "g2o": "graph.g2o", "dot": "graph.dot"}
     source = result.path / files[args.format]
-    if result.is_ranging and args.format in ("g2o", "gtsam", "dot"):
-        raise InputError(
-            f"{result.path} is the result of a ranging run, whose measurements are not exported to {args.format} yet: "
-            "export tum or ros2"
-        )
     if not source.exists():
         raise InputError(f"{result.path} does not contain {source.name}: solve the run again with this version")
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -109,24 +108,59 @@ def _left_out(pose_graph: Path) -> str:
     return "".join(f"; {line.removeprefix('# ')}" for line in lines if line.startswith("# left out: "))
 
 
-def _range_graph(args: argparse.Namespace, out: Path) -> int:
+def _ranging(result: "Result", form: str, out: Path) -> int:
+    """Write the graph of a ranging run."""
+    import shutil
+
+    from coloc_graph.errors import InputError
+    from coloc_graph.exchange.jrl import read_jrl
+    from coloc_graph.exchange.pyfg import write_pyfg
+    from coloc_graph.exchange.range_graph_files import letters_of
+    from coloc_graph.exchange.ranging_graph import planar_dot, planar_g2o, planar_gtsam, without_bearings
+    from coloc_graph.results.folder import RANGING_GRAPH
+    from coloc_graph.run.atomic_file import write_atomically
+
+    source = result.path / RANGING_GRAPH
+    if not source.exists():
+        raise InputError(f"{result.path} does not contain {source.name}: solve the run again with this version")
+    graph, team = read_jrl(source), result.config.team
+    robots = {letter: robot for robot, letter in letters_of(team.names).items()}
+    landmarks = [one.name for one in team.landmarks]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    said = ""
+    match form:
+        case "jrl":
+            write_atomically(out, source.read_bytes())
+        case "pyfg":
+            graph, said = without_bearings(graph)
+            write_pyfg(graph, out)
+        case "g2o":
+            text, said = planar_g2o(graph, robots)
+            write_atomically(out, text)
+        case "dot":
+            write_atomically(out, planar_dot(graph, robots, landmarks))
+            said = "one box is all poses of a robot, and the edges are counts"
+        case "gtsam":
+            if out.is_dir():
+                shutil.rmtree(out)  # an earlier export, as was checked
+            out.mkdir()
+            for name, text in planar_gtsam(graph, robots, landmarks).items():
+                (out / name).write_text(text, encoding="utf-8")
+    names = ", ".join(f"{letter} = {robot}" for letter, robot in robots.items()) if form in ("pyfg", "jrl") else ""
+    print("; ".join(part for part in (f"wrote {out}", said, names and f"robots {names}") if part))
+    return 0
+
+
+def _range_graph(args: argparse.Namespace, out: Path, result: "Result | None" = None) -> int:
     """Write the graph of a result, or of a file, in a format of the field's benchmarks."""
     from coloc_graph.cli.printing import counted
-    from coloc_graph.errors import InputError
     from coloc_graph.exchange.g2o import read_g2o
     from coloc_graph.exchange.range_graph_files import WRITERS, of_pose_graph, read_range_graph
-    from coloc_graph.results.folder import read_result
 
     robots = ""
-    if Path(args.result).is_file():
+    if result is None:
         graph = read_range_graph(args.result)
     else:
-        result = read_result(args.result)
-        if result.is_ranging:
-            raise InputError(
-                f"{result.path} is the result of a ranging run, whose measurements are not exported to {args.format} "
-                "yet: export tum or ros2"
-            )
         times = {
             (robot, int(stance)): float(time)
             for robot, one in result.trajectories.items()

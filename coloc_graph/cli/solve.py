@@ -43,6 +43,13 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     )
     command.add_argument("--incremental", action="store_true", help="solve stance by stance, as online")
     command.add_argument(
+        "--lag",
+        type=float,
+        metavar="N",
+        help="with --incremental: number of last stances, or seconds of a ranging run, whose poses stay variables "
+        "(default: 50 stances, 40 s)",
+    )
+    command.add_argument(
         "--tracking",
         nargs="+",
         metavar="NAME=VALUE",
@@ -175,6 +182,7 @@ def _options(args: argparse.Namespace) -> "tuple[SolveOptions, Team | None]":
         odometry=options.odometry and not args.without_odometry,
         incremental=options.incremental or args.incremental,
         between_robots=options.between_robots and not args.without_robots,
+        lag=options.lag if args.lag is None else args.lag,
     )
     if args.scale is not None or args.tracking:
         frontend = options.resolved().frontend

@@ -13,6 +13,7 @@ OF_RUNS = (
     "method",
     "scale",
     "incremental",
+    "lag",
     "without_odometry",
     "without_robots",
     "processes",

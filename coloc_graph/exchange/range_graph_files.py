@@ -1,7 +1,7 @@
 """Files of factor graphs by their endings, and pose graphs of g2o as `RangeGraph`."""
 
 import string
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +77,14 @@ def of_pose_graph(graph: G2oGraph, times: Mapping[Node, float]) -> tuple[RangeGr
         known = {name: known.get(name, min(known.values())) for name in names.values()}
         relatives = [one if one.time else _at(one, min(known.values())) for one in relatives]
     return RangeGraph(graph.planar, known, {}, initial, relatives=tuple(relatives)), letters
+
+
+def letters_of(robots: Iterable[str]) -> dict[str, str]:
+    """Return a letter for each robot, its own first one where that is free."""
+    letters: dict[str, str] = {}
+    for robot in robots:
+        letters[robot] = _free(robot, letters)
+    return letters
 
 
 def _at(one: RelativeValue, time: float) -> RelativeValue:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.frontend.sensor_delay import SensorDelay, sensor_delay
-from coloc_graph.measurements import MAX_KEYFRAME_INTERVAL, Drive, RangeBearings, Steps
+from coloc_graph.measurements import MAX_KEYFRAME_INTERVAL, Keyframes, RangeBearings, Steps
 from coloc_graph.run import OdometrySample, Ranges, Run
 from coloc_graph.team import Ranging, Wheels
 
@@ -40,7 +40,7 @@ class _Path:
         return np.stack([np.interp(times, self.times, column) for column in self.variances.T], axis=-1)
 
 
-def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
+def keyframes_of(run: Run, *, between_robots: bool = True) -> Keyframes:
     """Make the keyframes of a run with ranges and bearings.
 
     Parameters
@@ -52,7 +52,7 @@ def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
 
     Returns
     -------
-    Drive
+    Keyframes
         Keyframes with odometry between them, the measurements, and warnings.
 
     Raises
@@ -102,7 +102,7 @@ def keyframes_of(run: Run, *, between_robots: bool = True) -> Drive:
     for name, path, at in zip(names, paths, times, strict=True):
         wheels = run.team[name].wheels or Wheels()
         steps.append(_steps(path, at, wheels) if path is not None else _no_steps())
-    return Drive(
+    return Keyframes(
         robots=names,
         landmarks=landmarks,
         times=tuple(times),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from coloc_graph.backend import Estimate, PoseGraph, chain, diagnose, joint, smooth
-from coloc_graph.backend.planar import Latest, optimise_keyframes
+from coloc_graph.backend.planar import LAG, IncrementalKeyframes, Latest, optimise_keyframes
 from coloc_graph.errors import EstimationError
 from coloc_graph.frontend import PairMeasurement, UnusedSighting, describe_unused, share_clock_offsets
 from coloc_graph.frontend.keyframes import keyframes_of
@@ -34,7 +34,6 @@ from coloc_graph.pipeline.explanations import (
 from coloc_graph.pipeline.incremental import (
     EnteredStance,
     OdometryAndSightings,
-    RangingSolver,
     StanceSolver,
     measure_stance,
 )
@@ -322,19 +321,20 @@ def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_up
     started = time.perf_counter()
     keyframes = keyframes_of(run, between_robots=options.between_robots)
     seconds = time.perf_counter() - started
-    updates: tuple[float, ...] = ()
+    updates: list[float] = []
     online: Mapping[str, Trajectory] = {}
     if options.incremental:
-        solver = RangingSolver(run.team, keyframes)
-        begin = solver.times[0]
-        for time_now in solver.times:
-            latest = solver.enter(time_now)
+        incremental = IncrementalKeyframes(run.team, keyframes, lag=LAG if options.lag is None else options.lag)
+        begin, end = (incremental.times[n] for n in (0, -1))
+        for until in incremental.times:
+            before = time.perf_counter()
+            latest = incremental.add(until)
+            updates.append(time.perf_counter() - before)
             if on_update is not None:
                 on_update(latest)
             if progress is not None:
-                progress(round(time_now - begin), round(solver.times[-1] - begin) or 1)
-        estimate = solver.estimate()
-        updates, online = tuple(solver.seconds), solver.online
+                progress(round(until - begin), round(end - begin) or 1)
+        estimate, online = incremental.estimate(), incremental.online
     else:
         estimate = optimise_keyframes(run.team, keyframes)
     if not estimate.trajectories:
@@ -346,7 +346,7 @@ def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_up
         "it must be measured together with two robots or landmarks of known positions",
     )
     warnings = [*keyframes.warnings, *warnings_of_ranges(estimate)]
-    return _Solved(estimate, warnings, seconds, (), updates, online, missing)
+    return _Solved(estimate, warnings, seconds, (), tuple(updates), online, missing)
 
 
 def _warnings(

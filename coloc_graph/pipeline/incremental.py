@@ -1,17 +1,15 @@
 """Incremental solving stance by stance, of a logged run or of a team in the field."""
 
-import math
 import time
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from coloc_graph.backend import Estimate, Estimator, StanceEstimate
+from coloc_graph.backend import Estimator, StanceEstimate
+from coloc_graph.backend.fixed_lag import LAG
 from coloc_graph.backend.graph import PoseKeys, slips_of
 from coloc_graph.backend.landmarks import landmarks_of
-from coloc_graph.backend.planar import IncrementalKeyframes, Latest
-from coloc_graph.backend.planar.incremental import UPDATE_PERIOD
 from coloc_graph.errors import ColocError
 from coloc_graph.frontend import (
     PairMeasurement,
@@ -30,8 +28,7 @@ from coloc_graph.frontend import (
 from coloc_graph.frontend.clock_evidence import ClockEvidence
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.frontend.stance_ranges import StanceRanges, merged
-from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.measurements import Drive, Measurement, Sighting
+from coloc_graph.measurements import Measurement, Sighting
 from coloc_graph.pipeline.clocks import CorrectedRun, RunClocks, run_clocks, stance_evidence
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.pipeline.ranges import instants_in, of_targets, place_ranges, standing_of
@@ -190,8 +187,9 @@ class StanceSolver:
         self.options = (options or SolveOptions()).resolved()
         self.team = team
         robot_models = self.options.robot_models(team) or None
+        lag = LAG if self.options.lag is None else int(self.options.lag)
         self.estimator = Estimator(
-            team.reference, team.names, team.floor, slips_of(team), robot_models, landmarks_of(team)
+            team.reference, team.names, team.floor, slips_of(team), robot_models, landmarks_of(team), lag
         )
         #: All pairs of all stances, unusable ones included.
         self.measured: tuple[PairMeasurement, ...] = ()
@@ -374,30 +372,3 @@ class StanceSolver:
         self._history = [one for one in self._history if one[0].index != index]
         self.measured = tuple(one for one in self.measured if one.homography.stance != index)
         self.seconds.pop()
-
-
-class RangingSolver:
-    """Incremental solver of a ranging run, in the order of time."""
-
-    def __init__(self, team: Team, keyframes: Drive) -> None:
-        self._incremental = IncrementalKeyframes(team, keyframes)
-        begin = min(float(times[0]) for times in keyframes.times if len(times))
-        end = max(float(times[-1]) for times in keyframes.times if len(times))
-        #: Times of the updates that take in all measurements [UTC s].
-        self.times = tuple(begin + n * UPDATE_PERIOD for n in range(1, math.ceil((end - begin) / UPDATE_PERIOD) + 2))
-        #: Poses as they were estimated at their times, by robot; filled by `estimate`.
-        self.online: Mapping[str, Trajectory] = {}
-        #: Duration of each step [s].
-        self.seconds: list[float] = []
-
-    def enter(self, until: float) -> Latest:
-        """Add all measurements before a time [UTC s]; return the newest poses."""
-        started = time.perf_counter()
-        latest = self._incremental.advance(until)
-        self.seconds.append(time.perf_counter() - started)
-        return latest
-
-    def estimate(self) -> Estimate:
-        """Return the estimate of all measurements; once, at the end."""
-        estimate, self.online = self._incremental.finish()
-        return estimate

@@ -1,5 +1,6 @@
 """Options of a solve: `SolveOptions`."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -32,6 +33,9 @@ class SolveOptions:
         Estimate in the order of time, as a team in the field would.
     between_robots : bool
         Of a run with ranges: use ranges between robots too, not only those to landmarks.
+    lag : float, optional
+        Of an incremental estimate: number of last stances, or seconds of a ranging run, whose poses stay variables; so
+        an update costs as much in a run of any length. The default is 50 stances, or 40 s.
     """
 
     method: Method | None = None
@@ -39,12 +43,17 @@ class SolveOptions:
     odometry: bool = True
     incremental: bool = False
     between_robots: bool = True
+    lag: float | None = None
 
     def __post_init__(self) -> None:
         if self.method is not None and self.method not in METHODS:
             raise InputError(f"there is no method `{self.method}`: choose one of {', '.join(METHODS)}")
         if self.incremental and self.method == "chain":
             raise InputError("method `chain` cannot be incremental: leave out `incremental`, or use `joint`")
+        if self.lag is not None and not self.incremental:
+            raise InputError("a lag applies to incremental estimates only: give `incremental` too, or leave it out")
+        if self.lag is not None and not 1 <= self.lag < math.inf:
+            raise InputError(f"a lag of {self.lag:g} leaves no pose to estimate: give 1 (stance or second) or more")
 
     def resolved(self) -> "SolveOptions":
         """Return the options of a run with stances, with the default method and front end where none is chosen."""

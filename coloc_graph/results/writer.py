@@ -18,7 +18,9 @@ from coloc_graph.evaluation import Accuracy, accuracy_json, align, evaluate, usu
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.exchange.gtsam_files import write_gtsam
+from coloc_graph.exchange.jrl import write_jrl
 from coloc_graph.exchange.landmarks import landmark_rows, landmarks_csv, map_row
+from coloc_graph.exchange.ranging_graph import ranging_graph
 from coloc_graph.exchange.tum import write_tum
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.solution import Solution
@@ -28,6 +30,7 @@ from coloc_graph.results.folder import (
     GTSAM_FACTORS,
     LANDMARKS,
     MEASUREMENTS,
+    RANGING_GRAPH,
     atomic_result,
     write_summary,
 )
@@ -124,7 +127,9 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
             (part / "online").mkdir()
             for robot, trajectory in solution.online.items():
                 write_tum(trajectory, part / "online" / f"{robot}.tum")
-        if not estimate.is_ranging:
+        if estimate.is_ranging:
+            write_jrl(ranging_graph(estimate, solution.run.team), part / RANGING_GRAPH)
+        else:
             write_g2o(estimate, part / "graph.g2o")
             write_gtsam(estimate, part / GTSAM_FACTORS)
             (part / "graph.dot").write_text(to_dot(estimate.graph), encoding="utf-8")

@@ -1,6 +1,8 @@
 import json
+import re
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -10,12 +12,16 @@ from msgspec.structs import replace as with_fields
 
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar import IncrementalKeyframes, optimise_keyframes
-from coloc_graph.backend.planar.factors import DriveFactors, State
+from coloc_graph.backend.planar.factors import KeyframeFactors, State
 from coloc_graph.backend.planar.filter import Models, filter_forward
 from coloc_graph.backend.planar.initial_pose import RigidAlignmentRansac
 from coloc_graph.cli import main
 from coloc_graph.errors import EstimationError, InputError, RunError
+from coloc_graph.exchange.g2o import read_g2o
 from coloc_graph.exchange.mrclam import import_mrclam
+from coloc_graph.exchange.pyfg import read_pyfg
+from coloc_graph.exchange.range_graph import factors_of, key_of, values_of
+from coloc_graph.exchange.ranging_graph import ranging_graph
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.results.writer import assess, assess_online, write_result
@@ -143,12 +149,12 @@ def test_a_map_that_lies_elsewhere_moves_the_estimate_with_it_and_nothing_else(f
 
 
 def test_what_was_read_wrong_is_doubted_and_moves_nothing(run, batch):
-    drive = batch.estimate.ranging.keyframes
-    target, robots = drive.measured.target.copy(), len(drive.robots)
-    landmarks = np.flatnonzero((target >= robots) & (drive.measured.share[:, 0] > 0.3))
+    keyframes = batch.estimate.ranging.keyframes
+    target, robots = keyframes.measured.target.copy(), len(keyframes.robots)
+    landmarks = np.flatnonzero((target >= robots) & (keyframes.measured.share[:, 0] > 0.3))
     wrong = landmarks[10::8]
-    target[wrong] = robots + (target[wrong] - robots + 3) % len(drive.landmarks)
-    estimate = optimise_keyframes(run.team, replace(drive, measured=replace(drive.measured, target=target)))
+    target[wrong] = robots + (target[wrong] - robots + 3) % len(keyframes.landmarks)
+    estimate = optimise_keyframes(run.team, replace(keyframes, measured=replace(keyframes.measured, target=target)))
     assert (
         set(wrong)
         == set(np.flatnonzero(estimate.ranging.outliers))
@@ -161,8 +167,8 @@ def test_what_was_read_wrong_is_doubted_and_moves_nothing(run, batch):
 
 
 def test_the_filter_needs_no_first_poses(run):
-    drive = keyframes_of(run)
-    filtered = filter_forward(run.team, drive)
+    keyframes = keyframes_of(run)
+    filtered = filter_forward(run.team, keyframes)
     assert set(filtered.placed_at) == {0, 1, 2}
     assert max(filtered.placed_at.values()) < 20
     assert filtered.used.mean() > 0.9
@@ -183,11 +189,11 @@ def test_that_a_range_is_a_depth_and_longer_to_robots_is_found_out(run, batch):
 @pytest.fixture(scope="module")
 def somewhere(unmapped):
     """Factors without a map, and a state that is far from their optimum."""
-    drive = keyframes_of(unmapped)
-    factors = DriveFactors(drive, Models(unmapped.team, drive))
+    keyframes = keyframes_of(unmapped)
+    factors = KeyframeFactors(keyframes, Models(unmapped.team, keyframes))
     rng = np.random.default_rng(0)
     shared = rng.normal(size=len(factors.free)) * 0.05
-    factors.landmarks(shared)[:] += 3 + rng.normal(size=(len(drive.landmarks), 2))
+    factors.landmarks(shared)[:] += 3 + rng.normal(size=(len(keyframes.landmarks), 2))
     return factors, State(rng.normal(size=(len(factors), 3)), shared)
 
 
@@ -278,13 +284,13 @@ def test_factors_that_leave_a_variable_open_are_one_sentence(somewhere):
 
 
 def test_what_has_left_the_window_is_not_forgotten(run, batch):
-    drive = keyframes_of(run)
-    one = IncrementalKeyframes(run.team, drive, lag=10.0, calibrating=12.0)
-    start = min(times[0] for times in drive.times)
+    keyframes = keyframes_of(run)
+    one = IncrementalKeyframes(run.team, keyframes, lag=10.0, calibrating=12.0)
+    start = min(times[0] for times in keyframes.times)
     for second in range(1, 42):
-        latest = one.advance(start + second)
+        latest = one.add(start + second)
     assert set(latest.poses) == set(run.team.names)
-    estimate, _ = one.finish()
+    estimate = one.estimate()
     for robot in run.team.names:
         # of wheels and sensors as much is known as in batch
         for kind in ("wheels", "ranging"):
@@ -298,8 +304,8 @@ def test_what_has_left_the_window_is_not_forgotten(run, batch):
 
 
 def test_errors_that_last_count_by_how_long_they_do(run):
-    drive = keyframes_of(run)
-    m, memory = drive.measured, run.team["R1"].ranging.range_memory
+    keyframes = keyframes_of(run)
+    m, memory = keyframes.measured, run.team["R1"].ranging.range_memory
     pair = np.flatnonzero((m.robot == 0) & (m.target == m.target[m.robot == 0][0]))
     assert m.share[pair[0]].tolist() == [1.0, 1.0]
     gaps = np.diff(m.time[pair])
@@ -370,7 +376,10 @@ def test_a_robot_needs_a_camera_or_a_sensor_of_ranges():
 
 def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     out = tmp_path / "result"
-    assert main(["solve", str(run.path), "--out", str(out), "--incremental"]) == 0
+    assert main(["solve", str(run.path), "--out", str(out), "--lag", "30"]) == 2
+    assert "a lag applies to incremental estimates only" in capsys.readouterr().err
+    assert main(["solve", str(run.path), "--out", str(out), "--incremental", "--lag", "30"]) == 0
+    assert "lag = 30" in (out / "config.toml").read_text()
     printed = capsys.readouterr().out
     assert "RMS position" in printed and "3 robots" not in printed
     summary = json.loads((out / "summary.json").read_text())
@@ -385,7 +394,7 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     assert len(rows) == 1 + summary["measurements"]["used"] + summary["measurements"]["rejected"]
     assert {one.name for one in out.iterdir()} == {
         *("summary.json", "config.toml", "team.toml", "report.html", "landmarks.csv", "measurements.csv"),
-        *("trajectories", "online"),
+        *("trajectories", "online", "graph.jrl"),
     }
     report = (out / "report.html").read_text()
     assert "the map of the landmarks" in report
@@ -394,8 +403,19 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     assert json.loads(capsys.readouterr().out)["ate_m"] == pytest.approx(summary["accuracy"]["ate_m"])
     assert main(["solve", str(run.path), "--out", str(out), "--method", "chain"]) == 2
     capsys.readouterr()
-    assert main(["export", "g2o", str(out), "--out", str(tmp_path / "x.g2o")]) == 2
-    assert "is the result of a ranging run, whose measurements are not exported to g2o" in capsys.readouterr().err
+    used = summary["measurements"]["used"]
+    for form, lost in (
+        ("g2o", f"left out: {used} ranges and bearings and {len(LANDMARKS)} landmarks"),
+        ("pyfg", " bearings between robots, which PyFG cannot express"),
+        *(("dot", "one box is all poses of a robot"), ("jrl", "robots R = R1"), ("gtsam", "")),
+    ):
+        assert main(["export", form, str(out), "--out", str(tmp_path / f"x.{form}")]) == 0
+        assert lost in capsys.readouterr().out
+    poses = read_g2o(tmp_path / "x.g2o")
+    assert poses.values.size() == summary["poses"] and len(poses.ends) == summary["poses"] - 3
+    assert sum(int(n) for n in re.findall(r'-- .*label="(\d+)"', (tmp_path / "x.dot").read_text())) == used
+    graph = read_pyfg(tmp_path / "x.pyfg")
+    assert len(graph.ranges) + len(graph.relatives) - len(poses.ends) == used
     assert main(["export", "ros2", str(out), "--out", str(tmp_path / "x.mcap")]) == 0
     assert main(["export", "foxglove", str(out), "--out", str(tmp_path / "f.mcap")]) == 0
     with (tmp_path / "f.mcap").open("rb") as file:
@@ -415,6 +435,17 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     (out / "measurements.csv").write_text("\n".join([*rows[:9], rows[9].replace(rows[9].split(",")[3], "soon")]) + "\n")
     assert main(["view", str(out), "--export", str(page), "--force"]) == 2
     assert "measurements.csv is damaged" in capsys.readouterr().err
+
+
+def test_factors_for_gtsam_have_the_estimate_as_optimum(run, batch):
+    graph = ranging_graph(batch.estimate, run.team)
+    start = values_of(graph.initial)
+    found = gtsam.LevenbergMarquardtOptimizer(factors_of(graph), start).optimize()
+    for robot, letter in zip(run.team.names, "Rab", strict=True):
+        trajectory = batch.estimate.trajectories[robot]
+        solved = np.array([found.atPose2(key_of(f"{letter}{n}")).translation() for n in range(len(trajectory))])
+        off = np.hypot(*(solved - trajectory.positions[:, :2]).T)
+        assert np.all(off < 0.02 * np.sqrt(trajectory.covariances[:, 3, 3]))
 
 
 def test_the_viewer_shows_where_each_was_and_what_it_measured(run, batch, tmp_path):

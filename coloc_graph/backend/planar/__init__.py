@@ -5,9 +5,10 @@
 
 from coloc_graph.backend.planar.batch import optimise_keyframes
 from coloc_graph.backend.planar.filter import Filtered, filter_forward
-from coloc_graph.backend.planar.incremental import IncrementalKeyframes, Latest
+from coloc_graph.backend.planar.incremental import LAG, IncrementalKeyframes, Latest
 
 __all__ = [
+    "LAG",
     "Filtered",
     "IncrementalKeyframes",
     "Latest",

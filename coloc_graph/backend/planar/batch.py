@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.linear_system import Optimum, Rows, gauss_newton
 from coloc_graph.backend.marginals import Marginals
-from coloc_graph.backend.planar.factors import DriveFactors, State, robust
+from coloc_graph.backend.planar.factors import KeyframeFactors, State, robust
 from coloc_graph.backend.planar.filter import Filtered, Models, filter_forward
 from coloc_graph.backend.planar.summary import OUTLIER, Found, measured_off, ranging_estimate
 from coloc_graph.backend.sensor_calibration import SensorErrors
 from coloc_graph.errors import EstimationError
-from coloc_graph.measurements import Drive
+from coloc_graph.measurements import Keyframes
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
@@ -26,14 +26,14 @@ MIN_REDUNDANCY = 0.3  # share of squared residuals that the fit leaves, for an e
 NOISE_RANGE = (0.2, 5.0)  # estimated noise relative to that stated
 
 
-def optimise_keyframes(team: Team, drive: Drive, *, calibrate_noise: bool = True) -> Estimate:
+def optimise_keyframes(team: Team, keyframes: Keyframes, *, calibrate_noise: bool = True) -> Estimate:
     """Estimate everything together, given all odometry and measurements; a filter gives the initial values.
 
     Parameters
     ----------
     team : Team
         The team.
-    drive : Drive
+    keyframes : Keyframes
         Keyframes, odometry and measurements.
     calibrate_noise : bool
         Scale the stated noise of ranges and bearings to the residuals, by robot and kind. That of odometry is as
@@ -44,21 +44,21 @@ def optimise_keyframes(team: Team, drive: Drive, *, calibrate_noise: bool = True
     EstimationError
         No robot can be localised, or the optimisation does not converge.
     """
-    filtered = filter_forward(team, drive)
-    models = Models(team, drive)
+    filtered = filter_forward(team, keyframes)
+    models = Models(team, keyframes)
     if not filtered.placed_at:
         raise EstimationError(
             "no robot can be localised: a robot must observe at least two landmarks with known positions, several times"
         )
-    factors = DriveFactors(drive, models)
+    factors = KeyframeFactors(keyframes, models)
     fit = _fitted(factors, _start(filtered, factors))
     iterations, absorbed = fit.optimum.iterations, None
     if calibrate_noise:
         noise, absorbed = _noise(factors, fit)
-        factors = DriveFactors(drive, models, noise)
+        factors = KeyframeFactors(keyframes, models, noise)
         fit = _fitted(factors, fit.state)
         iterations += fit.optimum.iterations
-    taken = np.zeros(len(drive.measured), bool)
+    taken = np.zeros(len(keyframes.measured), bool)
     taken[fit.problem.measured] = True
     return ranging_estimate(factors, _found(factors, filtered, fit), taken, iterations, absorbed)
 
@@ -70,7 +70,7 @@ class _Problem:
     `gauge` is the pose that defines the world, with its value, if no landmark does.
     """
 
-    factors: DriveFactors
+    factors: KeyframeFactors
     poses: Index
     steps: Index
     measured: Index
@@ -103,9 +103,9 @@ class _Fit:
         return Marginals(self.optimum.system.graph, self.problem.factors.keys.size, self.optimum.ordering)
 
 
-def _start(filtered: Filtered, factors: DriveFactors) -> State:
+def _start(filtered: Filtered, factors: KeyframeFactors) -> State:
     """Return the initial values, by the filter."""
-    poses = np.concatenate(filtered.whole(factors.drive, factors.models))
+    poses = np.concatenate(filtered.whole(factors.keyframes, factors.models))
     shared = factors.start()
     factors.wheels(shared)[:] = filtered.wheels
     factors.ranging(shared)[:] = filtered.ranging
@@ -114,7 +114,7 @@ def _start(filtered: Filtered, factors: DriveFactors) -> State:
     return State(poses, np.where(factors.free, shared, factors.start()))
 
 
-def _posed(factors: DriveFactors, state: State) -> _Problem:
+def _posed(factors: KeyframeFactors, state: State) -> _Problem:
     placed = np.isfinite(state.poses[:, 0])
     poses = np.flatnonzero(placed)
     last = factors.first[1:][np.diff(factors.first) > 0] - 1
@@ -125,7 +125,7 @@ def _posed(factors: DriveFactors, state: State) -> _Problem:
     return _Problem(factors, poses, np.setdiff1d(poses, last), np.flatnonzero(ends), gauge)
 
 
-def _fitted(factors: DriveFactors, state: State) -> _Fit:
+def _fitted(factors: KeyframeFactors, state: State) -> _Fit:
     """Find the optimum near a state; Levenberg-Marquardt is no better here."""
     problem = _posed(factors, state)
     tolerance = COST_TOLERANCE_PER_POSE * len(factors)
@@ -141,36 +141,36 @@ def in_body(poses: Array, covariances: Array) -> Array:
 
 
 def found_landmarks(
-    factors: DriveFactors, shared: Array, C: Array, there: Sequence[int]
+    factors: KeyframeFactors, shared: Array, C: Array, there: Sequence[int]
 ) -> dict[int, tuple[Array, Array]]:
     """Return positions and covariances of the landmarks `there`, and of exact ones."""
     return {
         n: (factors.landmarks(shared)[n], factors.landmark_covariance(n, C))
-        for n in range(len(factors.drive.landmarks))
+        for n in range(len(factors.keyframes.landmarks))
         if n in there or factors.is_exact(n)
     }
 
 
-def _found(factors: DriveFactors, filtered: Filtered, fit: _Fit) -> Found:
+def _found(factors: KeyframeFactors, filtered: Filtered, fit: _Fit) -> Found:
     state, poses = fit.state, fit.problem.poses
     covariances = np.full((len(factors), 3, 3), np.nan)
     covariances[poses] = in_body(state.poses[poses], np.array([fit.marginals.covariance(n) for n in poses.tolist()]))
     C = factors.shared_covariance(fit.marginals)
     errors = [
         factors.errors_in(robot, state.shared, C) if robot in filtered.placed_at else SensorErrors(None, None)
-        for robot in range(len(factors.drive.robots))
+        for robot in range(len(factors.keyframes.robots))
     ]
     seen = np.flatnonzero(np.isfinite(filtered.landmarks[:, 0])).tolist()
     return Found(state, covariances, found_landmarks(factors, state.shared, C, seen), errors)
 
 
-def _noise(factors: DriveFactors, fit: _Fit) -> tuple[Array, float]:
+def _noise(factors: KeyframeFactors, fit: _Fit) -> tuple[Array, float]:
     """Return factors (robots, 2) on the sigmas of ranges and bearings, and the absorbed degrees of freedom.
 
     The fit absorbs a part of each squared residual. Of a measurement with a share s, of which it absorbs h, it leaves
     s (1 - h) degrees of freedom, and not s - h, since correlated errors are not fitted as independent ones would be.
     """
-    m, index = factors.drive.measured, fit.problem.measured
+    m, index = factors.keyframes.measured, fit.problem.measured
     taken = _taken(fit)
     share, robots = m.share[index], m.robot[index]
     off = measured_off(factors, fit.state)[index]

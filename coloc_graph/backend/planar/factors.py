@@ -17,7 +17,7 @@ from coloc_graph.backend.planar.filter import Models
 from coloc_graph.backend.sensor_calibration import SensorErrors
 from coloc_graph.backend.sensor_model import RANGING, WHEELS
 from coloc_graph.geometry.se2 import wrap
-from coloc_graph.measurements import Drive
+from coloc_graph.measurements import Keyframes
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -36,7 +36,7 @@ class State:
     shared: Array
 
 
-class DriveFactors:
+class KeyframeFactors:
     """Factors of a ranging run. `noise` (robots, 2) multiplies the standard deviations of ranges and bearings.
 
     `first` (robots + 1,) is each robot's first pose, `times` (n,) are the times of all. `observer` (m,) and `seen` (m,)
@@ -44,14 +44,14 @@ class DriveFactors:
     that are estimated.
     """
 
-    def __init__(self, drive: Drive, models: Models, noise: Array | None = None) -> None:
-        self.drive, self.models = drive, models
-        robots, landmarks = len(drive.robots), len(drive.landmarks)
+    def __init__(self, keyframes: Keyframes, models: Models, noise: Array | None = None) -> None:
+        self.keyframes, self.models = keyframes, models
+        robots, landmarks = len(keyframes.robots), len(keyframes.landmarks)
         self.noise = np.ones((robots, 2)) if noise is None else noise
-        self.first: Index = np.cumsum([0, *map(len, drive.times)])
-        self.times = np.concatenate(drive.times)
+        self.first: Index = np.cumsum([0, *map(len, keyframes.times)])
+        self.times = np.concatenate(keyframes.times)
         self.robot: Index = np.repeat(np.arange(robots), np.diff(self.first))
-        m = drive.measured
+        m = keyframes.measured
         self.of_robot = m.target < robots
         self.observer: Index = self.first[m.robot] + m.keyframe
         self.seen: Index = np.where(self.of_robot, self.first[np.minimum(m.target, robots)] + m.target_keyframe, -1)
@@ -133,11 +133,11 @@ class DriveFactors:
 
     def measured(self, state: State, index: Index) -> Rows:
         """Linearise some ranges and bearings (n,), weighted by their shares of new information."""
-        m = self.drive.measured
+        m = self.keyframes.measured
         robots, observer, of_robot = m.robot[index], self.observer[index], self.of_robot[index]
         seen, landmark = np.maximum(self.seen[index], 0), self._landmark[index]
         pose, there = state.poses[observer], state.poses[seen, :2]
-        if len(self.drive.landmarks):
+        if len(self.keyframes.landmarks):
             there = np.where(of_robot[:, None], there, self.landmarks(state.shared)[landmark])
         c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
         dx, dy = (there - pose[:, :2]).T
@@ -160,7 +160,7 @@ class DriveFactors:
     @cached_property
     def keys(self) -> Keys:
         """Keys of all variables: poses by their number, then wheels and sensors by robot, then landmarks."""
-        robots, landmarks = len(self.drive.robots), len(self.drive.landmarks)
+        robots, landmarks = len(self.keyframes.robots), len(self.keyframes.landmarks)
         sizes = np.repeat([3, WHEELS, RANGING, 2], [len(self), robots, robots, landmarks])
         return Keys(sizes, np.concatenate([np.ones(3 * len(self), bool), self.free]))
 

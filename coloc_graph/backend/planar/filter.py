@@ -21,7 +21,7 @@ from coloc_graph.backend.sensor_model import (
     WheelsModel,
 )
 from coloc_graph.geometry.se2 import between, compose, wrap
-from coloc_graph.measurements import Drive
+from coloc_graph.measurements import Keyframes
 from coloc_graph.team import Ranging, Team, Wheels
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ class Filtered:
     used: NDArray[np.bool_]
     placed_at: dict[int, int] = field(default_factory=dict)
 
-    def whole(self, drive: Drive, models: "Models") -> list[Array]:
+    def whole(self, keyframes: Keyframes, models: "Models") -> list[Array]:
         """Return the poses of all keyframes, those before a robot's initial pose by odometry backwards."""
         out = []
         for robot, poses in enumerate(self.poses):
@@ -74,11 +74,11 @@ class Filtered:
 class Models:
     """Wheels and sensors of a team, with the tolerances of their errors."""
 
-    def __init__(self, team: Team, drive: Drive) -> None:
+    def __init__(self, team: Team, keyframes: Keyframes) -> None:
         self.team = team
-        robots = [team[name] for name in drive.robots]
+        robots = [team[name] for name in keyframes.robots]
         self.wheels = [
-            WheelsModel(steps, robot.wheels or Wheels()) for robot, steps in zip(robots, drive.steps, strict=True)
+            WheelsModel(steps, robot.wheels or Wheels()) for robot, steps in zip(robots, keyframes.steps, strict=True)
         ]
         self.sensors = Sensors([robot.ranging or Ranging(range_sigma=1.0, bearing_sigma_deg=1.0) for robot in robots])
         self.wheels_sigmas = np.array(
@@ -86,7 +86,7 @@ class Models:
         )
         self.ranging_sigmas = self.sensors.tolerances
         positions = {one.name: one for one in team.landmarks}
-        known = [positions[name] for name in drive.landmarks]
+        known = [positions[name] for name in keyframes.landmarks]
         self.map = np.array([one.position or (math.nan, math.nan) for one in known], float).reshape(-1, 2)
         self.map_sigmas = np.array([one.position_sigma for one in known], float)
 
@@ -96,17 +96,17 @@ class Models:
         return bool(np.isfinite(self.map).any())
 
 
-def filter_forward(team: Team, drive: Drive) -> Filtered:
+def filter_forward(team: Team, keyframes: Keyframes) -> Filtered:
     """Run the filter over all keyframes and measurements."""
-    return Filter(team, drive).run()
+    return Filter(team, keyframes).run()
 
 
 class Filter:
     """EKF whose state is the robots, their calibration errors and the landmarks."""
 
-    def __init__(self, team: Team, drive: Drive) -> None:
-        self.drive, self.models = drive, Models(team, drive)
-        robots, landmarks = len(drive.robots), len(drive.landmarks)
+    def __init__(self, team: Team, keyframes: Keyframes) -> None:
+        self.keyframes, self.models = keyframes, Models(team, keyframes)
+        robots, landmarks = len(keyframes.robots), len(keyframes.landmarks)
         self._robots = robots
         self._wheels, self._ranging = 3 * robots, (3 + WHEELS) * robots
         self._marks = self._ranging + RANGING * robots
@@ -125,16 +125,16 @@ class Filter:
         self._placing = [RigidAlignmentRansac() for _ in range(robots)]
         # odometry pose of each robot in a frame of its own, until it has an initial pose
         self._own: list[Pose] = [(0.0, 0.0, 0.0)] * robots
-        reference = drive.robots.index(team.reference)
+        reference = keyframes.robots.index(team.reference)
         if not self.models.map_known:
             self._placed[reference] = True
         self.out = Filtered(
-            poses=[np.full((len(t), 3), np.nan) for t in drive.times],
-            covariances=[np.full((len(t), 3, 3), np.nan) for t in drive.times],
+            poses=[np.full((len(t), 3), np.nan) for t in keyframes.times],
+            covariances=[np.full((len(t), 3, 3), np.nan) for t in keyframes.times],
             landmarks=np.full((landmarks, 2), np.nan),
             wheels=np.zeros((robots, WHEELS)),
             ranging=np.zeros((robots, RANGING)),
-            used=np.zeros(len(drive.measured), bool),
+            used=np.zeros(len(keyframes.measured), bool),
         )
         if not self.models.map_known:
             self.out.placed_at[reference] = 0
@@ -142,9 +142,9 @@ class Filter:
 
     def run(self) -> Filtered:
         """Process all measurements in the order of time, then the steps to the last keyframes."""
-        for index in range(len(self.drive.measured)):
+        for index in range(len(self.keyframes.measured)):
             self.take(index)
-        for robot, times in enumerate(self.drive.times):
+        for robot, times in enumerate(self.keyframes.times):
             self._go(robot, len(times) - 1)
         self.out.landmarks[self._known] = self.mean[self._marks :].reshape(-1, 2)[self._known]
         self.out.wheels = self.mean[self._wheels : self._ranging].reshape(-1, WHEELS).copy()
@@ -153,7 +153,7 @@ class Filter:
 
     def take(self, index: int) -> None:
         """Process the next measurement."""
-        m = self.drive.measured
+        m = self.keyframes.measured
         robot, target = int(m.robot[index]), int(m.target[index])
         range_, bearing = float(m.range[index]), float(m.bearing[index])
         self._go(robot, int(m.keyframe[index]))

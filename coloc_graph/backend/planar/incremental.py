@@ -14,14 +14,14 @@ from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.linear_system import LinearSystem, Summary
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.batch import found_landmarks, in_body
-from coloc_graph.backend.planar.factors import DriveFactors, State, robust
+from coloc_graph.backend.planar.factors import KeyframeFactors, State, robust
 from coloc_graph.backend.planar.filter import Filter
 from coloc_graph.backend.planar.summary import Found, ranging_estimate
 from coloc_graph.backend.planar.trajectory import trajectory
 from coloc_graph.backend.sensor_calibration import SensorErrors
 from coloc_graph.geometry.se2 import compose
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.measurements import Drive
+from coloc_graph.measurements import Keyframes
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ class IncrementalKeyframes:
     ----------
     team : Team
         The team.
-    drive : Drive
+    keyframes : Keyframes
         Keyframes, odometry and measurements.
     lag : float
         Time for which poses are corrected [s].
@@ -70,26 +70,28 @@ class IncrementalKeyframes:
         Time at the beginning in which all poses are [s].
     """
 
-    def __init__(self, team: Team, drive: Drive, *, lag: float = LAG, calibrating: float = CALIBRATION_TIME) -> None:
-        self.drive, self._lag, self._calibrating = drive, lag, calibrating
-        self._filter = Filter(team, drive)
-        self._factors = factors = DriveFactors(drive, self._filter.models)
+    def __init__(
+        self, team: Team, keyframes: Keyframes, *, lag: float = LAG, calibrating: float = CALIBRATION_TIME
+    ) -> None:
+        self.keyframes, self._lag, self._calibrating = keyframes, lag, calibrating
+        self._filter = Filter(team, keyframes)
+        self._factors = factors = KeyframeFactors(keyframes, self._filter.models)
         self._state = State(np.full((len(factors), 3), np.nan), factors.start())
-        self._entered = [0] * len(drive.robots)  # number of keyframes of each that were added
+        self._entered = [0] * len(keyframes.robots)  # number of keyframes of each that were added
         self._inside = np.zeros(len(factors), bool)
         self._left = -np.inf  # time before which all poses were marginalised [UTC s]
         self._before: tuple[Summary, Array] | None = None  # their marginal, and its linearisation point
         self._gauge: tuple[int, Array] | None = None
         self._landmarks: set[int] = set()
         self._next = 0
-        self._taken = np.zeros(len(drive.measured), bool)
+        self._taken = np.zeros(len(keyframes.measured), bool)
         self._solved: _Solved | None = None
         self._smoothed, self._online = (np.full((len(factors), 3), np.nan) for _ in range(2))
         self._smoothed_C, self._online_C = (np.full((len(factors), 3, 3), np.nan) for _ in range(2))
 
-    def advance(self, time: float) -> Latest:
-        """Process all measurements before a time [UTC s], and return the newest poses."""
-        m = self.drive.measured
+    def add(self, time: float) -> Latest:
+        """Add all measurements before a time [UTC s], and return the newest poses."""
+        m = self.keyframes.measured
         while self._next < len(m) and m.time[self._next] < time:
             self._filter.take(self._next)
             self._next += 1
@@ -101,7 +103,7 @@ class IncrementalKeyframes:
             self._note_latest(before)
             self._leave(time)
         latest = {}
-        for robot, (name, count) in enumerate(zip(self.drive.robots, self._entered, strict=True)):
+        for robot, (name, count) in enumerate(zip(self.keyframes.robots, self._entered, strict=True)):
             if count:
                 last = int(self._factors.first[robot]) + count - 1
                 latest[name] = self._online[last], self._online_C[last]
@@ -110,13 +112,13 @@ class IncrementalKeyframes:
     def _enter_robots(self, time: float) -> None:
         """Add new keyframes of the robots that have poses: the first ones by the filter, then by odometry."""
         factors, poses = self._factors, self._state.poses
-        for robot, times in enumerate(self.drive.times):
+        for robot, times in enumerate(self.keyframes.times):
             if robot not in self._filter.out.placed_at:
                 continue
             first, until = int(factors.first[robot]), int(np.searchsorted(times, time))
             entered = self._entered[robot]
             if not entered and until:
-                whole = self._filter.out.whole(self.drive, factors.models)[robot][:until]
+                whole = self._filter.out.whole(self.keyframes, factors.models)[robot][:until]
                 entered = max(int(np.isfinite(whole[:, 0]).sum()), 1)
                 poses[first : first + entered] = whole[:entered]
                 if not factors.models.map_known and self._gauge is None:
@@ -134,7 +136,7 @@ class IncrementalKeyframes:
 
     def _enter_landmarks(self) -> None:
         """Add landmarks that the filter knows since the last time."""
-        for number in range(len(self.drive.landmarks)):
+        for number in range(len(self.keyframes.landmarks)):
             position = self._filter.landmark(number)
             if position is not None and number not in self._landmarks and not self._factors.is_exact(number):
                 self._factors.landmarks(self._state.shared)[number] = position
@@ -149,11 +151,13 @@ class IncrementalKeyframes:
 
     def _measured(self, inside: NDArray[np.bool_]) -> Index:
         """Return the processed measurements between poses inside, or of known landmarks."""
-        factors, m = self._factors, self.drive.measured
+        factors, m = self._factors, self.keyframes.measured
         earliest = factors.times[inside].min() - 1.0
         index = np.arange(np.searchsorted(m.time, earliest), self._next)
-        landmark = m.target[index] - len(self.drive.robots)
-        placed = np.array([n in self._landmarks or factors.is_exact(n) for n in range(len(self.drive.landmarks))], bool)
+        landmark = m.target[index] - len(self.keyframes.robots)
+        placed = np.array(
+            [n in self._landmarks or factors.is_exact(n) for n in range(len(self.keyframes.landmarks))], bool
+        )
         there = inside[factors.seen[index]]
         if len(placed):
             there = np.where(landmark < 0, there, placed[np.maximum(landmark, 0)])
@@ -223,8 +227,8 @@ class IncrementalKeyframes:
         self._online[poses] = self._state.poses[poses]
         self._online_C[poses] = in_body(self._state.poses[poses], solved.covariances(poses))
 
-    def finish(self) -> tuple[Estimate, dict[str, Trajectory]]:
-        """Return the smoothed estimate of all keyframes, and, by robot, the estimates at their times."""
+    def estimate(self) -> Estimate:
+        """Return the smoothed estimate of all keyframes that were added."""
         factors, state = self._factors, self._state
         C = np.zeros((len(factors.free),) * 2)
         if self._solved is not None:
@@ -241,13 +245,23 @@ class IncrementalKeyframes:
         ]
         landmarks = found_landmarks(factors, state.shared, C, sorted(self._landmarks))
         found = Found(State(self._smoothed, state.shared), self._smoothed_C, landmarks, errors)
-        estimate = ranging_estimate(factors, found, self._taken, 0)
-        online = {}
-        for robot, name in enumerate(self.drive.robots):
+        return ranging_estimate(factors, found, self._taken, 0)
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Times of the updates that add everything, one each `UPDATE_PERIOD` [UTC s]."""
+        begin, end = self._factors.times.min(), self._factors.times.max()
+        return tuple((begin + UPDATE_PERIOD * np.arange(1, np.ceil((end - begin) / UPDATE_PERIOD) + 2)).tolist())
+
+    @property
+    def online(self) -> dict[str, Trajectory]:
+        """Poses as they were estimated at their times, by robot."""
+        found, factors = {}, self._factors
+        for robot, name in enumerate(self.keyframes.robots):
             own = slice(factors.first[robot], factors.first[robot + 1])
             there = np.isfinite(self._online[own, 0])
             if there.any():
-                online[name] = trajectory(
-                    name, self.drive.times[robot][there], self._online[own][there], self._online_C[own][there]
+                found[name] = trajectory(
+                    name, self.keyframes.times[robot][there], self._online[own][there], self._online_C[own][there]
                 )
-        return estimate, online
+        return found

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from coloc_graph.backend.calibration import Calibration
 from coloc_graph.backend.estimate import Estimate, Rejection
 from coloc_graph.backend.landmarks import StaticPose
-from coloc_graph.backend.planar.factors import DriveFactors, State
+from coloc_graph.backend.planar.factors import KeyframeFactors, State
 from coloc_graph.backend.planar.trajectory import trajectory
 from coloc_graph.backend.ranging import RangingProblem
 from coloc_graph.backend.sensor_calibration import CalibratedSensors, SensorErrors
@@ -36,28 +36,28 @@ class Found:
     errors: Sequence[SensorErrors]
 
 
-def measured_off(factors: DriveFactors, state: State) -> Array:
+def measured_off(factors: KeyframeFactors, state: State) -> Array:
     """Return residuals (n, 2) in units of the measurements' sigmas, without shares; NaN where an end has no pose."""
-    m = factors.drive.measured
+    m = factors.keyframes.measured
     return factors.measured(state, np.arange(len(m))).residuals / np.sqrt(m.share)
 
 
 def ranging_estimate(
-    factors: DriveFactors, found: Found, taken: NDArray[np.bool_], iterations: int, absorbed: float | None = None
+    factors: KeyframeFactors, found: Found, taken: NDArray[np.bool_], iterations: int, absorbed: float | None = None
 ) -> Estimate:
     """Return the estimate of an optimiser's result by the measurements `taken`.
 
     `absorbed` are the degrees of freedom of a batch fit beyond the shares; without it there is no chi2.
     """
-    drive, models = factors.drive, factors.models
+    keyframes, models = factors.keyframes, factors.models
     off = np.where(taken[:, None], measured_off(factors, found.state), np.nan)
     valid = np.isfinite(off[:, 0])
     outliers = valid & (np.abs(np.where(valid[:, None], off, 0.0)).max(axis=1, initial=0.0) > OUTLIER)
     good = valid & ~outliers
-    share = drive.measured.share[good]
+    share = keyframes.measured.share[good]
     chi2, dof = float((share * off[good] ** 2).sum()), float(share.sum())
     trajectories, numbers, disconnected = {}, {}, []
-    for robot, (name, times) in enumerate(zip(drive.robots, drive.times, strict=True)):
+    for robot, (name, times) in enumerate(zip(keyframes.robots, keyframes.times, strict=True)):
         own = np.arange(factors.first[robot], factors.first[robot + 1])
         poses, covariances = found.state.poses[own], found.covariances[own]
         there = np.isfinite(poses[:, 0])
@@ -70,7 +70,7 @@ def ranging_estimate(
         chi2 += float(np.nansum(steps**2))
         dof += 3.0 * np.isfinite(steps[:, 0]).sum() - 3.0 * there.sum()
     landmarks, positions = {}, {}
-    for number, name in enumerate(drive.landmarks):
+    for number, name in enumerate(keyframes.landmarks):
         if number in found.landmarks:
             position, C = found.landmarks[number]
             landmarks[name] = _placed(position, C)
@@ -78,10 +78,10 @@ def ranging_estimate(
                 sigma = float(np.sqrt(np.trace(C) / 2))
                 positions[name] = Landmark(name=name, position=tuple(position.tolist()), position_sigma=sigma)
                 dof -= 2
-    problem = RangingProblem(drive, numbers, off, outliers, factors.noise, models.map_known)
+    problem = RangingProblem(keyframes, numbers, off, outliers, factors.noise, models.map_known)
     sensors = {
         name: CalibratedSensors(models.team[name], errors, tuple(factors.noise[robot].tolist()))
-        for robot, (name, errors) in enumerate(zip(drive.robots, found.errors, strict=True))
+        for robot, (name, errors) in enumerate(zip(keyframes.robots, found.errors, strict=True))
     }
     return Estimate(
         method="ranging",

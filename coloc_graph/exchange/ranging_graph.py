@@ -1,0 +1,209 @@
+"""The graph of a ranging run for other programs: odometry, and bearings and ranges as those of calibrated sensors.
+
+Errors of wheels and sensors are taken as estimated. A measurement becomes the bearing and range of its target from the
+robot's body, with the covariance that noise, correlation in time and robust weight leave it: one with the gradient of
+the original, so that the optimum is the estimate. Outliers are left out.
+"""
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from coloc_graph.backend import Estimate
+from coloc_graph.backend.planar.factors import CAUCHY, GAUGE_SIGMA
+from coloc_graph.backend.sensor_model import RANGING, Sensors, WheelsModel
+from coloc_graph.exchange.gtsam_files import SCRIPT
+from coloc_graph.exchange.range_graph import (
+    LANDMARK,
+    BearingRangeValue,
+    Prior,
+    RangeGraph,
+    RangeValue,
+    RelativeValue,
+    factors_of,
+    is_landmark,
+    is_pose,
+    key_of,
+    values_of,
+)
+from coloc_graph.exchange.range_graph_files import letters_of
+from coloc_graph.geometry.lie import rotation_z, se3_inverse, yaw
+from coloc_graph.geometry.se2 import wrap
+from coloc_graph.team import Ranging, Team, Wheels
+
+Array = NDArray[np.float64]
+
+MIN_LANDMARK_SIGMA = 1e-3  # m, of the prior of a landmark whose position is exact
+
+
+def ranging_graph(estimate: Estimate, team: Team) -> RangeGraph:
+    """Return the graph of a ranging run: poses by `letters_of` the robots, landmarks by their number in the team."""
+    problem = estimate.ranging
+    letters = letters_of(problem.robots)
+    initial: dict[str, Any] = {}
+    times: dict[str, float] = {}
+    for name, numbers in problem.numbers.items():
+        path = estimate.trajectories[name]
+        poses = np.column_stack([path.positions[:, :2], yaw(path.T_world_body)]).tolist()
+        for number, pose, time in zip(numbers.tolist(), poses, path.times.tolist(), strict=True):
+            initial[f"{letters[name]}{number}"] = gtsam.Pose2(*pose)
+            times[f"{letters[name]}{number}"] = time
+    places = {name: one.planar[:2] for name, one in estimate.landmarks.items()}
+    marks = {one.name: f"{LANDMARK}{number}" for number, one in enumerate(team.landmarks)}
+    start = min(times.values())
+    priors = []
+    for one in team.landmarks:
+        if one.position is not None and one.name in places:
+            C = max(one.position_sigma, MIN_LANDMARK_SIGMA) ** 2 * np.eye(2)
+            priors.append(Prior(start, marks[one.name], np.array(one.position), C))
+    if not problem.on_map:
+        first = next(iter(initial))
+        priors.append(Prior(times[first], first, initial[first], GAUGE_SIGMA**2 * np.eye(3)))
+    calibrated = estimate.calibration.sensors
+    wheels = {name: calibrated[name].wheels or team[name].wheels or Wheels() for name in problem.robots}
+    stated = [team[name].ranging or Ranging(range_sigma=1.0, bearing_sigma_deg=1.0) for name in problem.robots]
+    sensors = [calibrated[name].ranging or one for name, one in zip(problem.robots, stated, strict=True)]
+    return RangeGraph(
+        planar=True,
+        times=times,
+        initial={**initial, **{marks[name]: np.array(at) for name, at in places.items()}},
+        priors=tuple(priors),
+        relatives=tuple(_steps(estimate, wheels, letters)),
+        bearings=tuple(_bearings(estimate, Sensors(stated), Sensors(sensors), {**letters, **marks})),
+    )
+
+
+def _steps(estimate: Estimate, wheels: dict[str, Wheels], letters: dict[str, str]) -> Iterator[RelativeValue]:
+    problem = estimate.ranging
+    for name, numbers in problem.numbers.items():
+        keyframes, own = problem.keyframes, problem.robots.index(name)
+        model = WheelsModel(keyframes.steps[own], wheels[name])
+        begins = numbers[:-1][np.diff(numbers) == 1]
+        steps, _ = model.steps(begins, np.zeros(3))
+        scales = np.array([model.wheels.scale, model.wheels.scale, model.wheels.turn_scale])
+        turn = rotation_z(steps[:, 2])  # GTSAM's tangent is that of the later pose
+        covariances = turn.mT @ (model.covariances[begins] * np.outer(scales, scales)) @ turn
+        for number, step, C in zip(begins.tolist(), steps, covariances, strict=True):
+            ends = f"{letters[name]}{number}", f"{letters[name]}{number + 1}"
+            yield RelativeValue(float(keyframes.times[own][number + 1]), *ends, gtsam.Pose2(*step), C)
+
+
+def _bearings(
+    estimate: Estimate, stated: Sensors, sensors: Sensors, names: dict[str, str]
+) -> Iterator[BearingRangeValue]:
+    problem = estimate.ranging
+    m, used = problem.keyframes.measured, np.flatnonzero(problem.used)
+    robot, of_robot = m.robot[used], m.target[used] < len(problem.robots)
+    row_of = {name: dict(zip(of.tolist(), range(len(of)), strict=True)) for name, of in problem.numbers.items()}
+    rows, places = [], []
+    for one in (problem.measurements[row] for row in used.tolist()):
+        rows.append(estimate.trajectories[one.robot].T_world_body[row_of[one.robot][one.keyframe]])
+        if one.target in row_of:
+            at = estimate.trajectories[one.target].positions[row_of[one.target][one.target_keyframe]]
+        else:
+            at = np.array(estimate.landmarks[one.target].planar[:2])
+        places.append((at[0], at[1], 0.0, 1.0))
+    points = (se3_inverse(np.array(rows)) @ np.array(places)[..., None])[:, :2, 0]
+    expected = sensors.expected(robot, points, np.zeros((len(used), RANGING)), of_robot)
+    residuals = expected.values - np.stack([m.range[used], m.bearing[used]], axis=-1)
+    residuals[:, 1] = wrap(residuals[:, 1])
+    distance = np.hypot(*points.T)
+    polar = np.empty_like(expected.by_xy)
+    polar[:, 0, 0], polar[:, 0, 1] = -points[:, 1] / distance**2, points[:, 0] / distance**2
+    polar[:, 1] = points / distance[:, None]
+    J = polar @ np.linalg.inv(expected.by_xy)
+    share = m.share[used]
+    off = (share * problem.residuals[used] ** 2).sum(axis=1) / CAUCHY**2
+    sigmas = stated.sigmas(robot, m.range[used]) * problem.noise[robot]
+    C = J @ ((sigmas**2 / share * (1 + off)[:, None])[:, :, None] * J.mT)
+    moved = (J @ residuals[..., None])[..., 0]
+    bearing, distance = np.arctan2(points[:, 1], points[:, 0]) - moved[:, 0], distance - moved[:, 1]
+    for n, one in enumerate(problem.measurements[row] for row in used.tolist()):
+        ends = f"{names[one.robot]}{one.keyframe}", names[one.target]
+        if one.target_keyframe >= 0:
+            ends = ends[0], f"{ends[1]}{one.target_keyframe}"
+        yield BearingRangeValue(one.time, *ends, float(bearing[n]), float(distance[n]), (C[n] + C[n].T) / 2)
+
+
+def without_bearings(graph: RangeGraph) -> tuple[RangeGraph, str]:
+    """Return a graph without bearings, and what it lost: landmarks keep positions in poses, robots ranges alone."""
+    relatives, ranges = list(graph.relatives), list(graph.ranges)
+    for one in graph.bearings:
+        if is_landmark(one.second):
+            c, s = np.cos(one.bearing), np.sin(one.bearing)
+            J = np.array([[-one.distance * s, c], [one.distance * c, s]])
+            at = one.distance * np.array([c, s])
+            relatives.append(RelativeValue(one.time, one.first, one.second, at, J @ one.covariance @ J.T))
+        else:
+            ranges.append(RangeValue(one.time, one.first, one.second, one.distance, float(one.covariance[1, 1])))
+    lost = len(ranges) - len(graph.ranges)
+    said = f"left out: {lost} bearings between robots, which PyFG cannot express; jrl holds them" if lost else ""
+    return replace(graph, relatives=tuple(relatives), ranges=tuple(ranges), bearings=()), said
+
+
+def planar_g2o(graph: RangeGraph, robots: dict[str, str]) -> tuple[str, str]:
+    """Return the poses and odometry of a graph in the g2o format, and what it cannot hold.
+
+    `robots` are names by letter.
+    """
+    poses = {name: number for number, name in enumerate(name for name in graph.initial if not is_landmark(name))}
+    marks, ends = len(graph.initial) - len(poses), len(graph.bearings)
+    said = (
+        f"left out: {ends} ranges and bearings and {marks} landmarks, which a pose graph cannot express; the poses are "
+        "those with them, and jrl, pyfg or gtsam hold them"
+    )
+    lines = [f"# {said}"]
+    for name, number in poses.items():
+        lines.append(f"# {number} is {robots[name[0]]}@{name[1:]}")
+        lines.append(f"VERTEX_SE2 {number} {_pose(graph.initial[name])}")
+    # nothing else ties robots to each other
+    firsts = {name[0]: number for name, number in reversed(poses.items())}
+    lines += [f"FIX {number}" for number in firsts.values()]
+    for one in graph.relatives:
+        upper = np.linalg.inv(one.covariance)[np.triu_indices(3)].tolist()
+        numbers = " ".join(map(repr, upper))
+        lines.append(f"EDGE_SE2 {poses[one.first]} {poses[one.second]} {_pose(one.value)} {numbers}")
+    return "\n".join(lines) + "\n", said
+
+
+def _pose(pose: gtsam.Pose2) -> str:
+    return " ".join(repr(float(number)) for number in (pose.x(), pose.y(), pose.theta()))
+
+
+def planar_gtsam(graph: RangeGraph, robots: dict[str, str], landmarks: Iterable[str]) -> dict[str, str]:
+    """Return the files of a graph for GTSAM, as `gtsam_files` does, with GTSAM's own planar factors."""
+    out, marks = io.StringIO(), dict(enumerate(landmarks))
+    rows = csv.writer(out, lineterminator="\n")
+    rows.writerow(["key", "kind", "of"])
+    for name, value in graph.initial.items():
+        of = f"{robots[name[0]]}@{name[1:]}" if is_pose(value) else f"landmark {marks[int(name[1:])]}"
+        rows.writerow([key_of(name), "planar pose" if is_pose(value) else "position", of])
+    return {
+        "graph.txt": factors_of(graph).serialize(),
+        "values.txt": values_of(graph.initial).serialize(),
+        "keys.csv": out.getvalue(),
+        "solve.py": SCRIPT.read_text(encoding="utf-8"),
+    }
+
+
+def planar_dot(graph: RangeGraph, robots: dict[str, str], landmarks: Iterable[str]) -> str:
+    """Draw robots and landmarks, one box for all poses of a robot, with the number of measurements between them."""
+    marks = dict(enumerate(landmarks))
+    counts = Counter(name[0] for name in graph.initial if not is_landmark(name))
+    pairs = Counter((one.first[0], one.second if is_landmark(one.second) else one.second[0]) for one in graph.bearings)
+    lines = ["graph ranging {", "  node [shape=box, style=rounded, fontname=Helvetica];"]
+    lines += [f'  {letter} [label="{robots[letter]}: {count} poses"];' for letter, count in counts.items()]
+    lines += [
+        f'  {name} [label="{marks[int(name[1:])]}", shape=hexagon, style=solid, color="#555555"];'
+        for name in graph.initial
+        if is_landmark(name)
+    ]
+    lines += [f'  {i} -- {j} [label="{count}", style=dashed];' for (i, j), count in pairs.items()]
+    return "\n".join([*lines, "}"]) + "\n"
