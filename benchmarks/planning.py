@@ -5,6 +5,7 @@
     python benchmarks/planning.py --on L --seconds 5     on with walls: L, U, pillars, rooms
     python benchmarks/planning.py --safety 1000 --on L   how near robots come to each other and to walls
     python benchmarks/planning.py --length 21.5          a longer way
+    python benchmarks/planning.py --keep f.jsonl --for 280  a part, to which later ones with more seeds add theirs
     python benchmarks/planning.py --fps 30 --seconds 1.67  as many images, and less time to drive
 
 The mover drives its way at 0.2 m/s, robots hide what is behind them, and stop where their leaps slip to (1 cm and
@@ -15,12 +16,14 @@ with its patrol; b3 is greedy by information, b4 by the common view, b5 by chanc
 """
 
 import argparse
+import hashlib
 import json
 import math
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -60,11 +63,13 @@ RADIUS = 0.17  # of a Create [m]
 class Outcome:
     """Outcome of one run.
 
-    Errors of A's and B's last poses [m], [deg], the number of void stances and of all, and why it `failed`.
+    Errors of A's and B's last poses [m], [deg], the sigma of the positions that the estimator states [m], the number of
+    void stances and of all, and why it `failed`.
     """
 
     end: tuple[float, ...] = ()
     heading: tuple[float, ...] = ()
+    stated: float = math.nan
     void: int = 0
     stances: int = 0
     failed: str = ""
@@ -121,13 +126,17 @@ def outcome(seed: int, plan: Plan, fps: float, depth: str, floor_plan: FloorPlan
     except ColocError as error:
         return Outcome(failed=str(error), stances=len(plan.stances))
     true = align(solution.estimate.trajectories, truth_of(world), "A", on_floor=True)
-    end, heading = [], []
+    end, heading, variance = [], [], []
     for robot in PAIR:
         T, q = solution.estimate.trajectories[robot].T_world_body[-1], true[robot][-1]
+        covariances = solution.estimate.trajectories[robot].covariances
+        assert covariances is not None
+        variance.append(np.trace(covariances[-1][3:5, 3:5]))
         end.append(float(np.linalg.norm(T[:2, 3] - q[:2, 3])))
         off = math.atan2(T[1, 0], T[0, 0]) - math.atan2(q[1, 0], q[0, 0])
         heading.append(abs(math.degrees(math.remainder(off, math.tau))))
-    return Outcome(tuple(end), tuple(heading), len(solution.unused), len(plan.stances))
+    stated = math.sqrt(np.mean(variance))
+    return Outcome(tuple(end), tuple(heading), stated, len(solution.unused), len(plan.stances))
 
 
 def from_images(world: World) -> Solution:
@@ -151,11 +160,53 @@ def ratio(outcomes: Sequence[Outcome], base: Sequence[Outcome], what: str) -> tu
         for a, b in zip(outcomes, base, strict=True)
         if not (a.failed or b.failed)
     ]
-    squares = np.array(pairs)
+    return bootstrapped(np.array(pairs))
+
+
+def bootstrapped(squares: np.ndarray) -> tuple[float, float, float]:
+    """Root of the ratio of the sums of two columns (n, 2), with its bootstrap interval (95 %)."""
     drawn = np.random.default_rng(0).integers(len(squares), size=(BOOTSTRAPS, len(squares)))
     sums = squares[drawn].sum(axis=1)
     low, high = np.percentile(np.sqrt(sums[:, 0] / sums[:, 1]), [2.5, 97.5])
     return float(np.sqrt(squares[:, 0].sum() / squares[:, 1].sum())), float(low), float(high)
+
+
+def promised_ratio(outcomes: Sequence[Outcome], sigma: float) -> tuple[float, float, float]:
+    """Promised sigma of the end as a share of the RMS, with its bootstrap interval (95 %)."""
+    return bootstrapped(np.array([(sigma**2, np.square(one.end).mean()) for one in outcomes if not one.failed]))
+
+
+class Kept:
+    """Outcomes of plans and seeds, kept in a file (JSON lines) if there is one."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._found: dict[tuple[str, int], Outcome] = {}
+        if path is not None and path.exists():
+            for row in map(json.loads, path.read_text(encoding="utf-8").splitlines()):
+                key = row.pop("plan"), row.pop("seed")
+                self._found[key] = Outcome(**{k: tuple(v) if isinstance(v, list) else v for k, v in row.items()})
+
+    def of(self, plan: Plan, seed: int) -> Outcome | None:
+        """Outcome of a seed, if it is there."""
+        return self._found.get((digest(plan), seed))
+
+    def add(self, plan: Plan, seed: int, one: Outcome) -> None:
+        """Keep an outcome."""
+        self._found[digest(plan), seed] = one
+        if self._path is not None:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"plan": digest(plan), "seed": seed, **asdict(one)}) + "\n")
+
+
+def digest(plan: Plan) -> str:
+    """Hash of a plan, whose numbers count to 1e-6."""
+    rows = [
+        [stance.mover, stance.duration, *stance.anchors, *(list(stance.standing.items())), *stance.waypoints]
+        for stance in plan.stances
+    ]
+    rounded = json.loads(json.dumps(rows), parse_float=lambda text: round(float(text), 6))
+    return hashlib.sha256(json.dumps(rounded).encode()).hexdigest()[:16]
 
 
 def safety(mission: Mission, draws: int, floor_plan: FloorPlan | None) -> str:
@@ -215,58 +266,85 @@ def dense(points: Sequence[Sequence[float]]) -> np.ndarray:
     return np.column_stack([np.interp(along, far, column) for column in at.T])
 
 
-def table(
+def outcomes(
+    made: dict[str, Mission],
     seeds: Sequence[int],
-    fps: float,
-    seconds: float,
-    depth: str,
-    only: Sequence[str],
-    *,
-    length: float = LENGTH,
-    floor_plan: FloorPlan | None = None,
-    draws: int = 0,
-) -> dict[str, object]:
-    """Run all plans over the seeds and print a row each; with `draws` print how near robots come instead."""
-    team = stated_team(reference_team(), WRONG)
-    made = missions(team, fps, seconds, only, length, floor_plan)
-    if draws:
-        found = {name: safety(mission, draws, floor_plan) for name, mission in made.items()}
-        for name, text in found.items():
-            print(f"{name:8} {text}", flush=True)
-        return dict(found)
+    kept: Kept,
+    work: Callable[[int, Plan], Outcome],
+    until: float,
+    processes: int,
+) -> dict[str, list[Outcome]]:
+    """Outcomes of all plans for the seeds for which there is time until `until`, seed by seed."""
+    found: dict[str, list[Outcome]] = {name: [] for name in made}
+    batch = 2 * processes
+    for start in range(0, len(seeds), batch):
+        some = seeds[start : start + batch]
+        for mission in made.values():
+            missing = [seed for seed in some if kept.of(mission.plan, seed) is None]
+            if missing and time.monotonic() > until:
+                return found
+            if missing:
+                for seed, one in zip(missing, over(missing, mission.plan, work, processes), strict=True):
+                    kept.add(mission.plan, seed, one)
+        for name, mission in made.items():
+            found[name] += [one for seed in some if (one := kept.of(mission.plan, seed)) is not None]
+    return found
+
+
+def over(seeds: Sequence[int], plan: Plan, work: Callable[[int, Plan], Outcome], processes: int) -> list[Outcome]:
+    """Outcomes of a plan for seeds, on several processes if so many are asked for."""
+    one = partial(work, plan=plan)
+    return [one(seed) for seed in seeds] if processes == 1 else over_seeds(one, seeds, processes)
+
+
+def table(made: dict[str, Mission], found: dict[str, list[Outcome]], fps: float) -> dict[str, object]:
+    """Print a row for each plan, with the ratios to the first one and to the best fixed gait, b2."""
     rows: dict[str, object] = {}
-    base: list[Outcome] | None = None
-    for name, mission in made.items():
-        one = partial(outcome, plan=mission.plan, fps=fps, depth=depth, floor_plan=floor_plan)
-        runs = over_seeds(one, seeds)
-        base = runs if base is None else base
-        end, heading = ratio(runs, base, "end"), ratio(runs, base, "heading")
-        realised = rms(runs, "end")
+    first = next(iter(found))
+    bases = [first, *(["b2"] if "b2" in found and first != "b2" else [])]
+    for name, runs in found.items():
+        mission = made[name]
+        promised = promised_ratio(runs, mission.end_sigma)
+        ratios = {
+            base: {what: ratio(runs, found[base], what) for what in ("end", "heading")}
+            for base in bases
+            if base != name
+        }
         row = {
+            "seeds": len(runs),
             "stances": len(mission.plan.stances),
             "images": round(mission.capture_time * fps),
             "mission_s": mission.duration,
-            "end_mm": 1e3 * realised,
+            "end_mm": 1e3 * rms(runs, "end"),
             "promised_mm": 1e3 * mission.end_sigma,
-            "promised_over_realised": mission.end_sigma / realised,
+            "stated_mm": 1e3 * math.sqrt(np.mean([one.stated**2 for one in runs if not one.failed])),
+            "promised_over_realised": promised,
             "heading_deg": rms(runs, "heading"),
             "promised_heading_deg": math.degrees(mission.heading_sigma),
-            "end_ratio": end,
-            "heading_ratio": heading,
+            "ratios": ratios,
             "void": sum(one.void for one in runs) / sum(one.stances for one in runs),
             "failed": [one.failed for one in runs if one.failed],
         }
         rows[name] = row
         print(
-            f"{name:8} {row['stances']:3} stances {row['images']:5} images {mission.duration:4.0f} s  end "
-            f"{row['end_mm']:5.1f} mm (promised {row['promised_mm']:5.1f}, ratio {row['promised_over_realised']:.2f})  "
-            f"heading {row['heading_deg']:.3f} deg ({row['promised_heading_deg']:.3f})  of the first: end {end[0]:.2f} "
-            f"({end[1]:.2f}-{end[2]:.2f}), heading {heading[0]:.2f} ({heading[1]:.2f}-{heading[2]:.2f})  void "
-            f"{100 * row['void']:.1f} %"
+            f"{name:8} {len(runs):3} seeds {row['stances']:3} stances {row['images']:5} images "
+            f"{mission.duration:4.0f} s"
+            f"  end {row['end_mm']:5.1f} mm (promised {row['promised_mm']:5.1f}, stated {row['stated_mm']:5.1f}, "
+            f"promised over realised {interval(promised)})  heading {row['heading_deg']:.3f} deg "
+            f"({row['promised_heading_deg']:.3f})  void {100 * row['void']:.1f} %"
+            + "".join(
+                f"  of {base}: end {interval(one['end'])}, heading {interval(one['heading'])}"
+                for base, one in ratios.items()
+            )
             + (f"  failed {len(row['failed'])}: {row['failed'][0]}" if row["failed"] else ""),
             flush=True,
         )
     return rows
+
+
+def interval(found: tuple[float, float, float]) -> str:
+    """A ratio with its interval."""
+    return f"{found[0]:.2f} ({found[1]:.2f}-{found[2]:.2f})"
 
 
 def main() -> int:
@@ -282,18 +360,25 @@ def main() -> int:
     parser.add_argument("--safety", type=int, default=0, metavar="DRAWS")
     parser.add_argument("--only", nargs="*", default=[])
     parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="outcomes of earlier parts, to which this one adds")
+    parser.add_argument("--for", dest="seconds_left", type=float, default=math.inf, help="begin no more after this [s]")
+    parser.add_argument("--processes", type=int, default=2)
     args = parser.parse_args()
+    until = time.monotonic() + args.seconds_left
     depth, seeds = ("images", args.images) if args.images else ("tracks", args.seeds)
-    found = table(
-        range(args.first, args.first + seeds),
-        args.fps,
-        args.seconds,
-        depth,
-        args.only,
-        length=args.length,
-        floor_plan=None if args.on is None else FLOOR_PLANS[args.on],
-        draws=args.safety,
-    )
+    floor_plan = None if args.on is None else FLOOR_PLANS[args.on]
+    team = stated_team(reference_team(), WRONG)
+    made = missions(team, args.fps, args.seconds, args.only, args.length, floor_plan)
+    found: dict[str, object]
+    if args.safety:
+        found = {name: safety(mission, args.safety, floor_plan) for name, mission in made.items()}
+        for name, text in found.items():
+            print(f"{name:8} {text}", flush=True)
+    else:
+        work = partial(outcome, fps=args.fps, depth=depth, floor_plan=floor_plan)
+        every = range(args.first, args.first + seeds)
+        runs = outcomes(made, every, Kept(args.keep), work, until, args.processes)
+        found = table(made, runs, args.fps)
     if args.json:
         args.json.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
     return 0

@@ -12,7 +12,10 @@ DIFFERENT = 0.15  # poses are compared one by one from this distance on, in whic
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A team after some planned stances: what it is believed to be, and how it came there."""
+    """A team after some planned stances: what it is believed to be, and how it came there.
+
+    `by_gait` is true if the first of its leaps is that of the gait.
+    """
 
     belief: Belief
     standing: Mapping[str, Planar]

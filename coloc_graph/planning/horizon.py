@@ -27,9 +27,10 @@ from coloc_graph.planning.rollout import Rollout
 Array = NDArray[np.float64]
 
 DEPTH = 2  # stances that are looked ahead
-BEAM = 6  # plans that are followed from one stance to the next
+BEAM = 4  # plans that are followed from one stance to the next
 MANY_BEAM = 3  # the same of more than two observers
 SHARES = (0.6, 1.0, 1.7)  # durations of a stance that are compared, relative to the pace of the mission
+FINALISTS = 3  # first leaps whose stances are planned to be compared, with the gait's own
 PREFERRED = 1.03  # the gait's own leap is left for one that promises a variance this much smaller
 MAX_STANCE_DURATION = 60.0  # longest duration of a stance [s]
 ROW = 0.6  # distance between rows of observers at the beginning [m]
@@ -238,21 +239,61 @@ class Horizon:
                 f"no observer can leap from where the team stands, {gone:.1f} m along the course: the way is too "
                 "narrow for the robots, or their cameras share no view there"
             )
-        leaper, target, duration = best[0].choices[0]
+        if self.objective != "goal":
+            stance, promise = self._planned(belief, best[0].choices[0])
+            return Decision(stance, promise, best[0].choices)
+        variance, node, stance, promise = self._finalist(belief, seconds, best)
+        leaper, target, duration = node.choices[0]
+        reason = self._rollout_of(promise.belief.poses, leaper).reason(
+            promise.belief, leaper, seconds - self._spent(duration, belief, leaper, target)
+        )
+        if not node.by_gait:
+            reason += "; this leap promises less than the gait's own"
+        return Decision(stance, promise, node.choices, math.sqrt(variance), reason)
+
+    def _planned(self, belief: Belief, choice: tuple[str, Planar, float]) -> tuple[PlannedStance, Promise]:
+        """Plan the mover's drive of a stance after a leap."""
+        leaper, target, duration = choice
         after = belief.after_leap(leaper, target, odometry=self.predictor.odometry)
         anchors = self.foremost_first(belief.poses, leaper)
         placed = {name: after.poses[name] for name in (*anchors, leaper)}
         leapt = math.dist(belief.poses[leaper][:2], target[:2])
-        stance, promise = best_stance(self.predictor, after, placed, anchors, self.mover, duration, self.goal, leapt)
-        if self.objective != "goal":
-            return Decision(stance, promise, best[0].choices)
-        ahead = best[0].choices
-        reason = self._rollout_of(promise.belief.poses, leaper).reason(
-            promise.belief, leaper, seconds - self._spent(duration, belief, leaper, target)
-        )
-        if not best[0].by_gait and len(ahead) == 1:
-            reason += "; this leap promises less than the gait's own"
-        return Decision(stance, promise, ahead, math.sqrt(best[0].score), reason)
+        return best_stance(self.predictor, after, placed, anchors, self.mover, duration, self.goal, leapt)
+
+    def _finalist(
+        self, belief: Belief, seconds: float, nodes: Sequence[Node]
+    ) -> tuple[float, Node, PlannedStance, Promise]:
+        """Choose among the best first leaps by what their stances promise with planned drives.
+
+        Evenly spread images are not what a drive brings, and the best of many such guesses looks better than it is: a
+        leap that is not the gait's own has to promise a variance less by `PREFERRED`.
+        """
+        found: list[tuple[float, float, Node, PlannedStance, Promise]] = []
+        problem: InputError | None = None
+        for node in _first_leaps(nodes):
+            leaper, target, duration = node.choices[0]
+            try:
+                stance, promise = self._planned(belief, node.choices[0])
+            except InputError as error:
+                problem = error
+                continue
+            left = seconds - self._spent(duration, belief, leaper, target)
+            now = Node(promise.belief, {name: promise.belief.poses[name] for name in self.observers}, left, 0.0)
+            ahead = [] if self.arrived(now.standing) else self._expand(now, (), in_lane=True)
+            variance = min((one.score for one in ahead), default=self._variance(now, leaper))
+            found.append((variance * (1.0 if node.by_gait else PREFERRED), variance, node, stance, promise))
+        if not found:
+            assert problem is not None
+            raise problem
+        return min(found, key=lambda each: each[0])[1:]
+
+    def _variance(self, node: Node, front: str) -> float:
+        """Variance at the end of the mission of a team whose `front` stands still next [m^2]."""
+        rollout = self._rollout_of(node.belief.poses, front)
+        used = rollout.rows(node.belief)
+        poses = {name: np.array([node.belief.poses[name]]) for name in self.observers}
+        P = node.belief.covariance[None][:, used[:, None], used]
+        return float(rollout.end_variance(P, poses, front, np.array([node.seconds]))[0])
 
     def _spent(self, duration: Any, belief: Belief, leaper: str, target: Planar) -> Any:
         """Return the seconds of the budget that a stance of a `duration` (...) [s] costs."""
@@ -362,8 +403,6 @@ class Horizon:
             )
             for k in range(len(SHARES))
         ], axis=1)  # fmt: skip
-        # compared by a few places only, the best of many looks better than it is
-        value = np.where(leaps.by_gait[seen, None], value, PREFERRED * value)
         best = value.argmin(axis=1)
         return [
             self._child(node, leaps, int(n), float(durations[k, b]), float(value[k, b]), after[k, b])
@@ -381,4 +420,15 @@ class Horizon:
         choice = leaps.leaper, target, seconds
         left = node.seconds - seconds - self.timed * float(leaps.times[n])
         standing = {**node.standing, leaps.leaper: target}
-        return Node(belief, standing, left, score, (*node.choices, choice), bool(leaps.by_gait[n]))
+        by_gait = node.by_gait if node.choices else bool(leaps.by_gait[n])
+        return Node(belief, standing, left, score, (*node.choices, choice), by_gait)
+
+
+def _first_leaps(nodes: Sequence[Node]) -> list[Node]:
+    """Of nodes, the best first, those of the first `FINALISTS` different first leaps, and of the gait's own."""
+    kept: dict[tuple[str, Planar], Node] = {}
+    for node in nodes:
+        first = node.choices[0][:2]
+        if first not in kept and (node.by_gait or len(kept) < FINALISTS):
+            kept[first] = node
+    return list(kept.values())

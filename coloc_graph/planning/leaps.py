@@ -101,11 +101,13 @@ def possible_leaps(
     before = course.at(front)[2]
     turning = any(abs(float(wrap(course.at(front + ahead)[2] - before))) > BEND for ahead in (AHEAD, 2 * AHEAD))
     toe_ins = TOE_INS if len(observers) < MANY else TOE_INS[:2]
-    for advance, side, width, toe, turned in product(ADVANCES, (-1.0, 1.0), WIDTHS, toe_ins, TURNS):
+    ahead_of = {}
+    for advance in ADVANCES:
         way = front + min(advance * gait.leap, MAX_LEAP)
-        x, y, heading = course.at(way)
         # near a corner a robot may look into it
-        bend = float(wrap(course.at(way + AHEAD)[2] - before))
+        ahead_of[advance] = way, course.at(way), float(wrap(course.at(way + AHEAD)[2] - before))
+    for advance, side, width, toe, turned in product(ADVANCES, (-1.0, 1.0), WIDTHS, toe_ins, TURNS):
+        way, (x, y, heading), bend = ahead_of[advance]
         straight = abs(bend) < BEND
         if straight and turned < 1.0:
             continue

@@ -17,7 +17,8 @@ from coloc_graph.planning.prediction import Predictor
 Array = NDArray[np.float64]
 
 HEADING_ARM = 4.0  # a last heading counts as what it displaces at this distance [m]
-SECONDS = tuple(0.5 * 1.3**n for n in range(20))  # durations of a stance for which the rest is computed [s]
+RATIO = 1.3  # between durations of a stance for which the rest is computed
+SECONDS = tuple(0.5 * RATIO**n for n in range(20))  # these durations [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +147,15 @@ class Rollout:
         stances = np.maximum((self._course.length - ways) / self.gait.leap + 0.5, 0.0)
         fewer = np.minimum(np.floor(stances).astype(int), self._A.shape[1] - 2)
         each = np.maximum(seconds, 0.0) / np.maximum(stances, 0.5) - self._leap_time
-        pace = np.clip(np.round(np.log(np.maximum(each, 1e-3) / SECONDS[0]) / math.log(1.3)), 0, len(SECONDS) - 1)
-        share = np.clip(stances - fewer, 0.0, 1.0)
-        few, many = (self._after(P, anchor, fewer + more, pace.astype(int)) for more in (0, 1))
-        return np.asarray((1 - share) * few + share * many)
+        # between the durations of `SECONDS` on either side: rounded to one, some time would be free to spend
+        pace = np.clip(np.log(np.maximum(each, 1e-3) / SECONDS[0]) / math.log(RATIO), 0.0, len(SECONDS) - 1.0)
+        slower = np.minimum(pace.astype(int), len(SECONDS) - 2)
+        shares = np.clip(stances - fewer, 0.0, 1.0), pace - slower
+        total = np.zeros(len(P))
+        for more, longer in np.ndindex(2, 2):
+            weight = np.abs(1 - more - shares[0]) * np.abs(1 - longer - shares[1])
+            total += weight * self._after(P, anchor, fewer + more, slower + longer)
+        return total
 
     def stance_seconds(self, seconds: float) -> float:
         """Return the duration of each stance [s] of a mission of these `seconds`, from its first stance on."""
