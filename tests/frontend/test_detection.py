@@ -2,10 +2,12 @@
 
 import time
 
+import cv2
 import numpy as np
 import pytest
 
 from coloc_graph.frontend import Detector, detect_hue, detect_leds, detector_for
+from coloc_graph.frontend.images.components import components
 from coloc_graph.run import Flag
 from coloc_graph.simulation import Sensor, render, spots
 from coloc_graph.team import Markers
@@ -83,6 +85,29 @@ def test_a_light_beside_another_is_where_it_would_be_without(radius, apart, leve
     errors, square = near_another(radius, apart, level)
     assert (np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(len(errors))).all()
     assert square < 2.5
+
+
+def test_a_crowd_of_lights_is_deblended_at_once_and_right():
+    uv = np.array([20.0, 10.0]) + 5.0 * np.stack(np.meshgrid(np.arange(4), np.arange(3)), -1).reshape(-1, 2)
+    image = led_image(uv, 0.7, sensor=Sensor())
+    assert len({id(one.group) for one in Detector().find(image)}) == 1
+    blobs = detect_leds(image)
+    off = np.linalg.norm(blobs.uv[:, None] - uv, axis=2)
+    assert sorted(off.argmin(axis=1).tolist()) == list(range(len(uv)))
+    assert off.min(axis=1).max() < 0.25
+
+
+@pytest.mark.parametrize("share", [0.04, 0.15, 0.3])
+def test_components_are_those_of_labels(share):
+    rng = np.random.default_rng(6)
+    for _ in range(5):
+        above = (255 * (rng.random((40, 60)) < share)).astype(np.uint8)
+        _, _, stats, _ = cv2.connectedComponentsWithStats(above, connectivity=8)
+        found = components(above)
+        assert sorted((*one.bounds, one.pixels) for one in found) == sorted(map(tuple, stats[1:].tolist()))
+        for (left, top, width, height), _, (u, v) in found:
+            assert left <= u < left + width
+            assert top <= v < top + height
 
 
 def test_lights_that_touch_are_said_to_or_are_where_they_are():

@@ -5,32 +5,37 @@ which is all that a tracker needs. `Detector.measure` turns many candidates at o
 covariances and flags (`Flag`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.frontend.images.centroid import at_points, axes, measure_first
+from coloc_graph.frontend.images.centroid import at_points, axes, long_axis
+from coloc_graph.frontend.images.components import (
+    MAX_LED_SIZE,
+    Bounds,
+    Box,
+    bounds_of,
+    components,
+    cut_off,
+    deblending_group,
+    window_of,
+)
+from coloc_graph.frontend.images.deblending import measure_lights
 from coloc_graph.run.messages import Flag
 from coloc_graph.team import Camera, Markers
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
-#: A rectangle of an image (u0, v0, u1, v1), u1 and v1 not included.
-Box = tuple[int, int, int, int]
+Light = NDArray[np.uint8] | NDArray[np.float32]
 
 BORDER = 20  # px around a search box that are examined; more than the radius of the largest blob and its margin
 RIM = 4  # px around a search box that are examined first
-MAX_SINGLE_SPOT_AREA = 400  # px, bounding box of bright pixels that may be one spot without labelling
-MARGIN = 3  # px between a candidate and the border of its window
-SIZES = (11, 15, 21, 31, 45, 63)  # px, sides of windows; a few sizes, so that many windows are measured at once
-SIZE_FOR = [next(size for size in SIZES if size >= wanted) for wanted in range(SIZES[-1] + 1)]
 MAX_PADDED_PIXELS = 1 << 16  # windows are padded to a larger size while all together hold no more pixels
-MAX_DEBLENDING_WINDOW = 31  # px, side of the largest window in which blobs are deblended
-MAX_LED_SIZE = 14  # px, of a blob that is deblended; larger ones are lamps
 MIN_CONTRAST = 4.0  # of a blob's peak, in standard deviations of the noise around it
 MAX_LIGHTS = 200  # lights of an image that are measured, the largest ones
 DIP = 0.8  # brightness between two spots, as a share of the darker one, below which they count as two
@@ -59,6 +64,14 @@ class Blobs:
         )
 
 
+class _Group(NamedTuple):
+    """Blobs that are measured together: their boxes and their window in the searched light, and its pixels (h, w)."""
+
+    boxes: Sequence[Bounds]
+    window: Box
+    light: Light
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Candidate:
     """Blob before it is measured.
@@ -69,31 +82,28 @@ class Candidate:
         Approximate centre [px].
     area
         Number of pixels above `level`.
-    window
-        Light around the blob, (h, w) [grey levels].
+    group
+        Blobs with which it is deblended, and the light around them.
+    number
+        Index of its own box in the group.
     corner
-        Pixel (u, v) of the window's first element.
-    box
-        Bounding box of the blob's bright pixels, (left, top, width, height) [px in the window].
+        Pixel (u, v) of the first element of the group's window.
     level
         Grey level above which a pixel is bright.
     clipped
         True if the blob touches the border of the image.
-    others
-        Bounding boxes of other blobs in the window.
     touched
-        True if another blob in the window is too large to be deblended.
+        True if other blobs near it are too large or too many to be deblended.
     """
 
     uv: tuple[float, float]
     area: int
-    window: NDArray[np.uint8] | NDArray[np.float32]
+    group: _Group
+    number: int
     corner: tuple[int, int]
-    box: tuple[int, int, int, int]
     level: float
     clipped: bool
-    others: tuple[tuple[int, int, int, int], ...] = ()
-    touched: bool = False
+    touched: bool
 
 
 @dataclass(frozen=True)
@@ -135,7 +145,7 @@ class Detector:
             real &= (u >= box[0] - 0.5) & (v >= box[1] - 0.5) & (u < box[2] - 0.5) & (v < box[3] - 0.5)
         return replace(blobs[real], left_out=left_out)
 
-    def light(self, part: Pixels) -> NDArray[np.uint8] | NDArray[np.float32]:
+    def light(self, part: Pixels) -> Light:
         """Return the light of markers in a part of an image, (h, w) [grey levels]: brightness, or chroma of the hue."""
         if self.hue_deg is None:
             return part if part.ndim == 2 else np.asarray(part.max(axis=2))
@@ -166,39 +176,40 @@ class Detector:
         coarse = max(1, min(part.shape) // 6)
         few = sorted(part[::coarse, ::coarse].ravel().tolist())
         level = float(few[len(few) // 2]) + t.levels
-        blobs = _components(part, level)
-        if box is not None and any(_cut_off(blob, area, light.shape) for blob, _ in blobs):
+        above = cv2.threshold(light, level, 255, cv2.THRESH_BINARY)[1].astype(np.uint8, copy=False)
+        blobs = components(above[area[1] : area[3], area[0] : area[2]])
+        if box is not None and any(cut_off(blob, area, light.shape) for blob in blobs):
             area = (0, 0, light.shape[1], light.shape[0])
-            blobs = _components(light, level)
+            blobs = components(above)
         every = blobs if area == (0, 0, light.shape[1], light.shape[0]) else None
-        blobs = [one for one in blobs if t.min_area <= one[0][4] <= t.max_area]
+        blobs = [one for one in blobs if t.min_area <= one.pixels <= t.max_area]
         left_out = max(len(blobs) - MAX_LIGHTS, 0)
         if left_out:
-            blobs = sorted(blobs, key=lambda one: -one[0][4])[:MAX_LIGHTS]
+            blobs = sorted(blobs, key=lambda one: -one.pixels)[:MAX_LIGHTS]
         found = []
-        for (left, top, width, height, pixels), (x, y) in blobs:
+        groups: dict[Bounds, _Group] = {}
+        for (left, top, width, height), pixels, (x, y) in blobs:
             left, top = left + area[0], top + area[1]
             u, v = x + area[0] + u0, y + area[1] + v0
-            inside = box is None or (box[0] - 1 <= u < box[2] + 1 and box[1] - 1 <= v < box[3] + 1)
-            if inside:
-                clipped = left + u0 <= 0 or top + v0 <= 0
-                clipped |= left + u0 + width >= image.shape[1] or top + v0 + height >= image.shape[0]
-                own = (left, top, width, height)
-                window = _window(own, light.shape)
-                # any other light there?
-                around = light[window[1] : window[3], window[0] : window[2]]
-                group: list[tuple[int, int, int, int]] = []
-                touched = False
-                if max(width, height) <= MAX_LED_SIZE and np.count_nonzero(around > level) > pixels:
-                    every = _components(light, level) if every is None else every
-                    group, touched = _deblending_group(own, [tuple(blob) for blob, _ in every], light.shape)
-                if len(group) < 2:
-                    corner = window[0] + u0, window[1] + v0
-                    box_in_window = left - window[0], top - window[1], width, height
-                    one = Candidate((u, v), pixels, around.copy(), corner, box_in_window, level, clipped, (), touched)
-                    found.append(one)
-                else:
-                    found.append(_cut(light, group, (u0, v0), (u, v), pixels, level, clipped, touched))
+            if box is not None and not (box[0] - 1 <= u < box[2] + 1 and box[1] - 1 <= v < box[3] + 1):
+                continue
+            own, touched = (left, top, width, height), False
+            group = groups.get(own)
+            if group is None:
+                window, boxes = window_of(own, light.shape), [own]
+                around = above[window[1] : window[3], window[0] : window[2]]
+                if max(width, height) <= MAX_LED_SIZE and cv2.countNonZero(around) > pixels:  # another light there
+                    every = components(above) if every is None else every
+                    boxes = deblending_group(own, every, light.shape)
+                    touched = not boxes
+                    boxes = boxes or [own]
+                    window = window_of(bounds_of(boxes), light.shape)
+                group = _Group(boxes, window, light[window[1] : window[3], window[0] : window[2]].copy())
+                groups |= dict.fromkeys(boxes, group)
+            clipped = left + u0 <= 0 or top + v0 <= 0
+            clipped |= left + u0 + width >= image.shape[1] or top + v0 + height >= image.shape[0]
+            number, corner = group.boxes.index(own), (u0 + group.window[0], v0 + group.window[1])
+            found.append(Candidate((u, v), pixels, group, number, corner, level, clipped, touched))
         return found, left_out
 
     def measure(self, candidates: Sequence[Candidate]) -> tuple[Blobs, NDArray[np.bool_]]:
@@ -212,130 +223,49 @@ class Detector:
         n = len(candidates)
         uv, covariance = np.zeros((n, 2)), np.zeros((n, 2, 2))
         flags, peak, real = np.zeros(n, np.uint8), np.zeros(n), np.zeros(n, bool)
-        for rows in _batches([max(one.window.shape) for one in candidates]):
+        for rows in _batches([max(one.group.light.shape) for one in candidates]):
             own = [candidates[row] for row in rows]
             uv[rows], covariance[rows], flags[rows], peak[rows], real[rows] = self._measure(own)
         return Blobs(uv, covariance, flags, peak, np.array([one.area for one in candidates], float)), real
 
     def _measure(self, candidates: list[Candidate]) -> tuple[Array, Array, NDArray[np.uint8], Array, NDArray[np.bool_]]:
         t = self.threshold
-        light, size = _padded([one.window for one in candidates])
-        boxes = np.array([box for one in candidates for box in (one.box, *one.others)])
-        counts = np.array([1 + len(one.others) for one in candidates])
-        window, first = np.repeat(np.arange(len(candidates)), counts), np.cumsum(counts) - counts
-        level = np.array([one.level for one in candidates])[:, None, None]
-        each = _in_boxes(light.shape, boxes) & (light > level)[window]
-        inner = each[first]
-        spots, touching = measure_first(light, size, each, window, t.levels, t.shot_gain)
-        peak = np.where(inner, spots.signal, 0.0).max(axis=(1, 2))
-        n = np.arange(len(candidates))
-        pixel = np.clip(np.rint(spots.centre), 0, size - 1).astype(int)
+        groups = {id(one.group): one.group for one in candidates}
+        light, size = _padded([one.light for one in groups.values()])
+        counts = np.array([len(one.boxes) for one in groups.values()])
+        first = dict(zip(groups, (np.cumsum(counts) - counts).tolist(), strict=True))
+        wanted = np.array([first[id(one.group)] + one.number for one in candidates])
+        window = np.repeat(np.arange(len(groups)), counts)
+        levels = np.empty(len(groups))
+        levels[window[wanted]] = [one.level for one in candidates]
+        inner = _in_boxes(light.shape[1], groups.values())
+        inner &= (light > levels[:, None, None])[window]
+        spots, touching = measure_lights(light, size, inner, window, wanted, t.levels, t.shot_gain)
+        inner, n, own = inner[wanted], np.arange(len(candidates)), window[wanted]
+        peak = spots.inner_signal.max(axis=(1, 2))
+        pixel = np.minimum(np.maximum(np.rint(spots.centre), 0), size[own] - 1).astype(int)
         # a window that slid off its candidate found no spot there
-        on_it = inner[n, pixel[:, 1], pixel[:, 0]]
-        real = spots.found & on_it & (peak >= MIN_CONTRAST * spots.noise)
+        real = spots.found & inner[n, pixel[:, 1], pixel[:, 0]] & (peak >= MIN_CONTRAST * spots.noise)
 
-        short, long, along = axes(spots.shape)
-        # one spot, even motion-blurred, has one hump along its long axis; two that touch have a dip in between
-        steps = np.linspace(-1.25, 1.25, 11)
-        points = spots.centre + steps[:, None, None] * (long[:, None] * along)
-        humps = at_points(spots.signal, np.tile(n, len(steps)), points.reshape(-1, 2), size).reshape(len(steps), -1)
-        dip = humps[3:8].min(axis=0) < DIP * np.minimum(humps[:5].max(axis=0), humps[6:].max(axis=0))
+        short, long = axes(spots.shape)
         flags = np.zeros(len(candidates), np.uint8)
-        flags[(inner & (light >= t.saturation)).any(axis=(1, 2))] |= np.uint8(Flag.SATURATED)
-        flags[np.array([one.clipped for one in candidates])] |= np.uint8(Flag.CLIPPED)
+        flags[((light[own] >= t.saturation) & inner).any(axis=(1, 2))] |= np.uint8(Flag.SATURATED)
+        flags[[one.clipped for one in candidates]] |= np.uint8(Flag.CLIPPED)
         flags[long > t.elongation * short] |= np.uint8(Flag.BLURRED)
-        touching |= np.array([one.touched for one in candidates])
-        flags[touching | ((long > 1.4 * short) & dip)] |= np.uint8(Flag.MERGED)
+        touching |= [one.touched for one in candidates]
+        drawn_out = np.flatnonzero(long > 1.4 * short)
+        if len(drawn_out):
+            # one spot, even motion-blurred, has one hump along its long axis; two that touch have a dip in between
+            steps = np.linspace(-1.25, 1.25, 11)
+            along = long[drawn_out, None] * long_axis(spots.shape[drawn_out])
+            points = spots.centre[drawn_out] + steps[:, None, None] * along
+            rows = np.tile(drawn_out, len(steps))
+            humps = at_points(spots.signal, rows, points.reshape(-1, 2), size[own]).reshape(len(steps), -1)
+            dip = humps[3:8].min(axis=0) < DIP * np.minimum(humps[:5].max(axis=0), humps[6:].max(axis=0))
+            touching[drawn_out[dip]] = True
+        flags[touching] |= np.uint8(Flag.MERGED)
         corners = np.array([one.corner for one in candidates], float)
         return spots.centre + corners, spots.covariance, flags, peak, real
-
-
-def _components(light: NDArray[np.uint8] | NDArray[np.float32], level: float) -> list[tuple[list[int], list[float]]]:
-    """Connected pixels above a level: (left, top, width, height, pixels) and the approximate centre of each."""
-    above = cv2.threshold(light, level, 255, cv2.THRESH_BINARY)[1]
-    if above.dtype != np.uint8:
-        above = above.astype(np.uint8)
-    left, top, width, height = cv2.boundingRect(above)
-    if not width:
-        return []
-    if max(width, height) <= 1.5 * min(width, height) + 1 and width * height <= MAX_SINGLE_SPOT_AREA:
-        # most patches hold one compact spot, which needs no labels: two apart would leave the box half empty
-        pixels = cv2.countNonZero(above)
-        if pixels >= 0.6 * width * height:
-            return [([left, top, width, height, pixels], [left + (width - 1) / 2, top + (height - 1) / 2])]
-    _, _, stats, centres = cv2.connectedComponentsWithStats(above, connectivity=8, ltype=cv2.CV_16U)
-    return list(zip(stats[1:].tolist(), centres[1:].tolist(), strict=True))
-
-
-def _cut_off(blob: list[int], area: Box, shape: tuple[int, ...]) -> bool:
-    """Return whether a blob is cut by the border of the searched area inside the light (h, w)."""
-    left, top, width, height, _ = blob
-    return (
-        (left == 0 and area[0] > 0)
-        or (top == 0 and area[1] > 0)
-        or (left + width == area[2] - area[0] and area[2] < shape[1])
-        or (top + height == area[3] - area[1] and area[3] < shape[0])
-    )
-
-
-def _window(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> Box:
-    """Smallest standard window that holds a box with a margin, moved to lie in the light (h, w)."""
-    left, top, width, height = box
-    wanted = max(width, height) + 2 * MARGIN
-    size = SIZE_FOR[wanted] if wanted < len(SIZE_FOR) else wanted
-    x = max(min(left + (width - size) // 2, shape[1] - size), 0)
-    y = max(min(top + (height - size) // 2, shape[0] - size), 0)
-    return x, y, x + size, y + size
-
-
-def _around(boxes: Sequence[tuple[int, int, int, int]]) -> tuple[int, int, int, int]:
-    """Bounding box of boxes (left, top, width, height)."""
-    left, top = min(box[0] for box in boxes), min(box[1] for box in boxes)
-    return left, top, max(box[0] + box[2] for box in boxes) - left, max(box[1] + box[3] for box in boxes) - top
-
-
-def _deblending_group(
-    own: tuple[int, int, int, int], blobs: Sequence[tuple[int, ...]], shape: tuple[int, ...]
-) -> tuple[list[tuple[int, int, int, int]], bool]:
-    """Boxes of a blob and of all that must be deblended with it, since they lie in the window of the group.
-
-    Returns only its own box, and True, if the group is too large.
-    """
-    group = [own]
-    while True:
-        window = _window(_around(group), shape)
-        if window[2] - window[0] > MAX_DEBLENDING_WINDOW or max(max(box[2:]) for box in group) > MAX_LED_SIZE:
-            return [own], True
-        more = [
-            blob
-            for blob in blobs
-            if blob[0] < window[2]
-            and blob[1] < window[3]
-            and blob[0] + blob[2] > window[0]
-            and blob[1] + blob[3] > window[1]
-            and blob[:4] not in group
-        ]
-        if not more:
-            return group, False
-        group += [(blob[0], blob[1], blob[2], blob[3]) for blob in more]
-
-
-def _cut(
-    light: NDArray[np.uint8] | NDArray[np.float32],
-    group: Sequence[tuple[int, int, int, int]],
-    origin: tuple[int, int],
-    uv: tuple[float, float],
-    area: int,
-    level: float,
-    clipped: bool,
-    touched: bool,
-) -> Candidate:
-    """Candidate with a window that holds all boxes of a group, the first of which is its own."""
-    x, y, end_x, end_y = _window(_around(group), light.shape)
-    box, *others = ((left - x, top - y, width, height) for left, top, width, height in group)
-    window = light[y:end_y, x:end_x].copy()
-    corner = (x + origin[0], y + origin[1])
-    return Candidate(uv, area, window, corner, box, level, clipped, tuple(others), touched)
 
 
 def _batches(sizes: Sequence[int]) -> list[list[int]]:
@@ -349,21 +279,25 @@ def _batches(sizes: Sequence[int]) -> list[list[int]]:
     return together
 
 
-def _padded(windows: Sequence[NDArray[np.uint8] | NDArray[np.float32]]) -> tuple[Array, NDArray[np.int64]]:
-    """Pad windows of several sizes into one array (n, h, w), and return it with their sizes (n, 2) [px: u, v]."""
+def _padded(windows: Sequence[Light]) -> tuple[Array, NDArray[np.int64]]:
+    """Pad windows of several sizes into square ones (n, s, s), and return them with their sizes (n, 2) [px: u, v]."""
     shapes = np.array([window.shape for window in windows])
-    light = np.zeros((len(windows), *shapes.max(axis=0)))
+    side = shapes.max()
+    if (shapes == side).all():
+        return np.array(windows, float), shapes
+    light = np.zeros((len(windows), side, side))
     for row, window in zip(light, windows, strict=True):
         row[: window.shape[0], : window.shape[1]] = window
     return light, shapes[:, ::-1]
 
 
-def _in_boxes(shape: tuple[int, ...], boxes: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Masks (m, h, w) of the pixels of windows that lie in boxes (m, 4)."""
-    left, top, width, height = boxes.T[..., None]
-    x, y = np.arange(shape[2]), np.arange(shape[1])
-    in_x, in_y = (x >= left) & (x < left + width), (y >= top) & (y < top + height)
-    return np.asarray(in_y[..., :, None] & in_x[..., None, :])
+def _in_boxes(side: int, groups: Iterable[_Group]) -> NDArray[np.bool_]:
+    """Masks (m, side, side) of the pixels of the groups' windows that lie in their boxes, one after the other."""
+    boxes = np.array([(*box, *one.window[:2]) for one in groups for box in one.boxes])
+    begin = boxes[:, :2] - boxes[:, 4:]
+    pixel = np.arange(side)
+    along = (pixel >= begin[:, :, None]) & (pixel < (begin + boxes[:, 2:4])[:, :, None])
+    return np.asarray(along[:, 1, :, None] & along[:, 0, None, :])
 
 
 def detector_for(markers: Markers | None, camera: Camera | None = None) -> Detector:
