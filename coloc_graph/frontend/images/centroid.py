@@ -87,7 +87,7 @@ def measure_spots(
         Centre, covariance and shape of each spot.
     """
     n, side = len(light), light.shape[2]
-    signal, noise = without_background(light, size, levels)
+    signal, noise = without_background(light, size, inner, levels)
     inner_signal = signal * inner
     start = rough_shape(inner)
     # in rows: x and y of centres, xx, xy and yy of shapes, matrices row by row
