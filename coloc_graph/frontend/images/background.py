@@ -155,7 +155,7 @@ def _around(inner: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Pixels (n, h, w) that the light of spots with bright pixels `inner` does not reach."""
     reached = []
     for axis in (1, 2):
-        lit = inner.any(axis=axis)
+        lit = np.asarray(inner.any(axis=axis))
         grown = lit.copy()
         for step in range(1, REACH + 1):
             grown[:, step:] |= lit[:, :-step]
