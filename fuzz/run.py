@@ -28,15 +28,7 @@ def main() -> int:
     args, rest = parser.parse_known_args()
     if args.inside:
         return inside(args.inside, args.out, rest)
-    names = (
-        args.targets
-        or subprocess.run(
-            [sys.executable, "-c", "from fuzz.targets import TARGETS; print(*TARGETS)"],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.split()
-    )
+    names = args.targets or _names()
     if args.list:
         print(*names, sep="\n")
         return 0

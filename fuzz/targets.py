@@ -24,23 +24,34 @@ from coloc_graph.exchange.camera_info import camera_info_text, read_camera_info
 from coloc_graph.exchange.csv_table import read_table
 from coloc_graph.exchange.dat_table import read_dat
 from coloc_graph.exchange.g2o import read_g2o
+from coloc_graph.exchange.jrl import write_jrl
 from coloc_graph.exchange.landmarks import read_landmarks
+from coloc_graph.exchange.pyfg import write_pyfg
+from coloc_graph.exchange.range_graph import factors_of
+from coloc_graph.exchange.range_graph_files import read_range_graph
+from coloc_graph.exchange.ranges_csv import read_ranges
 from coloc_graph.exchange.ros_bag import BagMessage, open_bag
 from coloc_graph.exchange.ros_import import import_ros
 from coloc_graph.exchange.ros_map import read_map
 from coloc_graph.exchange.tracks import TRACKS_HEADER, import_tracks
 from coloc_graph.exchange.tum import read_tum, write_tum
 from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.results.comparison import of_result
+from coloc_graph.results.config import CONFIG, read_options, write_config
 from coloc_graph.results.folder import read_result
 from coloc_graph.robot_io.link import messages
 from coloc_graph.run import decode, open_run, read_true_team, read_truth, run_id, schemas
 from coloc_graph.run.index import MAGIC
 from coloc_graph.simulation import reference_team, simulate
-from coloc_graph.team import read_team, write_team
+from coloc_graph.team import Ranging, read_team, write_team
 
 FOLDER = Path(tempfile.mkdtemp(prefix="fuzz-"))
 FILE = FOLDER / "input"
+_TEAM = reference_team()
+RANGING = msgspec.structs.replace(
+    _TEAM, robots=tuple(msgspec.structs.replace(one, ranging=Ranging(range_sigma=0.1)) for one in _TEAM.robots)
+)
 
 
 def _file(data: bytes, suffix: str = "") -> Path:
@@ -172,6 +183,46 @@ def camera_info(data: bytes) -> None:
     read_camera_info(_file(data, ".yaml"))
 
 
+def opencv(data: bytes) -> None:
+    """A calibration of OpenCV, as YAML or XML."""
+    read_camera_info(_file(data, ".yml"))
+
+
+def kalibr(data: bytes) -> None:
+    """A camera of Kalibr's chain."""
+    read_camera_info(_file(data, ".yaml"), chain_camera="cam0")
+
+
+def _graph(path: Path) -> None:
+    """Read a graph with ranges, make its factors, and write it in both formats, each of which is then read."""
+    graph = read_range_graph(path)
+    factors_of(graph)
+    for write, name in ((write_pyfg, "again.pyfg"), (write_jrl, "again.jrl")):
+        write(graph, FOLDER / name)
+        again = read_range_graph(FOLDER / name)
+        assert set(again.names) == set(graph.names) and len(again.ranges) == len(graph.ranges), name
+
+
+def pyfg(data: bytes) -> None:
+    """A factor graph with ranges, PyFG."""
+    _graph(_file(data, ".pyfg"))
+
+
+def jrl(data: bytes) -> None:
+    """A factor graph with ranges, JRL."""
+    _graph(_file(data, ".jrl"))
+
+
+def ranges(data: bytes) -> None:
+    """Ranges as CSV."""
+    read_ranges(_file(data, ".csv"), RANGING, 0.0, 10.0)
+
+
+def config(data: bytes) -> None:
+    """config.toml, by which a run is solved."""
+    read_options(_file(data, ".toml"))
+
+
 def tum(data: bytes) -> None:
     """A TUM trajectory, its covariances behind a line of `===`."""
     poses, _, covariances = data.partition(b"===\n")
@@ -261,7 +312,22 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     one.__name__: one
     for one in (
         *(team, ros_map, run, chunk, record, bag_mcap, bag_db3, bag_ros1, bag_import, cdr, camera_info, tum, g2o),
-        *(tracks, table, result, landmarks, estimator, calibration, image, link),
+        *(
+            opencv,
+            kalibr,
+            pyfg,
+            jrl,
+            ranges,
+            config,
+            tracks,
+            table,
+            result,
+            landmarks,
+            estimator,
+            calibration,
+            image,
+            link,
+        ),
     )
 }
 
@@ -350,6 +416,11 @@ def _of_tum() -> Iterator[bytes]:
     T = np.tile(np.eye(4), (3, 1, 1))
     write_tum(Trajectory("A", np.arange(3.0), T, np.arange(3), np.tile(np.eye(6), (3, 1, 1))), FOLDER / "seed.tum")
     yield (FOLDER / "seed.tum").read_bytes() + b"===\n" + (FOLDER / "seed.cov.csv").read_bytes()
+    euroc = "1403636579758555392,0.1,0.2,0.3,1,0,0,0,0,0,0,0,0,0,0,0,0\n"
+    yield (
+        "#timestamp, p_x [m], p_y, p_z, q_w [], q_x [], q_y [], q_z [], v_x, v_y, v_z, b, b, b, b, b, b\n" + euroc
+    ).encode()
+    yield b"1.5 1 0 0 4 0 1 0 5 0 0 1 6\n2.5 1 0 0 4 0 1 0 5 0 0 1 7\n"
 
 
 def _of_g2o() -> Iterator[bytes]:
@@ -411,6 +482,64 @@ def _of_link() -> Iterator[bytes]:
         yield bytes([_KINDS.index(type(one))]) + messages.encode(one)
 
 
+def _of_opencv() -> Iterator[bytes]:
+    camera = reference_team().robots[0].camera
+    for suffix in (".yml", ".xml"):
+        path = FOLDER / f"seed{suffix}"
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        for name, value in (("image_width", camera.width), ("image_height", camera.height), ("fisheye_model", 0)):
+            storage.write(name, value)
+        storage.write("camera_matrix", camera.K)
+        storage.write("distortion_coefficients", np.array([0.1, 0.02, 0.0, 0.0, 0.0]))
+        storage.release()
+        yield path.read_bytes()
+
+
+def _of_kalibr() -> Iterator[bytes]:
+    yield (
+        b"cam0:\n  camera_model: pinhole\n  distortion_coeffs: [-0.01, 0.02, -0.003, 0.0004]\n"
+        b"  distortion_model: equidistant\n  intrinsics: [461.6, 460.1, 362.6, 248.1]\n  resolution: [752, 480]\n"
+    )
+
+
+def _of_camera_info() -> Iterator[bytes]:
+    text = camera_info_text(reference_team().robots[0].camera, "A")
+    yield text.encode()
+    yield (
+        f"{text}binning_x: 2\nbinning_y: 2\nroi: {{x_offset: 8, y_offset: 8, height: 64, width: 64}}\n---\n"
+    ).encode()
+
+
+def _of_pyfg() -> Iterator[bytes]:
+    yield (
+        b"VERTEX_SE2 1700000001.7 A0 1.25 3.0 -1.5\nVERTEX_SE2 1700000001.9 A1 1.5 3.25 -1.25\n"
+        b"VERTEX_SE2 1700000001.7 B3 0.0 0.0 0.5\n"
+        b"VERTEX_XY L8 2.0 1.0\nVERTEX_SE2:PRIOR 1700000001.7 A0 1.25 3.0 -1.5 0.01 0.0 0.0 0.01 0.0 0.001\n"
+        b"EDGE_SE2 1700000001.9 A0 A1 0.25 0.125 0.25 0.0004 0.0001 -0.0 0.0005 -0.0 0.0001\n"
+        b"EDGE_SE2_XY 1700000001.9 A1 L8 1.0 -2.0 0.25 0.125 0.5\nEDGE_RANGE 1700000001.7 A0 B3 3.5 0.0073\n"
+    )
+    yield (
+        b"VERTEX_SE3:QUAT 1700000001.0 A0 0.0 0.0 0.0 0.0 0.0 0.0 1.0\n"
+        b"VERTEX_SE3:QUAT 1700000002.0 A1 1.0 0.0 0.5 0.0 0.0 0.6 0.8\n"
+        b"VERTEX_XYZ L0 1.0 2.0 3.0\nEDGE_SE3:QUAT 1700000002.0 A0 A1 1.0 0.0 0.5 0.0 0.0 0.6 0.8 "
+        b"1 0 0 0 0 0.5 2 0 0 0 0 3 0 0 0 4 0 0 5 0 6\n"
+        b"EDGE_SE3_XYZ 1700000002.0 A1 L0 0.5 1.5 2.5 0.25 0.0 0.0 0.25 0.0 0.25\n"
+        b"EDGE_RANGE 1700000002.0 A0 L0 3.75 0.01\n"
+    )
+
+
+def _of_jrl() -> Iterator[bytes]:
+    for text in _of_pyfg():
+        graph = read_range_graph(_file(text, ".pyfg"))
+        write_jrl(graph, FOLDER / "seed.jrl")
+        yield (FOLDER / "seed.jrl").read_bytes()
+
+
+def _of_config() -> Iterator[bytes]:
+    write_config(SolveOptions(), reference_team(), FOLDER)
+    yield (FOLDER / CONFIG).read_bytes()
+
+
 _SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
     "team": _of_team,
     "ros_map": lambda: iter((MAP.encode(),)),
@@ -422,7 +551,13 @@ _SEEDS: dict[str, Callable[[], Iterator[bytes]]] = {
     "bag_db3": _of_bag("sqlite3"),
     "bag_ros1": _of_bag("ros1"),
     "cdr": _of_cdr,
-    "camera_info": lambda: iter((camera_info_text(reference_team().robots[0].camera, "A").encode(),)),
+    "camera_info": _of_camera_info,
+    "opencv": _of_opencv,
+    "kalibr": _of_kalibr,
+    "pyfg": _of_pyfg,
+    "jrl": _of_jrl,
+    "ranges": lambda: iter((b"time,robot,target,range\n1.5,A,B,2.5\n1.5,A,C,3\n2,B,A,1e0\n",)),
+    "config": _of_config,
     "tum": _of_tum,
     "g2o": _of_g2o,
     "tracks": _of_tracks,

@@ -211,12 +211,13 @@ _OpenCvLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", _mapping)
 def _fields(path: Path, chain_camera: str | None) -> Mapping[str, Any]:
     """Return the fields of a `camera_info`, or those of another format under its names."""
     text = _text(path)
-    if OPENCV_XML.match(text):
-        return of_opencv(path, of_opencv_xml(path, text))
-    if head := OPENCV_YAML.match(text):
-        return of_opencv(path, _yaml_fields(path, text[head.end() :], _OpenCvLoader))
-    fields = _yaml_fields(path, text, _Loader)
-    if is_kalibr(fields):
+    fields: Mapping[str, Any]
+    xml, head = OPENCV_XML.match(text), OPENCV_YAML.match(text)
+    if xml:
+        fields = of_opencv(path, of_opencv_xml(path, text))
+    elif head:
+        fields = of_opencv(path, _yaml_fields(path, text[head.end() :], _OpenCvLoader))
+    elif is_kalibr(fields := _yaml_fields(path, text, _Loader)):
         return of_kalibr(path, fields, chain_camera)
     if chain_camera is not None:
         raise InputError(f"{path}: is no Kalibr chain of cameras: leave out --chain-camera")

@@ -100,6 +100,11 @@ def test_damaged_files_are_one_sentence(tmp_path, text, words):
     assert "\n" not in str(why.value)
 
 
+def test_a_camera_of_a_chain_is_asked_of_a_chain_only(tmp_path):
+    with pytest.raises(InputError, match="is no Kalibr chain of cameras: leave out --chain-camera"):
+        read_camera_info(opencv_file(tmp_path / "a.yml", np.array(FIVE)), chain_camera="cam0")
+
+
 def test_a_kalibr_chain_is_read_camera_by_camera(tmp_path, capsys):
     (tmp_path / "camchain.yaml").write_text(KALIBR)
     wide, _ = read_camera_info(tmp_path / "camchain.yaml", chain_camera="cam0")
