@@ -33,6 +33,11 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--out", required=True, metavar="PATH", help="file to write; for tum and gtsam a folder")
     command.add_argument("--truth", action="store_true", help="tum: the truth of the run, not the estimate; ros2: both")
     command.add_argument("--layout", action="store_true", help="foxglove: write a layout (.json) beside the file, too")
+    command.add_argument(
+        "--tracks",
+        action="store_true",
+        help="foxglove: annotate the images with the tracks of all markers, followed again (takes as long as solving)",
+    )
     command.add_argument("--run", dest="run_path", metavar="RUN", help="the result's run, if it has moved")
     add_force(command)
     command.set_defaults(run=run)
@@ -55,8 +60,9 @@ def run(args: argparse.Namespace) -> int:
         require_writable(out, force=args.force)
     if args.truth and args.format not in ("tum", "ros2"):
         raise InputError(f"--truth applies to tum and ros2, not to {args.format}: leave it out")
-    if args.layout and args.format != "foxglove":
-        raise InputError(f"--layout applies to foxglove, not to {args.format}: leave it out")
+    for option in ("layout", "tracks"):
+        if getattr(args, option) and args.format != "foxglove":
+            raise InputError(f"--{option} applies to foxglove, not to {args.format}: leave it out")
     if args.format in ("pyfg", "jrl") and Path(args.result).is_file():
         return _range_graph(args, out)
     if Path(args.result).suffix in (".pyfg", ".jrl", ".g2o") and Path(args.result).is_file():
@@ -69,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     if args.truth and args.format == "tum":
         return _truth(result, args.run_path, out)
     if args.format == "foxglove":
-        return _foxglove(result, args.run_path, out, layout=args.layout, force=args.force)
+        return _foxglove(result, args, out)
     if args.format == "ros2":
         from coloc_graph.exchange.ros_export import write_ros2
         from coloc_graph.results.aligned_truth import aligned_truth
@@ -202,11 +208,12 @@ def _truth(result: "Result", run_path: str | None, out: Path) -> int:
     return 0
 
 
-def _foxglove(result: "Result", run_path: str | None, out: Path, *, layout: bool, force: bool) -> int:
+def _foxglove(result: "Result", args: argparse.Namespace, out: Path) -> int:
     """Write a result for Foxglove, with a layout beside it."""
     import os
+    from contextlib import nullcontext
 
-    from coloc_graph.cli.printing import warn
+    from coloc_graph.cli.printing import progress, warn
     from coloc_graph.errors import InputError
     from coloc_graph.exchange.foxglove_export import LAYOUT
     from coloc_graph.results.foxglove import export_foxglove
@@ -215,13 +222,14 @@ def _foxglove(result: "Result", run_path: str | None, out: Path, *, layout: bool
     if out.suffix != ".mcap":
         raise InputError(f"{out} is not the name of an MCAP file: give one that ends in .mcap")
     beside = out.with_suffix(".json")
-    if layout and os.path.lexists(beside):
-        require_writable(beside, force=force)
+    if args.layout and os.path.lexists(beside):
+        require_writable(beside, force=args.force)
     out.parent.mkdir(parents=True, exist_ok=True)
-    messages, warnings = export_foxglove(result, out, Path(run_path) if run_path else None)
+    with progress("stances tracked") if args.tracks else nullcontext() as report:
+        messages, warnings = export_foxglove(result, out, Path(args.run_path) if args.run_path else None, report)
     warn(warnings)
     print(f"wrote {out}: {messages} messages of {len(result.trajectories)} robots")
-    if layout:
+    if args.layout:
         write_atomically(beside, LAYOUT.read_bytes())
         print(f"wrote {beside}: import it as a layout in Foxglove")
     return 0

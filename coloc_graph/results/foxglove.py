@@ -1,34 +1,49 @@
 """Export of a result to Foxglove: with the truth and the detections of its run, where that is still there."""
 
 import math
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.errors import ColocError
+from coloc_graph.errors import ColocError, DegenerateGeometry
 from coloc_graph.exchange.foxglove_export import DrawnEdge, write_foxglove
 from coloc_graph.exchange.landmarks import read_landmarks
+from coloc_graph.frontend import FrontendOptions
+from coloc_graph.frontend.stance_tracks import StanceTracks
 from coloc_graph.results.aligned_truth import aligned_truth
 from coloc_graph.results.folder import LANDMARKS, MEASUREMENTS, Result
 from coloc_graph.results.measurement_table import read_measurements
-from coloc_graph.run import open_run
+from coloc_graph.run import Detections, Run, open_run
 
 Array = NDArray[np.float64]
 
 NO_INDEX = -1  # of a landmark, which has one pose
 
 
-def export_foxglove(result: Result, out: Path, run_path: Path | None = None) -> tuple[int, list[str]]:
-    """Write a result as an MCAP file for Foxglove; return the number of messages, and warnings of what it lacks."""
-    warnings, truth, detections = [], dict[str, Array](), []
+def export_foxglove(
+    result: Result,
+    out: Path,
+    run_path: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[int, list[str]]:
+    """Write a result as an MCAP file for Foxglove; return the number of messages, and warnings of what it lacks.
+
+    Images are annotated with the recorded detections or, given a callback (done, total) of stances, with the tracks of
+    the markers, which are followed again.
+    """
+    warnings, truth, detections = [], dict[str, Array](), list[Iterable[Detections]]()
     try:
         path = result.run_path if run_path is None else run_path
         result.require_run(path)
         run = open_run(path)
-        detections = [run.detections(robot) for robot in run.team.names if run.has_detections(robot)]
+        if progress is not None:
+            detections = [_tracked(run, result.config.options.frontend or FrontendOptions(), progress)]
+        else:
+            detections = [run.detections(robot) for robot in run.team.names if run.has_detections(robot)]
         truth = aligned_truth(result, path)
     except ColocError as why:
         warnings.append(f"exported without truth or without detections: {why}")
@@ -42,6 +57,29 @@ def export_foxglove(result: Result, out: Path, run_path: Path | None = None) -> 
         detections=chain.from_iterable(detections),
     )
     return messages, warnings
+
+
+def _tracked(run: Run, options: FrontendOptions, progress: Callable[[int, int], None]) -> Iterator[Detections]:
+    """Yield the tracked marker centres of each image in a stance."""
+    stances = list(run.stances)
+    for number, stance in enumerate(stances, start=1):
+        tracks = StanceTracks(run, stance, options.tracker)
+        for robot in stance.observers:
+            centres = defaultdict[float, list[tuple[str, Array, Array, float]]](list)
+            try:
+                found = tracks.of(robot)
+            except DegenerateGeometry:
+                continue
+            for track in found:
+                for time, *one in zip(track.times.tolist(), track.uv, track.covariance, track.peak, strict=True):
+                    centres[time].append((track.marker, *one))
+            for time, seen in sorted(centres.items()):
+                names, uv, covariance, peak = zip(*seen, strict=True)
+                none = np.zeros(len(names))
+                yield Detections(
+                    robot, time, np.array(uv), np.array(covariance), names, none.astype(np.uint8), np.array(peak), none
+                )
+        progress(number, len(stances))
 
 
 def _edges(result: Result) -> Iterator[DrawnEdge]:

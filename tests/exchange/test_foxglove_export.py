@@ -13,6 +13,7 @@ from coloc_graph.exchange.landmarks import LandmarkRow
 from coloc_graph.exchange.tum import read_tum
 from coloc_graph.results.folder import read_result
 from coloc_graph.run import open_run, read_truth
+from coloc_graph.run.schemas import to_ns
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +101,20 @@ def test_cameras_and_annotations(messages, result):
     annotations = [one for one in of(messages, "ImageAnnotations") if one[1] == "/A/annotations"]
     for seen, (_, _, _, drawn) in zip(run.detections("A"), annotations, strict=True):
         assert [(c.position.x, c.position.y) for c in drawn.circles] == [tuple(uv) for uv in seen.uv.tolist()]
+
+
+def test_tracks_annotate_the_images_of_stances(result, tmp_path, capsys):
+    path = tmp_path / "tracks.mcap"
+    assert main(["export", "foxglove", str(result), "--out", str(path), "--tracks"]) == 0
+    assert "stances tracked: " in capsys.readouterr().err
+    run = open_run(read_result(result).run_path)
+    drawn = {one[2]: one[3] for one in of(decoded(path), "ImageAnnotations") if one[1] == "/A/annotations"}
+    for stance in run.stances:
+        for seen in run.detections("A", stance.start, stance.end):
+            if len(seen.markers):
+                found = drawn[to_ns(seen.time)]
+                assert {(c.position.x, c.position.y) for c in found.circles} == {tuple(uv) for uv in seen.uv.tolist()}
+                assert {one.text for one in found.texts} == set(seen.markers)
 
 
 def test_landmarks_are_in_the_scene(result, tmp_path):
