@@ -1,20 +1,24 @@
 """Share of drawn faults whose true cause is named, alone or among equals, and of innocent robots that are blamed.
 
-    python benchmarks/blame.py [--worlds 34] [--first 1] [--healthy] [--json FILE]
+    python benchmarks/blame.py [--worlds 34] [--first 1] [--variant NAME] [--healthy] [--json FILE]
 
 Each world is a hallway, or a team of four, of 8 stances at depth tracks, and is solved once for each kind of fault,
 with one drawn fault of the kind: a clock, an odometry jump, a lever arm of odometry, a robot that moved and is called
 an anchor, a bump, or a wrong homography. `--healthy` solves worlds without a fault instead. A fault counts where it
 moves a pose by more than 3 sigma, or leaves one without a pose, if nothing is named.
+
+Variants: `wide` is a team of five, two of which move at once, with wider lanes and longer leaps; `images` has no wheel
+odometry; in `two` each run has two faults, of two robots.
 """
 
 import argparse
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -36,14 +40,18 @@ from coloc_graph.pipeline.clocks import CorrectedRun
 from coloc_graph.pipeline.incremental import OdometryAndSightings, measure_stance
 from coloc_graph.run import Detections, OdometrySample, Stance
 from coloc_graph.simulation import Imperfections
-from coloc_graph.simulation.scenarios import team_of
+from coloc_graph.simulation.scenarios import TEAM_GAIT, team_of
 from coloc_graph.simulation.teams import build_team_world
+from coloc_graph.simulation.world import stream
 
 STANCES = 8  # stances of a run
 POINTS = 100  # points of a stance of a hallway
 TEAM_POINTS = 300  # points of a pair of a stance of a team
 COUNTED = 3.0  # sigmas by which a fault that counts changes a pose
 KINDS = ("clock", "jump", "arm", "moves", "bump", "homography")
+SEEN_KINDS = ("clock", "moves", "bump", "homography")  # faults that no wheels tell
+PAIRS = (("clock", "bump"), ("jump", "homography"), ("arm", "moves"), ("bump", "jump"), ("homography", "moves"))
+VARIANTS = ("usual", "wide", "images", "two")
 
 
 @dataclass(frozen=True)
@@ -141,7 +149,7 @@ def bumped(run: MemoryRun, fault: Fault) -> MemoryRun:
         for k, every in enumerate(world.captures)
     )
     moved = replace(path, times=times, knots=knots)
-    made = MemoryRun(replace(world, paths={**world.paths, fault.robot: moved}, captures=captures))
+    made = type(run)(replace(world, paths={**world.paths, fault.robot: moved}, captures=captures))
     made.bumped_before = fault.stance  # type: ignore[attr-defined]
     for robot in run.team.names:  # no wheel feels it
         made._odometry[robot] = list(run.odometry(robot))
@@ -204,12 +212,12 @@ def accusations(solution: Solution) -> list[set[tuple[str, str]]]:
     return said
 
 
-def verdict(solution: Solution, fault: Fault) -> tuple[bool, bool]:
-    """Return whether the right cause is named, and whether a sentence names innocent robots alone."""
+def verdict(solution: Solution, fault: Fault, guilty: Collection[str]) -> tuple[bool, bool]:
+    """Return whether the right cause is named, and whether a sentence names none of the `guilty` robots."""
     kinds = {"clock": "clock", "jump": "odometry", "arm": "odometry", "moves": "moved", "bump": "moved"}
     right = (kinds.get(fault.kind, f"homography {fault.stance}"), fault.robot)
     said = accusations(solution)
-    return any(right in one for one in said), any(all(robot != fault.robot for _, robot in one) for one in said)
+    return any(right in one for one in said), any(all(robot not in guilty for _, robot in one) for one in said)
 
 
 class Measured:
@@ -259,48 +267,80 @@ def effect(run: Any, healthy: Estimate, measure: Measured) -> float:
     return round(float(np.sqrt(far)), 1)
 
 
-def world_of(seed: int) -> MemoryRun:
-    """A hallway, or a team of four."""
+class Wheelless(MemoryRun):
+    """A run without odometry."""
+
+    def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
+        """As `Run`."""
+        return iter(())
+
+
+def world_of(seed: int, variant: str = "usual") -> MemoryRun:
+    """A hallway, or a team of four; of `wide`, a team of five."""
     imperfections = Imperfections(mount_sigma_deg=0.3, height_sigma=0.002, floor_sigma_deg=0.1)
-    if seed % 2 == 0:
-        return MemoryRun(simulated("hallway", seed, points=POINTS, stances=STANCES, imperfections=imperfections))
-    world = build_team_world(team_of(4, 1, STANCES), seed=seed, points=TEAM_POINTS, imperfections=imperfections)
-    return MemoryRun(world)
+    made = Wheelless if variant == "images" else MemoryRun
+    if variant == "wide":
+        gait = replace(TEAM_GAIT, leap=1.15 * TEAM_GAIT.leap, abreast=1.1 * TEAM_GAIT.abreast)
+        shape = team_of(5, 2, STANCES, stream(seed, "formation"), gait)
+    elif seed % 2 == 0:
+        return made(simulated("hallway", seed, points=POINTS, stances=STANCES, imperfections=imperfections))
+    else:
+        shape = team_of(4, 1, STANCES)
+    return made(build_team_world(shape, seed=seed, points=TEAM_POINTS, imperfections=imperfections))
 
 
-def healthy_world(number: int) -> list[dict[str, Any]]:
+def healthy_world(number: int, variant: str) -> list[dict[str, Any]]:
     """Solve a world without a fault, and return its accusations and warnings as one row."""
-    solution = solve(world_of(number), SolveOptions())  # type: ignore[arg-type]
+    solution = solve(world_of(number, variant), SolveOptions())  # type: ignore[arg-type]
     said = [sorted(one) for one in accusations(solution)]
     return [{"kind": "healthy", "world": number, "said": said, "innocent": bool(said), "warnings": solution.warnings}]
 
 
-def faulty_world(number: int, kinds: Sequence[str] = KINDS) -> list[dict[str, Any]]:
-    """Return one row for each kind of fault, drawn in the same world."""
-    world = world_of(number)
+def faulty_world(number: int, variant: str) -> list[dict[str, Any]]:
+    """Return one row for each fault of runs with one fault of each kind, or two, drawn in the same world."""
+    world = world_of(number, variant)
     batch.measure_stance = measure = Measured()  # type: ignore[assignment]
     healthy = solve(world, SolveOptions()).estimate  # type: ignore[arg-type]
-    return [faulted(world, healthy, measure, number, kind) for kind in kinds]
+    singles = [(kind,) for kind in (SEEN_KINDS if variant == "images" else KINDS)]
+    return [row for kinds in (PAIRS if variant == "two" else singles)
+            for row in faulted(world, healthy, measure, number, kinds)]  # fmt: skip
 
 
-def faulted(world: MemoryRun, healthy: Estimate, measure: Measured, number: int, kind: str) -> dict[str, Any]:
-    """Solve a world with a drawn fault, and return its accusations, the verdict and the fault's effect as a row."""
-    fault = drawn(world, kind, np.random.default_rng((number, KINDS.index(kind))))
+def faulted(
+    world: MemoryRun, healthy: Estimate, measure: Measured, number: int, kinds: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Solve a world with drawn faults of different robots, and return accusations, verdict and effect of each."""
+    rng = np.random.default_rng((number, *(KINDS.index(kind) for kind in kinds)))
+    faults: list[Fault] = []
+    while len(faults) < len(kinds):
+        one = drawn(world, kinds[len(faults)], rng)
+        faults += [] if one.robot in [other.robot for other in faults] else [one]
     began = time.process_time()
-    row: dict[str, Any] = {"kind": fault.kind, "world": number, "robot": fault.robot, "stance": fault.stance}
-    row["size"] = round(fault.size, 3)
-    faulty = bumped(world, fault) if fault.kind == "bump" else Faulty(world, fault)
-    row["effect"] = effect(faulty, healthy, measure)
+    rows: list[dict[str, Any]] = []
+    for fault in faults:
+        row: dict[str, Any] = {"kind": fault.kind, "world": number, "robot": fault.robot, "stance": fault.stance}
+        effect_alone = effect(with_faults(world, [fault]), healthy, measure)
+        rows.append({**row, "size": round(fault.size, 3), "effect": effect_alone, "of": list(kinds)})
     try:
-        solution = solve(faulty, SolveOptions())  # type: ignore[arg-type]
+        solution = solve(with_faults(world, faults), SolveOptions())  # type: ignore[arg-type]
     except Exception as error:  # one failure must not end the others
-        return {**row, "error": f"{type(error).__name__}: {error}"}
-    right, innocent = verdict(solution, fault)
+        return [{**row, "error": f"{type(error).__name__}: {error}"} for row in rows]
     said = [sorted(one) for one in accusations(solution)]
     seconds = round(time.process_time() - began, 2)
-    return {**row, "right": right, "innocent": innocent, "said": said, "seconds": seconds,
-            "chi2": round(solution.estimate.chi2 / max(solution.estimate.dof, 1), 2),
-            "warnings": list(solution.warnings)}  # fmt: skip
+    shared = {"said": said, "seconds": seconds, "warnings": list(solution.warnings),
+              "chi2": round(solution.estimate.chi2 / max(solution.estimate.dof, 1), 2)}  # fmt: skip
+    for row, fault in zip(rows, faults, strict=True):
+        right, innocent = verdict(solution, fault, [one.robot for one in faults])
+        row.update(shared, right=right, innocent=innocent)
+    return rows
+
+
+def with_faults(run: MemoryRun, faults: Sequence[Fault]) -> Any:
+    """The run with all of some faults."""
+    faulty: Any = run
+    for one in sorted(faults, key=lambda one: one.kind != "bump"):  # which changes the world itself
+        faulty = bumped(faulty, one) if one.kind == "bump" else Faulty(faulty, one)
+    return faulty
 
 
 def main() -> None:
@@ -308,11 +348,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, default=34, help="number of worlds (default: 34)")
     parser.add_argument("--first", type=int, default=1, help="first world (default: 1)")
+    parser.add_argument(
+        "--variant", choices=VARIANTS, default="usual", help="kind of worlds and faults (default: usual)"
+    )
     parser.add_argument("--healthy", action="store_true", help="solve the worlds without a fault")
     parser.add_argument("--processes", type=int, default=2, help="number of processes (default: 2)")
     parser.add_argument("--json", metavar="FILE", type=Path, help="append every fault to a file, one a line")
     options = parser.parse_args()
-    work = healthy_world if options.healthy else faulty_world
+    work = partial(healthy_world if options.healthy else faulty_world, variant=options.variant)
     worlds = range(options.first, options.first + options.worlds)
     rows = list[dict[str, Any]]()
     with ProcessPoolExecutor(options.processes, mp_context=get_context("spawn")) as pool:

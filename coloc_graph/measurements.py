@@ -220,13 +220,13 @@ class Sighting:
     observer, seen
         Names of the observing robot, and of the robot or landmark that it sees.
     time
-        Time of the image [UTC s, observer's clock]; a moving robot's pose of this stance is that at this time.
+        Time of the image [UTC s, the reference robot's clock]; a moving robot's pose of this stance is that at this time.
     T_observer_seen
         Pose of body `seen` in body `observer`, (4, 4), or a `gtsam.Pose3`.
     covariance
         Covariance (3, 3) of heading [rad], x, y [m], in the frame of `seen`: both stand on the floor.
     x_markers, x_covariance
-        Rays (x, y, 1) to its first two markers, (2, 2), and their covariance (2, 2, 2). The joint estimate takes these
+        Rays (x, y, 1) to its first two markers, (2, 2), and their covariance (4, 4). The joint estimate takes these
         instead of the pose.
     R_camera_view
         Rotation (3, 3) of the frame of these rays; None: the camera's own.

@@ -221,17 +221,17 @@ class _Markers:
         seen = p_view[:, :, 2].min(axis=1) > 1e-3
         w = 1 / np.where(seen[:, None], p_view[..., 2], 1.0)
         x = p_view[..., :2] * w[..., None]
-        e = (self._roots @ (x - self._x)[..., None])[..., 0]
+        e = (self._roots @ (x - self._x).reshape(n, 4, 1))[..., 0]
         project = np.zeros((n, 2, 2, 3))
         project[..., 0, 0] = project[..., 1, 1] = w
         project[..., 2] = -x * w[..., None]
-        project = self._roots @ project @ self._R_camera_view[:, None].mT
-        by_camera = np.concatenate([project @ hat(p_camera), -project], axis=-1).reshape(n, 4, 6)
+        project = project @ self._R_camera_view[:, None].mT
         turned = project @ (R_cw @ R_ws)[:, None]
-        by_seen = np.concatenate([-turned @ hat(p_body), turned], axis=-1).reshape(n, 4, 6)
-        by_markers = (turned @ self._of_markers).reshape(n, 4, 2)
+        by_camera = self._roots @ np.concatenate([project @ hat(p_camera), -project], axis=-1).reshape(n, 4, 6)
+        by_seen = self._roots @ np.concatenate([-turned @ hat(p_body), turned], axis=-1).reshape(n, 4, 6)
+        by_markers = self._roots @ (turned @ self._of_markers).reshape(n, 4, 2)
         return (
-            e.reshape(n, 4),
+            e,
             [by_camera @ cameras.by_body, by_seen, by_camera @ cameras.by_errors, by_markers],
             seen,
         )

@@ -19,7 +19,7 @@ from coloc_graph.run import Stance
 from coloc_graph.run.atomic_file import write_atomically
 from coloc_graph.team import Floor, Landmark, Robot, Slip
 
-FORMAT = "coloc-graph-checkpoint-6"
+FORMAT = "coloc-graph-checkpoint-7"
 
 #: Measurements; `Any`, since msgspec cannot decode a union of dataclasses: a file has each under its `KINDS`.
 Measurements = tuple[Any, ...]

@@ -41,13 +41,14 @@ class WheelTrack:
         """Interpolate x [m], y [m], yaw [rad] (n, 3) at times (n,), odometry frame; constant outside the samples."""
         return np.stack([np.interp(times, self.times, column) for column in self._poses.T], axis=1)
 
-    def speed_at(self, time: float) -> float:
-        """Speed between the samples about an instant [m/s]; 0 if there are none near."""
+    def rates_at(self, time: float) -> tuple[float, float]:
+        """Yaw rate [rad/s] and speed [m/s] between the samples about an instant; 0 if there are none near."""
         after = int(np.searchsorted(self.times, time))
         if not 0 < after < len(self.times) or self.times[after] - self.times[after - 1] > MAX_GAP:
-            return 0.0
-        distance = np.hypot(*(self._poses[after, :2] - self._poses[after - 1, :2]))
-        return float(distance / max(self.times[after] - self.times[after - 1], 1e-6))
+            return 0.0, 0.0
+        period = max(self.times[after] - self.times[after - 1], 1e-6)
+        dx, dy, dyaw = (self._poses[after] - self._poses[after - 1]) / period
+        return float(dyaw), float(np.hypot(dx, dy))
 
     def covers(self, times: Array) -> NDArray[np.bool_]:
         """Return at which times (n,) the pose is known: not in a gap between samples in which it changed."""
@@ -146,8 +147,8 @@ class WheelTrack:
         J[:, 1, 0], J[:, 1, 1], J[:, 1, 2] = c, -s, -arm[:, 1]
         J[:, 2, 0], J[:, 2, 1], J[:, 2, 2] = s, c, arm[:, 0]
         covariance = (J @ C @ J.mT).sum(axis=0) + np.diag(np.square(MIN_SIGMAS))
-        late = clock_sigma * np.array([self.speed_at(start), self.speed_at(end)])
-        covariance[1:, 1:] += (late**2).sum() * np.eye(2)
+        turned_late, late = clock_sigma**2 * np.square([self.rates_at(start), self.rates_at(end)]).sum(axis=0)
+        covariance += np.diag([turned_late, late, late])
         T_odom = floor_pose(x[[0, -1]], y[[0, -1]], yaw[[0, -1]])
         T_before_after = se3_between(*T_odom)
         return Odometry(self.robot, before, after, T_before_after, (covariance + covariance.T) / 2)

@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from coloc_graph.frontend.homography.eq2_pose import turned_normal
 from coloc_graph.frontend.homography.plane import on_plane
 from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.homography.plane_view import view_of_plane
 from coloc_graph.frontend.odometry import WheelTrack
+from coloc_graph.frontend.pairing.clock_offset import ClockOffset
 from coloc_graph.frontend.pairing.correspondence import pair_by_time
 from coloc_graph.frontend.tracks.marker_pairs import longest_pair, named_pair, tracks_of
 from coloc_graph.frontend.tracks.tracking import Track
@@ -23,6 +25,7 @@ from coloc_graph.team import Markers, Robot
 Array = NDArray[np.float64]
 
 SPAN_TOLERANCE = 0.35  # relative error of the distance between a robot's two markers
+SPEED_WINDOW = 0.3  # samples within this of a sighting tell how the markers moved [s]
 MIN_DRIVEN = 0.1  # m that a robot must drive for its odometry to tell its unnamed markers apart
 _NO_ERRORS = np.zeros((1, 6))
 
@@ -43,6 +46,7 @@ def sight(
     plane: Plane,
     wheels: WheelTrack | None = None,
     at: float | None = None,
+    clock: ClockOffset | None = None,
 ) -> Sighting | None:
     """Sight a body with two markers.
 
@@ -60,6 +64,9 @@ def sight(
         Wheel odometry of the body, which tells markers without names apart.
     at
         Time of the sighting [UTC s]; by default the instant at which the markers are seen best.
+    clock
+        Observer's clock minus the reference robot's. The time of the sighting is corrected by it, and what the body
+        moves within its standard deviation is in the covariance.
 
     Returns
     -------
@@ -94,24 +101,37 @@ def sight(
         np.stack([getattr(track, name)[row] for track, row in zip(pair, shared[best], strict=True)])
         for name in ("covariance", "loads")
     )
-    noise = observer.camera.centre_covariance(stated, loads)
+    noise = block_diag(*observer.camera.centre_covariance(stated, loads))
+    clock = clock or ClockOffset(0.0, 0.0)
+    if clock.sigma:
+        noise += _late(times, uv, best, clock.sigma)
     pose, covariance = _pose(observer, markers, plane, uv[best], noise)
     T_observer_seen = floor_pose(pose[1], pose[2], pose[0])
-    bias = observer.camera.bias_px**2 * np.eye(2)
     view = view_of_plane(observer.camera, plane.N)
     x = view.normalise(uv[best])
-    J = view.per_pixel(x)
+    J = block_diag(*view.per_pixel(x))
     return Sighting(
         stance=stance.index,
         observer=observer.name,
         seen=seen.name,
-        time=float(times[best]),
+        time=float(times[best]) - clock.value,
         T_observer_seen=T_observer_seen,
         covariance=covariance,
         x_markers=x,
-        x_covariance=J @ (noise + bias) @ J.mT,
+        x_covariance=J @ (noise + observer.camera.bias_px**2 * np.eye(4)) @ J.T,
         R_camera_view=view.R_camera_view if view is not observer.camera else None,
     )
+
+
+def _late(times: Array, uv: Array, best: int, sigma: float) -> Array:
+    """Covariance (4, 4) of two markers' pixels (n, 2, 2) at the sample `best`, as its time is known to `sigma` [s]."""
+    near = np.flatnonzero(np.abs(times - times[best]) < max(SPEED_WINDOW, sigma))
+    rows = slice(max(min(int(near[0]), best - 2), 0), max(int(near[-1]), best + 2) + 1)
+    t = times[rows] - times[best]
+    terms = np.stack([np.ones_like(t), t, t**2 / 2], axis=1)
+    _, speed, acceleration = np.linalg.lstsq(terms, uv[rows].reshape(-1, 4), rcond=1e-9)[0]
+    moved = np.stack([sigma * speed, np.sqrt(3 / 4) * sigma**2 * acceleration])  # second moments of both terms
+    return np.asarray(moved.T @ moved)
 
 
 def at_rest(track: Track, time: float) -> Track:
@@ -209,11 +229,11 @@ def _on_floor(observer: Robot, plane: Plane, uv: Array, errors: Array = _NO_ERRO
 def _pose(observer: Robot, markers: Markers, plane: Plane, uv: Array, noise: Array) -> tuple[Array, Array]:
     """Heading, x, y (3,) of a body with its first two markers at pixels (2, 2), and their covariance (3, 3).
 
-    The line through both gives the heading, their midpoint the position.
+    `noise` (4, 4) is the covariance of these pixels. The line through both gives the heading, their midpoint the
+    position.
     """
     root = np.zeros((10, 10))
-    bias = observer.camera.bias_px**2 * np.eye(2)
-    root[:2, :2], root[2:4, 2:4] = (np.linalg.cholesky(C + bias) for C in noise)
+    root[:4, :4] = np.linalg.cholesky(noise + observer.camera.bias_px**2 * np.eye(4))
     mount = observer.mount
     root[4:, 4:] = np.diag(
         [

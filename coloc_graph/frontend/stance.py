@@ -52,7 +52,7 @@ LITTLE_IN_COMMON = 30  # points below which two of many observers may be left un
 WELL_EXPLAINED = 0.8  # share of inliers from which on no other tracks are tried
 NOT_OBSERVABLE = (
     "the clock offset is not observable, since the mover drove at constant speed: let it stop and go "
-    "(the offset stays at its prior, `clock_sigma`)"
+    "(the offset stays at its prior, `clock_sigma`, which the poses of movers that they sighted contain)"
 )
 
 #: Source of the marker plane's distance.

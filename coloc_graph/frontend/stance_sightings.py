@@ -8,6 +8,7 @@ from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.plane import plane_from_mount
 from coloc_graph.frontend.landmarks import UnusedSighting
 from coloc_graph.frontend.odometry import WheelTrack
+from coloc_graph.frontend.pairing.clock_offset import ClockOffset
 from coloc_graph.frontend.sighting import at_rest, sight
 from coloc_graph.frontend.stance import PairMeasurement
 from coloc_graph.frontend.stance_tracks import stance_plane
@@ -39,6 +40,7 @@ def sight_movers(
     if run.team.floor is None or stance.index in run.planes:
         return []
     tracks: dict[str, list[Track]] = {}
+    measured = list(measured)
     for one in measured:
         if one.tracks is not None:
             for observer, seen in zip((one.homography.robot_i, one.homography.robot_j), one.tracks, strict=True):
@@ -52,11 +54,23 @@ def sight_movers(
         for mover in stance.movers:
             named = len(stance.movers) == 1 or any(track.marker for track in seen)
             own = seen if named else [track for track in seen if track.mover == mover]
-            sighting = sight(stance, run.team[observer], run.team[mover], own, plane, wheels.get(mover))
+            clock = _clock(run, observer, measured)
+            sighting = sight(stance, run.team[observer], run.team[mover], own, plane, wheels.get(mover), clock=clock)
             before = best.get(mover)
             if sighting is not None and (before is None or np.trace(sighting.covariance) < np.trace(before.covariance)):
                 best[mover] = sighting
     return list(best.values())
+
+
+def _clock(run: Recorded, observer: str, measured: Iterable[PairMeasurement]) -> ClockOffset:
+    """Clock of an observer minus the reference robot's, by the homography of both or as the team states it."""
+    if observer == run.team.reference:
+        return ClockOffset(0.0, 0.0)
+    for h in (one.homography for one in measured):
+        if {h.robot_i, h.robot_j} == {observer, run.team.reference} and h.time_offset_sigma:
+            found = ClockOffset(h.time_offset, h.time_offset_sigma)
+            return found if h.robot_j == observer else found.reversed()
+    return ClockOffset(0.0, run.team.clock_sigma)
 
 
 def unsighted_movers(

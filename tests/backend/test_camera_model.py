@@ -146,7 +146,7 @@ def test_what_cannot_be_seen_is_told_apart(rng):
     below = T_WORLD_J.copy()
     below[2, 3] = -1.0
     assert not at(model, T_WORLD_I, below, *EXACT)[2]
-    sight = MarkersModel(np.zeros((2, 2)), np.broadcast_to(1e-6 * np.eye(2), (2, 2, 2)), MOUNT_I, MARKERS)
+    sight = MarkersModel(np.zeros((2, 2)), 1e-6 * np.eye(4), MOUNT_I, MARKERS)
     assert not at(sight, T_WORLD_I, T_WORLD_I @ floor_pose(-2, 0, 0), np.zeros(6), np.zeros(2))[2]
 
 
@@ -227,7 +227,8 @@ def test_jacobians_of_a_stated_plane(rng):
 def test_sighted_markers(rng):
     T_seen = floor_pose(1.4, 0.2, 0.7)
     x = seen_by(floor_pose(0.3, 0.1, 0.2), MOUNT_I, MARKERS.p_body @ T_seen[:3, :3].T + T_seen[:3, 3])
-    covariance = np.broadcast_to(1e-6 * np.array([[1.0, 0.3], [0.3, 2.0]]), (2, 2, 2))
+    root = np.tril(rng.standard_normal((4, 4))) + 3 * np.eye(4)
+    covariance = 1e-6 * root @ root.T
     model = MarkersModel(x, covariance, MOUNT_I, MARKERS)
     level = floor_pose(0.3, 0.1, 0.2)
     assert np.abs(at(model, level, T_seen, np.zeros(6), np.zeros(2))[0]).max() < 1e-9
@@ -262,7 +263,7 @@ def test_factors_evaluated_at_once_are_those_evaluated_alone(rng):
     seen.append(FactorEvaluator(made[0], (2, 1), (None, 12, 21, None), (6, 6, 2, 1)))
     seen.append(FactorEvaluator(made[0], (1, 3), (11, 12, 21, 31), (6, 6, 2, 1)))  # robot 3 is below the floor
     x = seen_by(T_WORLD_I, MOUNT_I, MARKERS.p_body @ T_WORLD_J[:3, :3].T + T_WORLD_J[:3, 3] + (1.0, 0.0, 0.0))
-    sight = MarkersModel(x, np.broadcast_to(1e-6 * np.eye(2), (2, 2, 2)), MOUNT_I, MARKERS)
+    sight = MarkersModel(x, 1e-6 * np.eye(4), MOUNT_I, MARKERS)
     seen.append(FactorEvaluator(sight, (1, 2), (11, 21), (6, 2)))
 
     def values_of(step):

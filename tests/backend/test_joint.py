@@ -341,7 +341,7 @@ def seen_wrong(graph, factor):
     last = [m for m in graph.measurements if isinstance(m, Sighting)][-1]
     span = last.x_markers[1] - last.x_markers[0]
     along = span / np.linalg.norm(span)
-    off = factor * np.sqrt(along @ last.x_covariance[0] @ along) * along
+    off = factor * np.sqrt(along @ last.x_covariance[:2, :2] @ along) * along
     bad = replace(last, x_markers=last.x_markers + np.array([np.zeros(2), off]))
     measurements = tuple(
         bad if m is last else m

@@ -121,7 +121,7 @@ def test_a_tag_is_sighted_where_it_stands_as_surely_as_it_says():
         assert np.abs(xi[1:]).max() < 0.02 and abs(xi[0]) < np.deg2rad(4)
         sigmas.append(xi @ np.linalg.solve(made.covariance, xi))
         # what all its images share is not averaged away
-        assert np.sqrt(made.x_covariance[0, 0, 0]) > 0.04 / 301
+        assert np.sqrt(made.x_covariance[0, 0]) > 0.04 / 301
     assert np.mean(sigmas) < 3 * 2.0
 
 

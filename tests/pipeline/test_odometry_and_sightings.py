@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from coloc_graph.frontend import FrontendOptions, WheelTrack, measure_pair, sight, sight_movers
 from coloc_graph.frontend.homography.plane import plane_from_mount
+from coloc_graph.frontend.pairing.clock_offset import ClockOffset
 from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.pipeline.batch import solve
@@ -119,6 +120,28 @@ def test_nees_of_sightings_is_inside_its_interval(rng, tolerance):
         off = planar(se3_inverse(seen.T_observer_seen) @ truth)
         nees.append(off @ np.linalg.solve(seen.covariance, off))
     low, high = chi2.ppf([0.005, 0.995], 3 * len(nees))
+    assert low < sum(nees) < high
+
+
+@pytest.mark.parametrize(("value", "seconds"), [(0.0, 0.1), (0.3, 0.02)])
+def test_nees_of_a_mover_contains_the_uncertainty_of_the_clock_of_who_saw_it(rng, value, seconds):
+    """It drives and turns: a pose at a time by the reference robot's clock is known no better than that clock."""
+    team = reference_team()
+    observer, mover = team["A"], team["C"]
+    plane = plane_from_mount(observer.mount, mover.markers, team.floor)
+    nees, stamps = [], 0.1 * np.arange(8)
+    for _ in range(100):
+        x, y, yaw, speed, turning = rng.uniform((0.8, -0.1, -3, -0.2, -0.5), (1.4, 0.1, 3, 0.2, 0.5))
+
+        def at(times, x=x, y=y, yaw=yaw, speed=speed, turning=turning):
+            return floor_pose(x, y, yaw) @ floor_pose(speed * times, 0.0, turning * times)
+
+        late = value + seconds * rng.standard_normal()
+        tracks = seen_from(rng, observer, mover, at(stamps - late), noise=0.1)
+        seen = sight(STANCE, observer, mover, tracks, plane, clock=ClockOffset(value, seconds))
+        off = planar(se3_inverse(seen.T_observer_seen) @ at(np.array(seen.time)))
+        nees.append(off @ np.linalg.solve(seen.covariance, off))
+    low, high = chi2.ppf([0.001, 0.999], 3 * len(nees))
     assert low < sum(nees) < high
 
 
