@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from monte_carlo import MemoryRun, over_seeds, simulated
 
-from coloc_graph.backend import joint
+from coloc_graph.backend import Bump, joint
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.pipeline.incremental import StanceSolver
 from coloc_graph.run import Detections
@@ -69,8 +69,11 @@ def one_seed(seed: int) -> dict[str, bool]:
             solver.enter(run, stance)
         return solver
 
+    def bumps(solver: StanceSolver) -> tuple[Bump, ...]:
+        return solver.estimator.bumps(solver.estimator.faults())
+
     def named(solver: StanceSolver) -> bool:
-        return any((b.stay_put.robot, b.stay_put.after) == (anchor, k) for b in solver.estimator.bumps())
+        return any((b.stay_put.robot, b.stay_put.after) == (anchor, k) for b in bumps(solver))
 
     healthy = up_to(k + 1)
     bumped = up_to(k)
@@ -85,7 +88,7 @@ def one_seed(seed: int) -> dict[str, bool]:
     return {
         "pushed anchors named": named(bumped),
         "pushed anchors that contradict": bool(said.rejected) or said.agreement.p_value() < 1e-4,
-        "healthy anchors named": bool(healthy.estimator.bumps()),
+        "healthy anchors named": bool(bumps(healthy)),
         "wrong homographies refused": bool(found.rejected),
         "wrong homographies taken for a push": bool(found.bumped),
     }

@@ -220,7 +220,7 @@ class Sighting:
     observer, seen
         Names of the observing robot, and of the robot or landmark that it sees.
     time
-        Time of the image [UTC s, the reference robot's clock]; a moving robot's pose of this stance is that at this time.
+        Time of the image [UTC s, the reference robot's clock]; a moving robot's pose of this stance is that at it.
     T_observer_seen
         Pose of body `seen` in body `observer`, (4, 4), or a `gtsam.Pose3`.
     covariance

@@ -228,8 +228,3 @@ def _innovation(fit: Fit, link: Link) -> Agreement:
     if not all(map(fit.values.exists, factor.keys())):
         return UNCHECKED
     return innovation([factor], fit.values, fit.marginals.joint(list(factor.keys())))
-
-
-def find_bumps(method: Method, graph: PoseGraph) -> tuple[Bump, ...]:
-    """Find the anchors that did not stay put, the most significant first; none where another cause explains more."""
-    return with_stack(len(graph.nodes), lambda: bumps_of(find_faults(method, graph, None)[0], graph))

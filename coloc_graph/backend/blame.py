@@ -81,6 +81,11 @@ class Fault:
     sigmas: float
     T_before_after: gtsam.Pose3 | None = None
 
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """The cause, and those that explain as much."""
+        return self.cause, *self.alternative
+
     def bump(self, graph: PoseGraph) -> Bump:
         """Return the bump that it is."""
         stay = self.cause.links[0]

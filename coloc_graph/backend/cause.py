@@ -26,6 +26,10 @@ class Cause:
         """True if an anchor was bumped."""
         return isinstance(self.links[0], StayPut)
 
+    def is_seen_in(self, stance: int) -> bool:
+        """Return whether it is what cameras measured in a stance, and nothing else."""
+        return all(isinstance(link, RelativePose | Sighting) and link.stance == stance for link in self.links)
+
     @property
     def robots(self) -> tuple[str, ...]:
         """Robots of which one, at least, is at fault."""

@@ -6,6 +6,7 @@ from concurrent.futures import Future
 from typing import TypeVar
 
 from coloc_graph.backend import Bump
+from coloc_graph.backend.cause import to_check
 from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.frontend import FrontendOptions, StanceTracks
 from coloc_graph.machine import machine
@@ -60,10 +61,10 @@ class EstimationWorker:
         self._judging = None
         return _result(done, "judging the stance")
 
-    def enter(self, stance: Stance) -> None:
-        """Measure a stance and enter it into the estimate, from what is recorded now."""
+    def enter(self, stance: Stance, *, retake: bool = False) -> None:
+        """Measure a stance and enter it into the estimate, from what is recorded now; `retake` as of `enter_stance`."""
         record = self._record.now() if isinstance(self._record, Record) else self._record
-        self._entering = self._worker.submit(self._enter, stance, record)
+        self._entering = self._worker.submit(self._enter, stance, record, retake)
 
     def entered(self) -> EnteredStance | list[Bump] | None:
         """Return the entered stance, None while it is not; or bumps of its anchors: then it has not entered."""
@@ -83,16 +84,29 @@ class EstimationWorker:
             self._tracks = stance.start, StanceTracks(self._record, stance, frontend.tracker)
         return self._tracks[1]
 
-    def _enter(self, stance: Stance, record: Recorded) -> EnteredStance | list[Bump]:
-        one = enter_stance(self._solver, record, stance, self._tracks_of(stance))
+    def _enter(self, stance: Stance, record: Recorded, retake: bool) -> EnteredStance | list[Bump]:
+        one = enter_stance(self._solver, record, stance, self._tracks_of(stance), retake=retake)
         gc.freeze()  # the record and the estimate stay: looking through them for garbage would hold up later stances
         return one
 
 
 def enter_stance(
-    solver: StanceSolver, record: Recorded, stance: Stance, tracks: StanceTracks | None = None
+    solver: StanceSolver,
+    record: Recorded,
+    stance: Stance,
+    tracks: StanceTracks | None = None,
+    *,
+    retake: bool = False,
 ) -> EnteredStance | list[Bump]:
     """Measure a stance and enter it into the estimate.
+
+    Parameters
+    ----------
+    solver, record, stance, tracks
+        Estimator, record, the stance, and its tracks where they exist already.
+    retake
+        The stance can be taken again: it does not enter if what its cameras measured may be wrong. A clock or wheels
+        that are wrong would be as wrong again.
 
     Returns
     -------
@@ -102,7 +116,7 @@ def enter_stance(
     Raises
     ------
     ColocError
-        If it measures nothing, or cannot enter.
+        If it measures nothing, cannot enter, or is to be taken again.
     """
     noisy = Restated(record, solver.noise.used(record.team))  # as a logged run is measured
     pairs = solver.measure(record, stance, tuple(measure_stance(noisy, stance, solver.options, tracks)))
@@ -115,8 +129,13 @@ def enter_stance(
         raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
     if not one.estimate.rejected and one.estimate.agreement.p_value() > CONTRADICTED:
         return one
-    # contradicted: was an anchor pushed since the stance before?
-    bumped = [bump for bump in solver.estimator.bumps() if bump.stay_put.after == stance.index]
+    faults = solver.estimator.faults()
+    seen = [fault for fault in faults if any(cause.is_seen_in(stance.index) for cause in fault.causes)]
+    bumped = [bump for bump in solver.estimator.bumps(faults) if bump.stay_put.after == stance.index]
+    if retake and seen:
+        solver.withdraw()
+        causes = seen[0].causes
+        raise RobotError(f"{' or else '.join(map(str, causes))}: the stance is taken again; check {to_check(*causes)}")
     if bumped:
         solver.withdraw()
     return bumped or one

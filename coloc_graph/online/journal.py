@@ -8,7 +8,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -35,18 +35,21 @@ class Attempt:
         The stance.
     recorded
         Number of detections and of odometry samples of each robot that were recorded then, of the whole run.
+    retake
+        True if it could be taken again.
     digest
         Digest of the estimate after it; "" if it did not enter, or the coordinator ended before.
     """
 
     stance: Stance
     recorded: dict[str, tuple[int, int]]
+    retake: bool = False
     digest: str = ""
 
 
-def row_of(stance: Stance, recorded: Counts) -> dict[str, Any]:
+def row_of(stance: Stance, recorded: Counts, retake: bool) -> dict[str, Any]:
     """Return the row of a stance that is about to enter."""
-    return {"stance": stance.index, "begun": asdict(stance), "recorded": dict(recorded)}
+    return {"stance": stance.index, "begun": asdict(stance), "recorded": dict(recorded), "retake": retake}
 
 
 def row_of_entered(one: EnteredStance) -> dict[str, Any]:
@@ -88,12 +91,12 @@ def read_attempts(path: Path) -> list[Attempt]:
             try:
                 if row["what"] == "entering":
                     stance = msgspec.convert(row["begun"], Stance)
-                    attempts.append(Attempt(stance, msgspec.convert(row["recorded"], dict[str, tuple[int, int]])))
+                    recorded = msgspec.convert(row["recorded"], dict[str, tuple[int, int]])
+                    attempts.append(Attempt(stance, recorded, row.get("retake") is True))
                 elif row["what"] == "resumed" and attempts and attempts[-1].stance.index >= row["stances"]:
                     attempts.pop()  # the coordinator ended before this one was decided
                 elif row["what"] == "entered" and attempts and attempts[-1].stance.index == row["stance"]:
-                    last = attempts[-1]
-                    attempts[-1] = Attempt(last.stance, last.recorded, str(row.get("digest", "")))
+                    attempts[-1] = replace(attempts[-1], digest=str(row.get("digest", "")))
             except (KeyError, TypeError, msgspec.ValidationError) as error:
                 raise RunError(f"{path}: is not the log of a mission ({error})") from error
     return attempts
@@ -132,7 +135,7 @@ class Journal:
             if record is None:
                 continue
             with suppress(ColocError):
-                one = enter_stance(solver, record, attempt.stance)
+                one = enter_stance(solver, record, attempt.stance, retake=attempt.retake)
                 if isinstance(one, EnteredStance):
                     yield attempt, one
 

@@ -91,6 +91,7 @@ class LeapFrog:
         self._failures = 0  # attempts at the present stance that failed
         self._captures = machine.time_ns() // 1_000_000  # capture numbers are unique across coordinators
         self._recovered = -math.inf
+        self._warned: set[str] = set()
         self._steps = {
             MissionState.GATHERING: self._gather,
             MissionState.SYNCHRONISING: self._synchronise,
@@ -294,8 +295,9 @@ class LeapFrog:
             self._enter(MissionState.ESTIMATING)
             end = self._registry.record.rounded(attempt.last_image + MARGIN)
             stance = replace(attempt.stance, end=end, anchors=self._anchors())
-            self._log.note("entering", **row_of(stance, self._registry.record.counts))
-            self._worker.enter(stance)
+            retake = not self._failures  # what is wrong twice is no accident of the images
+            self._log.note("entering", **row_of(stance, self._registry.record.counts, retake))
+            self._worker.enter(stance, retake=retake)
         elif self.states.lasted(COLLECT_TIME):
             raise RobotError(f"not all images of stance {self._index} came within {COLLECT_TIME:.0f} s")
 
@@ -313,6 +315,7 @@ class LeapFrog:
         self._registry.follow(one)
         self._decisions.take(one, self._registry.poses())
         self._log.note("entered", **row_of_entered(one), latency=round(latency, 4))
+        self._note_warnings(one)
         if self._on_stance is not None:
             self._on_stance(one)
         self._failures, self.attempt = 0, None
@@ -385,6 +388,14 @@ class LeapFrog:
             self._log.note("bumped", robot=robot, text=text)
         if reasons:
             raise RobotError("; ".join(reasons.values()))
+
+    def _note_warnings(self, one: EnteredStance) -> None:
+        """Note what another attempt cannot cure: clocks and wheels that are wrong, once each."""
+        outliers = [f"the {other.measurement} was rejected: it is {other.reason}" for other in one.estimate.rejected]
+        for text in (*one.warnings, *outliers):
+            if text not in self._warned:
+                self._warned.add(text)
+                self._log.note("warning", text=text)
 
     # the stance
 

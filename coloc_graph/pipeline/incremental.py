@@ -164,12 +164,15 @@ class EnteredStance:
         Its measurements, and the odometry into it.
     pairs : tuple of PairMeasurement
         Measurements of all pairs, unusable ones included.
+    warnings : tuple of str
+        Warnings on clocks and odometry, as they are known with this stance.
     """
 
     stance: Stance
     estimate: StanceEstimate
     measurements: tuple[Measurement, ...]
     pairs: tuple[PairMeasurement, ...]
+    warnings: tuple[str, ...] = ()
 
 
 class StanceSolver:
@@ -284,7 +287,7 @@ class StanceSolver:
         self.seconds.append((self._measuring + adding - started, time.perf_counter() - adding))
         self.measured += tuple(replace(one, with_team=None) for one in shared)
         self._earlier_noise, self.noise = self.noise, self._next_noise
-        return EnteredStance(here, said, made, shared)
+        return EnteredStance(here, said, made, shared, tuple(self.warnings))
 
     def _enter_ranges(
         self,
