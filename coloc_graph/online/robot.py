@@ -230,7 +230,6 @@ class RobotProgram:
             self._wheels_fault = wheels.fault
             self._tell("recovered", "the line to the wheels is back")
         self._opening = False
-        self._crowded = False  # True once an image had more lights than are measured
 
     def _go_on_counting(self) -> None:
         """Join the odometry of a newly opened line to what was counted before, also by an earlier program."""
