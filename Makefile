@@ -33,7 +33,7 @@ types: $(VENV)/installed-dev
 
 ifeq ($(ARGS),)
 unit: $(VENV)/installed-dev
-	$(BIN)/pytest --numprocesses 2 --dist loadfile -m "not realtime" tests/experiments/test_notebooks.py tests
+	$(BIN)/pytest --numprocesses 3 --dist loadfile -m "not realtime" tests
 	$(BIN)/pytest -m realtime
 else
 unit: $(VENV)/installed-dev

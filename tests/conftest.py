@@ -6,14 +6,10 @@ import signal
 import numpy as np
 import pytest
 
-from coloc_graph.pipeline.batch import METHODS, SolveOptions, solve
+from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.results.writer import write_result
 from coloc_graph.run import RunWriter, open_run, read_true_team, read_truth
 from coloc_graph.simulation import simulate
-
-#: What runs in real time, against devices, links and browsers: not beside other tests.
-REALTIME = ("camera", "create", "link", "live_world", "online", "viewer_browser", "viewer_export")
-
 
 # Under `nohup` or in the background of a script SIGHUP or SIGINT are ignored, which the programs that tests start would
 # inherit. A handler that does nothing ignores them as well, and is not inherited.
@@ -27,15 +23,19 @@ def pytest_addoption(parser):
     parser.addoption("--whole", action="store_true", help="run tests marked long, and a mission of 12 stances")
 
 
+def pytest_ignore_collect(collection_path, config):
+    """Import only the files that have tests in real time where only these are asked for."""
+    if config.option.markexpr == "realtime" and collection_path.name.startswith("test_"):
+        return True if "mark.realtime" not in collection_path.read_text(encoding="utf-8") else None
+    return None
+
+
 def pytest_collection_modifyitems(config, items):
-    """Mark the tests that run in real time, and skip the long ones unless asked for."""
+    """Skip the long tests unless asked for."""
     if not config.getoption("--whole"):
         for item in items:
             if item.get_closest_marker("long"):
                 item.add_marker(pytest.mark.skip(reason="long statistics: make test-long"))
-    for item in items:
-        if item.path.stem.removeprefix("test_") in REALTIME:
-            item.add_marker(pytest.mark.realtime)
 
 
 def copy_run(source, to, *, change=lambda record: record, stances=None, team=None, truth=False, more=()):
@@ -95,10 +95,22 @@ def short(tmp_path_factory):
     return path
 
 
+class Solutions(dict):
+    """Solutions of a run by method, each solved when it is first asked for."""
+
+    def __init__(self, path):
+        super().__init__()
+        self._path = path
+
+    def __missing__(self, method):
+        self[method] = solve(open_run(self._path), SolveOptions(method=method))
+        return self[method]
+
+
 @pytest.fixture(scope="session")
 def solutions(hallway):
     """The solutions of the hallway by method."""
-    return {method: solve(open_run(hallway), SolveOptions(method=method)) for method in METHODS}
+    return Solutions(hallway)
 
 
 @pytest.fixture(scope="session")

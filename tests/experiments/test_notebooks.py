@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import jupytext
-import nbclient
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.py"))
@@ -29,6 +27,9 @@ def test_there_is_one_for_each_experiment():
     [pytest.param(path, id=path.stem, marks=[pytest.mark.long] * (path.stem in LONG)) for path in NOTEBOOKS],
 )
 def test_a_notebook_runs_and_shows_its_figure(path, tmp_path):
+    import jupytext  # takes seconds, which every process that collects tests would spend
+    import nbclient
+
     notebook = jupytext.read(path)
     assert notebook.metadata["jupytext"]["text_representation"]["format_name"] == "percent"
     kinds = [cell.cell_type for cell in notebook.cells]

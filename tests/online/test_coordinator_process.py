@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from fake_robots import FakeRobot, fake_team
 
-from coloc_graph.cli import running
+from coloc_graph.cli import main, running
 from coloc_graph.cli.nonblocking_log import CAPACITY, NonBlockingHandler
 from coloc_graph.errors import InputError
 from coloc_graph.online.mission_folder import MissionFolder
@@ -24,7 +24,6 @@ from coloc_graph.run import open_run
 from coloc_graph.simulation.simulated_team import field_team, free_address
 from coloc_graph.team import write_team
 
-pytestmark = pytest.mark.realtime
 F_SETPIPE_SZ = 1031
 
 
@@ -56,9 +55,12 @@ class Mission:
         self._pipe = full_pipe()
         self.process = self.start(stdout=self._pipe[1], stderr=self._pipe[1], preexec_fn=ignore_terminal)
 
-    def start(self, *more, address=None, **options):
-        command = [sys.executable, "-m", "coloc_graph.cli", "coordinate", str(self.folder / "team.toml")]
-        command += ["--out", str(self.folder / "mission"), "--goal", "5,0", "--listen", address or self.address, *more]
+    def arguments(self, *more, address=None):
+        command = ["coordinate", str(self.folder / "team.toml"), "--out", str(self.folder / "mission")]
+        return [*command, "--goal", "5,0", "--listen", address or self.address, *more]
+
+    def start(self, **options):
+        command = [sys.executable, "-m", "coloc_graph.cli", *self.arguments()]
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, **options)
 
     def rows(self):
@@ -98,40 +100,39 @@ def test_a_mission_goes_on_while_nobody_reads_its_output(mission):
     mission.wait_for("looking")
 
 
-def test_a_second_coordinator_of_the_same_folder_is_refused_and_changes_nothing(mission):
+def test_a_second_coordinator_of_the_same_folder_is_refused_and_changes_nothing(mission, capfd):
     mission.wait_for("looking")
     folder = mission.folder / "mission"
     before = {path.name: path.stat().st_ino for path in folder.iterdir()}
-    second = mission.start("--resume", address=free_address(), stderr=subprocess.PIPE, stdout=subprocess.PIPE)
-    out, err = second.communicate(timeout=30.0)
-    assert second.returncode == 2 and out == b"" and err.count(b"\n") == 1
-    assert b"is being written by another command" in err
+    assert main(mission.arguments("--resume", address=free_address())) == 2
+    out, err = capfd.readouterr()
+    assert out == "" and err.count("\n") == 1
+    assert "is being written by another command" in err
     assert {path.name: path.stat().st_ino for path in folder.iterdir()} == before
 
 
-def test_a_taken_port_is_refused_before_a_record_is_touched(mission, tmp_path):
+def test_a_taken_port_is_refused_before_a_record_is_touched(mission, tmp_path, capfd):
     mission.wait_for("looking")
-    command = [sys.executable, "-m", "coloc_graph.cli", "coordinate", str(mission.folder / "team.toml")]
-    command += ["--listen", mission.address, "--out"]
+    command = ["coordinate", str(mission.folder / "team.toml"), "--listen", mission.address, "--out"]
     earlier = tmp_path / "earlier"
     earlier.mkdir()
     (earlier / "run.mcap").write_bytes(b"a record")
     for more in ([str(tmp_path / "new")], [str(earlier), "--resume"]):
-        done = subprocess.run([*command, *more], capture_output=True, timeout=30.0, check=False)
-        assert done.returncode == 2 and done.stderr.count(b"\n") == 1
-        assert b"cannot open the link" in done.stderr and b"in use" in done.stderr and b".rs" not in done.stderr
+        assert main([*command, *more]) == 2
+        err = capfd.readouterr().err
+        assert err.count("\n") == 1 and "cannot open the link" in err and "in use" in err and ".rs" not in err
     assert not (tmp_path / "new").exists()
     assert (earlier / "run.mcap").read_bytes() == b"a record" and not list(earlier.glob("run.*.mcap"))
 
 
-def test_a_second_program_of_a_robot_is_told_and_ends_and_one_after_it_is_admitted(mission, tmp_path):
+def test_a_second_program_of_a_robot_is_told_and_ends_and_one_after_it_is_admitted(mission, tmp_path, capfd):
     mission.wait_for("looking")
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((240, 320), np.uint8))
-    command = [sys.executable, "-m", "coloc_graph.cli", "robot", "A", str(mission.folder / "team.toml")]
+    command = ["robot", "A", str(mission.folder / "team.toml")]
     command += ["--out", str(tmp_path), "--connect", mission.address, "--camera", f"video:{tmp_path}"]
-    done = subprocess.run(command, capture_output=True, timeout=30.0, check=False)
-    assert done.returncode == 2 and b"Traceback" not in done.stderr
-    assert done.stderr.splitlines()[-1].startswith(b"coloc: another program runs as robot A already")
+    assert main(command) == 2
+    err = capfd.readouterr().err
+    assert "Traceback" not in err and err.splitlines()[-1].startswith("coloc: another program runs as robot A already")
     first = mission.robots["A"]
     sessions = [row["session"] for row in mission.rows() if row["what"] == "session" and row["robot"] == "A"]
     assert sessions == [first.session] and first.link.refused is None

@@ -14,8 +14,9 @@ from coloc_graph.results.writer import assess
 from coloc_graph.run import open_run
 from coloc_graph.simulation.simulated_team import field_team
 
+pytestmark = pytest.mark.realtime
 #: How many stances, or with --whole, and before which an anchor is pushed then.
-STANCES = 3
+STANCES = 2
 WHOLE = 12
 PUSHED = 5
 #: What a wheel may turn on for after what let it go was cut off [s].
@@ -43,7 +44,7 @@ def mission(tmp_path_factory, request):
         m.time_to_stand("the link is cut")
         time.sleep(3.0)
         m.relay.mend()
-        in_mid_stance(2)
+        in_mid_stance(1)  # once more
         time.sleep(1.5)
         m.killed_at = time.time()
         m.coordinator.kill()
@@ -95,7 +96,7 @@ def test_the_mission_ends_by_itself_with_every_stance_once(mission):
 def test_what_happened_is_named(mission):
     assert "C is not there" in reasons(mission, 0)
     assert "not there" in reasons(mission, 1) or "has sent nothing" in reasons(mission, 1)
-    assert any(row["what"] == "resumed" and row["stances"] == 2 for row in mission.rows)
+    assert any(row["what"] == "resumed" and row["stances"] == 1 for row in mission.rows)
     if mission.stances < WHOLE:
         return
     assert f"robot {mission.pushed} was bumped between stances {PUSHED - 1} and {PUSHED}" in reasons(mission, PUSHED)
@@ -112,7 +113,7 @@ def test_wheels_stand_soon_after_they_are_let_go(mission):
 
 def test_a_killed_coordinator_s_record_misses_half_a_second_at_most(mission):
     cut_off = open_run(mission.folder / "mission" / "run.1.mcap")
-    assert len(cut_off.stances) == 2
+    assert len(cut_off.stances) == 1
     last = max(one.time for robot in "AB" for one in cut_off.detections(robot))
     assert mission.killed_at - last < 0.5 + 0.2  # and the image before that
     goes_on = open_run(mission.folder / "mission" / "run.mcap")
@@ -146,9 +147,8 @@ def test_it_is_as_accurate_as_the_same_record_in_batch(mission):
         for incremental in (True, False)
     )
     assert online.ate < 1.2 * batch.ate + 1e-4
-    for row in batch.robots:
-        if row.robot != "C":
-            assert row.true_length > 0.3 and abs(row.length_error) < 0.02
+    leapt = [row for row in batch.robots if row.robot != "C" and row.true_length > 0.3]
+    assert len(leapt) == min(mission.stances - 1, 2) and all(abs(row.length_error) < 0.02 for row in leapt)
     assert batch.ate < 0.05
 
 

@@ -65,6 +65,7 @@ def video(request, tmp_path):
     return tmp_path
 
 
+@pytest.mark.realtime
 def test_a_video_is_shown_at_the_cameras_rate_and_ends_with_a_sentence(video):
     camera = replace(CAMERA, fps=20.0)
     with open_camera(f"video:{video}", camera, "A") as source:
@@ -82,6 +83,7 @@ def test_a_video_is_shown_at_the_cameras_rate_and_ends_with_a_sentence(video):
         assert number_in(source.read()) <= 5
 
 
+@pytest.mark.realtime
 def test_who_reads_slowly_gets_the_newest_image_and_the_number_of_those_that_he_missed(video):
     with open_camera(f"video:{video}", CAMERA, "A") as source:
         first = number_in(source.read())
@@ -201,7 +203,8 @@ def test_a_world_that_refuses_or_is_none(tmp_path, answer, words):
         open_camera(f"world:{world.path}", CAMERA, "C")
 
 
-def test_a_world_that_does_not_answer_is_given_up(tmp_path):
+def test_a_world_that_does_not_answer_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("coloc_graph.robot_io.camera.simulated.ANSWER_TIMEOUT", 0.2)
     with World(tmp_path / "w", lambda _, ended: ended.wait(5)) as world:
         since = time.monotonic()
         with pytest.raises(CameraError, match=r"cannot be opened .timed out.: is the simulated world running"):
@@ -282,7 +285,8 @@ class Hanging:
         self.closed.set()
 
 
-def test_a_device_that_hangs_keeps_nobody_from_closing_and_opening_anew():
+def test_a_device_that_hangs_keeps_nobody_from_closing_and_opening_anew(monkeypatch):
+    monkeypatch.setattr("coloc_graph.robot_io.camera.source.ENDING", 0.1)
     let_go, made = threading.Event(), []
 
     def connect():

@@ -17,6 +17,7 @@ from tcp_relay import Relay
 
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError, RobotError
+from coloc_graph.robot_io.link import recovery
 from coloc_graph.robot_io.link.certificates import make_certificates
 from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
 from coloc_graph.robot_io.link.messages import (
@@ -35,7 +36,7 @@ from coloc_graph.robot_io.link.messages import (
     decode,
     encode,
 )
-from coloc_graph.robot_io.link.recovery import NEWEST_PERIOD, RECOVERY_PERIOD
+from coloc_graph.robot_io.link.recovery import RECOVERY_PERIOD
 from coloc_graph.robot_io.link.robot_link import RobotLink
 from coloc_graph.robot_io.link.session import KEPT_KINDS
 from coloc_graph.robot_io.link.zenoh_config import Tls, config_of, tls_of
@@ -130,6 +131,13 @@ class Robot:
     def _number(self, kind):
         self.sent[kind] += 1
         return self.sent[kind] - 1
+
+
+@pytest.fixture
+def soon_asked(monkeypatch):
+    """The newest message is requested after a shorter time; the time [s]."""
+    monkeypatch.setattr(recovery, "NEWEST_PERIOD", 0.3)
+    return recovery.NEWEST_PERIOD
 
 
 @pytest.fixture
@@ -291,7 +299,7 @@ def test_what_robots_send_is_checked(pair, caplog):
     assert len(heard.events) == 2 and "3 Event messages of A are lost" in caplog.text
 
 
-def test_what_does_not_come_by_itself_is_asked_for(pair):
+def test_what_does_not_come_by_itself_is_asked_for(soon_asked, pair):
     heard, robot = pair
     robot.put_event("0")
     assert until(lambda: len(heard.events) == 1)
@@ -303,7 +311,7 @@ def test_what_does_not_come_by_itself_is_asked_for(pair):
     assert until(lambda: len(heard.events) == 300)
     assert [int(one.text) for _, one in heard.events] == list(range(300))
     assert heard.link.counts.missed == 0
-    time.sleep(1.5 * NEWEST_PERIOD)  # the newest is asked for again, and is no replay
+    time.sleep(1.5 * soon_asked)  # the newest is asked for again, and is no replay
     assert heard.link.counts.replayed == 0
 
 
@@ -318,9 +326,9 @@ def test_a_request_that_fails_is_no_answer(pair, monkeypatch):
         Event, "_max=1"
     )
     failing = [True]
-    recovery = heard.link._recoveries["A"]
-    request = recovery.request
-    monkeypatch.setattr(recovery, "request", lambda *one: not failing[0] and request(*one))
+    of_a = heard.link._recoveries["A"]
+    request = of_a.request
+    monkeypatch.setattr(of_a, "request", lambda *one: not failing[0] and request(*one))
     gap = msgspec.structs.replace(heard.events[0][1], number=2)
     heard.link._receiver(Event)("coloc/A/events", encode(gap))
     time.sleep(5 * RECOVERY_PERIOD)
@@ -342,7 +350,7 @@ def test_a_reply_that_is_an_error_is_no_answer(pair):
         assert asked == [False] * 5
 
 
-def test_restarts_of_one_robot_leave_another_robots_data_alone(pair):
+def test_restarts_of_one_robot_leave_another_robots_data_alone(soon_asked, pair):
     heard, a = pair
     for _ in range(40):
         a.put_wheels()
@@ -360,7 +368,7 @@ def test_restarts_of_one_robot_leave_another_robots_data_alone(pair):
         assert until(lambda: heard.link.counts.unknown >= before + 300)
     a.put_wheels()
     assert until(lambda: len(heard.wheels) == 45)
-    time.sleep(1.5 * NEWEST_PERIOD)
+    time.sleep(1.5 * soon_asked)
     assert [one.number for _, one in heard.wheels] == list(range(45))
     assert heard.link.counts.missed == 0 and heard.link.counts.replayed == 0
 
@@ -402,7 +410,8 @@ def test_a_second_program_of_the_same_name_is_refused_and_the_first_one_goes_on(
 
 def test_a_command_to_a_program_that_was_restarted_meanwhile_is_refused(pair):
     heard, robot = pair
-    robot._answer = lambda body: time.sleep(3.0) or "late"
+    ended = threading.Event()
+    robot._answer = lambda body: ended.wait(LONG) and "late"
     replies = []
     asking = threading.Thread(target=lambda: replies.append(heard.link.ask("A", Halt(), LONG)))
     asking.start()
@@ -410,6 +419,7 @@ def test_a_command_to_a_program_that_was_restarted_meanwhile_is_refused(pair):
     robot.link._session.zenoh.close()
     with Robot("A", heard.address, session="second") as second:
         asking.join()
+        ended.set()
         assert not replies[0].ok and "restarted meanwhile" in replies[0].text and second.bodies == []
 
 
@@ -448,7 +458,6 @@ def test_what_is_measured_waits_for_the_clock():
 
 ROBOT = """
 import sys, time
-from coloc_graph.robot_io.link.recovery import NEWEST_PERIOD, RECOVERY_PERIOD
 from coloc_graph.robot_io.link.robot_link import RobotLink
 from coloc_graph.robot_io.link.messages import Event
 with RobotLink("A", connect=sys.argv[1], handler=lambda body: "", session=sys.argv[2]) as link:
@@ -637,12 +646,12 @@ def test_a_stranger_is_not_let_in(secured, certificates, tmp_path):
     mixed = Tls(tls_of(certificates, "A").ca, others.certificate, others.key)  # who knows ours, and has none of it
     for tls in (others, mixed):
         with outsider(heard.address, tls) as stranger:
-            for _ in range(20):
+            for _ in range(6):
                 stranger.put("coloc/A/status", b"\x00")
                 assert not list(stranger.get("coloc/A/command/first", payload=encode(command(Halt())), timeout=0.05))
             assert list(stranger.info.peers_zid()) == []
     with outsider(heard.address.replace("tls/", "tcp/")) as stranger:
-        for _ in range(20):
+        for _ in range(6):
             stranger.put("coloc/A/status", b"\x00")
             time.sleep(0.02)
         assert list(stranger.info.peers_zid()) == []

@@ -92,6 +92,7 @@ def off(frame, uv):
 # ---- what is seen
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("robot", ["A", "B"])
 def test_leds_are_seen_where_the_truth_projects_them(world, robot):
     with camera_of(world, robot) as camera:
@@ -112,6 +113,7 @@ def test_they_are_where_the_tolerances_drew_them_and_not_where_the_team_says(wor
     assert off(frame, uv).min() > 0.5
 
 
+@pytest.mark.realtime
 def test_a_moving_robot_is_seen_where_it_was_in_the_middle_of_the_exposure(own):
     with Create(own.ports["C"], 2) as wheels, camera_of(own, "A") as camera:
         errors = []
@@ -129,6 +131,7 @@ def test_a_moving_robot_is_seen_where_it_was_in_the_middle_of_the_exposure(own):
     assert np.median(np.max(errors, axis=1)) < 0.15
 
 
+@pytest.mark.realtime
 def test_a_moving_camera_sees_from_where_it_is(own):
     with Create(own.ports["A"], 2) as wheels, camera_of(own, "A") as camera:
         errors = []
@@ -157,6 +160,7 @@ def test_a_camera_that_has_moved_sees_what_one_that_is_opened_there_does():
         assert (after.pixels != before.pixels).mean() > 0.05
 
 
+@pytest.mark.realtime
 def test_images_come_at_the_cameras_rate_soon_and_with_noise_of_their_own(world):
     with camera_of(world, "B") as camera:
         frames, ages = [], []
@@ -174,6 +178,7 @@ def test_images_come_at_the_cameras_rate_soon_and_with_noise_of_their_own(world)
     assert all(np.std(frames[0].pixels.astype(float) - frame.pixels) > 3 for frame in frames[1:])
 
 
+@pytest.mark.realtime
 def test_stamps_are_of_the_clients_clock(world):
     ahead = 3_600_000_000_000
     with camera_of(world, "A", clock=lambda: time.monotonic_ns() + ahead) as camera:
@@ -182,6 +187,7 @@ def test_stamps_are_of_the_clients_clock(world):
     assert 0 < age * 1e-9 < 1.0
 
 
+@pytest.mark.realtime
 def test_only_cameras_that_somebody_has_opened_are_rendered(world):
     assert until(lambda: cameras_running() == 0)
     with camera_of(world, "A") as camera:
@@ -230,6 +236,7 @@ def test_a_team_that_says_another_size_is_told(world):
         camera.read(2.0)
 
 
+@pytest.mark.realtime
 def test_a_frozen_camera_is_an_error_in_time_and_thaws(own):
     with camera_of(own, "A") as camera, camera_of(own, "B") as other:
         camera.read(2.0)
@@ -246,6 +253,7 @@ def test_a_frozen_camera_is_an_error_in_time_and_thaws(own):
         camera.read(2.0)
 
 
+@pytest.mark.realtime
 def test_a_client_that_does_not_read_holds_up_nobody(own):
     with socket.socket(socket.AF_UNIX) as client, camera_of(own, "A") as camera:
         client.connect(own.address)
@@ -425,6 +433,7 @@ class Program:
             pipe.close()
 
 
+@pytest.mark.realtime
 def test_the_program_serves_takes_commands_and_ends_with_the_truth(tmp_path):
     with Program(tmp_path, "--seed", "3", "--epoch", "5000000000") as program:
         assert program.about["epoch_ns"] == 5_000_000_000
