@@ -344,15 +344,17 @@ class Estimator:
         with self._all_or_nothing():
             return self._enter(None, measurements)
 
-    def revoke(self, measurement: Measurement) -> StanceEstimate:
-        """Remove a measurement, as if it had never been added, and return the poses of the last stance.
+    def revoke(self, *measurements: Measurement) -> StanceEstimate:
+        """Remove measurements, as if they had never been added, and return the poses of the last stance.
 
-        Measurements that were rejected because they contradicted this one are taken back.
+        Measurements that were rejected because they contradicted these are taken back.
         """
-        if not any(one is measurement for one in self._log):
-            raise EstimationError(f"the {measurement} cannot be removed: it was not added")
+        added = set(map(id, self._log))
+        for one in measurements:
+            if id(one) not in added:
+                raise EstimationError(f"the {one} cannot be removed: it was not added")
         with self._all_or_nothing():
-            self._take_out(self.stances, {id(measurement)}, set(self._rejected))
+            self._take_out(self.stances, set(map(id, measurements)), set(self._rejected))
         return self._at(next(reversed(self._stances.values())), self.rejected, UNCHECKED)
 
     def withdraw(self) -> Stance:

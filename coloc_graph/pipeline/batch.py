@@ -53,9 +53,7 @@ __all__ = ["METHODS", "EnteredStance", "Progress", "Solution", "SolveOptions", "
 log = logging.getLogger(__name__)
 
 NOISE_ROUNDS = 2  # of learning the noise and measuring again: which points are inliers depends on it
-
 FEW_STANCES = 4  # stances below which an offset of clocks may pass for another fault
-
 MAX_MISFIT = 2.0  # misfit of an estimate from which on clocks are doubted in any case
 
 BATCH = {"chain": chain, "smooth": smooth, "joint": joint}
@@ -308,9 +306,10 @@ def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: 
             on_update(one)
     _require_poses(run, options, solver.measured)
     _require_ties(run, solver.estimator.graph, solver.measured)
-    estimate = solver.estimator.estimate()
+    arms, estimate = find_lever_arms(solver.estimator.estimate(), BATCH[options.method or "joint"])
     frontend, updates = zip(*solver.seconds, strict=True)
-    warnings = _warnings(run, options, estimate, solver.measured, solver.warnings, solver.unused)
+    said = [*solver.warnings, *map(str, arms.values())]
+    warnings = _warnings(run, options, estimate, solver.measured, said, solver.unused)
     missing = without_poses(run, options, estimate, solver.measured, solver.unused)
     left_out = unused_ranges(solver.unused_ranges)
     return _Solved(estimate, warnings, sum(frontend), solver.measured, updates, {}, missing, solver.noise, left_out)

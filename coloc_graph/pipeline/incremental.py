@@ -28,8 +28,9 @@ from coloc_graph.frontend import (
 from coloc_graph.frontend.clock_evidence import ClockEvidence
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measured_again
 from coloc_graph.frontend.stance_ranges import StanceRanges, merged
-from coloc_graph.measurements import Measurement, Sighting
+from coloc_graph.measurements import Measurement, Odometry, Sighting
 from coloc_graph.pipeline.clocks import CorrectedRun, RunClocks, run_clocks, stance_evidence
+from coloc_graph.pipeline.lever_arm import MIN_REJECTED, LeverArm, mend_lever_arms, of_bodies
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.pipeline.ranges import instants_in, of_targets, place_ranges, standing_of
 from coloc_graph.run import OdometrySample, Ranges, Recorded, Run, Stance
@@ -196,10 +197,13 @@ class StanceSolver:
         )
         #: All pairs of all stances, unusable ones included.
         self.measured: tuple[PairMeasurement, ...] = ()
-        #: Warnings on clocks.
+        #: Warnings on clocks and lever arms.
         self.warnings: list[str] = []
         #: Clocks that turned out to be wrong; their stamps are corrected from then on.
         self.clocks: RunClocks | None = None
+        #: Lever arms of odometry that were found; it is moved to the body from then on.
+        self.arms: dict[str, LeverArm] = {}
+        self._doubted = MIN_REJECTED  # rejections from which on lever arms are looked for
         self._evidence: list[ClockEvidence] = []
         #: Time of the front end and of the estimator for each stance [s].
         self.seconds: list[tuple[float, float]] = []
@@ -240,7 +244,7 @@ class StanceSolver:
             if clocks is not None:
                 self.clocks, run = clocks, clocks.corrected(as_it_is)
                 shared, warnings = again()
-        self.warnings = [*(self.clocks.sentences() if self.clocks else ()), *warnings]
+        self.warnings = [*(self.clocks.sentences() if self.clocks else ()), *map(str, self.arms.values()), *warnings]
         self._next_noise = self.noise.updated(shared)
         shared = measured_again(shared, self._next_noise.used(run.team))
         self._measuring = time.perf_counter() - started
@@ -272,7 +276,7 @@ class StanceSolver:
         started = time.perf_counter()
         noisy = Restated(run, self._next_noise.used(self.team))
         motions = [] if self.team.floor is None else self._motions.of_stance(noisy, stance, shared)
-        made = (*(m.relative_pose for m in shared if m.relative_pose is not None), *motions)
+        made = of_bodies((*(m.relative_pose for m in shared if m.relative_pose is not None), *motions), self.arms)
         adding = time.perf_counter()
         before = next(reversed(self.estimator.stances), None)
         # the first stance has no anchors, whatever it names
@@ -283,11 +287,28 @@ class StanceSolver:
             if self.team.floor is not None:
                 self._motions.withdraw()
             raise
+        said, made = self._mended(said, made)
         said = self._enter_ranges(run, here, before, said, made, ranges or {})
         self.seconds.append((self._measuring + adding - started, time.perf_counter() - adding))
         self.measured += tuple(replace(one, with_team=None) for one in shared)
         self._earlier_noise, self.noise = self.noise, self._next_noise
         return EnteredStance(here, said, made, shared, tuple(self.warnings))
+
+    def _mended(
+        self, said: StanceEstimate, made: tuple[Measurement, ...]
+    ) -> tuple[StanceEstimate, tuple[Measurement, ...]]:
+        """Look for lever arms that explain what was rejected; the estimate and measurements of the last stance."""
+        if sum(isinstance(one.measurement, Odometry | Sighting) for one in self.estimator.rejected) < self._doubted:
+            return said, made
+        self._doubted *= 2  # each time takes a few batch estimates
+        found, again = mend_lever_arms(self.estimator)
+        if again is None:
+            return said, made
+        self.arms |= found
+        self.warnings += map(str, found.values())
+        made = tuple(one for one in self.estimator.measurements if said.stance in (stance for _, stance in one.ends))
+        residuals = tuple(map(self.estimator.residual, made))
+        return replace(again, residuals=residuals, landmarks=said.landmarks), made
 
     def _enter_ranges(
         self,

@@ -1,18 +1,18 @@
 """Odometry of another point of a robot than its body's origin: found by the poses that cameras measured."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from coloc_graph.backend import Estimate, PoseGraph
+from coloc_graph.backend import Estimate, Estimator, PoseGraph, StanceEstimate, joint, smooth
 from coloc_graph.backend.batch import REJECTION_PRICE
 from coloc_graph.backend.blame import EQUAL_CHI2
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.lie import floor_pose, se3_between, se3_inverse
-from coloc_graph.measurements import Odometry, Sighting
+from coloc_graph.measurements import Measurement, Odometry, Sighting
 
 Array = NDArray[np.float64]
 
@@ -55,19 +55,43 @@ class LeverArm:
 
 
 def find_lever_arms(estimate: Estimate, solve: Callable[[PoseGraph], Estimate]) -> tuple[dict[str, LeverArm], Estimate]:
-    """Find the lever arm of a robot that explains what is rejected of an estimate, and the estimate with it.
+    """Find the lever arms that explain what is rejected of an estimate, and the estimate with them.
 
     Each robot's arm is measured against an estimate without its odometry; the one that explains most is kept if it
-    explains more than the rejections. Returns {} and the estimate itself where none does.
+    explains more than the rejections, and the next is looked for. Returns {} and the estimate itself where none does.
     """
+    arms: dict[str, LeverArm] = {}
+    while (best := _best_arm(estimate, solve, arms)) is not None:
+        arm, estimate = best
+        arms[arm.robot] = arm
+    return arms, estimate
+
+
+def mend_lever_arms(estimator: Estimator) -> tuple[dict[str, LeverArm], StanceEstimate | None]:
+    """Find lever arms by all inputs of an incremental estimate, and replace the odometry that has one.
+
+    Returns {} and None where there is none; takes a few batch estimates.
+    """
+    arms, _ = find_lever_arms(estimator.estimate(), joint if estimator.robot_models else smooth)
+    wrong = [one for one in estimator.measurements if isinstance(one, Odometry) and one.robot in arms]
+    if not wrong:
+        return {}, None
+    estimator.revoke(*wrong)
+    return arms, estimator.insert(*of_bodies(wrong, arms))
+
+
+def _best_arm(
+    estimate: Estimate, solve: Callable[[PoseGraph], Estimate], known: Container[str]
+) -> tuple[LeverArm, Estimate] | None:
+    """The lever arm, of robots whose is not `known`, that explains most, and the estimate with it; None of none."""
     doubted = [one.measurement for one in estimate.rejected if isinstance(one.measurement, Odometry | Sighting)]
     p_value = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
     if len(doubted) < MIN_REJECTED and not estimate.bumped and p_value > DOUBTED_P_VALUE:
-        return {}, estimate
+        return None
     best: tuple[float, LeverArm, Estimate] | None = None
     for robot in estimate.graph.robots:
         ways = [one for one in estimate.graph.measurements if isinstance(one, Odometry) and one.robot == robot]
-        if len(ways) < MIN_WAYS:
+        if len(ways) < MIN_WAYS or robot in known:
             continue
         try:
             without = solve(estimate.graph.without(ways))
@@ -80,8 +104,8 @@ def find_lever_arms(estimate: Estimate, solve: Callable[[PoseGraph], Estimate]) 
             if best is None or cost < best[0]:
                 best = cost, arm, moved
     if best is None or best[0] > _implausibility(estimate) - EQUAL_CHI2:
-        return {}, estimate
-    return {best[1].robot: best[1]}, best[2]
+        return None
+    return best[1], best[2]
 
 
 def _implausibility(estimate: Estimate) -> float:
@@ -123,10 +147,11 @@ def _arm(estimate: Estimate, robot: str, ways: Sequence[Odometry]) -> LeverArm |
 
 def with_lever_arms(graph: PoseGraph, arms: Mapping[str, LeverArm]) -> PoseGraph:
     """Return the graph with the odometry of some robots moved to their bodies."""
-    if not arms:
-        return graph
-    moved = tuple(
-        arms[one.robot].moved(one) if isinstance(one, Odometry) and one.robot in arms else one
-        for one in graph.measurements
+    return replace(graph, measurements=of_bodies(graph.measurements, arms)) if arms else graph
+
+
+def of_bodies(measurements: Iterable[Measurement], arms: Mapping[str, LeverArm]) -> tuple[Measurement, ...]:
+    """Return measurements with the odometry of some robots moved to their bodies."""
+    return tuple(
+        arms[one.robot].moved(one) if isinstance(one, Odometry) and one.robot in arms else one for one in measurements
     )
-    return replace(graph, measurements=moved)

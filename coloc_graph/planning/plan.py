@@ -9,6 +9,7 @@ from pathlib import Path
 
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar
+from coloc_graph.input_file import read_text
 
 COLUMNS = ("stance", "robot", "role", "order", "x", "y", "yaw_deg", "duration")
 ROLES = ("anchor", "observer", "mover")
@@ -114,12 +115,8 @@ def read_plan(path: str | Path) -> Plan:
     InputError
         If the file is no plan; the message names the line.
     """
-    try:
-        if Path(path).stat().st_size > MAX_PLAN_SIZE:
-            raise InputError(f"{path} is too large for a plan: give one of at most {MAX_PLAN_SIZE // 1_000_000} MB")
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"the plan {path} cannot be read: {error}") from error
+    path = Path(path)
+    text = read_text(path, "give a plan, as `coloc plan --out` writes it", limit=MAX_PLAN_SIZE)
     rows = csv.DictReader(io.StringIO(text))
     if rows.fieldnames is None or set(COLUMNS) - set(rows.fieldnames):
         raise InputError(f"{path} is not a plan: its first line must name the columns {', '.join(COLUMNS)}")

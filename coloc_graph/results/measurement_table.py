@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from coloc_graph.errors import InputError
+from coloc_graph.input_file import read_text
 from coloc_graph.measurements import Odometry, Range
 from coloc_graph.pipeline.solution import Solution
 
@@ -36,20 +37,17 @@ def measurement_table(solution: Solution) -> str:
 def read_measurements(path: Path, kinds: Iterable[str]) -> list[Mapping[str, str]]:
     """Return the rows of some kinds; `InputError` where the file is missing or damaged."""
     kinds = frozenset(kinds)
+    rows = csv.DictReader(io.StringIO(read_text(path, "solve the run again"), newline=""))
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = csv.DictReader(file)
-            if tuple(rows.fieldnames or ()) != MEASUREMENT_COLUMNS:
-                raise ValueError("its columns are not those of this version")
-            found: list[Mapping[str, str]] = []
-            for row in rows:
-                if row["used"] not in ("yes", "no") or None in row.values():
-                    raise ValueError(f"line {rows.line_num} is incomplete")
-                if row["kind"] in kinds:
-                    found.append(row)
-            return found
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}): solve the run again") from error
+        if tuple(rows.fieldnames or ()) != MEASUREMENT_COLUMNS:
+            raise ValueError("its columns are not those of this version")
+        found: list[Mapping[str, str]] = []
+        for row in rows:
+            if row["used"] not in ("yes", "no") or None in row.values():
+                raise ValueError(f"line {rows.line_num} is incomplete")
+            if row["kind"] in kinds:
+                found.append(row)
+        return found
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path} is damaged ({error}): solve the run again") from error
 

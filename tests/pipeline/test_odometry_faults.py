@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from teams import ate, graph_of_team, team_of
+from teams import ate, fed, graph_of_team, team_of
 
 from coloc_graph.backend import smooth
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.measurements import Odometry
-from coloc_graph.pipeline.lever_arm import find_lever_arms
+from coloc_graph.pipeline.lever_arm import find_lever_arms, mend_lever_arms
 from coloc_graph.pipeline.odometry_checks import checked
 from coloc_graph.run import OdometrySample, Stance
 
@@ -75,6 +75,23 @@ def test_odometry_of_another_point_of_the_body_is_found_and_moved_to_it(arm):
     assert "the odometry of B is not that of its body's origin" in str(arms["B"])
     assert not mended.rejected and not mended.bumped
     assert ate(mended, team) < 1.5 * ate(smooth(graph_of_team(team)), team)
+
+
+def test_odometry_of_another_point_is_moved_to_the_body_stance_by_stance():
+    team = team_of(3, 14, 2)
+    T = floor_pose(0.4, 0.1, 0.0)
+    estimator = fed(
+        team,
+        [
+            replace(m, T_before_after=se3_inverse(T) @ m.T_before_after @ T) if isinstance(m, Odometry) else m
+            for m in team.measurements
+        ],
+    )
+    before = len(estimator.rejected)
+    arms, last = mend_lever_arms(estimator)
+    assert before > 1 and len(arms) > 1 and last.stance == team.stances[-1].index
+    assert len(estimator.rejected) < before
+    assert ate(estimator.estimate(), team) < 1.5 * ate(smooth(graph_of_team(team)), team)
 
 
 def test_odometry_of_the_body_has_no_lever_arm():

@@ -48,6 +48,7 @@ def test_an_impossible_gait_is_refused(numbers, word):
 def test_a_plan_comes_back_from_its_file_as_it_was_written(tmp_path):
     plan, path = straight_plan(), tmp_path / "plan.csv"
     write_plan(plan, path)
+    path.write_text("\ufeff" + path.read_text())  # as a spreadsheet saves it
     again = read_plan(path)
     for one, other in zip(plan.stances, again.stances, strict=True):
         assert (one.anchors, one.mover, one.duration) == (other.anchors, other.mover, other.duration)
