@@ -267,8 +267,10 @@ class Isam2Graph:
         rejected: list[tuple[Link, Agreement]] = []
         passed: list[InsertedLink] = []
         factors, leading = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-        for one, gate in far:
-            off = self._agreement([one.factor if gate is None else gate], inside=False)
+        tested = [one.factor if gate is None else gate for one, gate in far]
+        known = self._known_of(tested)
+        for (one, gate), factor in zip(far, tested, strict=True):
+            off = self._agreement([factor], known, inside=False)
             if off.p_value() < REJECTION_P_VALUE:
                 rejected.append((one.link, off))
             else:
@@ -301,7 +303,8 @@ class Isam2Graph:
         rejected: list[tuple[Link, Agreement]] = []
         before = np.inf  # worst chi2 a step ago; it has converged where a step no longer lowers it
         while inside:
-            among = {index: self._agreement([one.factor]) for index, one in inside.items()}
+            known = self._known_of(one.factor for one in inside.values())
+            among = {index: self._agreement([one.factor], known) for index, one in inside.items()}
             worst = min(among, key=lambda index: among[index].p_value())
             if among[worst].p_value() >= REJECTION_P_VALUE:
                 break
@@ -315,11 +318,13 @@ class Isam2Graph:
             before = np.inf
         return rejected
 
-    def _agreement(self, factors: list[gtsam.NonlinearFactor], *, inside: bool = True) -> Agreement:
+    def _agreement(
+        self, factors: list[gtsam.NonlinearFactor], known: gtsam.Values | None = None, *, inside: bool = True
+    ) -> Agreement:
         if not factors:
             return UNCHECKED
         joint = joint_covariance(self.isam, keys_of(factors))
-        return (agreement if inside else innovation)(factors, self._known_of(factors), joint)
+        return (agreement if inside else innovation)(factors, self._known_of(factors) if known is None else known, joint)
 
     def _known_of(self, factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.Values:
         """Return the estimates of all variables that factors are on, and those of the latest batch."""

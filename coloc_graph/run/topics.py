@@ -13,7 +13,7 @@ from coloc_graph.run.index import Index, KeptChunk
 
 T = TypeVar("T")
 
-KEPT_CHUNKS = 24  # decompressed chunks in the cache of a run
+KEPT_CHUNKS = 256  # decompressed chunks in the cache of a run
 KEPT_MESSAGES = 250_000  # messages in the cache, besides the newest chunk
 KEPT_BYTES = 64 * 1024 * 1024  # bytes in the cache, besides the newest chunk
 
