@@ -320,6 +320,10 @@ class Range:
         Number of the averaged samples.
     place : (2,) float or None
         Of a landmark, where it is about in the robot's pose [m]: an initial value where no other measurement gives one.
+    bearing, bearing_sigma : float or None
+        Mean bearing [rad] of the target from the robot while both stand, and its standard deviation [rad].
+    bearings : int
+        Number of the averaged bearings.
     """
 
     robot: str
@@ -333,6 +337,9 @@ class Range:
     covariance: Array
     samples: int
     place: Array | None = None
+    bearing: float | None = None
+    bearing_sigma: float | None = None
+    bearings: int = 0
 
     def __post_init__(self) -> None:
         _as_arrays(self, "range", "moved", "target_moved", "covariance")

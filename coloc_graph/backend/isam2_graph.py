@@ -324,7 +324,9 @@ class Isam2Graph:
         if not factors:
             return UNCHECKED
         joint = joint_covariance(self.isam, keys_of(factors))
-        return (agreement if inside else innovation)(factors, self._known_of(factors) if known is None else known, joint)
+        return (agreement if inside else innovation)(
+            factors, self._known_of(factors) if known is None else known, joint
+        )
 
     def _known_of(self, factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.Values:
         """Return the estimates of all variables that factors are on, and those of the latest batch."""

@@ -3,6 +3,7 @@
 A NaN spoils an ISAM2 for good, and 1e150 comes back as NaN poses with finite covariances.
 """
 
+import math
 from collections.abc import Sequence
 from itertools import groupby
 
@@ -44,6 +45,10 @@ def _require_ranges(measured: Range) -> None:
         why = f"has a range of {measured.range.min():.3g} m: give metres above 0, at most {MAX_DISTANCE:.0e}"
     elif np.abs(C - C.T).max() > ROUNDING * np.abs(C).max() or np.linalg.eigvalsh(C)[0] < MIN_SIGMA**2:
         why = "has a covariance that is not symmetric and positive definite: every range needs an uncertainty"
+    elif measured.bearing is not None and not (
+        math.isfinite(measured.bearing) and MIN_SIGMA <= (measured.bearing_sigma or 0.0) < math.inf
+    ):
+        why = "has a bearing without a number or uncertainty: give both, in radians"
     if why is not None:
         raise MeasurementError(f"the {measured} {why}")
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.ranged_landmarks import Located, locate
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
+from coloc_graph.geometry.se2 import wrap
 from coloc_graph.measurements import Range
 from coloc_graph.run import Ranges
 from coloc_graph.team import Ranging, Team
@@ -45,10 +46,14 @@ class Standing:
 
 @dataclass(frozen=True, eq=False)
 class StanceRanges:
-    """Ranges for the graph, and the numbers of samples that are in none of them, by reason."""
+    """Ranges for the graph, and the numbers of samples and of bearings that are in none of them.
+
+    `unused` are ranges by reason.
+    """
 
     ranges: tuple[Range, ...]
     unused: Mapping[str, int]
+    unused_bearings: int = 0
 
     @property
     def samples(self) -> int:
@@ -106,10 +111,11 @@ def ranges_of_stances(
     unused: Counter[str] = Counter()
     made: list[_Link] = []
     for robot, records in recorded.items():
-        by_target: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        by_target: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
         for one in records:
-            for target, distance in zip(one.targets, one.range.tolist(), strict=True):
-                by_target[target].append((one.time, distance))
+            bearings = [np.nan] * len(one.targets) if one.bearing is None else one.bearing.tolist()
+            for target, distance, bearing in zip(one.targets, one.range.tolist(), bearings, strict=True):
+                by_target[target].append((one.time, distance, bearing))
         for target, samples in by_target.items():
             made += _links_of_pair(team, (robot, target), standing, wheels, np.array(samples), unused)
     noise = _noise_factors(made)
@@ -122,7 +128,8 @@ class _Link:
     """Averaged ranges of a pair of robots at a pair of poses: of n windows.
 
     `residuals` are the samples' differences from their window's mean in stated sigmas; `directions` (n, 2, 2) are those
-    of the range in the bodies of both robots, and `points` (n, 2, 2) the antennas on these.
+    of the range in the bodies of both robots, and `points` (n, 2, 2) the antennas on these. `bearing` is a mean [rad],
+    its standard deviation, and the number of samples.
     """
 
     robot: str
@@ -136,6 +143,7 @@ class _Link:
     directions: Array
     points: Array
     residuals: Array
+    bearing: tuple[float, float, int] | None
 
     @property
     def driven(self) -> tuple[tuple[str, int], ...]:
@@ -159,7 +167,7 @@ class _Link:
         place = None if j.stance >= 0 else (se3_inverse(i.T_world_body) @ j.T_world_body)[:2, 3]
         return Range(
             self.robot, self.target, i.stance, j.stance, float(self.times.mean()), self.range, *self.moved, C,
-            len(self.residuals), place,
+            len(self.residuals), place, *(self.bearing or ()),
         )  # fmt: skip
 
 
@@ -171,7 +179,7 @@ def _links_of_pair(
     samples: Array,
     unused: Counter[str],
 ) -> list[_Link]:
-    times, ranges = samples.T
+    times, ranges, bearings = samples.T
     ends = []
     known = np.ones(len(times), bool)
     for name in pair:
@@ -187,7 +195,8 @@ def _links_of_pair(
     kept = np.flatnonzero(known)
     if not len(kept):
         return []
-    return list(_windows(team, pair, standing, [one.of(kept) for one in ends], times[kept], ranges[kept], unused))
+    at = [one.of(kept) for one in ends]
+    return list(_windows(team, pair, standing, at, times[kept], ranges[kept], bearings[kept], unused))
 
 
 def _places(standing: Sequence[Standing], track: WheelTrack | None, times: Array) -> _Places:
@@ -211,6 +220,7 @@ def _windows(
     ends: Sequence[_Places],
     times: Array,
     ranges: Array,
+    bearings: Array,
     unused: Counter[str],
 ) -> Iterable[_Link]:
     sensor = team[pair[0]].ranging
@@ -235,6 +245,7 @@ def _windows(
     order = np.lexsort((times, *keys.T[::-1]))
     first = np.flatnonzero(np.r_[True, np.any(np.diff(keys[order], axis=0), axis=1)])
     rows: dict[tuple[int, int], list[tuple[int, float, float, Array]]] = defaultdict(list)
+    seen: dict[tuple[int, int], tuple[float, float, int] | None] = {}
     for index in np.split(order, first[1:]):
         median = float(np.median(off[index]))
         kept = index[np.abs(off[index] - median) < OUTLIER_SIGMAS * sigmas[index]]
@@ -247,10 +258,13 @@ def _windows(
         if len(kept) < len(index):
             unused["they are outliers among those next to them"] += len(index) - len(kept)
         mean = float(off[kept].mean())
-        sigma = float(np.sqrt((sigmas[kept] ** 2).mean() / _independent(times[kept], sensor)))
+        sigma = float(np.sqrt((sigmas[kept] ** 2).mean() / _independent(times[kept], sensor.range_memory)))
         middle = int(kept[np.argmin(np.abs(times[kept] - times[kept].mean()))])
         scatter = (off[kept] - mean) / sigmas[kept] * np.sqrt(len(kept) / max(len(kept) - 1, 1))
-        rows[int(ends[0].row[middle]), int(ends[1].row[middle])].append((middle, mean, sigma, scatter))
+        where = int(ends[0].row[middle]), int(ends[1].row[middle])
+        rows[where].append((middle, mean, sigma, scatter))
+        if resting[middle]:
+            seen[where] = _bearing(sensor, times[kept], ranges[kept], bearings[kept])
     for (row_i, row_j), each in rows.items():
         middles = np.array([one[0] for one in each])
         points = np.broadcast_to(np.array(antennas), (len(each), 2, 2))
@@ -266,14 +280,30 @@ def _windows(
             directions=directions[middles],
             points=points,
             residuals=np.concatenate([one[3] for one in each]),
+            bearing=seen.get((row_i, row_j)),
         )
 
 
-def _independent(times: Array, sensor: Ranging) -> float:
+def _bearing(sensor: Ranging, times: Array, ranges: Array, bearings: Array) -> tuple[float, float, int] | None:
+    """Mean bearing while both ends stand, its standard deviation [rad], and the number of samples; None of none."""
+    there = np.isfinite(bearings)
+    sigmas = np.hypot(np.deg2rad(sensor.bearing_sigma_deg), sensor.across_sigma / ranges)
+    if not there.any() or not sigmas.min() > 0:
+        return None
+    first = bearings[there][0]
+    off = wrap(bearings - first)
+    kept = there & (np.abs(off - np.median(off[there])) < OUTLIER_SIGMAS * sigmas)
+    if kept.sum() * 2 < there.sum():
+        return None
+    variance = (sigmas[kept] ** 2).mean() / _independent(times[kept], sensor.bearing_memory)
+    return float(wrap(first + off[kept].mean())), float(np.sqrt(variance)), int(kept.sum())
+
+
+def _independent(times: Array, memory: float) -> float:
     """Number of independent samples that determine their mean as well; see `keyframes._shares`."""
-    if len(times) < 2 or sensor.range_memory <= 0:
+    if len(times) < 2 or memory <= 0:
         return float(len(times))
-    return float(1 + np.tanh(np.diff(times) / (2 * sensor.range_memory)).sum())
+    return float(1 + np.tanh(np.diff(times) / (2 * memory)).sum())
 
 
 def _noise_factors(links: Iterable[_Link]) -> dict[str, float]:
@@ -289,14 +319,14 @@ def _noise_factors(links: Iterable[_Link]) -> dict[str, float]:
     return factors
 
 
-def merged(parts: Iterable[StanceRanges]) -> StanceRanges:
+def merged(parts: Sequence[StanceRanges]) -> StanceRanges:
     """Return the ranges of several intervals together."""
     unused: Counter[str] = Counter()
     ranges: list[Range] = []
     for one in parts:
         ranges += one.ranges
         unused.update(one.unused)
-    return StanceRanges(tuple(ranges), unused)
+    return StanceRanges(tuple(ranges), unused, sum(one.unused_bearings for one in parts))
 
 
 def locate_landmarks(

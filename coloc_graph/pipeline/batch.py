@@ -234,7 +234,7 @@ def _with_ranges(run: Run, options: SolveOptions, estimate: Estimate) -> tuple[E
         graph = replace(estimate.graph, measurements=(*estimate.graph.measurements, *found.ranges))
         both = joint(graph, start=estimate.values)
         estimate = replace(both, bumped=(*estimate.bumped, *both.bumped))
-    return estimate, unused_ranges(found.unused)
+    return estimate, unused_ranges(found)
 
 
 def _usable(measured: Sequence[PairMeasurement]) -> int:
@@ -311,7 +311,7 @@ def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: 
     said = [*solver.warnings, *map(str, arms.values())]
     warnings = _warnings(run, options, estimate, solver.measured, said, solver.unused)
     missing = without_poses(run, options, estimate, solver.measured, solver.unused)
-    left_out = unused_ranges(solver.unused_ranges)
+    left_out = unused_ranges(solver.ranges)
     return _Solved(estimate, warnings, sum(frontend), solver.measured, updates, {}, missing, solver.noise, left_out)
 
 

@@ -1,10 +1,11 @@
 """Contents of a run: the kind of its solution, unused data, and applicable options."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 from coloc_graph.errors import InputError
+from coloc_graph.frontend.stance_ranges import StanceRanges
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import Run
 
@@ -27,7 +28,7 @@ class Unused:
     Parameters
     ----------
     kind : str
-        The topic's kind (`ranges`, `odometry`, `image`, `detections`), `stances`, `planes`, `landmarks`, or
+        The topic's kind (`ranges`, `odometry`, `image`, `detections`), `bearings`, `stances`, `planes`, `landmarks`, or
         `tolerances` of mounts.
     count : int
         Number of messages; of landmarks, how many the team has.
@@ -85,9 +86,13 @@ def unused_in(run: Run, options: SolveOptions | None = None) -> tuple[Unused, ..
     return tuple(_beside_ranges(run) if kind_of(run) == "ranges" else _beside_stances(run, options))
 
 
-def unused_ranges(unused: Mapping[str, int]) -> tuple[Unused, ...]:
-    """Return the ranges of a run with stances that its estimate does not use, by reason."""
-    return tuple(Unused("ranges", count, _noun(count, "range"), why) for why, count in unused.items())
+def unused_ranges(found: StanceRanges) -> tuple[Unused, ...]:
+    """Return the ranges and bearings of a run with stances that its estimate does not use, by reason."""
+    unused = [Unused("ranges", count, _noun(count, "range"), why) for why, count in found.unused.items()]
+    if count := found.unused_bearings:
+        why = "bearings count while both ends stand, if their ranges do and the team states their noise"
+        unused.append(Unused("bearings", count, _noun(count, "bearing"), why))
+    return tuple(unused)
 
 
 def require_applicable(run: Run, options: SolveOptions) -> Kind:

@@ -374,9 +374,9 @@ class StanceSolver:
         return place_ranges(self.team, standing, wheels, recorded, stances, landmarks)
 
     @property
-    def unused_ranges(self) -> Mapping[str, int]:
-        """Number of samples of ranges that are not used, by reason."""
-        return merged([*self._ranges.values(), self._unlocated]).unused
+    def ranges(self) -> StanceRanges:
+        """All ranges, and the number of samples that are not used."""
+        return merged([*self._ranges.values(), self._unlocated])
 
     def _as_corrected(self, run: Any) -> Any:
         return run if self.clocks is None or isinstance(run, CorrectedRun) else self.clocks.corrected(run)

@@ -2,6 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence, Set
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -86,9 +87,11 @@ def place_ranges(
     """
     unused: Counter[str] = Counter()
     within: dict[str, list[Ranges]] = {}
+    of_sensors: list[Sequence[Ranges]] = []
     for robot, records in recorded.items():
         if team.floor is None or team[robot].ranging is None:
             continue  # `contents.unused_in` names them
+        of_sensors.append(records)
         within[robot] = [one for one in records if stances[0].start <= one.time <= stances[-1].end]
         unused["they are from before the first stance, or after the last"] += _count(records) - _count(within[robot])
     wheels = {robot: WheelTrack(robot, samples) for robot, samples in odometry.items()}
@@ -105,7 +108,10 @@ def place_ranges(
     within = {robot: of_targets(records, kept) for robot, records in within.items()}
     found = ranges_of_stances(team, standing, wheels, within)
     unused.update(found.unused)
-    return StanceRanges(found.ranges, {why: count for why, count in unused.items() if count})
+    of_records = (one.bearing for one in chain.from_iterable(of_sensors) if one.bearing is not None)
+    bearings = sum(int(np.isfinite(one).sum()) for one in of_records)
+    left_out = bearings - sum(one.bearings for one in found.ranges)
+    return StanceRanges(found.ranges, {why: count for why, count in unused.items() if count}, left_out)
 
 
 def of_targets(records: Iterable[Ranges], names: Set[str]) -> list[Ranges]:
@@ -116,7 +122,8 @@ def of_targets(records: Iterable[Ranges], names: Set[str]) -> list[Ranges]:
         if len(kept) == len(one.targets):
             found.append(one)
         elif kept:
-            found.append(Ranges(one.robot, one.time, tuple(one.targets[n] for n in kept), one.range[kept]))
+            bearing = None if one.bearing is None else one.bearing[kept]
+            found.append(Ranges(one.robot, one.time, tuple(one.targets[n] for n in kept), one.range[kept], bearing))
     return found
 
 

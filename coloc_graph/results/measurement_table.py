@@ -99,6 +99,7 @@ def _links(solution: Solution) -> Iterator[dict[str, Any]]:
         (robot_i, index_i), (robot_j, index_j) = one.ends
         if isinstance(one, Range):
             cells: dict[str, float] = {"range": float(one.range.mean()), "points": one.samples}
+            cells |= {} if one.bearing is None else {"bearing": one.bearing}
         else:
             cells = {"distance": float(np.linalg.norm(one.T_i_j[:3, 3]))}
         yield _row(

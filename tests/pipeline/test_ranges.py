@@ -50,14 +50,15 @@ def ranges_of(estimate):
     return [one for one in estimate.graph.measurements if isinstance(one, Range)]
 
 
-def test_jacobians_of_ranges_are_those_of_their_residuals(rng):
+@pytest.mark.parametrize("bearing", [{}, {"bearing": 0.3, "bearing_sigma": 0.02}])
+def test_jacobians_of_ranges_are_those_of_their_residuals(rng, bearing):
     root = rng.normal(size=(4, 4))
     sensor = Ranging(range_sigma=0.05, x=0.1, two_way=True, scale=1.1, offset=0.2)
     other = Ranging(range_sigma=0.05, y=0.1, offset=0.1)
     models = [
         RangeModel(
             Range("A", "B", 0, 0, 0.0, rng.uniform(1, 2, 4), rng.normal(0, 0.3, (4, 3)), rng.normal(0, 0.3, (4, 3)),
-                  root @ root.T + np.eye(4), 5),
+                  root @ root.T + np.eye(4), 5, **bearing),
             sensor, other,
         )
         for _ in range(3)
@@ -126,6 +127,43 @@ def test_incremental_estimate_of_stances_and_ranges_is_that_of_the_batch(mixed, 
         one.samples for one in ranges_of(solution.estimate))) < 60  # fmt: skip
     for robot, one in solution.estimate.trajectories.items():
         np.testing.assert_allclose(live.estimate.trajectories[robot].positions, one.positions, atol=3e-3)
+
+
+def test_bearings_while_both_stand_count_and_calibrate_their_sensor(mixed, copied, rng, tmp_path):
+    run, truth, true = open_run(mixed), read_truth(mixed), read_true_team(mixed)
+    offset, sigma = np.deg2rad([3.0, 2.0])
+
+    def at(robot, time):
+        path, antenna = truth[robot], true[robot].ranging
+        T = path.T_world_body[min(np.searchsorted(path.times, time), len(path.times) - 1)]
+        return T, T @ [antenna.x, antenna.y, 0.0, 1.0]
+
+    def seen(one):
+        T, here = at(one.robot, one.time)
+        d = np.array([T[:3, :3].T @ (at(target, one.time)[1] - here)[:3] for target in one.targets])
+        noise = sigma * rng.standard_normal(len(d))
+        return dataclasses.replace(one, bearing=np.arctan2(d[:, 1], d[:, 0]) + offset + noise)
+
+    records = [seen(one) for robot in "ABC" for one in run.ranges(robot)]
+    robots = tuple(
+        msgspec.structs.replace(robot, ranging=msgspec.structs.replace(
+            robot.ranging, bearing_sigma_deg=2.0, bearing_offset_sigma_deg=5.0))
+        for robot in run.team.robots
+    )  # fmt: skip
+    team = msgspec.structs.replace(run.team, robots=robots)
+    path = copied(mixed, tmp_path / "bearings.mcap", team=team, more=records)
+    found = solve(open_run(path))
+    used = [one for one in ranges_of(found.estimate) if one.bearing is not None]
+    (left_out,) = [one for one in found.unused if one.kind == "bearings"]
+    assert len(used) > 4 and sum(one.bearings for one in used) + left_out.count == sum(
+        len(one.targets) for one in records)  # fmt: skip
+    assert "while both ends stand" in str(left_out)
+    measured = {one.robot for one in used}
+    for robot in measured:
+        sensor = found.estimate.calibration.sensors[robot].ranging
+        assert sensor.bearing_offset_sigma_deg < 1.0
+        assert abs(sensor.bearing_offset_deg - 3.0) < 4 * sensor.bearing_offset_sigma_deg
+    assert 0.6 < found.estimate.chi2 / found.estimate.dof < 1.4
 
 
 def test_a_blocked_pair_is_an_outlier_with_a_reason(mixed, copied, tmp_path):
@@ -264,6 +302,7 @@ def range_of(**fields):
         ({"range": [np.nan]}, "not finite"),
         ({"covariance": [[0.0]]}, "every range needs an uncertainty"),
         ({"moved": np.zeros((2, 3))}, "give (n,)"),
+        ({"bearing": 0.1}, "has a bearing without a number or uncertainty"),
     ],
 )
 def test_ranges_that_cannot_be_are_refused_in_one_sentence(fields, why, solution):
