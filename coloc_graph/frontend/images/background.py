@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 STEP_CONTRAST = 4.0  # least height of a step, in standard deviations of a pixel's noise
-STEP_SHARE = 8  # a step leaves at least one in so many of the border's pixels on either side
+STEP_SHARE = 8  # a step leaves at least one in this many of the border's pixels on either side
 REACH = 2  # px around a spot's bright pixels that its light may reach
 
 
