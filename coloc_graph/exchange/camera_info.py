@@ -140,7 +140,7 @@ def read_camera_info(
     said = _left_out(path, fields, K)
     region = _region(path, fields, (width, height))
     if (region.width, region.height) != (width, height) or region.binning != (1, 1):
-        said.append(f"{path}: the camera is that of a region of the {width} x {height} px it states: {region}")
+        said.append(f"{path}: the camera is that of the images, which show {region} of {width} x {height} px")
     width, height = region.size
     K = region.intrinsics(K)
     values: dict[str, Any] = {

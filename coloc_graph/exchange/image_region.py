@@ -53,7 +53,8 @@ class ImageRegion:
 
     def __str__(self) -> str:
         w, h = self.size
-        return f"{self.width} x {self.height} px at ({self.x}, {self.y}), binned to {w} x {h}"
+        binned = "" if self.binning == (1, 1) else f", binned to {w} x {h},"
+        return f"{self.width} x {self.height} px at ({self.x}, {self.y}){binned}"
 
 
 def image_region(size: tuple[int, int], roi: Sequence[Any], binning: Sequence[Any]) -> ImageRegion:

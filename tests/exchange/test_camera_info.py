@@ -138,7 +138,7 @@ def test_a_region_of_interest_that_is_binned_is_the_camera_of_its_images(read):
     assert (binned.width, binned.height) == (200, 100) and binned.distortion == full.distortion
     # by hand: (306.7 - 100 - 0.5) / 2 and (227.2 - 60 - 1) / 3
     assert np.allclose((binned.fx, binned.fy, binned.cx, binned.cy), (215.1, 143.5, 103.1, 55.4))
-    assert "of a region of the 640 x 480 px it states: 400 x 301 px at (100, 60), binned to 200 x 100" in said
+    assert "the images, which show 400 x 301 px at (100, 60), binned to 200 x 100, of 640 x 480 px" in said
     u, v = full.project((0.1, 0.05, 1.0))[0]
     y, x = np.mgrid[:480, :640]
     image = np.exp(-((x - u) ** 2 + (y - v) ** 2) / 50)[60:360, 100:500].reshape(100, 3, 200, 2).mean(axis=(1, 3))
