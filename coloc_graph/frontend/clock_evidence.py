@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
+from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.clock_offset import ClockOffset, find_offset
 from coloc_graph.frontend.pairing.correspondence import Correspondences
 from coloc_graph.frontend.pairing.offset_search import REACH, TimedPath, search_offset
 from coloc_graph.frontend.tracks.interpolation import MAX_GAP
 from coloc_graph.frontend.tracks.paired_tracks import PairedTracks
 from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.wheel_offset import refine_wheel_offset
 from coloc_graph.run import OdometrySample, Recorded, Stance
 from coloc_graph.team import Camera, Team
 
@@ -50,7 +52,7 @@ class ClockEvidence:
 
 
 def clock_evidence(
-    run: Recorded, stance: Stance, seen: Mapping[tuple[str, str], Seen], *, cameras: bool = True
+    run: Recorded, stance: Stance, seen: Mapping[tuple[str, str], Seen], *, rough: bool = False
 ) -> Iterator[ClockEvidence]:
     """Yield offsets between clocks of a stance: of each pair of cameras, and of each camera and the movers' wheels.
 
@@ -62,22 +64,28 @@ def clock_evidence(
         The stance.
     seen : mapping of (str, str) to (list of Track, list of Track)
         Tracks of the movers' markers in both cameras, by pair of observers.
-    cameras : bool
-        Compare the pairs of cameras, too.
+    rough : bool
+        Compare wheels and cameras only, by a search without the refinement: to see whether any may differ.
     """
     middle, tracks = (stance.start + stance.end) / 2, dict[str, list[Track]]()
     for (i, j), both in seen.items():
         tracks.setdefault(i, both[0])
         tracks.setdefault(j, both[1])
-        between = _between_cameras(*both, run.team[i].camera, run.team[j].camera) if cameras else None
+        between = _between_cameras(*both, run.team[i].camera, run.team[j].camera) if not rough else None
         if between is not None:
             yield ClockEvidence(stance.index, middle, (i, "camera"), (j, "camera"), *between)
     for mover in stance.movers:
         samples = list(run.odometry(mover, stance.start - REACH, stance.end + REACH))
+        found: dict[str, ClockOffset] = {}
         for observer, own in tracks.items():
-            found = _camera_to_wheels(own, samples, run.team, mover, alone=len(stance.movers) == 1)
-            if found is not None:
-                yield ClockEvidence(stance.index, middle, (observer, "camera"), (mover, "wheels"), found)
+            camera = None if rough else run.team[observer].camera
+            offset = _camera_to_wheels(own, samples, run.team, mover, camera, alone=len(stance.movers) == 1)
+            if offset is not None:
+                found[observer] = offset
+        for observer, offset in found.items():
+            # the observers share the errors of the wheels, so that they know no more than one of them
+            shared = replace(offset, sigma=offset.sigma * np.sqrt(len(found)))
+            yield ClockEvidence(stance.index, middle, (observer, "camera"), (mover, "wheels"), shared)
 
 
 def _between_cameras(
@@ -157,22 +165,26 @@ def _path(track: Track) -> TimedPath:
 
 
 def _camera_to_wheels(
-    seen: list[Track], samples: Sequence[OdometrySample], team: Team, mover: str, *, alone: bool
+    seen: list[Track],
+    samples: Sequence[OdometrySample],
+    team: Team,
+    mover: str,
+    camera: Camera | None,
+    *,
+    alone: bool,
 ) -> ClockOffset | None:
-    """Offset of the wheels' clock from the camera's."""
+    """Offset of the wheels' clock from the camera's; refined if the camera is given."""
     markers = team[mover].markers
     if markers is None or len(samples) < 4:
         return None
-    times, poses = np.array([one.time for one in samples]), np.array([one.pose for one in samples])
-    new = np.append(True, np.diff(times) > 1e-4)
-    times, poses = times[new], poses[new]
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    paths = [
-        TimedPath(times, np.stack([poses[:, 0] + c * x - s * y, poses[:, 1] + s * x + c * y], axis=1))
-        for x, y in markers.positions
-    ]
+    new = np.append(True, np.diff([one.time for one in samples]) > 1e-4)
+    wheels = WheelTrack(mover, [one for one, kept in zip(samples, new, strict=True) if kept])
+    x, y, yaw = wheels.pose_at(wheels.times).T
+    c, s = np.cos(yaw), np.sin(yaw)
+    points = [np.array(one) for one in markers.positions]
+    paths = [TimedPath(wheels.times, np.stack([x + c * a - s * b, y + s * a + c * b], axis=1)) for a, b in points]
     named = [
-        (_path(one), paths[int(number)])
+        (one, int(number))
         for one in seen
         for body, _, number in [one.marker.rpartition("/")]
         if body == mover and number.isdecimal() and int(number) < len(paths) and _moves(one)
@@ -180,9 +192,17 @@ def _camera_to_wheels(
     choices = [named] if named else []
     if not named and alone:
         long = sorted((one for one in seen if _moves(one) and not one.marker), key=lambda one: -len(one.times))
-        choices = [[(_path(one), path)] for one in long[:1] for path in paths]
-    found = [one for pairs in choices if (one := search_offset(pairs, max_residual=MAX_WHEEL_ERROR))]
+        choices = [[(one, number)] for one in long[:1] for number in range(len(paths))]
+    found = [
+        (offset, chosen)
+        for chosen in choices
+        if (offset := search_offset([(_path(one), paths[n]) for one, n in chosen], max_residual=MAX_WHEEL_ERROR))
+    ]
     if not found:
         return None
-    best = min(found, key=lambda one: one.sigma)
+    best, chosen = min(found, key=lambda one: one[0].sigma)
+    if camera is not None and camera.model == "pinhole":
+        refined = refine_wheel_offset([(one, points[n]) for one, n in chosen], wheels, camera, best.value)
+        if refined is not None:
+            return refined
     return ClockOffset(best.value, float(np.hypot(best.sigma, SIGMA_FLOORS["wheels"])))

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 SIGNIFICANT = 5.0  # an offset that is corrected exceeds its sigma by this factor
 MIN_OFFSET = 3e-3  # and this [s]
-MIN_WHEEL_OFFSET = 0.06  # and of odometry, which may be filtered [s]
+MIN_WHEEL_OFFSET = 0.01  # and of odometry, which may be filtered [s]
 MIN_STEP = 0.05  # smallest step of a clock within a run [s]
 STEP_CHI2 = 50.0  # chi2 that a step must explain
 DRIFT_CHI2 = 25.0  # chi2 that drifts must explain
@@ -233,7 +233,7 @@ def _fit(
 ) -> tuple[dict[Sensor, tuple[float, float]], Array, Array]:
     """Offset and drift of each sensor by robust least squares, their covariance, and the residuals in sigmas.
 
-    Camera and wheels of one robot are tied, but for those that contradict it.
+    Camera and wheels of one robot are tied, but for those that contradict it, which count as one large residual each.
     """
     sensors = list(dict.fromkeys(sensor for one in evidence for sensor in (one.first, one.second)))
     number = {sensor: k for k, sensor in enumerate(sensors)}
@@ -246,6 +246,7 @@ def _fit(
             if drifting:
                 rows[row, n + number[sensor]] = sign * (one.time - origin) / one.offset.sigma
         right[row] = one.offset.value / one.offset.sigma
+    untied = 0
     ties = [(robot, kind) for robot, kind in sensors if kind == "camera" and (robot, "wheels") in number]
     while True:
         tied, alike = np.zeros((len(ties), width)), np.zeros((len(ties), width))
@@ -266,5 +267,7 @@ def _fit(
         if not len(off) or off.max() < SIGNIFICANT:
             break
         del ties[int(off.argmax())]
+        untied += 1
+    residuals = np.append(residuals, np.full(untied, SIGNIFICANT))
     values = {sensor: (float(x[k]), float(x[n + k]) if drifting else 0.0) for sensor, k in number.items()}
     return values, np.asarray(np.linalg.inv(normal), float), residuals

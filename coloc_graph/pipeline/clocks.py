@@ -191,7 +191,7 @@ def _wheels_differ(run: Any, stances: Sequence[Stance], measured: Mapping[int, S
     """Return whether odometry of some stances has another clock than the cameras that saw the robot move."""
     some = _spread(stances)
     evidence = [
-        one for stance in some for one in clock_evidence(run, stance, _seen(measured[stance.index][:1]), cameras=False)
+        one for stance in some for one in clock_evidence(run, stance, _seen(measured[stance.index][:1]), rough=True)
     ]
     return run_clocks(run.team, run.stances, evidence) is not None
 

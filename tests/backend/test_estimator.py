@@ -308,7 +308,7 @@ def test_a_checkpoint_keeps_what_was_rejected_revoked_and_withdrawn(tmp_path):
     [
         (lambda text: text[:-30], "is not a checkpoint, or a damaged one"),
         (lambda text: "{}", "is not a checkpoint"),
-        (lambda text: text.replace("checkpoint-6", "checkpoint-5"), "not a checkpoint of this version"),
+        (lambda text: text.replace("checkpoint-7", "checkpoint-5"), "not a checkpoint of this version"),
         (lambda text: text.replace('"relative_pose"', '"guess"', 1), "no kind of measurement `guess`"),
         (lambda text: text.replace('"rejected":{}', '"rejected":{"9":"why"}'), "that is not there is rejected"),
         (lambda text: _with(text, "journal", json.loads(text)["checkpoint"]["journal"] * 2), "damaged checkpoint"),

@@ -2,8 +2,16 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
+from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.offset_search import TimedPath, search_offset
+from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.wheel_offset import refine_wheel_offset
+from coloc_graph.geometry.lie import floor_pose, se3_inverse
+from coloc_graph.simulation import reference_team
+from coloc_graph.simulation.paths import Path
+from coloc_graph.simulation.wheels import odometry
 
 H = np.array([[0.9, 0.2, 30.0], [-0.1, 1.1, 12.0], [4e-4, -3e-4, 1.0]])
 
@@ -47,6 +55,36 @@ def test_an_offset_that_the_motion_does_not_tell_is_not_found():
     still = [TimedPath(times, 100 + 0.3 * rng.standard_normal(line.shape)) for _ in range(2)]
     assert search_offset([tuple(still)]) is None
     assert search_offset([]) is None
+
+
+def test_wheels_are_timed_to_the_bound_that_is_predicted():
+    """A robot that drives and turns at will, with wheels that slip, before a camera that looks down at an angle."""
+    rng = np.random.default_rng(3)
+    team, instants = reference_team(), np.arange(-1.0, 21.0, 0.02)
+    observer, mover = team["A"], team["C"]
+    T_camera_body = se3_inverse(observer.mount.T_body_camera)
+    off = []
+    for _ in range(6):
+        turning = np.sin(2 * np.pi * np.outer(instants, [0.05, 0.13, 0.21]) + rng.uniform(0, 6, 3)).sum(axis=1)
+        yaw, speed = np.cumsum(0.02 * turning), 0.1 + 0.05 * np.sin(instants + rng.uniform(0, 6))
+        xy = np.cumsum(0.02 * speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=1), axis=0)
+        xy += (1.5, 0.0) - xy.mean(axis=0)
+        path = Path(instants, np.column_stack([xy, yaw]), instants[:1], np.zeros((1, 2)))
+        late = rng.uniform(-0.5, 0.5)
+        wheels = odometry(path, [(0.0, 20.0)], rng).records("C", -1.0, 21.0, late)
+        times = np.arange(1.0, 19.0, 0.25)
+        T = floor_pose(*path.planar_at(times).T)
+        tracks = []
+        for p in mover.markers.p_body:
+            p_camera = (T[:, :3, :3] @ p + T[:, :3, 3]) @ T_camera_body[:3, :3].T + T_camera_body[:3, 3]
+            uv = observer.camera.project(p_camera)[0] + 0.3 * rng.standard_normal((len(times), 2))
+            C = np.broadcast_to(0.09 * np.eye(2), (len(times), 2, 2))
+            tracks.append((Track("A", "", times, uv, C, np.zeros(len(times))), p[:2]))
+        found = refine_wheel_offset(tracks, WheelTrack("C", wheels), observer.camera, late + rng.uniform(-0.02, 0.02))
+        assert found.sigma < 0.01
+        off.append((found.value - late) / found.sigma)
+    low, high = chi2.ppf([0.001, 0.999], len(off))
+    assert low < np.square(off).sum() < high
 
 
 def test_an_offset_that_leaves_the_paths_apart_is_none():
