@@ -305,12 +305,16 @@ def named_tracks(robot: str, detections: Iterable[Detections]) -> list[Track]:
     uv, covariance, peak, flags = (
         np.concatenate([getattr(one, name) for one in every]) for name in ("uv", "covariance", "peak", "flags")
     )
-    markers = np.array([marker for one in every for marker in one.markers])
+    names = [marker for one in every for marker in one.markers]
+    number = {name: n for n, name in enumerate(sorted(set(names)))}
+    markers = np.array([number[name] for name in names])
     whole = (flags & (Flag.CLIPPED | Flag.MERGED)) == 0
+    markers[~whole] = -1
+    saturated = (flags & Flag.SATURATED) != 0
     tracks = []
-    for marker in np.unique(markers[whole]).tolist():
-        own = whole & (markers == marker)
-        saturated = (flags[own] & Flag.SATURATED) != 0
-        columns = times[own], uv[own], covariance[own], peak[own].astype(float)
-        tracks.append(Track(robot, marker, *columns, saturated=saturated))
+    for marker, n in number.items():
+        own = np.flatnonzero(markers == n)
+        if len(own):
+            columns = times[own], uv[own], covariance[own], peak[own].astype(float)
+            tracks.append(Track(robot, marker, *columns, saturated=saturated[own]))
     return tracks

@@ -69,8 +69,10 @@ def decompose_svd(H: ArrayLike) -> tuple[Array, Array, Array]:
         R (2, ..., 3, 3), T/d (2, ..., 3) and N (2, ..., 3) of both solutions. Of the textbook's four these are the two
         whose plane lies in front of camera 1 (N_z > 0). If H is a pure rotation, T/d is 0 and N is undetermined.
     """
-    H = metric_scale(H)
+    H = np.asarray(H, float)
     _, s, Vt = np.linalg.svd(H)
+    H = H * (np.sign(np.linalg.det(H)) / s[..., 1])[..., None, None]
+    s = s / s[..., 1:2]
     v1, v2, v3 = Vt[..., 0, :], Vt[..., 1, :], Vt[..., 2, :]
     s1, s3 = s[..., 0] ** 2, s[..., 2] ** 2
     width = np.sqrt(np.maximum(s1 - s3, 1e-300))

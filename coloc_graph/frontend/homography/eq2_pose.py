@@ -79,14 +79,14 @@ def eq2_pose(measurement: HomographyMeasurement, mount_i: Mount, mount_j: Mount,
     _require_baseline(measurement, H)
     _, _, N_both = decompose_svd(H)
     which, normal_error = choose_by_normal(N_both, plane.N)
-    T_i_j, T_ci_cj = _poses(np.zeros((1, 17)), H, mount_i, mount_j, plane)
+    T_ci_cj = se3_inverse(se3(*decompose_with_normal(H, plane.N, plane.d)))
     return RelativePose(
         stance=measurement.stance,
         robot_i=measurement.robot_i,
         robot_j=measurement.robot_j,
-        T_i_j=T_i_j[0],
+        T_i_j=mount_i.T_body_camera @ T_ci_cj @ se3_inverse(mount_j.T_body_camera),
         covariance=np.full((6, 6), np.nan),
-        T_ci_cj=T_ci_cj[0],
+        T_ci_cj=T_ci_cj,
         solution=int(which),
         normal_error=float(normal_error),
     )
