@@ -5,7 +5,8 @@ called at some values therefore evaluates all of them there; the others look up 
 """
 
 from collections import defaultdict
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from types import TracebackType
 
 import gtsam
@@ -40,6 +41,11 @@ class FactorEvaluator:
         #: Factors with which it is evaluated; None: it is evaluated alone.
         self.among: BatchedFactors | None = None
         self._alone: BatchModel | None = None
+
+    @property
+    def kind(self) -> Hashable:
+        """Kind of factors that are evaluated in one batch."""
+        return self.model.kind, self.sizes
 
     def __call__(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         """Whitened residual (rows,); fills the Jacobians that GTSAM passes."""
@@ -82,25 +88,24 @@ def _evaluated(models: BatchModel, T_i: Array, T_j: Array, errors: Sequence[Arra
     return e, by
 
 
-class _Group:
-    """Factors of one kind, with the indices of their poses among all."""
+class Group:
+    """Factors of one kind."""
 
-    def __init__(self, members: Sequence[FactorEvaluator], indices: dict[int, int]) -> None:
+    def __init__(self, members: Sequence[FactorEvaluator]) -> None:
         self.members = members
         self._models = members[0].model.batch([one.model for one in members])
-        self._ends = [np.array([indices[one.poses[end]] for one in members]) for end in (0, 1)]
 
-    def at(self, poses: Array, errors: dict[int, Array]) -> tuple[Array, list[Array]]:
-        """Residuals (n, rows) and their Jacobians; `errors` are the calibration variables by key."""
+    def evaluated(self, T_i: Array, T_j: Array, errors: Callable[[int], Array]) -> tuple[Array, list[Array]]:
+        """Residuals (n, rows) and their Jacobians at poses (n, 4, 4) and calibration variables `errors`, by key."""
         slots = []
         for number, size in enumerate(self.members[0].sizes):
             slot = np.zeros((len(self.members), size))
             for row, one in enumerate(self.members):
                 key = one.keys[number]
                 if key is not None:
-                    slot[row] = errors[key]
+                    slot[row] = errors(key)
             slots.append(slot)
-        return _evaluated(self._models, poses[self._ends[0]], poses[self._ends[1]], slots)
+        return _evaluated(self._models, T_i, T_j, slots)
 
 
 class BatchedFactors:
@@ -113,18 +118,22 @@ class BatchedFactors:
         indices = {key: index for index, key in enumerate(self._poses)}
         kinds: dict[Hashable, list[FactorEvaluator]] = defaultdict(list)
         for one in members:
-            kinds[one.model.kind, one.sizes].append(one)
+            kinds[one.kind].append(one)
         self._groups = [
-            _Group(some[first : first + MAX_BATCH_SIZE], indices)
+            Group(some[first : first + MAX_BATCH_SIZE])
             for some in kinds.values()
             for first in range(0, len(some), MAX_BATCH_SIZE)
         ]
         self._index = {
             id(one): (n, row) for n, group in enumerate(self._groups) for row, one in enumerate(group.members)
         }
+        self._ends = [
+            [np.array([indices[one.poses[end]] for one in group.members]) for end in (0, 1)] for group in self._groups
+        ]
         self._values: dict[int, bytes] = {}  # poses and calibration variables of the last evaluation
         self._found: list[tuple[Array, list[Array]]] = []
         self._before: list[BatchedFactors | None] = []
+        self._held = False
 
     @property
     def keys(self) -> tuple[int, ...]:
@@ -143,9 +152,19 @@ class BatchedFactors:
         for one, before in zip(self.members, self._before, strict=True):
             one.among = before
 
+    @contextmanager
+    def held(self, values: gtsam.Values) -> Iterator[None]:
+        """Within this context all factors are evaluated at `values`, which are not compared with the last ones."""
+        self._evaluate(values)
+        self._held = True
+        try:
+            yield
+        finally:
+            self._held = False
+
     def at(self, member: FactorEvaluator, values: gtsam.Values) -> tuple[Array, list[Array]] | None:
         """Result of `FactorEvaluator.alone`, from the batch; None where the values lack a variable of the graph."""
-        if not self._is_current(member, values):
+        if not self._held and not self._is_current(member, values):
             if not all(map(values.exists, (*self._poses, *self._variables))):
                 return None
             self._evaluate(values)
@@ -163,6 +182,13 @@ class BatchedFactors:
     def _evaluate(self, values: gtsam.Values) -> None:
         poses = [values.atPose3(key).matrix() for key in self._poses]
         errors = {key: values.atVector(key) for key in self._variables}
-        self._found = [group.at(np.array(poses), errors) for group in self._groups]
-        self._values = {key: T.tobytes() for key, T in zip(self._poses, poses, strict=True)}
-        self._values |= {key: one.tobytes() for key, one in errors.items()}
+        where = {key: T.tobytes() for key, T in zip(self._poses, poses, strict=True)}
+        where |= {key: one.tobytes() for key, one in errors.items()}
+        if where == self._values:
+            return
+        every = np.array(poses)
+        self._found = [
+            group.evaluated(every[i], every[j], errors.__getitem__)
+            for group, (i, j) in zip(self._groups, self._ends, strict=True)
+        ]
+        self._values = where

@@ -1,6 +1,6 @@
 """GTSAM's factors of what a graph holds: gauge, floor priors, links; as poses alone, or jointly with the mounts."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Literal
 
 import gtsam
@@ -12,7 +12,7 @@ from coloc_graph.backend.calibration import Variables, is_calibration
 from coloc_graph.backend.graph import Link, PoseGraph, PoseLink, StayPut, pose_of
 from coloc_graph.backend.homography_factor import (
     homography_factor,
-    homography_pose,
+    homography_poses,
     markers_factor,
     range_factor,
     sighted_pose,
@@ -160,19 +160,34 @@ class Factors:
         return gtsam.BetweenFactorPose3(i, j, T_i_j, _noise(link))
 
     def expected(self, link: PoseLink, i: int, j: int, errors: Callable[[int], Array]) -> gtsam.Pose3:
-        """Return the pose of a link's second end in its first, with calibration variables at `errors` of their keys.
+        """Return the pose of a link's second end in its first; see `all_expected`."""
+        return self.all_expected([(link, i, j)], errors)[0]
 
-        The factor made for this is kept for the insertion of the link.
+    def all_expected(
+        self, links: Sequence[tuple[PoseLink, int, int]], errors: Callable[[int], Array]
+    ) -> list[gtsam.Pose3]:
+        """Return the poses of links' second ends in their first, with calibration variables at `errors` of their keys.
+
+        Links come with the keys of their ends. The factors made for this are kept for the insertion of the links.
         """
-        assert not isinstance(link, Range)
-        if self.variables is not None and self.floor is not None and self._as_seen(link):
+        poses = [pose_of(link) for link, _, _ in links]
+        if self.variables is None or self.floor is None:
+            return poses
+        homographies: dict[int, tuple[RelativePose, BatchedFactor]] = {}
+        for n, (link, i, j) in enumerate(links):
+            if not self._as_seen(link):
+                continue
             if isinstance(link, Sighting):
-                return sighted_pose(link, self.variables, errors)
-            assert isinstance(link, RelativePose)
-            factor = self.of_link(link, i, j)
-            self._ready[id(link)] = factor
-            return homography_pose(link, factor, errors)
-        return pose_of(link)
+                poses[n] = sighted_pose(link, self.variables, errors)
+            elif isinstance(link, RelativePose):
+                factor = self.of_link(link, i, j)
+                assert isinstance(factor, BatchedFactor)
+                self._ready[id(link)] = factor
+                homographies[n] = link, factor
+        found = homography_poses(*zip(*homographies.values(), strict=True), errors) if homographies else []
+        for n, pose in zip(homographies, found, strict=True):
+            poses[n] = pose
+        return poses
 
     def of_graph(
         self, graph: PoseGraph, keys: Iterable[int]

@@ -4,19 +4,20 @@ The models are in `camera_model`, `homography_model` and `range_model`. A mount 
 one with a tolerance is a variable, and one of the factor's keys after those of its two poses.
 """
 
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.batched_factors import BatchedFactor, FactorEvaluator
+from coloc_graph.backend.batched_factors import BatchedFactor, FactorEvaluator, Group
 from coloc_graph.backend.calibration import MOUNT, RANGING, SIZES, Variables, sigmas_of_plane
 from coloc_graph.backend.camera_model import MarkersModel
 from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
 from coloc_graph.backend.range_model import RangeModel
 from coloc_graph.errors import EstimationError
-from coloc_graph.geometry.lie import floor_pose, yaw
+from coloc_graph.geometry.lie import floor_pose, rotation_z, yaw
 from coloc_graph.measurements import Range, RelativePose, Sighting
 
 Array = NDArray[np.float64]
@@ -45,29 +46,38 @@ def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, 
     return BatchedFactor(FactorEvaluator(model, (i, j), keys, (MOUNT_SIZE, MOUNT_SIZE, *[2] * len(model.movers), 1)))
 
 
-def homography_pose(link: RelativePose, factor: gtsam.NonlinearFactor, errors: Callable[[int], Array]) -> gtsam.Pose3:
-    """Return the most likely pose of j in i on the floor by a homography's factor.
+def homography_poses(
+    links: Sequence[RelativePose], factors: Sequence[BatchedFactor], errors: Callable[[int], Array]
+) -> list[gtsam.Pose3]:
+    """Return the most likely poses of j in i on the floor, each by the factor of its homography.
 
     Calibration variables are at `errors` of their keys. The measured pose where the search diverges.
     """
-    i, j, *variable = map(int, factor.keys())
-    values = gtsam.Values()
-    values.insert(i, gtsam.Pose3())
-    for key in variable:
-        values.insert(key, errors(key))
-    T_i_j = gtsam.Pose3(floor_pose(link.T_i_j[0, 3], link.T_i_j[1, 3], yaw(link.T_i_j)))
-    values.insert(j, T_i_j)
-    for _ in range(MAX_STEPS):
-        values.update(j, T_i_j)
-        A, b = factor.linearize(values).jacobian()
-        planar = A[:, 8:11]  # heading, x, y of j
-        step = np.linalg.lstsq(planar, b, rcond=None)[0]
-        if not np.abs(step).max() < 0.5:
-            return gtsam.Pose3(link.T_i_j)
-        T_i_j = T_i_j.compose(gtsam.Pose3(gtsam.Rot3.Yaw(step[0]), np.array([step[1], step[2], 0.0])))
-        if np.linalg.norm(planar @ step) < 1.0:  # the rest is far within the noise
-            break
-    return T_i_j
+    poses = [gtsam.Pose3(link.T_i_j) for link in links]
+    kinds: dict[Hashable, list[int]] = defaultdict(list)
+    for n, factor in enumerate(factors):
+        kinds[factor.evaluator.kind].append(n)
+    for some in kinds.values():
+        group = Group([factors[n].evaluator for n in some])
+        T = np.array([links[n].T_i_j for n in some])
+        at, going = np.stack([T[:, 0, 3], T[:, 1, 3], yaw(T)], axis=1), np.ones(len(some), bool)
+        fits = going.copy()
+        for _ in range(MAX_STEPS):
+            e, by = group.evaluated(np.broadcast_to(np.eye(4), T.shape), floor_pose(*at.T), errors)
+            planar = by[1][:, :, 2:5]  # heading, x, y of j
+            step = -(np.linalg.pinv(planar) @ e[..., None])[..., 0]
+            fits &= ~going | (np.abs(step).max(axis=1) < 0.5)
+            going &= fits
+            turn = rotation_z(at[:, 2])[:, :2, :2]
+            moved = at + np.concatenate([(turn @ step[:, 1:, None])[..., 0], step[:, :1]], axis=1)
+            at = np.where(going[:, None], moved, at)
+            going &= np.linalg.norm((planar @ step[..., None])[..., 0], axis=1) >= 1.0  # the rest is within the noise
+            if not going.any():
+                break
+        for row, n in enumerate(some):
+            if fits[row]:
+                poses[n] = gtsam.Pose3(floor_pose(*at[row]))
+    return poses
 
 
 def markers_factor(link: Sighting, i: int, j: int, variables: Variables) -> BatchedFactor:

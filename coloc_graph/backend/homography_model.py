@@ -5,6 +5,7 @@ Vectorised, with the tangents of `camera_model`. Plain numpy, no graph.
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,10 +45,10 @@ class HomographyModel:
         self.on_floor, self.movers = on_floor, tuple(markers)
         self.height = next(iter(markers.values())).height
         self.mount_i, self.mount_j = mount_i, mount_j
-        level = see(np.eye(4)[None], Mounts([mount_i]).at(about[None]), np.array([self.height]))
+        level = _level_plane(mount_i, tuple(about.tolist()), self.height)
         self.spans: tuple[SpanModel, ...] = ()
-        if level.seen[0]:
-            made = SpanModel.near(spans, level.n[0], tilt_sigma, [markers[one.mover].span or 0.0 for one in spans])
+        if level is not None:
+            made = SpanModel.near(spans, level, tilt_sigma, [markers[one.mover].span or 0.0 for one in spans])
             self.spans = tuple(one.weighing(measured.share) for one in made)
         self.H_inverse: Array = np.asarray(np.linalg.inv(measured.H_j_i), float)
         b = measured.by_time_offset
@@ -76,6 +77,13 @@ class HomographyModel:
     def batch(models: Sequence["HomographyModel"]) -> "_Homographies":
         """Return the batch of models of one kind."""
         return _Homographies(models)
+
+
+@lru_cache(maxsize=256)
+def _level_plane(mount: Mount, errors: tuple[float, ...], height: float) -> Array | None:
+    """Plane n . X = 1 (3,) at a height over the floor, in the camera of a level robot; None at the camera's height."""
+    level = see(np.eye(4)[None], Mounts([mount]).at(np.array([errors])), np.array([height]))
+    return level.n[0] if level.seen[0] else None
 
 
 class _Homographies:

@@ -1,7 +1,7 @@
 """Optimum of a graph: initial values, and, of a joint estimate, the mounts first."""
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -13,7 +13,7 @@ from coloc_graph.backend.calibration import size_of
 from coloc_graph.backend.chain import compose, spanning_tree
 from coloc_graph.backend.chi2_test import Agreement, agreement
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
-from coloc_graph.backend.graph import Link, PoseGraph, PoseLink, point_of, pose_of
+from coloc_graph.backend.graph import Link, PoseGraph, point_of, pose_of
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.solver import optimise
 
@@ -46,13 +46,13 @@ class Fit:
     @cached_property
     def chi2(self) -> float:
         """Chi-squared of all factors."""
-        with self.batched:
+        with self.batched, self.batched.held(self.values):
             return float(2 * self.factors.error(self.values))
 
     @cached_property
     def marginals(self) -> Marginals:
         """Marginal covariances."""
-        with self.batched:
+        with self.batched, self.batched.held(self.values):
             return Marginals(self.factors.linearize(self.values), size_of)
 
     @cached_property
@@ -72,7 +72,7 @@ class Fit:
 
     def agreements(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
         """Test the links of some kinds against all others; by index, see `ALL_TESTED`."""
-        with self.batched:
+        with self.batched, self.batched.held(self.values):
             return self._agreements(kinds)
 
     def _agreements(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
@@ -90,7 +90,9 @@ class Fit:
         return found
 
 
-def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = None) -> Fit:
+def fit_graph(
+    method: Method, graph: PoseGraph, start: gtsam.Values | None = None, anchorings: int = MAX_ANCHORINGS
+) -> Fit:
     """Optimise a graph from `start`, or from the composition along the spanning tree.
 
     Variables that `start` lacks are composed; disconnected ones are left out. Raises `EstimationError` where
@@ -104,16 +106,17 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
     def errors(key: int) -> Array:
         return mounts.get(key, factors_of.nominal(key))
 
-    @cache
-    def expected(link: PoseLink) -> gtsam.Pose3:
-        i, j = map(graph.pose_keys.key, link.ends)
-        return factors_of.expected(link, i, j, errors) if mounts else pose_of(link)
-
+    expected: dict[int, gtsam.Pose3] = {}  # poses of links' second ends in their first, by identity
     known = {} if start is None else {key: start.atPose3(key) for key in poses_in(start)}
 
     def composed(*, odometry_last: bool) -> gtsam.Values:
         steps, values = spanning_tree(graph, graph.links, odometry_last=odometry_last), gtsam.Values()
-        for key, pose in compose(graph, steps, factors_of.start, expected, known).items():
+        if mounts:
+            new = [one.link for one in steps if one.to not in known and id(one.link) not in expected]
+            of_ends = [(link, *map(graph.pose_keys.key, link.ends)) for link in new]
+            expected.update(zip(map(id, new), factors_of.all_expected(of_ends, errors), strict=True))
+        poses = compose(graph, steps, factors_of.start, lambda link: expected.get(id(link)) or pose_of(link), known)
+        for key, pose in poses.items():
             values.insert(key, pose)
         for name, ranges in graph.ranged_points.items():
             key = graph.pose_keys.static()[name]
@@ -127,7 +130,7 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
     # two robots that are composed each by its own odometry end far apart after hundreds of stances
     others = composed(odometry_last=True) if mounts and not known else None
     iterations = 0
-    for left in reversed(range(MAX_ANCHORINGS)):
+    for left in reversed(range(anchorings)):
         factors, links, batched = factors_of.of_graph(graph, poses_in(values))
         for key in map(int, factors.keyVector()):
             for one in (values,) if others is None else (values, others):
@@ -137,7 +140,8 @@ def fit_graph(method: Method, graph: PoseGraph, start: gtsam.Values | None = Non
             if others is not None and factors.error(others) < factors.error(values):
                 values = others
             others = None
-            values, used = optimise(factors, values, roughly_first=len(graph.robots) >= MANY_ROBOTS)
+            many = len(graph.robots) >= MANY_ROBOTS
+            values, used = optimise(factors, values, roughly_first=many, held=batched.held)
         iterations += used
         # spans are linearised at the mounts known before: once more where the estimate is elsewhere
         if not left or factors_of.is_anchored(values):
@@ -156,6 +160,6 @@ def _mounts_first(graph: PoseGraph) -> gtsam.Values | None:
     if len(graph.stances) < LONG_RUN_STANCES or not spanning_tree(part, part.links):
         return None
     known = gtsam.Values()
-    for key, errors in calibrations_in(fit_graph("joint", part).values).items():
+    for key, errors in calibrations_in(fit_graph("joint", part, anchorings=1).values).items():
         known.insert(key, errors)
     return known

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import TypeVar
 
 import gtsam
@@ -115,10 +116,15 @@ def isam_parameters(*, calibrates: bool = False) -> gtsam.ISAM2Params:
 
 
 def optimise(
-    factors: gtsam.NonlinearFactorGraph, initial: gtsam.Values, *, roughly_first: bool = False
+    factors: gtsam.NonlinearFactorGraph,
+    initial: gtsam.Values,
+    *,
+    roughly_first: bool = False,
+    held: Callable[[gtsam.Values], AbstractContextManager[None]] = nullcontext,
 ) -> tuple[gtsam.Values, int]:
     """Optimise by Gauss-Newton, or by Levenberg-Marquardt with QR where that fails; return values and iterations.
 
+    Gauss-Newton evaluates all factors at some values within the context `held`, given these values.
     `roughly_first` begins Levenberg-Marquardt with Cholesky, which takes a thirtieth of the time where cliques are
     large, and may get stuck; QR continues from there.
 
@@ -133,7 +139,7 @@ def optimise(
         return initial, 0  # nothing to optimise; LM would only try out its dampings
     if not np.isfinite(before):
         raise EstimationError("the graph's error is not finite at the initial values: a measurement is not finite")
-    found = _gauss_newton(factors, initial, before)
+    found = _gauss_newton(factors, initial, before, held)
     if found is not None:
         return found
     if roughly_first:
@@ -161,7 +167,10 @@ def optimise(
 
 
 def _gauss_newton(
-    factors: gtsam.NonlinearFactorGraph, initial: gtsam.Values, before: float
+    factors: gtsam.NonlinearFactorGraph,
+    initial: gtsam.Values,
+    before: float,
+    held: Callable[[gtsam.Values], AbstractContextManager[None]],
 ) -> tuple[gtsam.Values, int] | None:
     """Return values and iterations of Gauss-Newton; None where it fails.
 
@@ -172,13 +181,16 @@ def _gauss_newton(
     values, error, rises, step = initial, before, 0, _cholesky_step
     for iteration in range(1, MAX_GAUSS_NEWTON + 1):
         try:
-            moved = step(factors.linearize(values), values)
+            with held(values):
+                linear = factors.linearize(values)
+            moved = step(linear, values)
         except RuntimeError:  # GTSAM's indeterminate system
             if step is _qr_step:
                 return None
             step = _qr_step
             continue
-        after = factors.error(moved)
+        with held(moved):
+            after = factors.error(moved)
         rises += after > error * (1 + 1e-9) + COST_TOLERANCE
         if not np.isfinite(after) or rises > MAX_RISES or after > MAX_RISE * before:
             return None
