@@ -7,11 +7,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors
+from coloc_graph.backend.batched_factors import MAX_BATCH_SIZE, BatchedFactor, BatchedFactors
 from coloc_graph.backend.calibration import Variables, is_calibration
 from coloc_graph.backend.graph import Link, PoseGraph, PoseLink, StayPut, pose_of
 from coloc_graph.backend.homography_factor import (
-    homography_factor,
+    homography_factors,
     homography_poses,
     markers_factor,
     range_factor,
@@ -151,7 +151,7 @@ class Factors:
             if isinstance(link, Sighting):
                 return markers_factor(link, i, j, self.variables)
             assert isinstance(link, RelativePose)
-            return homography_factor(link, i, j, self.variables, self.floor is not None)
+            return homography_factors([(link, i, j)], self.variables, self.floor is not None)[0]
         return self.between(link, i, j, pose_of(link))
 
     @staticmethod
@@ -173,6 +173,7 @@ class Factors:
         poses = [pose_of(link) for link, _, _ in links]
         if self.variables is None or self.floor is None:
             return poses
+        self._make_ready(links)
         homographies: dict[int, tuple[RelativePose, BatchedFactor]] = {}
         for n, (link, i, j) in enumerate(links):
             if not self._as_seen(link):
@@ -188,6 +189,20 @@ class Factors:
         for n, pose in zip(homographies, found, strict=True):
             poses[n] = pose
         return poses
+
+    def _make_ready(self, links: Sequence[tuple[Link, int, int]]) -> None:
+        """Make the factors of all homographies among links, given with the keys of their ends, at once."""
+        if self.variables is None:
+            return
+        new = [
+            (link, i, j)
+            for link, i, j in links
+            if isinstance(link, RelativePose) and id(link) not in self._ready and self._as_seen(link)
+        ]
+        for first in range(0, len(new), MAX_BATCH_SIZE):
+            some = new[first : first + MAX_BATCH_SIZE]
+            made = homography_factors(some, self.variables, self.floor is not None)
+            self._ready.update(zip((id(link) for link, _, _ in some), made, strict=True))
 
     def of_graph(
         self, graph: PoseGraph, keys: Iterable[int]
@@ -206,13 +221,11 @@ class Factors:
         for name in graph.ranged_points:
             if graph.pose_keys.static()[name] in wanted:
                 factors.add(self.of_point(graph.pose_keys.static()[name]))
-        links, made = [], []
         key_of = graph.pose_keys.key
-        for link in graph.links:
-            i, j = map(key_of, link.ends)
-            if i in wanted and j in wanted and i != j:
-                made.append(self.of_link(link, i, j))
-                links.append(link)
+        ends = [(link, *map(key_of, link.ends)) for link in graph.links]
+        ends = [(link, i, j) for link, i, j in ends if i in wanted and j in wanted and i != j]
+        self._make_ready(ends)
+        links, made = [link for link, _, _ in ends], [self.of_link(*one) for one in ends]
         for key in sorted({key for factor in made for key in factor.keys()[2:]}):
             factors.add(self.calibration_prior(key))
         for factor in made:

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from coloc_graph.backend.batched_factors import BatchedFactor, FactorEvaluator, Group
 from coloc_graph.backend.calibration import MOUNT, RANGING, SIZES, Variables, sigmas_of_plane
 from coloc_graph.backend.camera_model import MarkersModel
-from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
+from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel, level_plane
 from coloc_graph.backend.range_model import RangeModel
+from coloc_graph.backend.span_factor import SpanModel
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.lie import floor_pose, rotation_z, yaw
 from coloc_graph.measurements import Range, RelativePose, Sighting
+from coloc_graph.team import Markers
 
 Array = NDArray[np.float64]
 
@@ -26,24 +28,62 @@ MOUNT_SIZE = SIZES[MOUNT]
 MAX_STEPS = 8  # Gauss-Newton steps to one pose; three are usual
 
 
-def homography_factor(link: RelativePose, i: int, j: int, variables: Variables, on_floor: bool) -> BatchedFactor:
-    """Return the factor of a homography and its spans on poses i and j, their mounts, the movers' markers and clocks.
+def homography_factors(
+    links: Sequence[tuple[RelativePose, int, int]], variables: Variables, on_floor: bool
+) -> list[BatchedFactor]:
+    """Return the factors of homographies and their spans, all at once.
 
-    Of a homography of a stated plane: on the poses and that plane.
+    Each is on the poses i and j, given with its link, their mounts, the movers' markers and clocks; of a homography of
+    a stated plane: on the poses and that plane.
     """
-    assert link.homography is not None and link.plane is not None
-    mount_i, mount_j = (variables.robot_models[robot].mount for robot in (link.robot_i, link.robot_j))
-    if not link.plane.normal_from_mount:
-        plane = StatedPlaneModel(link.homography, link.plane.N / link.plane.d, mount_i, mount_j)
-        key = variables.plane(link.robot_i, link.stance, sigmas_of_plane(link))
-        return BatchedFactor(FactorEvaluator(plane, (i, j), (key,), (3,)))
-    measured = link.homography
-    markers = {robot: one for robot in link.movers if (one := variables.robot_models[robot].markers) is not None}
-    about, tilt_sigma = variables.anchor(link.robot_i)
-    clocks, sign = variables.clocks(link.robot_i, link.robot_j, measured.time_offset_sigma)
-    model = HomographyModel(measured, link.spans, mount_i, mount_j, markers, on_floor, about, tilt_sigma, sign)
-    keys = variables.mount(link.robot_i), variables.mount(link.robot_j), *map(variables.markers, model.movers), clocks
-    return BatchedFactor(FactorEvaluator(model, (i, j), keys, (MOUNT_SIZE, MOUNT_SIZE, *[2] * len(model.movers), 1)))
+    spans = _span_models([link for link, _, _ in links], variables)
+    made = []
+    for (link, i, j), own in zip(links, spans, strict=True):
+        assert link.homography is not None and link.plane is not None
+        measured = link.homography
+        mount_i, mount_j = (variables.robot_models[robot].mount for robot in (link.robot_i, link.robot_j))
+        if not link.plane.normal_from_mount:
+            plane = StatedPlaneModel(measured, link.plane.N / link.plane.d, mount_i, mount_j)
+            key = variables.plane(link.robot_i, link.stance, sigmas_of_plane(link))
+            made.append(BatchedFactor(FactorEvaluator(plane, (i, j), (key,), (3,))))
+            continue
+        clocks, sign = variables.clocks(link.robot_i, link.robot_j, measured.time_offset_sigma)
+        model = HomographyModel(measured, own, mount_i, mount_j, _markers_of(link, variables), on_floor, sign)
+        mounts = variables.mount(link.robot_i), variables.mount(link.robot_j)
+        keys = *mounts, *map(variables.markers, model.movers), clocks
+        sizes = (MOUNT_SIZE, MOUNT_SIZE, *[2] * len(model.movers), 1)
+        made.append(BatchedFactor(FactorEvaluator(model, (i, j), keys, sizes)))
+    return made
+
+
+def _markers_of(link: RelativePose, variables: Variables) -> dict[str, Markers]:
+    """Markers of the movers of a homography, by robot."""
+    return {robot: one for robot in link.movers if (one := variables.robot_models[robot].markers) is not None}
+
+
+def _span_models(links: Sequence[RelativePose], variables: Variables) -> list[list[SpanModel]]:
+    """Models of the usable spans of each homography of a plane below its camera."""
+    owners, spans, planes, sigmas, lengths = [], [], [], [], []
+    for n, link in enumerate(links):
+        markers = _markers_of(link, variables)
+        if not link.spans or link.plane is None or not link.plane.normal_from_mount:
+            continue
+        about, tilt_sigma = variables.anchor(link.robot_i)
+        height = next(iter(markers.values())).height
+        level = level_plane(variables.robot_models[link.robot_i].mount, tuple(about.tolist()), height)
+        if level is not None:
+            for span in link.spans:
+                owners.append(n)
+                spans.append(span)
+                planes.append(level)
+                sigmas.append(tilt_sigma)
+                lengths.append(markers[span.mover].span or 0.0)
+    found: list[list[SpanModel]] = [[] for _ in links]
+    models = SpanModel.near(spans, np.array(planes).reshape(-1, 3), np.array(sigmas), lengths)
+    for n, model in zip(owners, models, strict=True):
+        if model is not None:
+            found[n].append(model)
+    return found
 
 
 def homography_poses(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from coloc_graph.backend.camera_model import HATS, Mounts, SeenPlanes, see
 from coloc_graph.backend.span_factor import SpanModel, Spans
 from coloc_graph.geometry.lie import hat, se3_inverse, sl3_adjoint, sl3_log, sl3_log_derivative, sl3_vee
-from coloc_graph.measurements import HomographyMeasurement, MarkerSpan
+from coloc_graph.measurements import HomographyMeasurement
 from coloc_graph.team import Markers, Mount
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ class HomographyModel:
     """Residual of a measured homography, and of the spans of the movers in the same images.
 
     Rows 0 to 7 are the sl(3) coordinates h of log(H_measured^-1 H_predicted), whitened by the information; each span
-    adds three, see `SpanModel`, linearised at mount error `about` (3,) with tilts known to `tilt_sigma` [rad]. The
+    adds three, see `SpanModel`. The
     plane is level at the height of the first mover's markers: in the world where robots stand on a floor, otherwise in
     body i. `movers` are the robots whose markers were seen.
 
@@ -33,23 +33,17 @@ class HomographyModel:
     def __init__(
         self,
         measured: HomographyMeasurement,
-        spans: tuple[MarkerSpan, ...],
+        spans: Sequence[SpanModel],
         mount_i: Mount,
         mount_j: Mount,
         markers: dict[str, Markers],
         on_floor: bool,
-        about: Array,
-        tilt_sigma: float,
         clock_sign: float = 1.0,
     ) -> None:
         self.on_floor, self.movers = on_floor, tuple(markers)
         self.height = next(iter(markers.values())).height
         self.mount_i, self.mount_j = mount_i, mount_j
-        level = _level_plane(mount_i, tuple(about.tolist()), self.height)
-        self.spans: tuple[SpanModel, ...] = ()
-        if level is not None:
-            made = SpanModel.near(spans, level, tilt_sigma, [markers[one.mover].span or 0.0 for one in spans])
-            self.spans = tuple(one.weighing(measured.share) for one in made)
+        self.spans = tuple(one.weighing(measured.share) for one in spans)
         self.H_inverse: Array = np.asarray(np.linalg.inv(measured.H_j_i), float)
         b = measured.by_time_offset
         self.by_offset = np.zeros(8) if b is None else clock_sign * b
@@ -80,8 +74,11 @@ class HomographyModel:
 
 
 @lru_cache(maxsize=256)
-def _level_plane(mount: Mount, errors: tuple[float, ...], height: float) -> Array | None:
-    """Plane n . X = 1 (3,) at a height over the floor, in the camera of a level robot; None at the camera's height."""
+def level_plane(mount: Mount, errors: tuple[float, ...], height: float) -> Array | None:
+    """Plane n . X = 1 (3,) at a height over the floor, in the camera of a level robot with these errors of its mount.
+
+    None at the camera's height.
+    """
     level = see(np.eye(4)[None], Mounts([mount]).at(np.array([errors])), np.array([height]))
     return level.n[0] if level.seen[0] else None
 

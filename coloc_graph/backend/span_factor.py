@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.geometry.lie import across
 from coloc_graph.measurements import MarkerSpan
 
 Array = NDArray[np.float64]
@@ -57,10 +56,21 @@ def spans_on_plane(x_i: Array, n: Array) -> tuple[Array, Array, Array, Array]:
     return lengths, along[..., :1] * X[..., 0, :] - along[..., 1:] * X[..., 1, :], X, u
 
 
+def _at_instants(x_i: Array, n: Array) -> tuple[Array, Array, Array, Array]:
+    """`spans_on_plane` of rays x_i (k, 2, 2), each on its own plane (k, 3)."""
+    lengths, by_n, X, u = spans_on_plane(x_i[:, None], n)
+    return lengths[:, 0], by_n[:, 0], X[:, 0], u[:, 0]
+
+
+def _widened(shared: Array, columns: int) -> Array:
+    """Roots (k, 2, 2, q) of covariances with columns of zeros after theirs."""
+    return np.pad(shared, [(0, 0)] * (shared.ndim - 1) + [(0, columns - shared.shape[-1])])
+
+
 def _by_rays(X: Array, u: Array, n: Array) -> Array:
-    """Derivatives (k, 2, 2) of the distances by x_i."""
+    """Derivatives (k, 2, 2) of the distances by x_i, on planes n (k, 3)."""
     along = X @ u[:, :, None]
-    by_x = X[..., 2:] * (u[:, None, :2] - along * n[:2])
+    by_x = X[..., 2:] * (u[:, None, :2] - along * n[:, None, :2])
     return np.asarray(by_x * np.array([-1.0, 1.0])[:, None])
 
 
@@ -69,7 +79,7 @@ def _lengthening(X: Array, u: Array, n: Array, covariance: Array) -> Array:
 
     S is the covariance of the line from one marker to the other.
     """
-    J = X[..., 2, None, None] * (np.eye(3)[:, :2] - X[..., None] * n[:2])
+    J = X[..., 2, None, None] * (np.eye(3)[:, :2] - X[..., None] * n[:, None, None, :2])
     S = (J @ covariance @ J.mT).sum(axis=1)
     arm = np.sqrt(((X[:, 1] - X[:, 0]) ** 2).sum(-1))
     return np.asarray((S[:, 0, 0] + S[:, 1, 1] + S[:, 2, 2] - ((S @ u[..., None])[..., 0] * u).sum(axis=1)) / (2 * arm))
@@ -96,52 +106,65 @@ class SpanModel:
 
     @classmethod
     def near(
-        cls, spans: Sequence[MarkerSpan], n: Array, normal_sigma: float, lengths: Sequence[float]
-    ) -> tuple["SpanModel", ...]:
-        """Return the models of spans of `lengths` [m] near the plane n . X = 1 in camera i.
+        cls, spans: Sequence[MarkerSpan], n: Array, normal_sigma: Array, lengths: Sequence[float]
+    ) -> tuple["SpanModel | None", ...]:
+        """Return the models of spans near planes in their cameras, all at once; None of too few usable instants.
 
-        `normal_sigma` [rad] is that of the plane's normal. Spans with too few usable instants are left out.
+        Parameters
+        ----------
+        spans : sequence of MarkerSpan
+            s spans, of any homographies.
+        n : (s, 3) float
+            Planes n . X = 1 in the cameras [1/m].
+        normal_sigma : (s,) float
+            Standard deviations of the planes' normals [rad].
+        lengths : sequence of float
+            Spans as stated [m].
         """
-        turn = spans[0].R_camera_view if spans else None
-        R = np.eye(3) if turn is None else turn
-        n = n @ R
-        N = n / np.linalg.norm(n)
-        some, clear = [], []
-        for span, length in zip(spans, lengths, strict=True):
-            sine = (span.x_i @ N[:2] + N[2]) / np.sqrt(1 + (span.x_i**2).sum(-1))
-            which = (sine > max(MIN_SINE, CLEARANCE_SIGMAS * normal_sigma)).all(axis=1)
-            if which.sum() >= MIN_INSTANTS:
-                some.append((span, length))
-                clear.append(which)
-        if not some:
+        out: list[SpanModel | None] = [None] * len(spans)
+        if not spans:
             return ()
-        # the instants of all spans, one after the other; `apart` gives them by span, padded with zeros
-        x_i, covariance, by_h, shared = (
-            np.concatenate([getattr(span, name)[which] for (span, _), which in zip(some, clear, strict=True)])
-            for name in ("x_i", "covariance", "by_h", "shared")
+        R = np.array([np.eye(3) if span.R_camera_view is None else span.R_camera_view for span in spans])
+        n = (n[:, None] @ R)[:, 0]
+        N = n / np.linalg.norm(n, axis=1)[:, None]
+        most = max(span.shared.shape[-1] for span in spans)
+        x_i, covariance, by_h = (
+            np.concatenate([getattr(one, name) for one in spans]) for name in ("x_i", "covariance", "by_h")
         )
-        count = [int(which.sum()) for which in clear]
-        own = np.arange(max(count)) < np.array(count)[:, None]
+        shared = np.concatenate([_widened(span.shared, most) for span in spans])
+        of = np.repeat(np.arange(len(spans)), [len(span.x_i) for span in spans])
+        sine = ((x_i * N[of, None, :2]).sum(-1) + N[of, None, 2]) / np.sqrt(1 + (x_i**2).sum(-1))
+        which = (sine > np.maximum(MIN_SINE, CLEARANCE_SIGMAS * normal_sigma)[of, None]).all(axis=1)
+        which &= (np.bincount(of[which], minlength=len(spans)) >= MIN_INSTANTS)[of]
+        if not which.any():
+            return tuple(out)
+        x_i, covariance, by_h, shared, of = x_i[which], covariance[which], by_h[which], shared[which], of[which]
+        # the instants of all spans, one after the other; `apart` gives them by span, padded with zeros
+        some, count = np.unique(of, return_counts=True)
+        own = np.arange(count.max()) < count[:, None]
 
         def apart(each: Array) -> Array:
             """(k, ...) of all instants as (s, k, ...) of each span."""
-            out = np.zeros((*own.shape, *each.shape[1:]))
-            out[own] = each
-            return out
+            padded = np.zeros((*own.shape, *each.shape[1:]))
+            padded[own] = each
+            return padded
 
-        found, by_n, X, u = spans_on_plane(x_i, n)
-        by_x = _by_rays(X, u, n)
-        if normal_sigma < KNOWN_NORMAL:
+        planes, length = n[of], np.array(lengths)[of]
+        found, by_n, X, u = _at_instants(x_i, planes)
+        by_x = _by_rays(X, u, planes)
+        known = (normal_sigma < KNOWN_NORMAL)[of]
+        if known.any():
             # weigh each length at the nearest rays that have it right: noise that makes a length longer would make
             # its weight smaller, which over hundreds of instants is a bias of a tenth of a sigma
-            off = found - np.repeat([length for _, length in some], count)
             by_noise = (covariance @ by_x[..., None])[..., 0]
-            variance = (by_x * by_noise).sum(axis=(1, 2))
-            _, by_n, X, u = spans_on_plane(x_i - by_noise * (off / variance)[:, None, None], n)
-            by_x = _by_rays(X, u, n)
+            off = np.where(known, (found - length) / (by_x * by_noise).sum(axis=(1, 2)), 0.0)
+            _, by_n, X, u = _at_instants(x_i - by_noise * off[:, None, None], planes)
+            by_x = _by_rays(X, u, planes)
         sigma = np.sqrt((by_x * (covariance @ by_x[..., None])[..., 0]).sum(axis=(1, 2)))
-        J = (by_n @ np.stack([*across(N), N], axis=1)) / sigma[:, None]
-        weights = np.linalg.qr(apart(J))[0].mT / np.where(own, apart(sigma), 1.0)[:, None]
+        bases = np.linalg.svd(N[some, None])[2]
+        bases[:, 0] = N[some]
+        J = apart(by_n / sigma[:, None]) @ bases[:, [1, 2, 0]].mT
+        weights = np.linalg.qr(J)[0].mT / np.where(own, apart(sigma), 1.0)[:, None]
         # errors that all rays to one marker share do not average out
         each = apart((by_x[:, :, None] @ shared)[:, :, 0].reshape(len(x_i), -1))
         root = weights @ each
@@ -149,21 +172,22 @@ class SpanModel:
         weights = np.linalg.solve(factor, weights)
         log_det = 2 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
         by_h = weights @ apart((by_x[:, :, None] @ by_h)[:, :, 0].sum(axis=1))
-        noise = _lengthening(X, u, n, covariance)
-        ends = np.cumsum(count)
-        return tuple(
-            cls(
-                span.mover,
-                length,
-                x_i[end - k : end],
-                noise[end - k : end],
+        noise = _lengthening(X, u, planes, covariance)
+        for at, (index, k, end) in enumerate(
+            zip(some.tolist(), count.tolist(), np.cumsum(count).tolist(), strict=True)
+        ):
+            rows = slice(end - k, end)
+            out[index] = cls(
+                spans[index].mover,
+                lengths[index],
+                x_i[rows],
+                noise[rows],
                 weights[at, :, :k],
                 by_h[at],
                 float(log_det[at]),
-                R,
+                R[index],
             )
-            for at, ((span, length), k, end) in enumerate(zip(some, count, ends, strict=True))
-        )
+        return tuple(out)
 
     def weighing(self, share: float) -> "SpanModel":
         """Return the model with a share of the information, where other pairs have the rest of it."""

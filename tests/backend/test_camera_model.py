@@ -8,7 +8,7 @@ import pytest
 
 from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors, FactorEvaluator
 from coloc_graph.backend.camera_model import UNEVALUABLE, MarkersModel, Mounts
-from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel
+from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel, level_plane
 from coloc_graph.backend.span_factor import SpanModel, Spans, spans_on_plane
 from coloc_graph.geometry.lie import floor_pose, se3_exp, se3_inverse, sl3_log, sl3_normalise
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan
@@ -54,7 +54,17 @@ def span_of(rng, T_i=T_WORLD_I, noise=0.0, n=40):
 def model_of(rng, on_floor=True, measured=None, spans=None):
     spans = (span_of(rng),) if spans is None else spans
     measured = measured or homography(rng, offset=rng.normal(size=8))
-    return HomographyModel(measured, spans, MOUNT_I, MOUNT_J, {"C": MARKERS}, on_floor, np.zeros(6), 0.01)
+    return homography_model(measured, spans, {"C": MARKERS}, on_floor)
+
+
+def near(spans, n, sigma, lengths):
+    return SpanModel.near(spans, np.tile(n, (len(spans), 1)), np.full(len(spans), sigma), lengths)
+
+
+def homography_model(measured, spans, markers, on_floor=True):
+    level = level_plane(MOUNT_I, (0.0,) * 6, MARKERS.height)
+    models = near(spans, level, 0.01, [MARKERS.span] * len(spans))
+    return HomographyModel(measured, models, MOUNT_I, MOUNT_J, markers, on_floor)
 
 
 def at(model, T_i, T_j, *errors):
@@ -171,10 +181,10 @@ def test_a_span_has_unit_covariance_and_no_bias(rng):
     for _ in range(1500):
         noisy = true.x_i + (root @ rng.normal(size=(*true.x_i.shape, 1)))[..., 0]
         span = MarkerSpan("C", noisy, true.covariance, true.by_h, true.shared)
-        (model,) = SpanModel.near([span], n, 0.0, [MARKERS.span])
+        (model,) = near([span], n, 0.0, [MARKERS.span])
         off.append(Spans([model]).at(n[None], np.zeros(1))[0][0])
         without.append(off[-1] + model.weights @ model.noise)
-        (cautious,) = SpanModel.near([span], n, 6e-3, [MARKERS.span])
+        (cautious,) = near([span], n, 6e-3, [MARKERS.span])
         by_noisy_weights.append(Spans([cautious]).at(n[None], np.zeros(1))[0][0])
     off = np.array(off)
     np.testing.assert_allclose(np.cov(off.T), np.eye(3), atol=0.15)
@@ -188,10 +198,10 @@ def test_rays_near_the_horizon_and_few_of_them_say_nothing(rng):
     span = span_of(rng)
     T = T_WORLD_I @ MOUNT_I.T_body_camera
     n = T[:3, :3].T @ np.array([0.0, 0.0, -1.0]) / (T[2, 3] - 0.15)
-    every, cautious, none = (SpanModel.near([span], n, sigma, [MARKERS.span]) for sigma in (0.0, 0.06, 0.5))
+    every, cautious, none = (near([span], n, sigma, [MARKERS.span]) for sigma in (0.0, 0.06, 0.5))
     assert len(every[0].x_i) == 40
     assert 4 <= len(cautious[0].x_i) < 40  # 3 sigmas are 10 deg: farther than 1.4 m
-    assert none == ()
+    assert none == (None,)
 
 
 def test_spans_taken_together_are_those_taken_alone(rng):
@@ -200,8 +210,8 @@ def test_spans_taken_together_are_those_taken_alone(rng):
     T = T_WORLD_I @ MOUNT_I.T_body_camera
     n = T[:3, :3].T @ np.array([0.0, 0.0, -1.0]) / (T[2, 3] - 0.15)
     for spans in ([one, other], shared):
-        alone = [SpanModel.near([span], n, 0.0, [length])[0] for span, length in zip(spans, (0.25, 0.26), strict=True)]
-        for a, b in zip(alone, SpanModel.near(spans, n, 0.0, [0.25, 0.26]), strict=True):
+        alone = [near([span], n, 0.0, [length])[0] for span, length in zip(spans, (0.25, 0.26), strict=True)]
+        for a, b in zip(alone, near(spans, n, 0.0, [0.25, 0.26]), strict=True):
             assert (a.mover, a.length) == (b.mover, b.length)
             for name in ("x_i", "noise", "weights", "by_h"):
                 np.testing.assert_allclose(getattr(b, name), getattr(a, name), rtol=1e-9, atol=1e-9)
@@ -254,10 +264,7 @@ def test_factors_evaluated_at_once_are_those_evaluated_alone(rng):
     short, long = span_of(rng, n=25), replace(span_of(rng, n=40), mover="D")
     both = {"C": MARKERS, "D": MARKERS}
     made = [model_of(rng), model_of(rng, spans=(short,)), model_of(rng, False), model_of(rng, spans=())]
-    made += [
-        HomographyModel(homography(rng), spans, MOUNT_I, MOUNT_J, both, True, np.zeros(6), 0.01)
-        for spans in ((short, long), (long, short), (long,))
-    ]
+    made += [homography_model(homography(rng), spans, both) for spans in ((short, long), (long, short), (long,))]
     seen = [FactorEvaluator(model, (1, 2), (11, 12, *[21] * len(model.movers), 31), (6, 6, *[2] * len(model.movers), 1))
             for model in made]  # fmt: skip
     seen.append(FactorEvaluator(made[0], (2, 1), (None, 12, 21, None), (6, 6, 2, 1)))
