@@ -185,7 +185,8 @@ class Factors:
                 assert isinstance(factor, BatchedFactor)
                 self._ready[id(link)] = factor
                 homographies[n] = link, factor
-        found = homography_poses(*zip(*homographies.values(), strict=True), errors) if homographies else []
+        pairs = homographies.values()
+        found = homography_poses([link for link, _ in pairs], [factor for _, factor in pairs], errors)
         for n, pose in zip(homographies, found, strict=True):
             poses[n] = pose
         return poses
@@ -222,7 +223,7 @@ class Factors:
             if graph.pose_keys.static()[name] in wanted:
                 factors.add(self.of_point(graph.pose_keys.static()[name]))
         key_of = graph.pose_keys.key
-        ends = [(link, *map(key_of, link.ends)) for link in graph.links]
+        ends = [(link, key_of(link.ends[0]), key_of(link.ends[1])) for link in graph.links]
         ends = [(link, i, j) for link, i, j in ends if i in wanted and j in wanted and i != j]
         self._make_ready(ends)
         links, made = [link for link, _, _ in ends], [self.of_link(*one) for one in ends]

@@ -113,7 +113,8 @@ def fit_graph(
         steps, values = spanning_tree(graph, graph.links, odometry_last=odometry_last), gtsam.Values()
         if mounts:
             new = [one.link for one in steps if one.to not in known and id(one.link) not in expected]
-            of_ends = [(link, *map(graph.pose_keys.key, link.ends)) for link in new]
+            key_of = graph.pose_keys.key
+            of_ends = [(link, key_of(link.ends[0]), key_of(link.ends[1])) for link in new]
             expected.update(zip(map(id, new), factors_of.all_expected(of_ends, errors), strict=True))
         poses = compose(graph, steps, factors_of.start, lambda link: expected.get(id(link)) or pose_of(link), known)
         for key, pose in poses.items():

@@ -120,7 +120,7 @@ def optimise(
     initial: gtsam.Values,
     *,
     roughly_first: bool = False,
-    held: Callable[[gtsam.Values], AbstractContextManager[None]] = nullcontext,
+    held: Callable[[gtsam.Values], AbstractContextManager[object]] = nullcontext,
 ) -> tuple[gtsam.Values, int]:
     """Optimise by Gauss-Newton, or by Levenberg-Marquardt with QR where that fails; return values and iterations.
 
@@ -170,7 +170,7 @@ def _gauss_newton(
     factors: gtsam.NonlinearFactorGraph,
     initial: gtsam.Values,
     before: float,
-    held: Callable[[gtsam.Values], AbstractContextManager[None]],
+    held: Callable[[gtsam.Values], AbstractContextManager[object]],
 ) -> tuple[gtsam.Values, int] | None:
     """Return values and iterations of Gauss-Newton; None where it fails.
 

@@ -69,9 +69,9 @@ def decompose_svd(H: ArrayLike) -> tuple[Array, Array, Array]:
         R (2, ..., 3, 3), T/d (2, ..., 3) and N (2, ..., 3) of both solutions. Of the textbook's four these are the two
         whose plane lies in front of camera 1 (N_z > 0). If H is a pure rotation, T/d is 0 and N is undetermined.
     """
-    H = np.asarray(H, float)
-    _, s, Vt = np.linalg.svd(H)
-    H = H * (np.sign(np.linalg.det(H)) / s[..., 1])[..., None, None]
+    given = np.asarray(H, float)
+    _, s, Vt = np.linalg.svd(given)
+    scaled = given * (np.sign(np.linalg.det(given)) / s[..., 1])[..., None, None]
     s = s / s[..., 1:2]
     v1, v2, v3 = Vt[..., 0, :], Vt[..., 1, :], Vt[..., 2, :]
     s1, s3 = s[..., 0] ** 2, s[..., 2] ** 2
@@ -79,9 +79,9 @@ def decompose_svd(H: ArrayLike) -> tuple[Array, Array, Array]:
     a, b = np.sqrt(np.maximum(1 - s3, 0.0)) / width, np.sqrt(np.maximum(s1 - 1, 0.0)) / width
     u = a[..., None] * v1 + np.multiply.outer([1.0, -1.0], b[..., None] * v3)
     N = cross(v2, u)
-    R = closest_rotation(_turn(H, v2, u, N))
+    R = closest_rotation(_turn(scaled, v2, u, N))
     N = N * np.where(N[..., 2:] < 0, -1.0, 1.0)
-    return R, ((H - R) @ N[..., None])[..., 0], N
+    return R, ((scaled - R) @ N[..., None])[..., 0], N
 
 
 def _turn(H: Array, v2: Array, u: Array, N: Array) -> Array:
