@@ -4,7 +4,9 @@
 
 The grid: real images of a flat grid of 7 x 5 LEDs by a fisheye camera (Kannala-Brandt), places of the LEDs free. The
 noise is learnt from half of the images and judged on the other half, both ways: chi2 per degree of freedom, for each
-image and for saturated and other spots apart. Centres of mass and `cv2.SimpleBlobDetector` stand beside the detector.
+image and for saturated and other spots apart. Once it is predicted before an image is seen; and once every other LED of
+an image tells how much this image scatters, as the fit of a stance does, and the rest is judged. Centres of mass and
+`cv2.SimpleBlobDetector` stand beside the detector.
 
 The chain: three path-traced stances with truth, as they are and made worse. The noise is learnt from two stances by
 their homographies, which know no truth, and the detector is judged against truth on the third: NEES per degree of
@@ -27,6 +29,7 @@ from scipy.optimize import least_squares
 
 from coloc_graph.frontend import detect_leds
 from coloc_graph.frontend.homography.noise_components import NoiseEvidence, learn_components
+from coloc_graph.frontend.homography.scatter import learn_spread, variance_factor
 from coloc_graph.frontend.learnt_noise import NoiseBelief
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.pipeline.batch import SolveOptions, solve
@@ -181,16 +184,27 @@ def grid_figures(folder: Path) -> dict[str, object]:
     n = len(spots.uv)
     halves = np.arange(0, n, 2), np.arange(1, n, 2)
     means, sigmas = CentreNoise().logs
-    chi2, dof, stated = np.zeros((n, 35)), np.zeros((n, 35)), np.zeros(2)
+    chi2, dof, stated, adapted = np.zeros((n, 35)), np.zeros((n, 35)), np.zeros(2), np.zeros((n, 35))
     learnt = []
+    spreads = []
     evidence = [grid_evidence(spots[half]) for half in halves]
     for one, other, judged in ((0, 1, halves[1]), (1, 0, halves[0])):
         logs, covariance = learn_components([evidence[one]], np.array(means), np.diag(np.square(sigmas)))
-        learnt.append(CentreNoise.of_logs(logs.tolist(), np.sqrt(covariance.diagonal()).tolist()))
         # expected variances, larger than the medians by what is uncertain of them
-        logs = logs + covariance.diagonal() / 2
+        expected = logs + covariance.diagonal() / 2
+        own = [column.reshape(-1, 35).sum(axis=1) for column in judge(evidence[one], expected)]
+        spread, factor = learn_spread(*own, max(sigmas) ** 2, CentreNoise().spread, CentreNoise().spread_factor)
+        learnt.append(CentreNoise.of_logs(logs.tolist(), np.sqrt(covariance.diagonal()).tolist(), spread, factor))
+        logs = expected
         found = judge(evidence[other], logs)
         chi2[judged], dof[judged] = (column.reshape(-1, 35) for column in found)
+        spreads.append(spread * np.exp(np.log(factor) ** 2))
+        for image in judged:
+            for half in (0, 1):
+                seen = slice(half, None, 2)
+                rest = slice(1 - half, None, 2)
+                scale = variance_factor(float(chi2[image, seen].sum()), float(dof[image, seen].sum()), spreads[-1])
+                adapted[image, rest] = chi2[image, rest] / scale
         stated += [column.sum() for column in judge(evidence[other], np.array([0.0, -30.0, -30.0]))]
     saturated = spots.saturated
     scatter = {}
@@ -204,6 +218,11 @@ def grid_figures(folder: Path) -> dict[str, object]:
         "saturated": float(chi2[saturated].sum() / dof[saturated].sum()),
         "unsaturated": float(chi2[~saturated].sum() / dof[~saturated].sum()),
         "by_image": (chi2.sum(1) / dof.sum(1)).tolist(),
+        "spread": spreads,
+        "adapted": float(adapted.sum() / dof.sum()),
+        "adapted_saturated": float(adapted[saturated].sum() / dof[saturated].sum()),
+        "adapted_unsaturated": float(adapted[~saturated].sum() / dof[~saturated].sum()),
+        "adapted_by_image": (adapted.sum(1) / dof.sum(1)).tolist(),
         "floor_px": [one.floor_px for one in learnt],
         "saturated_px": [one.saturated_px for one in learnt],
         "scatter_px": scatter,
@@ -340,6 +359,10 @@ def table(figures: dict[str, object]) -> str:
             f"saturated {grid['saturated']:.2f}, others {grid['unsaturated']:.2f}",
             f"floors {', '.join(f'{one:.3f}' for one in grid['saturated_px'] + grid['floor_px'])} px",
             "by image: " + " ".join(f"{one:.2f}" for one in grid["by_image"]),
+            f"with the scatter of every other LED of an image, the rest: chi2/dof {grid['adapted']:.2f}; saturated "
+            f"{grid['adapted_saturated']:.2f}, others {grid['adapted_unsaturated']:.2f}; spread of log variance "
+            + ", ".join(f"{one:.2f}" for one in grid["spread"]),
+            "by image: " + " ".join(f"{one:.2f}" for one in grid["adapted_by_image"]),
             "scatter about lens and grid: " + ", ".join(f"{k} {v:.4f} px" for k, v in grid["scatter_px"].items()),
             "",
         ]

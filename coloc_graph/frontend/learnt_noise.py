@@ -12,8 +12,9 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from coloc_graph.frontend.homography.noise_components import NoiseEvidence, learn_components
+from coloc_graph.frontend.homography.noise_components import NoiseEvidence, learn_components, scatter_of
 from coloc_graph.frontend.homography.refinement import linearise, projection
+from coloc_graph.frontend.homography.scatter import learn_spread
 from coloc_graph.frontend.pairing.correspondence import separated
 from coloc_graph.frontend.stance import PairMeasurement
 from coloc_graph.team import CentreNoise, Team
@@ -55,6 +56,9 @@ class NoiseBelief:
     bias_px, bias_factor
         Medians of the errors that all centres of a marker share in a stance [px], and the factors within which they
         are known, (r,).
+    spread, spread_factor
+        Median of the standard deviation of the logarithms of stances' variances, and the factor within which it is
+        known.
     """
 
     robots: tuple[str, ...]
@@ -64,13 +68,17 @@ class NoiseBelief:
     typical: Array
     bias_px: Array
     bias_factor: Array
+    spread: float
+    spread_factor: float
 
     @classmethod
     def of(cls, team: Team) -> "NoiseBelief":
         """Return the prior that a team states for all robots with a camera."""
         robots = tuple(robot.name for robot in team.robots if robot.camera_if_any is not None)
-        logs = [(team[name].camera.centre_noise or CentreNoise()).logs for name in robots]
+        stated = [team[name].camera.centre_noise or CentreNoise() for name in robots]
+        logs = [one.logs for one in stated]
         means, sigmas = ([value for one in logs for value in one[which]] for which in (0, 1))
+        spreads = np.log([(one.spread, one.spread_factor) for one in stated or [CentreNoise()]])
         cameras = [team[name].camera for name in robots]
         return cls(
             robots,
@@ -80,6 +88,7 @@ class NoiseBelief:
             np.zeros((len(robots), 2)),
             np.array([one.bias_px or BIAS_PX for one in cameras]),
             np.array([one.bias_factor for one in cameras]),
+            *np.exp(spreads.mean(axis=0)).tolist(),
         )
 
     def updated(self, measured: Sequence[PairMeasurement]) -> "NoiseBelief":
@@ -87,14 +96,18 @@ class NoiseBelief:
         made = [found for found in map(self._evidence, measured) if found is not None]
         if not made:
             return self
-        mean, covariance = learn_components([evidence for evidence, _ in made], self.mean, self.covariance)
+        every = [evidence for evidence, _ in made]
+        mean, covariance = learn_components(every, self.mean, self.covariance)
+        chi2, dof, level = scatter_of(every, np.exp(mean + covariance.diagonal() / 2), self.covariance)
+        spread = learn_spread(chi2, dof, level, self.spread, self.spread_factor)
         points, typical = np.array(self.points), np.array(self.typical)
         sums = points[:, None] * typical
         for robot, number, mean_of_points in (seen for _, both in made for seen in both):
             points[robot] += number
             sums[robot] += number * mean_of_points
         typical = sums / np.maximum(points, 1)[:, None]
-        return replace(self, mean=mean, covariance=covariance, points=points, typical=typical)
+        changed = replace(self, mean=mean, covariance=covariance, points=points, typical=typical)
+        return replace(changed, spread=spread[0], spread_factor=spread[1])
 
     def with_bias(self, size: float, factor: float) -> "NoiseBelief":
         """Return the belief with shared errors of `size` times those of before, known within a factor."""
@@ -130,7 +143,8 @@ class NoiseBelief:
     def noise(self, robot: str) -> CentreNoise:
         """Return the noise of a camera: medians, each with its factor of uncertainty."""
         mean, covariance = self._of(robot)
-        return CentreNoise.of_logs(mean.tolist(), np.sqrt(covariance.diagonal()).tolist())
+        sigmas = np.sqrt(covariance.diagonal()).tolist()
+        return CentreNoise.of_logs(mean.tolist(), sigmas, self.spread, self.spread_factor)
 
     def sigma(self, robot: str) -> tuple[float, float]:
         """Return the standard deviation of a typical centre [px] and its factor of uncertainty."""
@@ -157,6 +171,8 @@ class NoiseBelief:
             before = NoiseBelief.of(team)
             values = (one[number] for one in (before.bias_px, before.bias_factor, self.bias_px, self.bias_factor))
             rows.append(NoiseRow(robot, "shared in a stance", "px", *map(float, values)))
+            values = (stated.spread, stated.spread_factor, self.spread, self.spread_factor)
+            rows.append(NoiseRow(robot, "log variance by stance", "", *values))
         return rows
 
     def used(self, team: Team) -> Team:
@@ -172,7 +188,8 @@ class NoiseBelief:
             widening = covariance.diagonal() / 2
             if self.points[self.robots.index(name)]:
                 widening = np.full(len(mean), 2 * math.log(self.sigma(name)[1]) ** 2)
-            noises[name] = CentreNoise.of_logs((mean + widening).tolist(), [0.0] * len(COMPONENTS))
+            spread = self.spread * math.exp(math.log(self.spread_factor) ** 2)  # root of the expected square
+            noises[name] = CentreNoise.of_logs((mean + widening).tolist(), [0.0] * len(COMPONENTS), spread, 1.0)
         expected = self.bias_px * np.exp(np.log(self.bias_factor) ** 2)  # root of the expected square
         return _with_noise(team, noises, dict(zip(self.robots, expected, strict=True)))
 

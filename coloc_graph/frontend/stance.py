@@ -1,5 +1,6 @@
 """Measure the homography and the relative pose between two observers in one stance, from images or detections."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -163,6 +164,12 @@ class _Seen:
         down = other.mount.R_body_camera.T @ np.array([0.0, 0.0, -1.0])
         return view_of_plane(one.camera, self.plane.N), view_of_plane(other.camera, down)
 
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the logarithms of stances' variances; 0 where no camera's noise is known."""
+        noises = (self.team[name].camera.centre_noise for name in (self.robot_i, self.robot_j))
+        return math.sqrt(sum(one.spread**2 for one in noises if one is not None) / 2)
+
 
 def little_in_common(measured: HomographyMeasurement, stance: Stance) -> bool:
     """Return whether two of many observers share too few points to be worth a warning."""
@@ -305,7 +312,7 @@ def _measured_from(seen: _Seen, found: Correspondences, team: Team) -> PairMeasu
     again = partial(_measured_from, seen, found)
     found = with_noise(found, seen.cameras, now.cameras)
     try:
-        made = _measured(now, found, fit_homography(found.pairs, seen.options.criterion))
+        made = _measured(now, found, fit_homography(found.pairs, seen.options.criterion, now.spread))
     except DegenerateGeometry as why:
         made = PairMeasurement(_unusable(seen.stance, seen.robot_i, seen.robot_j, found, str(why)), None, found)
     return replace(made, with_team=again)
@@ -322,7 +329,7 @@ def _measure_at_offset(
     seen, found = replace(seen, team=team or seen.team), rough
     try:
         tracks = PairedTracks(seen.tracks_i, seen.tracks_j, chosen, *seen.cameras)
-        clock = fit_at_offset(tracks, offset, seen.options.criterion)
+        clock = fit_at_offset(tracks, offset, seen.options.criterion, seen.spread)
         found = clock.found
         made = _measured(seen, found, clock.fit, clock.offset, clock.by_offset)
     except DegenerateGeometry as why:

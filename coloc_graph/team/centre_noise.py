@@ -24,6 +24,9 @@ class CentreNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         White floor [px]: what pixels, lens and background do to a centre, whatever its light.
     saturated_px, saturated_factor
         White floor of saturated spots [px], and its factor. They are brighter or longer exposed, and may have less.
+    spread, spread_factor
+        Standard deviation of the logarithms of variances from stance to stance about all that, and its factor: one
+        stance is shaken, or sees lights from the side.
     """
 
     scale: float = 1.0
@@ -32,13 +35,15 @@ class CentreNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     floor_factor: float = 3.0
     saturated_px: float = 0.03
     saturated_factor: float = 3.0
+    spread: float = 0.2
+    spread_factor: float = 3.0
 
     def __post_init__(self) -> None:
         require_finite(self)
-        for name in ("scale", "floor_px", "saturated_px"):
+        for name in ("scale", "floor_px", "saturated_px", "spread"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
-        for name in ("scale_factor", "floor_factor", "saturated_factor"):
+        for name in ("scale_factor", "floor_factor", "saturated_factor", "spread_factor"):
             if not 1 < getattr(self, name) <= 100:
                 raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 1, 100 at most")
 
@@ -50,7 +55,7 @@ class CentreNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         return [2 * math.log(one) for one in medians], [2 * math.log(one) for one in factors]
 
     @classmethod
-    def of_logs(cls, means: list[float], sigmas: list[float]) -> "CentreNoise":
+    def of_logs(cls, means: list[float], sigmas: list[float], spread: float, spread_factor: float) -> "CentreNoise":
         """Return the noise with these means and standard deviations of the logarithms of its variances."""
         scale, floor, saturated = (math.exp(one / 2) for one in means)
         scale_f, floor_f, saturated_f = (math.exp(max(one, 1e-6) / 2) for one in sigmas)
@@ -61,6 +66,8 @@ class CentreNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
             floor_factor=floor_f,
             saturated_px=saturated,
             saturated_factor=saturated_f,
+            spread=spread,
+            spread_factor=max(spread_factor, 1 + 1e-6),
         )
 
     @property

@@ -8,6 +8,7 @@ import pytest
 
 from coloc_graph.backend.shared_noise import SharedNoise
 from coloc_graph.frontend.homography.noise_components import NoiseEvidence, learn_components
+from coloc_graph.frontend.homography.scatter import learn_spread, variance_factor
 from coloc_graph.frontend.learnt_noise import NoiseBelief
 from coloc_graph.pipeline.batch import SolveOptions, StanceSolver, solve
 from coloc_graph.results.writer import write_result
@@ -50,6 +51,34 @@ def test_one_fit_after_the_other_gives_what_all_together_do():
     assert np.sqrt(belief[1].diagonal()) == pytest.approx(sigmas, rel=0.2)
 
 
+def scatters(rng, spread, fits=60, dof=62):
+    """Degrees of freedom and chi2 of fits whose variances differ, and those variances."""
+    variance = np.exp(spread * rng.standard_normal(fits))
+    return variance * rng.chisquare(dof, fits), np.full(fits, float(dof)), variance
+
+
+@pytest.mark.parametrize("spread", [0.05, 0.7])
+def test_the_spread_of_fits_is_found(spread):
+    chi2, dof, _ = scatters(np.random.default_rng(2), spread)
+    median, factor = learn_spread(chi2, dof, 0.1, 0.2, 3.0)
+    assert abs(np.log(median / spread)) < 2.5 * np.log(factor)
+    assert factor < (2.5 if spread < 0.2 else 1.2)
+    # a first fit cannot tell a noisy fit from a noisy run
+    assert learn_spread(chi2[:1], dof[:1], 4.0, 0.2, 3.0) == pytest.approx((0.2, 3.0), rel=0.3)
+
+
+def test_a_fit_gets_its_own_variance_as_far_as_fits_differ():
+    assert variance_factor(62 * 1.3, 62, 0.0) == 1.0  # chance
+    assert variance_factor(62 * 2.0, 62, 0.0) == 2.0  # more than chance
+    assert variance_factor(62 * 0.5, 62, 0.02) == pytest.approx(1.0, abs=0.05)
+    seen, dof, _ = scatters(np.random.default_rng(3), 0.7, 400)
+    # half of a fit's points tell what the variance of the other half is
+    factors = np.array([variance_factor(*pair, 0.7) for pair in zip(seen, dof, strict=True)])
+    _, _, variance = scatters(np.random.default_rng(3), 0.7, 400)
+    assert (variance / factors).mean() == pytest.approx(1.0, abs=0.03)
+    assert np.std(np.log(variance / factors)) < 0.25  # 0.7 without
+
+
 @pytest.fixture(scope="module")
 def hallway(tmp_path_factory):
     path = tmp_path_factory.mktemp("noise") / "run.mcap"
@@ -90,7 +119,7 @@ def test_a_short_run_keeps_what_is_stated_and_is_wide(hallway, tmp_path):
     assert stated.floor_px == pytest.approx(CentreNoise().floor_px)
     # of a floor that is known within a factor of three the variance is expected eleven times its median
     assert nothing.used(run.team)["A"].camera.centre_noise.variances[1] == pytest.approx(11.2 * 0.03**2, rel=0.01)
-    assert one.noise("C") == nothing.noise("C")  # whose camera saw nothing
+    assert one.noise("C").logs == nothing.noise("C").logs  # whose camera saw nothing
     assert one.noise("A").floor_factor > 1.5  # 0.3 px of stated noise tell little of a floor of 0.03
 
 
@@ -109,6 +138,7 @@ def test_learnt_noise_is_in_the_team_that_a_result_writes_and_the_next_run_start
         "stated sigma times",
         "white floor",
         "shared in a stance",
+        "log variance by stance",
     }
     assert "Noise of marker centres" in (tmp_path / "out" / "report.html").read_text()
 

@@ -25,6 +25,7 @@ from coloc_graph.frontend.homography.refinement import (
     squared_residuals,
     whitened_rows,
 )
+from coloc_graph.frontend.homography.scatter import variance_factor
 from coloc_graph.geometry.lie import sl3_normalise
 
 Array = NDArray[np.float64]
@@ -72,7 +73,7 @@ class HomographyFit:
     persistence: float = 1.0
 
 
-def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection") -> HomographyFit:
+def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection", spread: float = 0.0) -> HomographyFit:
     """Fit a homography to point pairs that may contain outliers.
 
     Parameters
@@ -81,12 +82,14 @@ def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection") -> 
         The same points in two images, with covariances.
     criterion
         "reprojection" (maximum likelihood) or "transfer" (the paper's).
+    spread
+        Standard deviation of the logarithms of single fits' variances about the stated one (`scatter`).
 
     Returns
     -------
     HomographyFit
-        The fit. If residuals exceed the stated covariances, its information is scaled down accordingly (never up);
-        its `chi2` is not scaled.
+        The fit. Its information is divided by the factor by which its residuals exceed the stated covariances beyond
+        chance, or differ from them as those of other fits do (`scatter.variance_factor`); its `chi2` is not scaled.
 
     Raises
     ------
@@ -116,8 +119,7 @@ def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection") -> 
     if len(agreeing) < 0.9 * len(pairs):
         _require_spread(agreeing, sigma)
     chi2, dof = float(squared[before].sum()), 2 * int(before.sum()) - 8
-    if chi2 > dof + 3 * np.sqrt(2 * dof):
-        information = information * (dof / chi2)
+    information = information / variance_factor(chi2, dof, spread)
     return HomographyFit(sl3_normalise(H), information, before, squared, chi2, dof, iterations)
 
 

@@ -101,6 +101,43 @@ def _score(evidence: Sequence[NoiseEvidence], variances: Array) -> tuple[Array, 
     return scores.sum(axis=0), information
 
 
+def scatter_of(evidence: Sequence[NoiseEvidence], variances: Array, covariance: Array) -> tuple[Array, Array, float]:
+    """Compare the residuals of each fit with variance components.
+
+    Parameters
+    ----------
+    evidence
+        Residuals of m fits.
+    variances, covariance
+        Variance components (k,), and the covariance (k, k) of their logarithms, as it is to be judged.
+
+    Returns
+    -------
+    tuple
+        chi2 (m,), degrees of freedom (m,), and the variance of the logarithm of a typical point's variance.
+    """
+    chi2, dof, levels = [], [], []
+    for one in evidence:
+        parts = variances[one.components, None, None, None] * one.parts
+        C = parts.sum(axis=0)
+        inverse = np.linalg.inv(C)
+        left, _, _ = _whitened(one, inverse)
+        chi2.append(one.weight * float(np.einsum("na,nab,nb->", left, C, left)))
+        dof.append(one.weight * float(2 * len(one.residual) - one.design.shape[2]))
+        share = np.zeros(len(variances))
+        np.add.at(share, one.components, np.einsum("nab,cnba->c", inverse, parts) / (2 * len(one.residual)))
+        levels.append(float(share @ covariance @ share))
+    return np.array(chi2), np.array(dof), float(np.mean(levels))
+
+
+def _whitened(one: NoiseEvidence, inverse: Array) -> tuple[Array, Array, Array]:
+    """Residuals (n, 2) that a fit leaves, times `inverse` (n, 2, 2); `inverse` times the design; its covariance."""
+    weighted = inverse @ one.design
+    normal = np.linalg.inv(np.einsum("nap,naq->pq", one.design, weighted))
+    h = normal @ np.einsum("nap,na->p", weighted, one.residual)
+    return (inverse @ (one.residual - one.design @ h)[..., None])[..., 0], weighted, normal
+
+
 def _scores(evidence: Sequence[NoiseEvidence], variances: Array) -> tuple[Array, Array]:
     """Derivatives (m, k) of the restricted log likelihood of each cluster, and the information of all (k, k)."""
     k = len(variances)
@@ -108,10 +145,7 @@ def _scores(evidence: Sequence[NoiseEvidence], variances: Array) -> tuple[Array,
     for one in evidence:
         parts = variances[one.components, None, None, None] * one.parts
         inverse = np.linalg.inv(parts.sum(axis=0))
-        weighted = inverse @ one.design
-        normal = np.linalg.inv(np.einsum("nap,naq->pq", one.design, weighted))
-        h = normal @ np.einsum("nap,na->p", weighted, one.residual)
-        left = (inverse @ (one.residual - one.design @ h)[..., None])[..., 0]
+        left, weighted, normal = _whitened(one, inverse)
         square = np.einsum("na,cnab,nb->nc", left, parts, left)
         spread = weighted @ np.linalg.cholesky(normal)  # so that what the fit explains is a sum of squares
         used = np.einsum("nap,cnab,nbp->nc", spread, parts, spread)

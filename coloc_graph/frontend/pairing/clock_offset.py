@@ -28,6 +28,7 @@ from coloc_graph.frontend.homography.fit import (
     fit_homography,
 )
 from coloc_graph.frontend.homography.refinement import Criterion, PointPairs, projection, squared_residuals
+from coloc_graph.frontend.homography.scatter import variance_factor
 from coloc_graph.frontend.pairing.correspondence import Correspondences
 from coloc_graph.frontend.tracks.paired_tracks import PairedTracks, ShiftedTracks
 from coloc_graph.geometry.lie import sl3_exp
@@ -122,6 +123,7 @@ def fit_at_offset(
     tracks: "PairedTracks",
     offset: ClockOffset,
     criterion: Criterion = "reprojection",
+    spread: float = 0.0,
 ) -> ClockFit:
     """Fit the homography at a known clock offset, whose uncertainty its information then contains.
 
@@ -133,6 +135,8 @@ def fit_at_offset(
         Clock offset with its standard deviation.
     criterion
         "reprojection" or "transfer".
+    spread
+        As in `fit_homography`.
 
     Returns
     -------
@@ -147,7 +151,7 @@ def fit_at_offset(
     at = tracks.at(offset.value)
     valid = np.flatnonzero(at.interpolated.valid)
     found = tracks.correspondences(at, valid)
-    fit = fit_homography(found.pairs, criterion)
+    fit = fit_homography(found.pairs, criterion, spread)
     kept = valid[fit.inliers]
     system = _System(tracks, at, fit.H, kept)
     H, chi2, iterations = fit.H, fit.chi2, fit.iterations
@@ -160,7 +164,7 @@ def fit_at_offset(
             if step @ system.by_H @ step < 1e-12:
                 break
         chi2 = system.chi2
-        information = system.by_H * _scale(chi2, fit.dof)
+        information = system.by_H / variance_factor(chi2, fit.dof, spread)
         by_offset = np.asarray(np.linalg.solve(system.by_H, system.by_H_offset), float)
     else:
         information = fit.information
@@ -265,11 +269,6 @@ class _System:
         return score, information, float(instrument @ across), float(made.std())
 
 
-def _scale(chi2: float, dof: int) -> float:
-    """Factor of the information if residuals exceed the noise beyond chance, else 1."""
-    return dof / chi2 if chi2 > dof + 3 * np.sqrt(2 * dof) else 1.0
-
-
 def _gated(squared: Array, valid: Used, among: Used) -> Used:
     """Mask of points within the gate, which widens with the median residual of the inliers `among` them."""
     agree = among & valid
@@ -305,7 +304,7 @@ def _evidence(
         sigma = float(np.sqrt(variance) / information)
         if abs(step) < 1e-3 * sigma and round_ >= 2:
             break
-    sigma /= np.sqrt(_scale(system.chi2, 2 * len(which) - 9))
+    sigma *= np.sqrt(variance_factor(system.chi2, 2 * len(which) - 9, 0.0))
     return ClockOffset(offset, sigma)
 
 
