@@ -171,8 +171,8 @@ class NoiseBelief:
             before = NoiseBelief.of(team)
             values = (one[number] for one in (before.bias_px, before.bias_factor, self.bias_px, self.bias_factor))
             rows.append(NoiseRow(robot, "shared in a stance", "px", *map(float, values)))
-            values = (stated.spread, stated.spread_factor, self.spread, self.spread_factor)
-            rows.append(NoiseRow(robot, "log variance by stance", "", *values))
+            differ = stated.spread, stated.spread_factor, self.spread, self.spread_factor
+            rows.append(NoiseRow(robot, "log variance by stance", "", *differ))
         return rows
 
     def used(self, team: Team) -> Team:
