@@ -90,6 +90,7 @@ def _time(text: str) -> float:
 def run(args: argparse.Namespace) -> int:
     """Search the gaits, plan the best one's drives, print, and write what is asked for."""
     from coloc_graph.errors import InputError
+    from coloc_graph.planning.belief import WHEELS
     from coloc_graph.planning.formation import PAPER
     from coloc_graph.planning.gaits import PAPER_SECONDS, GaitSearch
     from coloc_graph.planning.mission import stances_of
@@ -110,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("a map needs a goal on it: give --goal X,Y")
     rates = [robot.camera.fps for robot in team.robots if robot.camera_if_any is not None]
     fps = args.fps or min(rates, default=1.0)
-    predictor = Predictor(team, fps, args.noise, odometry=not args.without_odometry, speed=args.speed)
+    predictor = Predictor(team, fps, args.noise, None if args.without_odometry else WHEELS, args.speed)
     observers, mover, left = best_roles(predictor) if args.mover is None else roles_of(team, args.mover)
     if left:
         warn([f"{', '.join(left)} stay out of this plan"])

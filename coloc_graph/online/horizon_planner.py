@@ -1,6 +1,7 @@
 """Stances of a mission planned anew after each one, by the receding horizon; `HorizonPlanner`."""
 
 import contextlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -20,13 +21,17 @@ from coloc_graph.planning.mission import best_stance, leap_time
 from coloc_graph.planning.plan import PlannedStance
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.route import clear_way, polyline_length, route
+from coloc_graph.planning.slip import WheelErrors
+from coloc_graph.robot_io.create.odometry import ENCODER, SLIP, WHEELS
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
 
+CREATE = WheelErrors.of_wheels(math.hypot(SLIP, ENCODER), WHEELS[2].base)  # of the narrower model
 FIRST_NOISE = 0.1  # noise of a marker centre until a stance has shown it [px]
 PASSING = 0.6  # robots that drive at the same time keep this distance between their ways [m]
 RETRIES = 2  # attempts at a stance before another target is chosen
+SWEEP = (0.35, -0.35, 0.7, -0.7)  # turns with which one that leapt looks for the mover in further attempts [rad]
 MAX_SHARE = 1.5  # a stance counts for at most this share of the information that was expected of it
 
 
@@ -74,7 +79,7 @@ class HorizonPlanner:
                 "others out of the team"
             )
         fps = min(team[name].camera.fps for name in observers)
-        self._predictor = Predictor(team, fps, FIRST_NOISE, speed=speed, floor_map=floor_map)
+        self._predictor = Predictor(team, fps, FIRST_NOISE, CREATE, speed, floor_map, anew=True)
         self._left = pace * course.length
         self._horizon = Horizon(self._predictor, course, observers, mover, self._left, gait=gait, timed=True)
         self._belief: Belief | None = None
@@ -85,7 +90,7 @@ class HorizonPlanner:
         """Plan the next stance.
 
         Another attempt at it begins in the middle of the drive and goes the other way round; after some, another target
-        is chosen.
+        is chosen, and the one that leapt turns to look for the mover.
 
         Raises
         ------
@@ -109,6 +114,10 @@ class HorizonPlanner:
             decision = self._horizon.next(belief, max(self._left, 0.0), failed, leaper)
         self._decision = decision
         leap = decision.ahead[0][:2] if decision.ahead else None
+        if leap is not None and attempt >= RETRIES and leap[0] in situation.moved:
+            # it may have ended where it does not look at the views any more, and sees nothing that would correct it
+            x, y, yaw = leap[1]
+            leap = leap[0], (x, y, yaw + SWEEP[(attempt - RETRIES) % len(SWEEP)])
         drive, approach = self._approach(decision, situation.poses, leap)
         # the middle comes last, which is where a mover that has left a view goes back to
         middle = drive.mean(axis=0, keepdims=True)
@@ -137,7 +146,7 @@ class HorizonPlanner:
                 # the leap's odometry, about where the robot came to stand
                 target = belief.poses[name]
                 spent += leap_time(stood[name], target, self._predictor.speed)
-                belief = replace(belief, poses={**belief.poses, name: stood[name]}).after_leap(name, target)
+                belief = replace(belief, poses={**belief.poses, name: stood[name]}).after_leap(name, target, CREATE)
         anchors = tuple(name for name in self._observers if name in entered.stance.anchors)
         standing = {name: belief.poses[name] for name in (*anchors, *(o for o in self._observers if o not in anchors))}
         driven = tuple((float(x), float(y)) for x, y in self._plan.patrol)

@@ -28,6 +28,7 @@ from coloc_graph.team import Team
 SETTLED = 0.25  # all robots have stood for this time before a stance begins [s]
 MARGIN = 0.02  # a stance ends this long after its last image [s]
 DRIVE_TIME = 40.0  # longest time of a drive [s]
+GLANCE_TIME = 1.0  # the mover is sent to the middle of the views if it is not seen for this time where it begins [s]
 LOOK_TIME = 4.0  # longest time to see the mover, and for it to set off [s]
 COLLECT_TIME = 30.0  # longest time until the last images have come [s]
 HOLD_TIME = 120.0  # longest time until what is wrong is put right [s]
@@ -216,7 +217,7 @@ class LeapFrog:
             InView(self._team, self.mover, self._registry.poses(self.observers)),
             self._captures,
             self._plan.patrol,
-            self._registry[self.mover].tracker.pose(),
+            self._registry[self.mover].tracker,
         )
         self._worker.forget()
         for name in self.observers:
@@ -225,12 +226,16 @@ class LeapFrog:
 
     def _look(self) -> None:
         attempt = self._attempted()
-        missing = attempt.view.missing()
+        missing, mover = attempt.view.missing(), self._registry[self.mover]
         if not missing:
-            self._commander.drive(self.mover, attempt.first_round())
+            self._commander.drive(self.mover, attempt.whole_round() if attempt.to_middle else attempt.first_round())
             self._enter(MissionState.CAPTURING)
-        elif self.states.lasted(LOOK_TIME):
-            self._note_bumped(displaced(self._registry, attempt.view, attempt.mover_pose))
+        elif not attempt.to_middle and self.states.lasted(GLANCE_TIME):
+            # a leap that ended some degrees off shows less of the border, but the middle
+            attempt.to_middle = True
+            self._commander.drive(self.mover, attempt.way_back())
+        elif mover.arrived and self._registry.stood(LOOK_TIME):
+            self._note_bumped(displaced(self._registry, attempt.view, attempt.by_wheels(mover.tracker)))
             raise RobotError(
                 f"{' and '.join(missing)} did not see {self.mover} where it should be: put the robots where they "
                 "are said to stand, clear what is between them, and check that its lights are on"

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.geometry.se2 import Planar
+from coloc_graph.geometry.se2 import Planar, between, compose
 from coloc_graph.machine import machine
 from coloc_graph.online.pose_tracker import PoseTracker
 from coloc_graph.online.visibility import InView, Precision
@@ -18,7 +18,7 @@ OUT_OF_VIEW = 0.6  # the mover turns back after this time outside a view [s]
 
 
 class StanceAttempt:
-    """State of a stance while it is captured.
+    """State of a stance while it is captured; `to_middle` once the mover is sent where all should see it.
 
     Parameters
     ----------
@@ -30,16 +30,17 @@ class StanceAttempt:
         Number of this attempt, unique across coordinators.
     patrol
         Waypoints (n, 2) [m] of the mover.
-    mover_pose
-        Pose of the mover by its wheels when the attempt begins (x [m], y [m], yaw [rad]).
+    mover
+        Tracker of the mover's pose, before the attempt's images have moved it.
     """
 
     def __init__(
-        self, stance: Stance, view: InView, capture: int, patrol: NDArray[np.float64], mover_pose: Planar
+        self, stance: Stance, view: InView, capture: int, patrol: NDArray[np.float64], mover: PoseTracker
     ) -> None:
-        self.stance, self.view, self.capture, self.mover_pose = stance, view, capture, mover_pose
+        self.stance, self.view, self.capture = stance, view, capture
+        self._begun = mover.pose(), mover.odometry_at(math.inf) if mover.known else None
         self.precision: Precision | None = None
-        self.set_off = False
+        self.set_off = self.to_middle = False
         self._patrol, self._rounds = patrol, 0
         self._samples = dict.fromkeys(stance.observers, 0)
         self._expected: dict[str, int] = {}
@@ -60,6 +61,11 @@ class StanceAttempt:
             pose = pose[0] + off[0], pose[1] + off[1], pose[2] + off[2]
             tracker.fix(seen.time, pose)
         self.view.take(seen, pose)
+
+    def by_wheels(self, mover: PoseTracker) -> Planar:
+        """Return the pose of the mover by its pose when the attempt began and its wheels since."""
+        pose, odometry = self._begun
+        return pose if odometry is None else compose(pose, between(odometry, mover.odometry_at(math.inf)))
 
     @property
     def last_image(self) -> float:

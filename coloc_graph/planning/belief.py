@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar, between, wrap
+from coloc_graph.planning.slip import WheelErrors
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
@@ -22,9 +23,7 @@ FIXED = 1e-6  # standard deviation of the pose that defines the world [m, rad]
 MIN_TILT_SIGMA = 1e-5  # a floor that is stated as flat is taken to be flat to this [rad, m]
 BODY_LENGTH = 0.05  # a floor that tilts a body raises it by the tilt times this [m]
 
-ALONG = 0.01  # error of wheel odometry after one metre, growing with the root of the distance [m]
-TURNED = 0.01  # the same of the heading after turning by one radian [rad]
-VEER = 0.005  # the same of the heading after driving one metre [rad]
+WHEELS = WheelErrors()
 MIN_ODOMETRY_SIGMAS = (1e-3, 5e-4, 5e-4)  # wheel odometry is not taken to be better: heading [rad], x, y [m]
 
 
@@ -77,10 +76,10 @@ class Belief:
         blocks = [self.index(name) + np.arange(OBSERVER) for name in observers]
         return np.concatenate([*blocks, self.index(mover) + np.array([OBSERVER, OBSERVER + 1])])
 
-    def after_leap(self, robot: str, target: Planar, *, odometry: bool = True) -> "Belief":
-        """Return what is known once a robot has driven to a target in the world."""
+    def after_leap(self, robot: str, target: Planar, wheels: WheelErrors | None = WHEELS) -> "Belief":
+        """Return what is known once a robot has driven to a target in the world; without `wheels`, without odometry."""
         D, at = between(self.poses[robot], target), self.index(robot)
-        F, Q = leap_model(D, self.floor, odometry=odometry)
+        F, Q = leap_model(D, self.floor, wheels)
         block = np.eye(self.covariance.shape[-1])
         block[at : at + POSE, at : at + POSE] = F
         covariance = block @ self.covariance @ block.T
@@ -141,7 +140,7 @@ def updated(covariance: Array, rows: NDArray[np.int64], information: Array) -> A
     return np.asarray((new + new.mT) / 2)
 
 
-def leap_model(D: Planar, floor: tuple[float, float], *, odometry: bool = True) -> tuple[Array, Array]:
+def leap_model(D: Planar, floor: tuple[float, float], wheels: WheelErrors | None = WHEELS) -> tuple[Array, Array]:
     """Return how a leap D = T_before_after changes a pose's error, (6, 6), and the covariance (6, 6) that it adds.
 
     The robot turns towards its target, drives straight, and turns to its new heading; `floor` are sigmas of tilt [rad]
@@ -156,14 +155,14 @@ def leap_model(D: Planar, floor: tuple[float, float], *, odometry: bool = True) 
     F[3:5, 3:5] = [[c, s], [-s, c]]
     F[3:5, 2] = np.array([[c, s], [-s, c]]) @ [-D[1], D[0]]
     Q = np.diag([floor[0] ** 2, floor[0] ** 2, 0.0, 0.0, 0.0, floor[1] ** 2])
-    if not odometry:
+    if wheels is None:
         Q[2:5, 2:5] = UNKNOWN**2 * np.eye(3)
         return F, Q
-    turned, veer = TURNED**2 * abs(first), VEER**2 * distance
+    turned, veer = wheels.turned**2 * abs(first), wheels.veer**2 * distance
     # along and across the line that it drives, then in the body after the second turn
     line = np.zeros((3, 3))
-    line[0, 0] = turned + veer + TURNED**2 * abs(second)
-    line[1, 1] = ALONG**2 * distance
+    line[0, 0] = turned + veer + wheels.turned**2 * abs(second)
+    line[1, 1] = wheels.along**2 * distance
     line[2, 2] = (turned + veer / 3) * distance**2
     line[0, 2] = line[2, 0] = (turned + veer / 2) * distance
     c, s = math.cos(second), math.sin(second)

@@ -17,7 +17,6 @@ from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.mission import Mission, leap_frog, leap_time, stances_of
 from coloc_graph.planning.mover_path import cells
 from coloc_graph.planning.prediction import Predictor
-from coloc_graph.planning.slip import view_margin
 from coloc_graph.team import Robot, Team
 
 Array = NDArray[np.float64]
@@ -101,14 +100,13 @@ class GaitSearch:
         for k in (0, 1):
             standing = np.array([self._stop(gait, k), self._stop(gait, k + 1)])
             model = self.predictor.model((self.pair[k], self.pair[1 - k]), self.mover)
-            margin = float(view_margin(2 * gait.leap, self.predictor.team[self.pair[1 - k]].camera.fx))
-            found = cells(model, standing, margin)
+            found = cells(model, standing, self.predictor.margins(2 * gait.leap, (self.pair[k], self.pair[1 - k])))
             if len(found.places) < 3:
                 return None
             information.append(self.predictor.fps * found.information.mean(axis=0))
         D = [between(self._stop(gait, k), self._stop(gait, k + 2)) for k in (0, 1)]
         belief = Belief.start(self.predictor.team, {self.pair[0]: self._stop(gait, 0)})
-        leaps = [leap_model(one, belief.floor, odometry=self.predictor.odometry) for one in D]
+        leaps = [leap_model(one, belief.floor, self.predictor.wheels) for one in D]
         taken = leap_time(self._stop(gait, 0), self._stop(gait, 2), self.predictor.speed)
         return Candidate(gait, np.array(information), (leaps[0], leaps[1]), taken)
 

@@ -254,7 +254,7 @@ class Horizon:
     def _planned(self, belief: Belief, choice: tuple[str, Planar, float]) -> tuple[PlannedStance, Promise]:
         """Plan the mover's drive of a stance after a leap."""
         leaper, target, duration = choice
-        after = belief.after_leap(leaper, target, odometry=self.predictor.odometry)
+        after = belief.after_leap(leaper, target, self.predictor.wheels)
         anchors = self.foremost_first(belief.poses, leaper)
         placed = {name: after.poses[name] for name in (*anchors, leaper)}
         leapt = math.dist(belief.poses[leaper][:2], target[:2])

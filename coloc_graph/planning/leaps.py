@@ -15,7 +15,6 @@ from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.mission import leap_time
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.route import TO_ROBOT, reachable
-from coloc_graph.planning.slip import view_margin
 
 Array = NDArray[np.float64]
 
@@ -47,7 +46,7 @@ class Leaps:
     F, Q
         How each leap changes the error of its pose, and the covariance that it adds, (n, 6, 6).
     margins
-        Distance (n,) of markers from the borders of images at which the view does not miss them [px].
+        Distances (n, r, 2) of markers from the borders of images at which the views do not miss them [px].
     by_gait
         True (n,) for those of the gait itself.
     times
@@ -128,13 +127,13 @@ def possible_leaps(
         good &= ~(near & (np.abs(places[:, 2] - yaw) < FAILED))
     places, kept = places[good], np.array(gains)[good]
     made = [
-        leap_model(between(belief.poses[leaper], (x, y, yaw)), belief.floor, odometry=predictor.odometry)
+        leap_model(between(belief.poses[leaper], (x, y, yaw)), belief.floor, predictor.wheels)
         for x, y, yaw in places.tolist()
     ]
     F = np.array([one for one, _ in made]).reshape(-1, 6, 6)
     Q = np.array([one for _, one in made]).reshape(-1, 6, 6)
     leapt = np.hypot(*(places[:, :2] - np.array(belief.poses[leaper][:2])).T)
-    margins = view_margin(leapt, predictor.team[leaper].camera.fx)
+    margins = predictor.margins(leapt, (*anchors, leaper))
     times = np.array([leap_time(belief.poses[leaper], (x, y, w), predictor.speed) for x, y, w in places.tolist()])
     return Leaps(leaper, anchors, places, kept, F, Q, margins, np.array(by_gait, bool)[good], times)
 

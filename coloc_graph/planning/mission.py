@@ -13,7 +13,6 @@ from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.mover_path import best_drives, cells, design, patrol
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor, Promise
-from coloc_graph.planning.slip import view_margin
 
 SETTLE = 2.0  # time that all robots stand before a stance [s]
 
@@ -126,7 +125,7 @@ def leap_frog(
         target = predictor.stop(gait, pair, k + 1)
         times.append(leap_time(belief.poses[leaper], target, predictor.speed) if k else 0.0)
         if k:
-            belief = belief.after_leap(leaper, target, odometry=predictor.odometry)
+            belief = belief.after_leap(leaper, target, predictor.wheels)
         standing = {anchor: belief.poses[anchor], leaper: target}
         stance, promise = best_stance(
             predictor, belief, standing, (anchor,) if k else (), mover, seconds, goal, designed
@@ -156,8 +155,8 @@ def best_stance(
         If the observers see too little of the floor together, or no drive is clear of robots and walls.
     """
     names = tuple(standing)
-    margin = float(view_margin(leapt, predictor.team[names[-1]].camera.fx))
-    found = cells(predictor.model(names, mover), np.array(list(standing.values())), margin, predictor.free)
+    margins = predictor.margins(leapt, names)
+    found = cells(predictor.model(names, mover), np.array(list(standing.values())), margins, predictor.free)
     if len(found.places) < 2:
         raise InputError(
             f"{' and '.join(names)} have no common view of the floor where they are to stand: "

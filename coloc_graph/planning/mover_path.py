@@ -55,12 +55,12 @@ class Cells:
         return clear_way(points, self.standing, self.free, to_robot=CLEARANCE - CELL / 10)
 
 
-def cells(model: StanceModel, standing: Array, margin: float, free: Free | None = None) -> Cells:
+def cells(model: StanceModel, standing: Array, margins: Array, free: Free | None = None) -> Cells:
     """Find the places of the common view of observers at poses (r, 3), and what an image from each brings.
 
-    Markers are at least `margin` [px] from the borders of the images.
+    Markers are at least `margins` (r, 2) [px] from the borders of the images: left and right, upper and lower.
     """
-    places = places_in_common_view(model, standing, margin, free)
+    places = places_in_common_view(model, standing, margins, free)
     if not len(places):
         return Cells(places, np.zeros((0, model.variables, model.variables)), standing[:, :2], free)
     drive = np.concatenate([np.column_stack([places, np.full(len(places), yaw)]) for yaw in YAWS])
@@ -69,7 +69,7 @@ def cells(model: StanceModel, standing: Array, margin: float, free: Free | None 
     return Cells(places, mean, standing[:, :2], free)
 
 
-def places_in_common_view(model: StanceModel, standing: Array, margin: float, free: Free | None = None) -> Array:
+def places_in_common_view(model: StanceModel, standing: Array, margins: Array, free: Free | None = None) -> Array:
     """Places (n, 2) [m] where two cameras see all markers of the mover at any heading, clear of robots and walls."""
     xy = _grid(model, standing)
     away = np.hypot(*np.moveaxis(xy[:, None] - standing[None, :, :2], -1, 0)).min(axis=1)
@@ -79,7 +79,7 @@ def places_in_common_view(model: StanceModel, standing: Array, margin: float, fr
     reach = float(np.hypot(*model.p_markers[:, :2].T).max())
     rim = reach * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     points = np.concatenate([xy[:, None] + rim, np.full((len(xy), 4, 1), model.p_markers[0, 2])], axis=-1)
-    seen = model.in_view(standing, points.reshape(-1, 3), margin).reshape(len(standing), len(xy), 4)
+    seen = model.in_view(standing, points.reshape(-1, 3), margins).reshape(len(standing), len(xy), 4)
     return np.asarray(xy[seen.all(axis=2).sum(axis=0) >= 2])
 
 
@@ -230,7 +230,7 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
     standing
         Poses (b, r, 3) of the observers.
     margins
-        Distance (b,) of the markers from the borders of the images [px].
+        Distances (b, r, 2) of the markers from the borders of the images [px].
     free
         Returns which places are free of walls.
 
@@ -253,7 +253,7 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
     if not len(xy):  # it looks at a wall
         return np.zeros((len(standing), model.variables, model.variables)), np.zeros(len(standing), int)
     everywhere = np.broadcast_to(points.reshape(-1, 3), (len(standing), 4 * len(xy), 3))
-    seen = model.in_view(standing, everywhere, margins[:, None]).reshape(len(standing), -1, len(xy), 4)
+    seen = model.in_view(standing, everywhere, margins).reshape(len(standing), -1, len(xy), 4)
     common = seen.all(axis=3).sum(axis=1) >= 2
     away = np.hypot(*np.moveaxis(xy[None, :, None] - standing[:, None, :, :2], -1, 0)).min(axis=2)
     common &= away > CLEARANCE

@@ -5,14 +5,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.geometry.se2 import Planar
-from coloc_graph.planning.belief import Belief
+from coloc_graph.planning.belief import WHEELS, Belief
 from coloc_graph.planning.drive import SPEED, drive_through, there_and_back
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.plan import Plan, PlannedStance
+from coloc_graph.planning.slip import WheelErrors, view_margins
 from coloc_graph.planning.stance_information import StanceModel
 from coloc_graph.team import Team
 
@@ -44,20 +45,23 @@ class Predictor:
         Images a second.
     noise_px
         Standard deviation of a marker centre per axis [px]; None for what the cameras state.
-    odometry
-        False to predict without wheel odometry.
+    wheels
+        Errors of wheel odometry; None to predict without it.
     speed
         Speed of the mover and of leaps [m/s].
     floor_map
         Walls; None where there are none.
+    anew
+        True if each stance is planned once it is known where those stand that stay.
     """
 
     team: Team
     fps: float = 30.0
     noise_px: float | None = None
-    odometry: bool = True
+    wheels: WheelErrors | None = WHEELS
     speed: float = SPEED
     floor_map: FloorMap | None = None
+    anew: bool = False
     _models: dict[tuple[tuple[str, ...], str], StanceModel] = field(default_factory=dict)
 
     @property
@@ -81,6 +85,14 @@ class Predictor:
             self._models[key] = StanceModel(self.team, observers, mover, self.noise_px, floor_map=self.floor_map)
         return self._models[key]
 
+    def margins(self, leapt: ArrayLike, observers: Sequence[str]) -> Array:
+        """Return the distances (..., r, 2) of markers from the borders of images at which no view misses them [px].
+
+        The last observer comes from leaps (...) [m].
+        """
+        fx, wheels = self.team[observers[-1]].camera.fx, self.wheels or WHEELS
+        return view_margins(leapt, fx, wheels, len(observers), known=self.anew)
+
     def learn_noise(self, noise_px: float) -> None:
         """Set the noise of marker centres [px] to what stances have shown, if it has changed by a tenth."""
         if self.noise_px is None or abs(noise_px / self.noise_px - 1) > NOTABLE:
@@ -92,7 +104,7 @@ class Predictor:
         belief = before
         for name, target in stance.standing.items():
             if name not in stance.anchors and belief.poses[name] != target:
-                belief = belief.after_leap(name, target, odometry=self.odometry)
+                belief = belief.after_leap(name, target, self.wheels)
         observers = tuple(stance.standing)
         information, points = self.information(stance)
         if points < MIN_POINTS:

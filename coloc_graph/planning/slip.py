@@ -1,6 +1,7 @@
 """Slip of a robot at the end of a leap, and the margin that a view needs because of it."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,15 +19,57 @@ def stop_sigma(leapt: ArrayLike) -> NDArray[np.float64]:
     return np.hypot(STOP_SIGMA, STOP_PER_METRE * np.asarray(leapt, float))
 
 
-def view_margin(leapt: ArrayLike, focal_px: float) -> NDArray[np.float64]:
-    """Return the distance of markers from the borders of images [px] at which a slip does not make the view miss.
+@dataclass(frozen=True)
+class WheelErrors:
+    """Standard deviations of wheel odometry, which grow with the root of the way; where a leap ends is off by them.
+
+    Attributes
+    ----------
+    along
+        Of the distance, after one metre [m].
+    turned, veer
+        Of the heading, after turning by one radian and after driving one metre [rad].
+    """
+
+    along: float = 0.01
+    turned: float = 0.01
+    veer: float = 0.005
+
+    @classmethod
+    def of_wheels(cls, metre: float, base: float) -> "WheelErrors":
+        """Return those of two wheels `base` [m] apart, each of which is off by `metre` [m] after one metre."""
+        return cls(metre / math.sqrt(2), metre / math.sqrt(base), math.sqrt(2) * metre / base)
+
+
+def view_margins(
+    leapt: ArrayLike, focal_px: float, wheels: WheelErrors, observers: int, *, known: bool
+) -> NDArray[np.float64]:
+    """Return the distances of markers from the borders of images at which slips do not make a view miss.
 
     Parameters
     ----------
     leapt
-        Distances (...) that the observer has leapt [m].
+        Distances (...) that the last of the observers has leapt [m].
     focal_px
         Focal length of its camera [px].
+    wheels
+        Errors of its wheels.
+    observers
+        Number of observers.
+    known
+        True if the others are known to stand where they stand.
+
+    Returns
+    -------
+    ndarray
+        Distances (..., r, 2) of each observer from the left and right, and from the upper and lower borders [px].
     """
-    turn = np.hypot(HEADING_SIGMA, stop_sigma(leapt) / DISTANCE)
-    return np.asarray(MIN_MARGIN + SIGMAS * focal_px * turn)
+    leapt = np.asarray(leapt, float)
+    stop = stop_sigma(leapt)
+    turn = np.sqrt(HEADING_SIGMA**2 + wheels.turned**2 + wheels.veer**2 * leapt)
+    aside = np.sqrt(stop**2 + (wheels.turned**2 / 2 + wheels.veer**2 * leapt / 3) * leapt**2)
+    off = np.stack([np.hypot(turn, aside / DISTANCE), stop / DISTANCE], axis=-1)
+    margins = np.repeat((MIN_MARGIN + SIGMAS * focal_px * off)[..., None, :], observers, axis=-2)
+    if known:
+        margins[..., :-1, :] = MIN_MARGIN
+    return np.asarray(margins)

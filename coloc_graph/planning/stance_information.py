@@ -125,11 +125,12 @@ class StanceModel:
         self, standing: Array, points: Array, eyes: Array, p: Array, margin: float | Array
     ) -> NDArray[np.bool_]:
         seen = np.empty(p.shape[:-1], bool)
+        edges = np.broadcast_to(margin, (*standing.shape[:-1], 2))
         for n, camera in enumerate(self._cameras):
             uv, inside = camera.project(p[..., n, :, :])
             size = np.array([camera.width, camera.height])
             with np.errstate(invalid="ignore"):
-                edge = np.asarray(margin)[..., None]
+                edge = edges[..., n, None, :]
                 seen[..., n, :] = inside & (uv >= edge - 0.5).all(-1) & (uv <= size - 0.5 - edge).all(-1)
             others = np.delete(standing[..., :2], n, axis=-2)
             seen[..., n, :] &= ~hidden(eyes[..., n, None, :], points, others[..., None, :, :])

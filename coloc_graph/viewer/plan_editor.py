@@ -206,7 +206,7 @@ class PlanEditor:
         belief = before
         for name, pose in stance.standing.items():
             if name not in stance.anchors and belief.poses[name] != pose:
-                belief = belief.after_leap(name, pose, odometry=self._predictor.odometry)
+                belief = belief.after_leap(name, pose, self._predictor.wheels)
         try:
             return best_stance(
                 self._predictor, belief, dict(stance.standing), stance.anchors, stance.mover, stance.duration,

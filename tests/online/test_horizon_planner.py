@@ -66,6 +66,13 @@ def test_the_first_stance_is_where_the_robots_stand_and_the_second_after_a_leap(
         assert min(math.dist(waypoint, standing[name][:2]) for name in ("A", "B")) > 0.4
 
 
+def test_in_further_attempts_one_that_leapt_turns_to_look_for_the_mover(mission):
+    leaper = mission.plan(1).leap[0]
+    for attempt, turned in ((1, 0.0), (2, 0.35), (3, -0.35)):
+        leap = mission.plan(1, attempt, (leaper,)).leap
+        assert leap[1][2] - mission.planner._decision.ahead[0][1][2] == pytest.approx(turned)
+
+
 def test_another_attempt_turns_the_drive_round_and_a_third_chooses_another_target(mission):
     mission.plan(0)
     plans = [mission.plan(1, attempt) for attempt in range(3)]

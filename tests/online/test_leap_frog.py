@@ -135,6 +135,24 @@ def test_a_mission_places_its_robots_looks_and_holds_when_one_has_gone(mission):
     assert mission.leap_frog.describe() == "stance 0: holding"
 
 
+def test_a_mover_that_is_not_seen_at_the_border_of_a_view_is_sent_to_the_middle_first(mission):
+    mission.step(MissionState.GATHERING)
+    for name in "ABC":
+        mission.report(name)
+    mission.step(MissionState.SYNCHRONISING)
+    mission.step(MissionState.PLANNING)
+    mission.await_plan()
+    for number, state in enumerate((MissionState.LOOKING, MissionState.LOOKING, MissionState.HOLDING)):
+        name, drive = [(name, body) for name, body in mission.link.asked if isinstance(body, Drive)][-1]
+        arrived = Event(session="C", number=number, stamp=0, kind="arrived", text=str(drive.number))
+        mission.registry[name].take_event(arrived)
+        mission.leap_frog.states.since -= 1.0
+        mission.step(state)
+    start, middle = [body.places for _, body in mission.link.asked if isinstance(body, Drive)]
+    assert len(middle) == 1 and middle[0] not in start
+    assert "A and B did not see C where it should be" in (mission.record.path.parent / "mission.jsonl").read_text()
+
+
 def test_an_ask_renews_the_permission_to_move_and_ends_when_the_mission_is_stopped(mission):
     mission.commander.ask("A", Halt())
     assert mission.link.holds == 1
