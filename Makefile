@@ -12,32 +12,45 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+NICE := nice -n 10
 ARGS ?=
 DATA ?=
 GRAPHS ?=
 MRCLAM ?=
 
-.PHONY: demo test test-long lint types unit docs notebooks bench fuzz search clean
+.PHONY: demo test test-long lint types unit unit-and-types ordinary realtime docs notebooks bench fuzz search clean
 
 demo: $(VENV)/installed
 	$(BIN)/coloc demo --force $(ARGS)
 
-test: lint types unit
+test: lint
+	@$(MAKE) --no-print-directory unit-and-types
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
 types: $(VENV)/installed-dev
-	$(BIN)/mypy
+	$(NICE) $(BIN)/mypy
 
 ifeq ($(ARGS),)
+# tests in real time go first wherever they want a processor; their lines come when they have ended
 unit: $(VENV)/installed-dev
-	$(BIN)/pytest --numprocesses 3 --dist loadfile -m "not realtime" tests
-	$(BIN)/pytest -m realtime
+	@$(MAKE) --no-print-directory -j2 ordinary realtime
+
+unit-and-types: $(VENV)/installed-dev
+	@$(MAKE) --no-print-directory -j3 ordinary realtime types
+
+ordinary:
+	$(NICE) $(BIN)/pytest --numprocesses 3 --dist loadfile -m "not realtime" tests
+
+realtime:
+	@$(BIN)/pytest -p no:cacheprovider -m realtime >$(VENV)/realtime.log 2>&1; code=$$?; cat $(VENV)/realtime.log; exit $$code
 else
 unit: $(VENV)/installed-dev
 	$(BIN)/pytest $(ARGS)
+
+unit-and-types: types unit
 endif
 
 test-long: $(VENV)/installed-dev $(VENV)/installed-docs

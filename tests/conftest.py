@@ -1,7 +1,10 @@
 """Small runs and their solutions, made once for the whole suite."""
 
 import dataclasses
+import os
 import signal
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `coloc` does, before numpy is there: the tests are parallel
 
 import numpy as np
 import pytest

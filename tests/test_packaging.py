@@ -158,8 +158,10 @@ def lines_of_code(text):
 
 
 def test_no_module_has_grown_into_two():
-    lines = {path.name: lines_of_code(path.read_text(encoding="utf-8")) for path in MODULES.values()}
-    assert not {name: length for name, length in lines.items() if length > MAX_MODULE_LINES}
+    texts = {path.name: path.read_text(encoding="utf-8") for path in MODULES.values()}
+    long = {name: text for name, text in texts.items() if text.count("\n") > MAX_MODULE_LINES}
+    lengths = {name: lines_of_code(text) for name, text in long.items()}
+    assert not {name: length for name, length in lengths.items() if length > MAX_MODULE_LINES}
 
 
 def test_the_version_is_in_one_place_and_the_changelog_knows_it():

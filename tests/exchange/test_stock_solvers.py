@@ -25,7 +25,7 @@ def run(request, tmp_path_factory):
     path = tmp_path_factory.mktemp("runs") / f"{request.param}.mcap"
     scenario = "team" if request.param == "team" else "hallway"
     wrong = Imperfections(mount_sigma_deg=0.5, floor_sigma_deg=0.1 if request.param == "uneven" else 0.0)
-    simulate(scenario, path, stances=6, seed=4, imperfections=wrong)
+    simulate(scenario, path, stances=6 if scenario == "team" else 4, seed=4, imperfections=wrong)
     return open_run(path)
 
 

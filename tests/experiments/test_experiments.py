@@ -53,8 +53,8 @@ def single():
 
 @pytest.fixture(scope="module")
 def steps():
-    """Table I of two seeds."""
-    return table1(runs=2)
+    """Table I of one seed."""
+    return table1(runs=1)
 
 
 @pytest.fixture(scope="module")
@@ -168,10 +168,10 @@ def test_table_1_stands_where_the_paper_stood(steps):
         assert np.abs(steps.lengths_cm(segment, "ours") - segment.true_cm).max() < 0.6
     assert steps.mean_error_cm("ours") < steps.mean_error_cm("eq2") / 2
     assert steps.mean_error_cm("paper") == pytest.approx(0.2355, abs=1e-3)
-    assert [outing.seed for outing in steps.outings] == [0, 1]
 
 
 def test_table_2_goes_down_the_hallway(hall):
+    assert [outing.seed for outing in hall.outings] == [0, 1]
     for outing in hall.outings:
         assert set(outing.courses) == {"A", "B"}
         for course in outing.courses.values():

@@ -34,6 +34,11 @@ def ten(tmp_path_factory):
     return open_run(path)
 
 
+@pytest.fixture(scope="module")
+def ten_solved(ten):
+    return solve(ten)
+
+
 @pytest.mark.parametrize(("robots", "at_once"), [(3, None), (5, 1), (10, None), (10, 3), (30, 7)])
 def test_roles_rotate_and_who_does_not_move_is_an_anchor(robots, at_once):
     what = team_of(robots, at_once, 8)
@@ -74,8 +79,8 @@ def test_robots_belong_to_a_team_only(tmp_path):
         simulate("hallway", tmp_path / "run.mcap", robots=5)
 
 
-def test_a_team_is_solved_and_its_covariances_are_believable(ten):
-    solution = solve(ten, SolveOptions())
+def test_a_team_is_solved_and_its_covariances_are_believable(ten, ten_solved):
+    solution = ten_solved
     assert not solution.estimate.disconnected
     assert not solution.estimate.rejected
     assert 0.8 < solution.estimate.chi2 / solution.estimate.dof < 1.25
@@ -95,9 +100,9 @@ def test_a_team_is_solved_and_its_covariances_are_believable(ten):
     assert not [warning for warning in solution.warnings if "never see a marker" in warning]
 
 
-def test_many_robots_come_out_the_same_though_most_of_the_way_is_by_cholesky(ten, monkeypatch):
-    graph = solve(ten, SolveOptions()).estimate.graph
-    by_qr = joint(graph)
+def test_many_robots_come_out_the_same_though_most_of_the_way_is_by_cholesky(ten_solved, monkeypatch):
+    by_qr = ten_solved.estimate
+    graph = by_qr.graph
     monkeypatch.setattr("coloc_graph.backend.solver._gauss_newton", lambda *_: None)  # as where it diverges
     taken = []
     genuine = gtsam.LevenbergMarquardtParams.setLinearSolverType
@@ -114,8 +119,8 @@ def test_many_robots_come_out_the_same_though_most_of_the_way_is_by_cholesky(ten
         np.testing.assert_allclose(both.trajectories[robot].positions, trajectory.positions, atol=1e-6)
 
 
-def test_incrementally_a_team_comes_out_the_same(ten):
-    batch, step = (solve(ten, SolveOptions(incremental=one)).estimate for one in (False, True))
+def test_incrementally_a_team_comes_out_the_same(ten, ten_solved):
+    batch, step = ten_solved.estimate, solve(ten, SolveOptions(incremental=True)).estimate
     assert step.chi2 / step.dof == pytest.approx(batch.chi2 / batch.dof, rel=0.05)
     for robot, trajectory in batch.trajectories.items():
         # spans are taken apart for mounts as they were known then
@@ -136,8 +141,8 @@ def test_what_is_saved_of_a_team_knows_what_its_pairs_share(ten, tmp_path):
     assert again.estimate().dof == solver.estimator.estimate().dof
 
 
-def test_robots_that_share_no_view_of_a_mover_are_tied_by_seeing_each_other_stand(ten, monkeypatch):
-    graph = solve(ten, SolveOptions()).estimate.graph
+def test_robots_that_share_no_view_of_a_mover_are_tied_by_seeing_each_other_stand(ten, ten_solved, monkeypatch):
+    graph = ten_solved.estimate.graph
     standing = [
         m for m in graph.measurements if isinstance(m, Sighting) and m.seen in graph.by_index[m.stance].observers
     ]

@@ -108,16 +108,28 @@ def test_a_robot_that_stands_in_the_way_costs_points():
 
 
 def test_simulate_takes_a_gait_and_a_plan(tmp_path, capsys):
-    write_plan(straight_plan(), tmp_path / "plan.csv")
+    write_plan(straight_plan(2, duration=3.0), tmp_path / "plan.csv")
     run = tmp_path / "run.mcap"
-    assert main(["simulate", "hallway", "-l", "1.2", "--stances", "2", "--out", str(run)]) == 0
+    assert main(["simulate", "hallway", "-l", "1.2", "--stances", "2", "--points", "40", "--out", str(run)]) == 0
     assert main(["simulate", "hallway", "--plan", str(tmp_path / "plan.csv"), "--out", str(tmp_path / "p.mcap")]) == 0
     for name, *more in (
         ("six-step",),
         ("landmarks", "--length", "10", "--laps", "1"),
         ("team", "--robots", "4", "--stances", "2"),
     ):
-        arguments = ["simulate", name, *more, "--leap", "0.5", "-l", "0.9", "--out", str(tmp_path / f"{name}.mcap")]
+        arguments = [
+            "simulate",
+            name,
+            *more,
+            "--points",
+            "40",
+            "--leap",
+            "0.5",
+            "-l",
+            "0.9",
+            "--out",
+            str(tmp_path / f"{name}.mcap"),
+        ]
         assert main(arguments) == 0
     for name in ("six-step", "single-step", "landmarks", "team"):
         out = str(tmp_path / f"{name} planned.mcap")

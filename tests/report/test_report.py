@@ -220,8 +220,7 @@ def test_residual_figure_marks_the_unusable() -> None:
     assert at[1] == [[1.0, 0.0]]
 
 
-@pytest.mark.parametrize("stances", [1, 2, 3000])
-@pytest.mark.parametrize("with_truth", [True, False])
+@pytest.mark.parametrize(("stances", "with_truth"), [(1, True), (2, False), (3000, True)])
 def test_figures_of_tiny_and_huge_runs_are_drawn_and_stay_small(stances: int, with_truth: bool) -> None:
     estimate, every = leapfrog(stances)
     truth = every if with_truth else None
@@ -243,9 +242,11 @@ def test_figures_of_partial_results_are_drawn() -> None:
         {"A": replace(a, covariances=None), "B": replace(b, covariances=covariances)},
     ):
         partial = replace(estimate, trajectories=parts)
-        for true in (None, {"A": truth["A"]}):
-            for draw in (trajectories_figure, error_figure, hero_figure):
-                assert figure_svg(draw(partial, true)).startswith("<svg")
+        true = {"A": truth["A"]} if len(parts) == 1 else None
+        for draw in (trajectories_figure, error_figure, hero_figure):
+            assert figure_svg(draw(partial, true)).startswith("<svg")
+    for draw in (trajectories_figure, error_figure, hero_figure):
+        assert figure_svg(draw(replace(estimate, trajectories={"A": a, "B": none}), {"A": truth["A"]}))
     assert figure_svg(residual_figure([])).startswith("<svg")
     assert figure_svg(residual_figure([homography(3, "dark")])).startswith("<svg")
 

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -61,7 +62,7 @@ def solved(folder, out, executors, options=None):
 
 
 def test_a_folder_is_solved_and_a_bad_run_ends_none_of_the_others_and_what_is_there_stays(folder, tmp_path):
-    out, one = tmp_path / "out", partial(workers, 1)
+    out, one = tmp_path / "out", partial(ThreadPoolExecutor, 1)
     first = solved(folder, out, partial(workers, 2))
     assert first["a"].summary["stances"] and not first["a"].failed and not first["b"].failed
     assert "bad.mcap" in first["bad"].failed and not (out / "bad").exists()
@@ -131,7 +132,7 @@ def test_no_result_lies_in_another(folder, tmp_path, capsys):
 
 
 def test_a_run_that_has_become_bad_leaves_its_earlier_result_and_says_so(folder, tmp_path):
-    out, one = tmp_path / "out", partial(workers, 1)
+    out, one = tmp_path / "out", partial(ThreadPoolExecutor, 1)
     solved(folder, out, one)
     (folder / "a.mcap").write_bytes((folder / "bad.mcap").read_bytes())
     again = solved(folder, out, one)["a"]

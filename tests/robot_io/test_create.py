@@ -278,7 +278,7 @@ def test_a_stop_has_the_last_word_over_a_drive_that_is_under_way(create, robot):
         create.emergency_stop(f"test {n}")
         thread.join(timeout=2.0)
         assert not thread.is_alive()
-        assert until(lambda: robot._body.wanted == (0.0, 0.0), 0.04)
+        assert until(lambda: robot._body.wanted == (0.0, 0.0), 0.1)
         create.recover()
 
 
