@@ -169,14 +169,14 @@ def test_options_of_simulate_reach_the_world(call, tmp_path):
     assert team.floor.tilt_sigma_deg == 0.1
 
 
-def test_the_demo_goes_all_the_way(tmp_path):
-    done = coloc("demo", "--stances", 2, "--no-browser", "--out", "demo", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "robot" in done.stdout and f"report: {Path('demo', 'result', 'report.html')}" in done.stdout
-    assert "stances rendered: 2 of 2" in done.stderr
+def test_the_demo_goes_all_the_way(call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = call("demo", "--stances", 2, "--no-browser", "--out", "demo")
+    assert code == 0, err
+    assert "robot" in out and f"report: {Path('demo', 'result', 'report.html')}" in out
+    assert "stances rendered: 2 of 2" in err
     assert (tmp_path / "demo" / "result" / "report.html").stat().st_size > 1000
     assert (tmp_path / "demo" / "hallway.mcap").is_file()
-    assert "Traceback" not in done.stderr
 
 
 def test_the_installed_command_and_the_module_are_the_same(short):

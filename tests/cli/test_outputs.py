@@ -4,6 +4,7 @@ import json
 import logging
 import shutil
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -83,7 +84,9 @@ def test_a_result_is_replaced_by_itself_and_otherwise_only_with_force(solved, tm
     assert json.loads((out / "summary.json").read_text())["method"] == "chain"
 
 
-def test_results_of_a_folder_are_replaced_only_with_force(solved, tmp_path, capsys):
+def test_results_of_a_folder_are_replaced_only_with_force(solved, tmp_path, capsys, monkeypatch):
+    # processes are started in tests/results/test_many_runs.py
+    monkeypatch.setattr("coloc_graph.results.executors.workers", lambda *_: ThreadPoolExecutor(1))
     run, _ = solved
     folder, out = tmp_path / "runs", tmp_path / "results"
     folder.mkdir()
