@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.frontend.images.background import without_background
+from coloc_graph.frontend.images.sharp_spots import centres_of_mass, sharp_spots
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -126,6 +127,11 @@ def measure_spots(
     covariance = _covariances(signal, noise, centre, shape, size, shot_gain)
     gains = gain.T.reshape(n, 2, 2)
     covariance = gains @ covariance @ gains.mT / np.maximum(total * total, 1e-9)[:, None, None]
+    sharp, fits = sharp_spots(shape, start)
+    if len(sharp):
+        mass, own = centres_of_mass(signal[sharp], inner[sharp], noise[sharp], shot_gain)
+        centre[:, sharp] = np.where(fits, (centre[:, sharp] + mass) / 2, mass)
+        covariance[sharp] = np.where(fits[:, None, None], (covariance[sharp] + own) / 2, own)
     found = (total > 0) & np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(centre).all(axis=0)
     # undo the share of a Gaussian spot that a Gaussian window passes
     xx, xy, yy = shape
