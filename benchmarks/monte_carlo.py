@@ -4,7 +4,7 @@ A file per seed would only cost time: this is the same world, seen through the s
 """
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -97,9 +97,14 @@ def simulated(name: str, seed: int, *, points: int, **options: Any) -> World:
 def solved(world: World, options: SolveOptions) -> tuple[Solution, Accuracy]:
     """A world solved and compared with its truth."""
     solution = solve(MemoryRun(world), options)  # type: ignore[arg-type]
+    return solution, compared(world, solution.estimate.trajectories)
+
+
+def compared(world: World, trajectories: Mapping[str, Trajectory]) -> Accuracy:
+    """Trajectories compared with the truth of their world."""
     on_floor = world.team.floor is not None
-    true = align(solution.estimate.trajectories, truth_of(world), world.team.reference, on_floor=on_floor)
-    return solution, evaluate(solution.estimate.trajectories, true, on_floor=on_floor)
+    true = align(trajectories, truth_of(world), world.team.reference, on_floor=on_floor)
+    return evaluate(trajectories, true, on_floor=on_floor)
 
 
 def over_seeds(work: Callable[[int], T], seeds: Sequence[int], processes: int = 2) -> list[T]:

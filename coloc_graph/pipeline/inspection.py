@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from coloc_graph.errors import DegenerateGeometry, InputError
+from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.frontend.landmarks import describe_unused, sight_landmarks
 from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW, correspond_roughly, pair_by_time
 from coloc_graph.frontend.pairing.plane_check import implausible
@@ -86,6 +87,12 @@ def _ranging_findings(run: Run) -> list[Finding]:
             findings.append(Finding(robot, "it measured ranges and has no odometry: record its odometry, too"))
         elif run.topics.get(f"/{robot}/ranges") and run.team[robot].ranging is None:
             findings.append(Finding(robot, "the team states no range sensor: give the robot a [robots.ranging]"))
+    if not findings:
+        try:
+            said = keyframes_of(run).warnings
+        except InputError as why:
+            said = (str(why),)
+        findings += [Finding("run", one.removeprefix(f"{run.path}: ")) for one in said]
     if not any(landmark.position is not None for landmark in run.team.landmarks):
         findings.append(
             Finding("team", "no landmark's position is stated: the world is the reference robot's first pose")

@@ -354,10 +354,12 @@ def test_ranges_of_who_is_not_in_the_team_cannot_be_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_ranges_where_there_is_no_odometry_are_left_out_and_counted(tmp_path):
+def test_ranges_where_there_is_no_odometry_are_left_out_and_counted(tmp_path, capsys):
     run = open_run(write(tmp_path / "run.mcap", away=True))
     with pytest.raises(InputError, match="no range was measured while there is odometry"):
         keyframes_of(run)
+    main(["info", str(run.path)])
+    assert "no range was measured while there is odometry" in capsys.readouterr().out
 
 
 def test_one_landmark_alone_places_nobody(tmp_path, capsys):
