@@ -21,11 +21,11 @@ TEMPLATE_ROBOT = '\n[[robots]]\nname = "{name}"\n'
 TEMPLATE_CAMERA = """\
 
 [robots.camera]
-width = {width}                # px
+width = {width:<19}# px
 height = {height}
-fx = {focal}               # px; half the width divided by the tangent of half the horizontal angle of view
+fx = {focal:<22}# px; half the width divided by the tangent of half the horizontal angle of view
 fy = {focal}
-cx = {cx}                 # px, the image's centre unless calibrated
+cx = {cx:<22}# px, the image's centre unless calibrated
 cy = {cy}
 fps = {fps}
 

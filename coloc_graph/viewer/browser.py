@@ -119,7 +119,8 @@ def rendered(viewer: Viewer, size: tuple[int, int], timeout: float) -> Iterator[
             page.evaluate(caption_script(viewer.caption))
             yield page
     except (TimeoutError, OSError, ValueError, KeyError) as error:
-        raise InputError(f"{browser} renders no picture ({error}); write a page with --export instead") from error
+        why = f"within {timeout:.0f} s" if isinstance(error, TimeoutError) else f"({error})"
+        raise InputError(f"{browser} renders no picture {why}; write a page with --export instead") from error
 
 
 @contextmanager
