@@ -37,11 +37,16 @@ FOOTER_SIZE = len(FOOTER_HEAD) + 20
 
 
 class KeptChunk(NamedTuple):
-    """Messages of a decompressed chunk by channel, their number, and their size [bytes]."""
+    """Messages of a decompressed chunk by channel.
+
+    Their number and size [bytes], and the sums of these over all chunks put into the cache before.
+    """
 
     by_channel: dict[int, list[Message]]
     number: int
     size: int
+    number_before: int
+    size_before: int
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,9 @@ def _keep(index: Index, chunk: ChunkInfo, read: Iterable[Message]) -> KeptChunk:
     count = 0
     for count, one in enumerate(read, start=1):
         by_channel.setdefault(one.channel, []).append(one)
-    index.newest[chunk.offset] = kept = KeptChunk(by_channel, count, chunk.size)
+    last = next(reversed(index.newest.values()), None)
+    before = (0, 0) if last is None else (last.number_before + last.number, last.size_before + last.size)
+    index.newest[chunk.offset] = kept = KeptChunk(by_channel, count, chunk.size, *before)
     while len(index.newest) > 1 and _too_much(index.newest):
         index.newest.pop(next(iter(index.newest)), None)
     return kept
@@ -106,10 +108,10 @@ def _keep(index: Index, chunk: ChunkInfo, read: Iterable[Message]) -> KeptChunk:
 
 def _too_much(newest: dict[int, KeptChunk]) -> bool:
     """Return whether the cached chunks are too many, or too large."""
-    if len(newest) > KEPT_CHUNKS:
-        return True
-    kept = tuple(newest.values())
-    return sum(one.number for one in kept) > KEPT_MESSAGES or sum(one.size for one in kept) > KEPT_BYTES
+    first, last = next(iter(newest.values())), next(reversed(newest.values()))
+    number = last.number_before + last.number - first.number_before
+    size = last.size_before + last.size - first.size_before
+    return len(newest) > KEPT_CHUNKS or number > KEPT_MESSAGES or size > KEPT_BYTES
 
 
 def decoded(index: Index, items: tuple[str, Iterator[Item]], decoder: Callable[[Item], T]) -> Iterator[T]:
