@@ -89,22 +89,25 @@ def beside(sensor: Sensor) -> Sensor:
     return sensor[0], "wheels" if sensor[1] == "camera" else "camera"
 
 
-def usual_offset(clocks: Mapping[Sensor, SensorClock]) -> float:
-    """Offset that the clocks of most robots share [s]; 0 where as many share the reference's."""
-    first = {sensor: clock.segments[0].measured for sensor, clock in clocks.items()}
+def _usual(clocks: Mapping[Sensor, Sequence[Segment]]) -> Segment | None:
+    """The best known clock of those that most robots share; None where as many share the reference's."""
+    first = {sensor: segments[0] for sensor, segments in clocks.items()}
 
     def shared(offset: float) -> int:
-        return len({robot for (robot, _), one in first.items() if abs(one - offset) < MIN_STEP})
+        return len({robot for (robot, _), one in first.items() if abs(one.measured - offset) < MIN_STEP})
 
-    usual = max([0.0, *first.values()], key=lambda one: (shared(one), -abs(one)))
-    alike = [one for one in first.values() if abs(one - usual) < MIN_STEP]
-    return float(np.median(alike)) if abs(usual) >= MIN_STEP else 0.0
+    usual = max([0.0, *(one.measured for one in first.values())], key=lambda one: (shared(one), -abs(one)))
+    alike = [one for one in first.values() if abs(one.measured - usual) < MIN_STEP]
+    return min(alike, key=lambda one: one.sigma) if abs(usual) >= MIN_STEP else None
 
 
 def estimated_clocks(
     team: Team, stances: Sequence[Stance], evidence: Sequence[ClockEvidence]
 ) -> dict[Sensor, SensorClock]:
-    """Return the clock of each sensor that is tied to one whose clock is right; see `run_clocks`."""
+    """Return the clock of each sensor that is tied to one whose clock is right: as most robots', else the reference's.
+
+    See `run_clocks`.
+    """
     if not evidence:
         return {}
     parts = _split(sorted(evidence, key=lambda one: one.time))
@@ -112,9 +115,8 @@ def estimated_clocks(
         return {}  # no clock explains it: what was compared is not the same motion
     solved = [_solve(team, part) for part in parts]
     sensors = list(dict.fromkeys(sensor for one in evidence for sensor in (one.first, one.second)))
-    clocks: dict[Sensor, SensorClock] = {}
+    clocks: dict[Sensor, list[Segment]] = {}
     for sensor in sensors:
-        segments: list[Segment] = []
         for number, (part, offsets) in enumerate(zip(parts, solved, strict=True)):
             start = -np.inf if not number else _between(stances, parts[number - 1][-1].stance, part[0].stance)
             known = offsets.get(sensor) or offsets.get(beside(sensor))
@@ -122,14 +124,24 @@ def estimated_clocks(
                 continue
             offset, drift, sigma = known
             origin = float(np.mean([one.time for one in part]))
-            least = MIN_OFFSET if sensor[1] == "camera" else MIN_WHEEL_OFFSET
-            significant = abs(offset) > max(SIGNIFICANT * sigma, least)
-            found = Segment(start, offset if significant else 0.0, offset, sigma, drift, origin)
-            segments.append(found if segments else replace(found, start=-np.inf))
-        count = len({one.stance for one in evidence if sensor in (one.first, one.second)})
-        if segments:
-            clocks[sensor] = SensorClock(sensor, tuple(segments), count)
-    return clocks
+            start = start if sensor in clocks else -np.inf
+            clocks.setdefault(sensor, []).append(Segment(start, 0.0, offset, sigma, drift, origin))
+    usual = _usual(clocks)
+    count = {sensor: len({one.stance for one in evidence if sensor in (one.first, one.second)}) for sensor in clocks}
+    return {
+        sensor: SensorClock(sensor, tuple(_significant(sensor, one, usual) for one in segments), count[sensor])
+        for sensor, segments in clocks.items()
+    }
+
+
+def _significant(sensor: Sensor, one: Segment, usual: Segment | None) -> Segment:
+    """Return a clock's error against the `usual` clock, which is corrected where it is significant."""
+    measured, sigma = one.measured, one.sigma
+    if usual is not None:
+        measured, sigma = measured - usual.measured, float(np.hypot(sigma, usual.sigma))
+    least = MIN_OFFSET if sensor[1] == "camera" else MIN_WHEEL_OFFSET
+    offset = measured if abs(measured) > max(SIGNIFICANT * sigma, least) else 0.0
+    return replace(one, offset=offset, measured=measured, sigma=sigma)
 
 
 def _between(stances: Sequence[Stance], before: int, after: int) -> float:

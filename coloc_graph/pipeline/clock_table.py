@@ -9,7 +9,7 @@ import numpy as np
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend import StanceTracks
 from coloc_graph.frontend.clock_evidence import ClockEvidence, clock_evidence
-from coloc_graph.pipeline.clock_model import estimated_clocks, usual_offset
+from coloc_graph.pipeline.clock_model import estimated_clocks
 from coloc_graph.run import Run, Stance
 
 STANCES_COMPARED = 4  # stances whose motion is compared, evenly spread
@@ -70,14 +70,14 @@ def _by_motion(run: Run) -> list[ClockRow]:
     if not evidence:
         return []
     found = estimated_clocks(run.team, run.stances, evidence)
-    rows, usual = [], usual_offset(found)
+    rows = []
     for (robot, kind), clock in found.items():
         first = clock.segments[0]
         jumps = [b.error(b.start) - a.error(b.start) for a, b in itertools.pairwise(clock.segments)]
         rows.append(
             ClockRow(
                 robot,
-                f"{first.measured - usual:+.4f} s +- {1e3 * first.sigma:.1f} ms",
+                f"{first.measured:+.4f} s +- {1e3 * first.sigma:.1f} ms",
                 f"{1e6 * first.drift:+.0f} ppm" if first.drift else "none",
                 "; ".join(f"{jump:+.3f} s" for jump in jumps if jump) or "none",
                 "",

@@ -17,13 +17,10 @@ from coloc_graph.frontend.pairing.clock_offset import MAX_CLOCK_SIGMA
 from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW
 from coloc_graph.frontend.tracks.interpolation import MAX_GAP
 from coloc_graph.pipeline.clock_model import (
-    MIN_OFFSET,
     MIN_STEP,
-    SIGNIFICANT,
     SensorClock,
     beside,
     estimated_clocks,
-    usual_offset,
 )
 from coloc_graph.run import Detections, Image, OdometrySample, Stance
 from coloc_graph.team import Team
@@ -40,16 +37,14 @@ LEFT_SIGMA = 5e-3  # corrected clocks agree to this at least; the homographies t
 
 @dataclass(frozen=True, eq=False)
 class RunClocks:
-    """Clocks of a run by sensor, as errors against the reference robot's.
+    """Clocks of a run by sensor, as errors against the one that most robots share, else the reference robot's.
 
     The corrected ones agree to `sigma` [s]; 0 of cameras that take images rarely and at once, which are paired one to
-    one. `usual` [s] is the error that most robots share; `apart` [s] is the time between the images of two cameras that
-    show no instant in common.
+    one. `apart` [s] is the time between the images of two cameras that show no instant in common.
     """
 
     clocks: Mapping[Sensor, SensorClock]
     sigma: float
-    usual: float
     apart: float = 0.0
 
     def of_stamps(self, evidence: ClockEvidence) -> ClockEvidence:
@@ -75,9 +70,9 @@ class RunClocks:
             camera, wheels = self.clocks.get((robot, "camera")), self.clocks.get((robot, "wheels"))
             first = camera or wheels
             if first is not None:
-                said += _told(f"{robot}'s clock", first, self.usual)
+                said += _told(f"{robot}'s clock", first)
             if camera and wheels and not camera.agrees(wheels):
-                said += _told(f"the clock of {robot}'s odometry", wheels, self.usual)
+                said += _told(f"the clock of {robot}'s odometry", wheels)
         return said
 
 
@@ -88,15 +83,14 @@ def _error(clock: SensorClock | None, time: float) -> float:
     return next((one.error(time) for one in reversed(clock.segments) if time >= one.start), 0.0)
 
 
-def _told(name: str, clock: SensorClock, usual: float) -> Iterator[str]:
+def _told(name: str, clock: SensorClock) -> Iterator[str]:
     known = f"by motion in {clock.stances} stance{'s' * (clock.stances != 1)}"
     remedy = "the stamps were corrected; synchronise the robots' computers"
     first = clock.segments[0]
-    offset = first.offset - usual
-    if abs(offset) > max(SIGNIFICANT * first.sigma, MIN_OFFSET):
-        way = "ahead of" if offset > 0 else "behind"
+    if first.offset:
+        way = "ahead of" if first.offset > 0 else "behind"
         yield (
-            f"{name} is {abs(offset):.3f} s {way} the other robots' ({known}, "
+            f"{name} is {abs(first.offset):.3f} s {way} the other robots' ({known}, "
             f"sigma {1e3 * first.sigma:.1f} ms): {remedy}"
         )
     for before, after in itertools.pairwise(clock.segments):
@@ -126,13 +120,13 @@ def clocks_of_images_apart(measured: Sequence[PairMeasurement]) -> RunClocks | N
             times_i, times_j = (np.unique(np.concatenate([track.times for track in own])) for own in one.seen)
             nearest.append(float(np.median(np.abs(times_j[None] - times_i[:, None]).min(axis=1))))
     apart = max(nearest, default=0.0)
-    return RunClocks({}, apart, 0.0, apart) if PAIRING_WINDOW < apart < MAX_GAP else None
+    return RunClocks({}, apart, apart) if PAIRING_WINDOW < apart < MAX_GAP else None
 
 
 def unknown_clocks(run: Any) -> RunClocks | None:
     """Return clocks of which nothing is known, for a run whose team states that they agree; None for any other run."""
     cameras = [robot.name for robot in run.team.robots if robot.camera_if_any]
-    return None if run.team.clock_sigma or len(cameras) < 2 else RunClocks({}, MAX_CLOCK_SIGMA, 0.0)
+    return None if run.team.clock_sigma or len(cameras) < 2 else RunClocks({}, MAX_CLOCK_SIGMA)
 
 
 def implausibility(estimate: Estimate) -> float:
@@ -227,7 +221,7 @@ def run_clocks(team: Team, stances: Sequence[Stance], evidence: Sequence[ClockEv
     Parameters
     ----------
     team : Team
-        Its robots; the reference robot's clock is the run's time.
+        Its robots; the clock that most of them share, else the reference robot's, is the run's time.
     stances : sequence of Stance
         All stances, in the order of time.
     evidence : sequence of ClockEvidence
@@ -245,10 +239,9 @@ def run_clocks(team: Team, stances: Sequence[Stance], evidence: Sequence[ClockEv
     }
     if all(clock.is_right for clock in clocks.values()):
         return None
-    usual = usual_offset(clocks)
     sigmas = [one.sigma for (_, kind), clock in clocks.items() if kind == "camera" for one in clock.segments]
     at_once = any(one.synchronous for one in evidence)
-    return RunClocks(clocks, 0.0 if at_once else max([LEFT_SIGMA, *sigmas]), usual)
+    return RunClocks(clocks, 0.0 if at_once else max([LEFT_SIGMA, *sigmas]))
 
 
 class CorrectedRun:

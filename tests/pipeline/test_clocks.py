@@ -115,6 +115,19 @@ def test_a_clock_is_wrong_only_where_stances_agree_on_it(right, offsets, wrong):
         assert "B's clock is 1.700 s" in clocks.sentences()[0]
 
 
+def test_the_reference_s_clock_is_wrong_where_most_robots_share_another(right):
+    """Stances are of the clock that most share, and the time of others must not be moved away from it."""
+    evidence = [
+        ClockEvidence(stance.index, stance.start, ("A", "camera"), (robot, kind), ClockOffset(1.5 + late, sigma))
+        for stance in right.stances
+        for robot, kind, late, sigma in (("B", "camera", 0.0, 1e-4), ("C", "wheels", 4e-3, 4e-3))
+    ]
+    clocks = run_clocks(right.team, right.stances, evidence)
+    (sentence,) = clocks.sentences()
+    assert "A's clock is 1.500 s behind the other robots'" in sentence
+    assert [sensor for sensor, clock in clocks.clocks.items() if not clock.is_right] == [("A", "camera")]
+
+
 def test_the_table_shows_offsets_by_motion(right, tmp_path):
     rows = clock_table(with_clock(right, tmp_path / "wrong.mcap", "B", lambda t: 1.0))
     offsets = {(row.robot, row.known.split(", ")[1]): float(row.offset.split(" s")[0]) for row in rows}
