@@ -26,7 +26,9 @@ from coloc_graph.team import Slip
 
 TEST_SLIP = Slip(sigma=1e-3, sigma_deg=0.1)  # slip that a stay-put constraint is given to test it
 MAX_FAULTS = 4  # faults that are searched for one after the other
+MANY_FAULTS = 4.0  # chi2 left, in units of what the likeliest of `MAX_FAULTS` explains, from which many are wrong
 MAX_FITTED = 6  # causes that are fitted in each round, the likeliest
+MAX_GROUPS = 20  # groups of measurements that are tested together in each round, the worst
 MIN_GAIN = 0.5  # part of the largest predicted decrease of chi2 from which a cause is fitted
 GROUP_PRICE = 30.0  # chi2 that several measurements must explain beyond one of them
 EQUAL_CHI2 = 9.0  # two causes explain equally well if chi2 differs by less
@@ -172,6 +174,8 @@ def find_faults(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tup
         others = sorted((one for one in equal if one is not best), key=lambda one: one.cost)
         faults.append(_fault_of(best, others))
         graph = _with_fault(graph, best, others)
+        if likeliest.cost > MANY_FAULTS * MAX_FAULTS * best.gained.chi2:
+            break
         fit = None if others else best.fit  # the same graph again
     return tuple(faults), graph, False
 
@@ -197,9 +201,12 @@ def _suspects(fit: Fit) -> list[tuple[Cause, Agreement]]:
     if not wrong:
         return []
     found = [(Cause((fit.links[index],)), one) for index, one in wrong.items()]
-    for cause in _groups(fit.links, {id(fit.links[index]) for index in wrong}):
-        numbers = [index for index, link in enumerate(fit.links) if any(link is one for one in cause.links)]
-        factors = [fit.factor(index) for index in numbers]
+    places = {id(link): index for index, link in enumerate(fit.links)}
+    chi2 = {id(fit.links[index]): one.chi2 for index, one in alone.items()}
+    groups = _groups(fit.links, {id(fit.links[index]) for index in wrong})
+    worst_first = sorted(groups, key=lambda one: -sum(chi2.get(id(link), 0.0) for link in one.links))
+    for cause in worst_first[:MAX_GROUPS]:
+        factors = [fit.factor(index) for index in sorted(places[id(link)] for link in cause.links)]
         with fit.batched:
             one = agreement(factors, fit.values, fit.marginals.joint(keys_of(factors)))
         if one.dof:

@@ -23,6 +23,7 @@ from coloc_graph.team.centre_noise import COMPONENTS
 Array = NDArray[np.float64]
 
 BIAS_PX = 0.002  # median of the shared error where a team states nothing
+SAME_NOISE = 0.01  # relative difference of standard deviations of centres that changes no measurement
 PARTS = (("stated sigma times", "scale", ""), ("white floor", "floor", "px"), ("of saturated spots", "saturated", "px"))
 
 
@@ -153,6 +154,14 @@ class NoiseBelief:
         parts = np.exp(mean) * (stated, 1 - saturated, saturated)
         relative = parts / parts.sum()
         return math.sqrt(parts.sum()), math.exp(math.sqrt(relative @ covariance @ relative) / 2)
+
+    def differs_from(self, other: "NoiseBelief") -> bool:
+        """Return whether measurements differ by the two: the typical centre does by more than `SAME_NOISE`."""
+        now, before = (
+            [one.sigma(name) for name in self.robots] for one in (self, replace(other, typical=self.typical))
+        )
+        logs = np.log([[sigma * factor ** math.log(factor) for sigma, factor in one] for one in (now, before)])
+        return bool((np.abs(logs[0] - logs[1])[self.points > 0] > SAME_NOISE).any())
 
     def rows(self, team: Team) -> list[NoiseRow]:
         """Return the learnt components beside the stated ones."""

@@ -184,8 +184,11 @@ def _in_batch(
             looser = apart.corrected(run)
             with contextlib.suppress(EstimationError):  # what is wrong with the run as it is says more
                 return _in_batch(looser, options, measure.of(looser), apart, time.perf_counter() - started)
+    noise = belief
     for _ in range(NOISE_ROUNDS):
-        noise = belief.updated(measured)
+        last, noise = noise, belief.updated(measured)
+        if last is not belief and not noise.differs_from(last):
+            break
         measured = measured_again(measured, noise.used(run.team))
     log.info("%d stances measured: %d of %d pairs usable", len(run.stances), _usable(measured), len(measured))
     _require_poses(run, options, measured)

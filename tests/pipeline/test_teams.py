@@ -184,14 +184,14 @@ def test_of_many_observers_each_is_measured_with_those_that_see_most_of_the_same
     def track(marker, n):
         return Track("", marker, times[:n], np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros(n))
 
-    few = {name: [track("Z/0", 50)] for name in "ABCDE"}
-    assert len(pairs_of(tuple(few), few, 0.005)) == 10
+    few = {name: [track("Z/0", 50)] for name in "ABCD"}
+    assert len(pairs_of(tuple(few), few, 0.005)) == 6
     # two groups that watch different movers
     many = {f"{group}{n}": [track(f"{group}/0", 100), track("Z/0", 5)] for group in "XY" for n in range(10)}
     pairs = pairs_of(tuple(many), many, 0.005)
     assert all(sum(name in pair for pair in pairs) >= MIN_PARTNERS for name in many)
-    assert len(pairs) < 90
-    assert all(i[0] == j[0] for i, j in pairs)
+    assert len(pairs) < 70
+    assert sum(i[0] != j[0] for i, j in pairs) == 1  # which ties the two groups
 
 
 class Nameless:

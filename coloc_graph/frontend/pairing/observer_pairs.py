@@ -4,17 +4,21 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy.sparse.csgraph import minimum_spanning_tree
 
 from coloc_graph.frontend.pairing.correspondence import Correspondences, pair_each_by_time
 from coloc_graph.frontend.tracks.tracking import Track
 
-MIN_PARTNERS = 4  # pairs of each of many observers that are measured: with those that share most samples
+MIN_PARTNERS = 3  # pairs of each of many observers that are measured: with those that share most samples
 
 Pair = tuple[str, str]
 
 
 def pairs_of(observers: Sequence[str], tracks: Mapping[str, Sequence[Track]], window: float) -> list[Pair]:
-    """Select the pairs of observers to measure: all, or of many those that share most samples."""
+    """Select the pairs of observers to measure: all, or of many those that share most samples.
+
+    Of many, each has `MIN_PARTNERS`, and a spanning tree of most shared samples ties all that are tied by any samples.
+    """
     every = list(itertools.combinations(observers, 2))
     if len(observers) <= MIN_PARTNERS + 1:
         return every
@@ -27,11 +31,19 @@ def pairs_of(observers: Sequence[str], tracks: Mapping[str, Sequence[Track]], wi
     which, _ = pair_each_by_time(series, window)
     counts = np.bincount(np.array(of, np.int64)[which], minlength=len(every))
     common = dict(zip(every, counts.tolist(), strict=True))
-    best: set[Pair] = set()
+    best = _spanning(observers, common)
     for one in observers:
         own = sorted((pair for pair in every if one in pair), key=lambda pair: -common[pair])
         best.update(own[:MIN_PARTNERS])
     return [pair for pair in every if pair in best]
+
+
+def _spanning(observers: Sequence[str], common: Mapping[Pair, int]) -> set[Pair]:
+    """Return the pairs of a spanning tree of most shared samples, or of a tree of each group that shares any."""
+    shared = np.zeros((len(observers), len(observers)))
+    shared[np.triu_indices(len(observers), 1)] = list(common.values())  # in the order of `combinations`
+    tree = minimum_spanning_tree(-shared).toarray()
+    return {(observers[i], observers[j]) for i, j in np.argwhere(tree).tolist()}
 
 
 def information_weight(
