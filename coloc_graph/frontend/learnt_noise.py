@@ -16,7 +16,10 @@ from coloc_graph.frontend.homography.noise_components import NoiseEvidence, lear
 from coloc_graph.frontend.homography.refinement import linearise, projection
 from coloc_graph.frontend.homography.scatter import learn_spread
 from coloc_graph.frontend.pairing.correspondence import separated
-from coloc_graph.frontend.stance import PairMeasurement
+from coloc_graph.frontend.stance import FrontendOptions, PairMeasurement, measure_pair
+from coloc_graph.frontend.stance_tracks import StanceTracks
+from coloc_graph.run import Recorded, Stance
+from coloc_graph.run.recorded import Restated
 from coloc_graph.team import CentreNoise, Team
 from coloc_graph.team.centre_noise import COMPONENTS
 
@@ -239,3 +242,35 @@ def measured_again(measured: Iterable[PairMeasurement], team: Team) -> tuple[Pai
         )
         for one in measured
     )
+
+
+def measure_alone(
+    run: Recorded,
+    stance: Stance,
+    robot_i: str,
+    robot_j: str,
+    options: FrontendOptions | None = None,
+    tracks: StanceTracks | None = None,
+) -> PairMeasurement:
+    """Measure a pair of one stance as a run of this stance alone would: with the team's prior of the noise, updated.
+
+    Parameters
+    ----------
+    run, stance
+        Run and stance.
+    robot_i, robot_j
+        Names of the observers.
+    options
+        Options of the front end.
+    tracks
+        Tracks of the stance, if they exist already.
+
+    Returns
+    -------
+    PairMeasurement
+        The measurement.
+    """
+    prior = NoiseBelief.of(run.team)
+    noisy = Restated(run, prior.used(run.team))
+    first = measure_pair(noisy, stance, robot_i, robot_j, options or FrontendOptions(), tracks)
+    return measured_again([first], prior.updated([first]).used(run.team))[0]

@@ -12,9 +12,10 @@ import numpy as np
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.frontend.landmarks import describe_unused, sight_landmarks
+from coloc_graph.frontend.learnt_noise import measure_alone
 from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW, correspond_roughly, pair_by_time
 from coloc_graph.frontend.pairing.plane_check import implausible
-from coloc_graph.frontend.stance import FrontendOptions, little_in_common, measure_pair
+from coloc_graph.frontend.stance import little_in_common
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_plane
 from coloc_graph.pipeline.contents import kind_of, unused_in
 from coloc_graph.run import Detections, Run, Stance
@@ -169,7 +170,7 @@ def _of_detections(run: Run, stance: Stance, i: str, j: str, tracks: StanceTrack
             return [f"{i} and {j}: {why}"]
         unlikely = implausible(run, stance, i, found)
         return [unlikely] if unlikely else []
-    measured = measure_pair(run, stance, i, j, FrontendOptions(), tracks)
+    measured = measure_alone(run, stance, i, j, tracks=tracks)
     what = []
     if measured.homography.unusable and not little_in_common(measured.homography, stance):
         what.append(f"{i} and {j}: {measured.homography.unusable}")

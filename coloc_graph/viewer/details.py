@@ -7,7 +7,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.frontend import PairMeasurement, measure_pair
+from coloc_graph.frontend import PairMeasurement
+from coloc_graph.frontend.learnt_noise import measure_alone
 from coloc_graph.run import Run
 from coloc_graph.viewer import inspect
 from coloc_graph.viewer.frame import NO_LINES, Lines
@@ -82,7 +83,7 @@ class Details:
         stance = scene.stances[row]
         measured = []
         for pair in itertools.combinations(stance.observers, 2):
-            one = self._measured.get((stance.index, *pair)) or measure_pair(scene.run, stance, *pair, scene.frontend)
+            one = self._measured.get((stance.index, *pair)) or measure_alone(scene.run, stance, *pair, scene.frontend)
             if len(self._measured) > MEASURED_LIMIT:
                 self._measured.clear()
             self._measured[stance.index, *pair] = one

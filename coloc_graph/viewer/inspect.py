@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry, InputError
-from coloc_graph.frontend import PairMeasurement, measure_pair
+from coloc_graph.frontend import PairMeasurement
 from coloc_graph.frontend.homography.decomposition import choose_by_normal, decompose_svd
 from coloc_graph.frontend.homography.fit import INLIER_GATE
 from coloc_graph.frontend.homography.plane import on_plane
+from coloc_graph.frontend.learnt_noise import measure_alone
 from coloc_graph.frontend.stance_tracks import stance_plane
 from coloc_graph.frontend.tracks.tracking import Track
 from coloc_graph.geometry.lie import floor_pose, so3_log
@@ -55,7 +56,7 @@ def examine(scene: Scene, edge: int) -> Inspection:
         raise InputError("there is no run to measure this pair in: open the run, or a result that lies beside it")
     stance = scene.stances[row]
     robot_i, robot_j = (scene.robots[int(n)] for n in (scene.edges.i[edge], scene.edges.j[edge]))
-    measured = measure_pair(run, stance, robot_i, robot_j, scene.frontend)
+    measured = measure_alone(run, stance, robot_i, robot_j, scene.frontend)
     picture = _picture(run, scene.middle(row), (robot_i, robot_j), measured)
     return Inspection(measured, _solutions(run, measured), picture)
 

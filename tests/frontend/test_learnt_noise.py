@@ -9,7 +9,7 @@ import pytest
 from coloc_graph.backend.shared_noise import SharedNoise
 from coloc_graph.frontend.homography.noise_components import NoiseEvidence, learn_components
 from coloc_graph.frontend.homography.scatter import learn_spread, variance_factor
-from coloc_graph.frontend.learnt_noise import NoiseBelief
+from coloc_graph.frontend.learnt_noise import NoiseBelief, measure_alone
 from coloc_graph.pipeline.batch import SolveOptions, StanceSolver, solve
 from coloc_graph.results.writer import write_result
 from coloc_graph.run import RunWriter, open_run
@@ -121,6 +121,15 @@ def test_a_short_run_keeps_what_is_stated_and_is_wide(hallway, tmp_path):
     assert nothing.used(run.team)["A"].camera.centre_noise.variances[1] == pytest.approx(11.2 * 0.03**2, rel=0.01)
     assert one.noise("C").logs == nothing.noise("C").logs  # whose camera saw nothing
     assert one.noise("A").floor_factor > 1.5  # 0.3 px of stated noise tell little of a floor of 0.03
+
+
+def test_a_pair_measured_alone_has_the_noise_that_a_run_of_it_has(hallway, tmp_path):
+    run = restated(hallway, tmp_path / "run.mcap", 0.1)
+    alone = measure_alone(run, run.stances[0], "A", "B")
+    assert alone.fit.chi2 / alone.fit.dof == pytest.approx(1.0, abs=0.3)  # 100 as stated
+    belief = NoiseBelief.of(run.team)
+    assert belief.updated([alone]).sigma("A")[0] == pytest.approx(0.3, rel=0.25)
+    assert alone.homography.shared is not None
 
 
 def test_learnt_noise_is_in_the_team_that_a_result_writes_and_the_next_run_starts_from_it(hallway, tmp_path):

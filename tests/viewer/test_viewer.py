@@ -281,7 +281,7 @@ def test_of_a_large_team_no_names_are_written_and_it_is_said():
 def test_an_edge_is_measured_again_and_decomposed_both_ways(scene, solutions):
     measured = solutions["joint"].measurements[2]
     found = inspect.examine(scene, 2)
-    # measured with the noise that is stated, not that learnt from the run
+    # measured with the noise that this stance alone teaches, not that learnt from the run
     assert np.allclose(found.measured.homography.H_j_i, measured.homography.H_j_i, atol=1e-3)
     taken = [n for n, one in enumerate(found.solutions) if one.chosen]
     assert taken == [measured.relative_pose.solution]
