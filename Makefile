@@ -12,7 +12,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-NICE := nice -n 10
+NICE := nice -n 19
 ARGS ?=
 DATA ?=
 GRAPHS ?=

@@ -9,7 +9,6 @@ import sys
 from functools import partial
 from types import SimpleNamespace
 
-import distributed
 import matplotlib.image
 import numpy as np
 import pytest
@@ -144,9 +143,9 @@ def test_more_processes_give_the_same_cells(single):
 
 
 def test_work_goes_to_a_cluster_where_one_is_named():
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
-    ) as cluster:
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as cluster:
         done = spread(lambda n: (n, os.getpid()), [1, 2], cluster=cluster.scheduler_address)
     assert [n for n, _ in done] == [1, 2] and os.getpid() not in {process for _, process in done}
 

@@ -3,13 +3,12 @@
 import json
 import os
 import shutil
-import signal
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
-import distributed
 import pytest
+from killed_runs import kills_its_process_once
 
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
@@ -18,6 +17,8 @@ from coloc_graph.results import many_runs
 from coloc_graph.results.executors import workers
 from coloc_graph.results.many_runs import result_folders, runs_in, solve_runs
 from coloc_graph.run import open_run
+
+SUPPORT = Path(__file__).parents[1] / "support"
 
 
 @pytest.fixture(scope="module")
@@ -35,19 +36,6 @@ def runs(tmp_path_factory, short, copied):
 def folder(runs, tmp_path):
     """A copy of these, to be spoiled."""
     return Path(shutil.copytree(runs, tmp_path / "runs"))
-
-
-def kills_its_process_once(run, out, options):
-    """As `solve_one`, but for the run that kills the process it is in: the first time, or always."""
-    flag = Path(out).parent / "killed"
-    if run.stem == "a" and (out.parent.name == "always" or not flag.exists()):
-        flag.parent.mkdir(parents=True, exist_ok=True)
-        flag.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return solve_one(run, out, options)
-
-
-solve_one = many_runs.solve_one
 
 
 def solved(folder, out, executors, options=None):
@@ -79,7 +67,7 @@ def test_a_folder_is_solved_and_a_bad_run_ends_none_of_the_others_and_what_is_th
 
 def test_a_run_that_kills_its_process_is_tried_again_and_then_given_up(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(many_runs, "solve_one", kills_its_process_once)
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    monkeypatch.setenv("PYTHONPATH", f"{SUPPORT}:{os.environ.get('PYTHONPATH', '')}")
     (folder / "bad.mcap").unlink()
     once = solved(folder, tmp_path / "once", partial(workers, 1))
     assert not once["a"].failed and not once["b"].failed
@@ -90,10 +78,10 @@ def test_a_run_that_kills_its_process_is_tried_again_and_then_given_up(folder, t
 
 def test_a_cluster_goes_on_when_a_worker_is_killed(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(many_runs, "solve_one", kills_its_process_once)
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
-    ) as cluster:
+    monkeypatch.setenv("PYTHONPATH", f"{SUPPORT}:{os.environ.get('PYTHONPATH', '')}")
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as cluster:
         found = solved(folder, tmp_path / "out", partial(workers, cluster=cluster.scheduler_address))
     assert not found["a"].failed and not found["b"].failed and found["bad"].failed
     assert (tmp_path / "out" / "killed").exists()
