@@ -31,7 +31,7 @@ CREATE = WheelErrors.of_wheels(math.hypot(SLIP, ENCODER), WHEELS[2].base)  # of 
 FIRST_NOISE = 0.1  # noise of a marker centre until a stance has shown it [px]
 PASSING = 0.6  # robots that drive at the same time keep this distance between their ways [m]
 RETRIES = 2  # attempts at a stance before another target is chosen
-SWEEP = (0.35, -0.35, 0.7, -0.7)  # turns with which one that leapt looks for the mover in further attempts [rad]
+SWEEP = (0.35, -0.35, 0.7, -0.7)  # turns with which one that leapt and did not see the mover looks for it [rad]
 MAX_SHARE = 1.5  # a stance counts for at most this share of the information that was expected of it
 
 
@@ -90,7 +90,7 @@ class HorizonPlanner:
         """Plan the next stance.
 
         Another attempt at it begins in the middle of the drive and goes the other way round; after some, another target
-        is chosen, and the one that leapt turns to look for the mover.
+        is chosen. One that leapt and did not see the mover turns to look for it.
 
         Raises
         ------
@@ -114,10 +114,10 @@ class HorizonPlanner:
             decision = self._horizon.next(belief, max(self._left, 0.0), failed, leaper)
         self._decision = decision
         leap = decision.ahead[0][:2] if decision.ahead else None
-        if leap is not None and attempt >= RETRIES and leap[0] in situation.moved:
+        if leap is not None and attempt and leap[0] in situation.missing:
             # it may have ended where it does not look at the views any more, and sees nothing that would correct it
             x, y, yaw = leap[1]
-            leap = leap[0], (x, y, yaw + SWEEP[(attempt - RETRIES) % len(SWEEP)])
+            leap = leap[0], (x, y, yaw + SWEEP[(attempt - 1) % len(SWEEP)])
         drive, approach = self._approach(decision, situation.poses, leap)
         # the middle comes last, which is where a mover that has left a view goes back to
         middle = drive.mean(axis=0, keepdims=True)

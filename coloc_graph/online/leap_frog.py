@@ -90,6 +90,7 @@ class LeapFrog:
         self._plan: StancePlan | None = None
         self._leap: tuple[str, Planar] | None = None  # a leap that is still to be commanded
         self._failures = 0  # attempts at the present stance that failed
+        self._missing: tuple[str, ...] = ()  # observers that did not see the mover in the last attempt
         self._captures = machine.time_ns() // 1_000_000  # capture numbers are unique across coordinators
         self._recovered = -math.inf
         self._warned: set[str] = set()
@@ -165,7 +166,7 @@ class LeapFrog:
         """Have the next stance planned."""
         anchors = self._anchors()
         moved = tuple(name for name in self.observers if self.stances and name not in anchors)
-        self._decisions.decide(Situation(self._index, self._failures, self._registry.poses(), moved))
+        self._decisions.decide(Situation(self._index, self._failures, self._registry.poses(), moved, self._missing))
         self._enter(MissionState.PLANNING)
 
     def _await_plan(self) -> None:
@@ -211,7 +212,7 @@ class LeapFrog:
     def _begin_attempt(self) -> None:
         assert self._plan is not None
         now = self._registry.utc()
-        self._captures += 1
+        self._captures, self._missing = self._captures + 1, ()
         self.attempt = StanceAttempt(
             Stance(self._index, now, now, self.observers, (self.mover,), self._anchors()),
             InView(self._team, self.mover, self._registry.poses(self.observers)),
@@ -235,6 +236,7 @@ class LeapFrog:
             attempt.to_middle = True
             self._commander.drive(self.mover, attempt.way_back())
         elif mover.arrived and self._registry.stood(LOOK_TIME):
+            self._missing = tuple(missing)
             self._note_bumped(displaced(self._registry, attempt.view, attempt.by_wheels(mover.tracker)))
             raise RobotError(
                 f"{' and '.join(missing)} did not see {self.mover} where it should be: put the robots where they "
@@ -285,7 +287,12 @@ class LeapFrog:
         elif seconds > OUT_OF_VIEW and self.states.now == MissionState.CAPTURING:
             self._commander.drive(self.mover, attempt.way_back())
             self._enter(MissionState.TURNING_BACK, f"{self.mover} left the view of {' and '.join(missing)}")
-        elif seconds > DRIVE_TIME / 2:
+        elif seconds > DRIVE_TIME / 2 or (
+            self.states.now == MissionState.TURNING_BACK
+            and self._registry[self.mover].arrived
+            and self._registry.stood(LOOK_TIME)
+        ):
+            self._missing = tuple(missing)
             raise RobotError(f"{self.mover} did not come back into the view of {' and '.join(missing)}")
 
     def _end_capture(self, reason: str) -> None:

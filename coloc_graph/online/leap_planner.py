@@ -118,12 +118,15 @@ class Situation:
         Poses of all robots in the world (x [m], y [m], yaw [rad]), by name.
     moved
         Observers that have moved since the stance before: they are no anchors.
+    missing
+        Observers that did not see the mover in the attempt before.
     """
 
     index: int
     attempt: int
     poses: Mapping[str, Planar]
     moved: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
 
 
 class StancePlanner(Protocol):

@@ -39,8 +39,8 @@ class Mission:
             self.team, "C", observers, self.course, pace=24.0, speed=0.4, gait=GAIT
         )  # fmt: skip
 
-    def plan(self, index, attempt=0, moved=()):
-        return self.planner.plan(Situation(index, attempt, self.registry.poses(), moved))
+    def plan(self, index, attempt=0, moved=(), missing=()):
+        return self.planner.plan(Situation(index, attempt, self.registry.poses(), moved, missing))
 
 
 @pytest.fixture
@@ -68,8 +68,8 @@ def test_the_first_stance_is_where_the_robots_stand_and_the_second_after_a_leap(
 
 def test_in_further_attempts_one_that_leapt_turns_to_look_for_the_mover(mission):
     leaper = mission.plan(1).leap[0]
-    for attempt, turned in ((1, 0.0), (2, 0.35), (3, -0.35)):
-        leap = mission.plan(1, attempt, (leaper,)).leap
+    for attempt, missing, turned in ((1, (), 0.0), (1, (leaper,), 0.35), (2, (leaper,), -0.35)):
+        leap = mission.plan(1, attempt, (leaper,), missing).leap
         assert leap[1][2] - mission.planner._decision.ahead[0][1][2] == pytest.approx(turned)
 
 

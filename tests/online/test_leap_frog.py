@@ -150,6 +150,7 @@ def test_a_mover_that_is_not_seen_at_the_border_of_a_view_is_sent_to_the_middle_
         mission.step(state)
     start, middle = [body.places for _, body in mission.link.asked if isinstance(body, Drive)]
     assert len(middle) == 1 and middle[0] not in start
+    assert mission.leap_frog._missing == ("A", "B")
     assert "A and B did not see C where it should be" in (mission.record.path.parent / "mission.jsonl").read_text()
 
 
