@@ -85,6 +85,7 @@ class HorizonPlanner:
         self._belief: Belief | None = None
         self._decision: Decision | None = None
         self._plan: StancePlan | None = None
+        self._stood: list[Mapping[str, Planar]] = []  # where the observers stood in each stance
 
     def plan(self, situation: Situation) -> StancePlan:
         """Plan the next stance.
@@ -98,6 +99,7 @@ class HorizonPlanner:
             If no observer can leap, or the observers see too little of the floor together.
         """
         index, attempt, belief = situation.index, situation.attempt, self._believed(situation.poses)
+        self._horizon.require_progress(self._stood)
         before = self._decision if self._plan is not None and self._plan.index == index else None
         if before is not None and attempt < RETRIES and self._may_leap(before, situation):
             decision = before
@@ -151,6 +153,7 @@ class HorizonPlanner:
         standing = {name: belief.poses[name] for name in (*anchors, *(o for o in self._observers if o not in anchors))}
         driven = tuple((float(x), float(y)) for x, y in self._plan.patrol)
         seconds = entered.stance.end - entered.stance.start
+        self._stood.append(standing)
         came = PlannedStance(standing, anchors, self._mover, driven, seconds)
         information, expected = self._predictor.information(came)
         if expected > 0:

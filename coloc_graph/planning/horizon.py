@@ -37,6 +37,7 @@ ROW = 0.6  # distance between rows of observers at the beginning [m]
 STRAGGLE = 2.2  # an observer further behind the foremost one than this leaps next [m]
 MIN_CELLS = 3  # cells of the common view without which a stance is not planned
 MAX_STANCES = 2000
+STALLED = 6  # stances without progress after which a mission is given up
 ARRIVED = 0.1  # the goal is reached within this distance along the course [m]
 
 #: What decides between stances: the variance at the goal with the cost to go, the information gained, the size of the
@@ -157,6 +158,7 @@ class Horizon:
             belief, left = decision.promise.belief, left - stance.duration - self.timed * times[-1]
             if self.arrived(stance.standing):
                 return Mission(Plan(tuple(stances)), tuple(promises), tuple(times), start, tuple(reasons))
+            self.require_progress([one.standing for one in stances])
             if len(stances) > MAX_STANCES:
                 raise InputError(f"the goal is not reached in {MAX_STANCES} stances: give a nearer one, or more goals")
             decision = self.next(belief, left)
@@ -234,11 +236,7 @@ class Horizon:
             if self.objective != "goal" or self.arrived(best[0].standing):
                 break
         if not best[0].choices:
-            gone = self.course.length - self.remaining(standing)
-            raise InputError(
-                f"no observer can leap from where the team stands, {gone:.1f} m along the course: the way is too "
-                "narrow for the robots, or their cameras share no view there"
-            )
+            raise self._stuck(standing)
         if self.objective != "goal":
             stance, promise = self._planned(belief, best[0].choices[0])
             return Decision(stance, promise, best[0].choices)
@@ -250,6 +248,25 @@ class Horizon:
         if not node.by_gait:
             reason += "; this leap promises less than the gait's own"
         return Decision(stance, promise, node.choices, math.sqrt(variance), reason)
+
+    def require_progress(self, before: Sequence[Mapping[str, Planar]]) -> None:
+        """Require that of the stances before, each with where the observers stood, one of the last brought them on.
+
+        Raises
+        ------
+        InputError
+            If robots only change their places: none can pass another.
+        """
+        left = [self.remaining(standing) for standing in before]
+        if len(left) > STALLED and min(left[-STALLED:]) > min(left[:-STALLED]) - ARRIVED:
+            raise self._stuck(before[-1])
+
+    def _stuck(self, standing: Mapping[str, Planar]) -> InputError:
+        gone = self.course.length - self.remaining(standing)
+        return InputError(
+            f"no observer can leap on from where the team stands, {gone:.1f} m along the course: the way is too "
+            "narrow for the robots, or their cameras share no view there"
+        )
 
     def _planned(self, belief: Belief, choice: tuple[str, Planar, float]) -> tuple[PlannedStance, Promise]:
         """Plan the mover's drive of a stance after a leap."""

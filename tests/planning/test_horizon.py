@@ -134,6 +134,14 @@ def test_a_way_that_cannot_be_gone_is_one_sentence(course, floor_map, sentence):
         planner.next(belief, 30.0)
 
 
+def test_a_team_that_only_changes_its_places_is_told_so(straight):
+    planner, mission = straight
+    stood = [stance.standing for stance in mission.plan.stances]
+    planner.require_progress(stood)
+    with pytest.raises(InputError, match=r"no observer can leap on from where the team stands, .* m along"):
+        planner.require_progress([*stood[:2], *[stood[1]] * 6])
+
+
 def test_walls_block_the_view():
     floor_map = corridor(2.0)
     eyes = np.array([0.0, 0.0])
