@@ -20,6 +20,19 @@ def test_a_new_team_reads_back_and_has_nothing_wrong(tmp_path, capsys):
     assert "replace it with --force" in capsys.readouterr().err
 
 
+def test_a_principal_point_far_from_the_middle_is_said(tmp_path, capsys):
+    path = tmp_path / "team.toml"
+    assert main(["team", "new", "A", "B", "C", "--size", "320x240", "--out", str(path)]) == 0
+    text = path.read_text()
+    for axis, at in (("cx", 30.0), ("cy", 20.0)):
+        before = next(line for line in text.splitlines() if line.startswith(f"{axis} = "))
+        path.write_text(text.replace(before, f"{axis} = {at}", 1))
+        main(["team", "check", str(path)])
+        said = capsys.readouterr()
+        assert "the principal point of A is far from the middle" in said.out + said.err
+        assert "principal point of B" not in said.out + said.err
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

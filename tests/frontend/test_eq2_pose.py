@@ -193,6 +193,16 @@ def test_distance_from_a_span_is_exact_whatever_the_mount_says():
     assert found.normal_from_mount
 
 
+def test_an_instant_at_which_another_light_was_taken_for_a_marker_is_left_out():
+    plane = plane_from_mount(MOUNT, MARKERS)
+    a, b = two_markers(np.random.default_rng(0), 30, noise=0.3)
+    right = distance_from_span(plane, a, b, MARKERS)
+    b[7], a[11] = a[7] + 0.002, 3.0 * a[11]
+    found = distance_from_span(plane, a, b, MARKERS)
+    assert found.d == pytest.approx(right.d, abs=right.d_sigma)
+    assert found.d_sigma < 1.1 * right.d_sigma
+
+
 def test_distance_from_a_span_is_as_sure_as_it_says():
     rng, runs = np.random.default_rng(1), 300
     stated = Markers(height=0.15, positions=MARKERS.positions, span_sigma=5e-4)

@@ -312,6 +312,7 @@ def test_an_anchor_that_was_pushed_is_named_and_its_stance_comes_again(tmp_path,
 def test_a_record_gives_back_what_its_run_holds(tmp_path):
     team = reference_team()
     with Record(tmp_path / "run.mcap", team) as record:
+        assert record.newest() == 0.0
         for n in range(50):
             record.take(detections("A", 1e9 + n / 30))
             record.take(odometry("C", 1e9 + n / 20, 0.1 * n, 0.0, 0.0))

@@ -12,6 +12,7 @@ import pytest
 
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
+from coloc_graph.exchange.tum import read_tum
 from coloc_graph.pipeline.batch import solve
 from coloc_graph.results.folder import read_result
 from coloc_graph.results.measurement_table import MEASUREMENT_COLUMNS
@@ -199,6 +200,8 @@ def test_truth_that_begins_late_or_misses_robots_stops_no_estimate(short, copied
     assert "robot B is not evaluated: it has no truth" in said.err
     tables = said.out.split("x at the end")  # of the robots without truth their last poses are printed
     assert len(tables) == 2 and "\nB " in tables[1] and "\nA " in tables[0]
+    x, y = 100 * read_tum(tmp_path / "out" / "trajectories" / "B.tum").positions[-1, :2]
+    assert f"{x:.1f} +- " in tables[1] and f"{y:.1f} +- " in tables[1]
     assert list(json.loads((tmp_path / "out" / "summary.json").read_text())["accuracy"]["robots"]) == ["A"]
 
 

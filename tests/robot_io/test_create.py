@@ -99,6 +99,7 @@ def test_sensors(create, robot):
     state = create.state
     assert (state.bumps, state.cliffs, state.wheel_drops, state.charger) == (frozenset(),) * 3 + (None,)
     assert (state.voltage, state.charge, state.capacity) == pytest.approx((15.4, 2.1, 2.696))
+    assert not state.charging
     robot.cliff("front left")
     robot.wheel_drop("right")
     robot.dock()

@@ -38,6 +38,7 @@ def test_a_graph_and_its_result_are_shown_alike(graph, tmp_path):
         np.testing.assert_allclose(optimum.xyz[:, :, :2], [[[0, 0], [1, 0]], [[0, 1], [1, 1]]], atol=1e-6)
         assert stated.xyz[0, 1].tolist() == [0.8, 0.1, 0]
         assert (len(scene.odometry), len(scene.sightings)) == (2, 2)
+        assert [(one.start, one.end) for one in scene.stances] == [(0, 1), (1, 2)]
     graph.unlink()  # of the result nothing but the poses before is lost
     (layer,) = (scene := scene_of_pose_graph(tmp_path / "result")).layers
     assert layer.name == "optimum" and "the poses before are not shown" in scene.notes[0]
