@@ -83,7 +83,7 @@ def mend_lever_arms(estimator: Estimator) -> tuple[dict[str, LeverArm], StanceEs
 def _best_arm(
     estimate: Estimate, solve: Callable[[PoseGraph], Estimate], known: Container[str]
 ) -> tuple[LeverArm, Estimate] | None:
-    """The lever arm, of robots whose is not `known`, that explains most, and the estimate with it; None of none."""
+    """Most likely lever arm among robots outside `known`, and the estimate with it; None if none explains more."""
     doubted = [one.measurement for one in estimate.rejected if isinstance(one.measurement, Odometry | Sighting)]
     p_value = float(chdtrc(estimate.dof, estimate.chi2)) if estimate.dof > 0 else 1.0
     if len(doubted) < MIN_REJECTED and not estimate.bumped and p_value > DOUBTED_P_VALUE:

@@ -36,14 +36,16 @@ class InferredMoves:
     def sentence(self) -> str:
         """Description of what was inferred, and what to give."""
         said = [f"{robot} moved before stance {stance}" for robot, stance in self.moved]
+        unknown: dict[tuple[str, str], list[str]] = {}
+        for i, j, stance in self.unknown:
+            unknown.setdefault((i, j), []).append(str(stance))
         said += [
-            f"{i} or {j} moved before stance {stance}, and which of them is not known, so that neither ties it to the "
-            "stances before"
-            for i, j, stance in self.unknown
+            f"{i} or {j} moved before stance {', '.join(stances)} (not known which, so that neither is an anchor)"
+            for (i, j), stances in unknown.items()
         ]
         return (
             "nothing in the run states who moved between stances; by what the cameras measured, "
-            f"{', '.join(said)}: {REMEDY}"
+            f"{'; '.join(said)}: {REMEDY}"
         )
 
 
