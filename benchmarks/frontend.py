@@ -3,6 +3,7 @@
     python benchmarks/frontend.py [--repeats 7] [--json]
 
 - one LED at 200 grey levels over noise of 3: RMSE and bias of its centre, stated over observed variance;
+- finding and measuring the lights of a single image: two, 26, and 35 that are 4.4 px apart;
 - tracking one marker, frames a second, beside cv2.SimpleBlobDetector on the full frame: only following it, as
   that does, and with the measurement of its sub-pixel centres and their covariances;
 - a recorded run of two cameras at 100 fps, raw images, through the front end: times real time;
@@ -16,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -76,6 +78,21 @@ def centres(n: int = 1000) -> dict[str, float]:
         "bias_px": float(np.abs(np.mean(errors, axis=0)).max()),
         "stated_over_observed_variance": float((np.mean(variances, axis=0) / observed).mean()),
     }
+
+
+def single_images(repeats: int) -> dict[str, float]:
+    """Milliseconds of finding and measuring the lights of one image."""
+    grid = np.stack(np.meshgrid(np.arange(7.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+    places = {
+        "two_ms": (np.array([[100.3, 80.2], [160.7, 90.4]]), 1.5),
+        "many_ms": ([30.2, 40.4] + 38.3 * grid[:26], 1.2),
+        "close_ms": ([140.2, 110.4] + 4.4 * grid[grid[:, 0] < 6][:35], 0.8),
+    }
+    found = {}
+    for name, (uv, radius) in places.items():
+        image = render(spots(uv, radius, 220.0), background=15.0, sensor=Sensor(), rng=np.random.default_rng(0))
+        found[name] = 1e3 * seconds(partial(detect_leds, image), 10 * repeats)
+    return found
 
 
 def tracking(repeats: int, width: int = 320, height: int = 240) -> dict[str, float]:
@@ -181,6 +198,7 @@ def main() -> int:
     cv2.setNumThreads(1)
     figures = {
         "centres": centres(),
+        "single_images": single_images(args.repeats),
         "tracking": tracking(args.repeats),
         "tracking_vga": tracking(args.repeats, 640, 480),
         "real_time": real_time(args.repeats),
@@ -190,10 +208,14 @@ def main() -> int:
     if args.json:
         print(json.dumps(figures, indent=2))
         return 0
-    c, t, v, r, h, b = figures.values()
+    c, s, t, v, r, h, b = figures.values()
     print(
         f"LED centre, peak {c['peak']:.0f} over noise 3: RMSE {c['rmse_px']:.3f} px (at most 0.05), bias "
         f"{c['bias_px']:.4f} px (0.02), stated / observed variance {c['stated_over_observed_variance']:.2f}"
+    )
+    print(
+        f"lights of a single image: two {s['two_ms']:.2f} ms, 26 {s['many_ms']:.2f} ms, 35 that are 4.4 px apart "
+        f"{s['close_ms']:.1f} ms"
     )
     print(
         f"tracking one marker at 320x240: followed {t['following_fps']:.0f} frames/s, with sub-pixel centres and "
