@@ -28,7 +28,7 @@ def plan_figure(missions: Sequence[tuple[str, Mission]], floor_map: FloorMap | N
     """
     height = 2.6 if floor_map is None else 6.0
     figure = Figure(figsize=(11, height * len(missions) + 0.3), layout="constrained")
-    axes = figure.subplots(len(missions), 1, sharex=True, squeeze=False)[:, 0]
+    axes = figure.subplots(len(missions), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for axis, (name, mission) in zip(axes, missions, strict=True):
         if floor_map is not None:
             rows, columns = floor_map.distance.shape
