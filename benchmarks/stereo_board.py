@@ -50,7 +50,7 @@ class Stereo:
     """OpenCV's calibration: both cameras, T_right_left (4, 4) [m], its RMS [px], the corners.
 
     `corners` are (pairs, 2 cameras, corners, 2) [px]; `planes` (pairs, 6) are N [unit] and d [m] in the left
-    camera, by PnP, and for corners of 1 px how well: normal [deg], d [m].
+    camera, by PnP, and for corners of 1 px how well: normal [deg], d [m]. `plane_rms` is what PnP leaves, an axis [px].
     """
 
     cameras: tuple[Camera, Camera]
@@ -58,6 +58,7 @@ class Stereo:
     rms: float
     corners: Array
     planes: Array
+    plane_rms: float
 
 
 @dataclass(frozen=True)
@@ -120,9 +121,10 @@ def calibrate(corners: Array, size: tuple[int, int]) -> Stereo:
     rms, _, _, _, _, R, T, *_ = cv2.stereoCalibrate(
         boards, images[0], images[1], K1, D1, K2, D2, size, flags=cv2.CALIB_FIX_INTRINSIC
     )
-    planes = []
+    planes, left = [], []
     for seen in images[0]:
         _, turn, shift = cv2.solvePnP(board, seen, K1, D1)
+        left.append(cv2.projectPoints(board, turn, shift, K1, D1)[0].reshape(-1, 2) - seen)
         N = cv2.Rodrigues(turn)[0][:, 2]
         d = float(N @ shift.ravel())
         planes.append([*(N * np.sign(d)), abs(d), *_plane_sigmas(board, turn, shift, K1, D1)])
@@ -138,7 +140,8 @@ def calibrate(corners: Array, size: tuple[int, int]) -> Stereo:
         )
         for K, D in K_D
     ]
-    return Stereo((cameras[0], cameras[1]), se3(R, T.ravel()), float(rms), corners, np.array(planes))
+    plane_rms = float(np.sqrt(np.mean(np.square(left))))
+    return Stereo((cameras[0], cameras[1]), se3(R, T.ravel()), float(rms), corners, np.array(planes), plane_rms)
 
 
 def _plane_sigmas(board: Array, turn: Array, shift: Array, K: Array, D: Array) -> tuple[float, float]:
@@ -167,7 +170,7 @@ def benchmark(stereo: Stereo) -> dict[str, object]:
         chained = solve(run, "chain", FrontendOptions(criterion="transfer", pose="eq2"))
         reprojected = solve(run, "chain", FrontendOptions(pose="eq2"))
         smoothed = solve(run, "smooth", FrontendOptions())
-        joint = solve(bring_in(stereo, sigma, Path(folder), stereo.rms), "joint", FrontendOptions())
+        joint = solve(bring_in(stereo, sigma, Path(folder), stereo.plane_rms), "joint", FrontendOptions())
     rows = [
         _row("eq. (2), criterion transfer (the paper's)", stereo, _poses(chained)),
         _row("eq. (2), criterion reprojection", stereo, _poses(reprojected)),
@@ -199,7 +202,7 @@ def benchmark(stereo: Stereo) -> dict[str, object]:
 def bring_in(stereo: Stereo, sigma: float, folder: Path, bias: float | None = None) -> Run:
     """The corners as a user would bring them: TEAM.toml and three CSVs in `folder`, one stance a pair.
 
-    With a `bias` [px], what calibration leaves of the corners, planes have the tolerance that PnP has with it.
+    With a `bias` [px], what PnP leaves of the corners, planes have the tolerance that PnP has with it.
     """
     robots = [
         Robot(name=name, camera_if_any=camera, mount_if_any=Mount(height=0.0))
