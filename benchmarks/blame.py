@@ -203,12 +203,13 @@ def accusations(solution: Solution) -> list[set[tuple[str, str]]]:
         for rejection in solution.estimate.rejected
     ]
     for sentence in solution.warnings:
-        said += [
-            {(what, robot)}
+        named = {
+            (what, robot)
             for what in ("clock", "odometry")
             for robot in solution.run.team.names
             if f"{robot}'s {what}" in sentence or sentence.startswith(f"the {what} of {robot} ")
-        ]
+        }
+        said += [named] if named else []
     return said
 
 

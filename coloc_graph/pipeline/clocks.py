@@ -66,13 +66,18 @@ class RunClocks:
                 f"clocks are taken to differ by {1e3 * self.sigma:.0f} ms (1 sigma); take images at once, or state how "
                 "exact the clocks are as `clock_sigma` of the team"
             )
-        for robot in dict.fromkeys(robot for robot, _ in self.clocks):
+        robots = list(dict.fromkeys(robot for robot, _ in self.clocks))
+        for robot in robots:
+            doubt = ""
+            if len(robots) == 2:
+                (other,) = (one for one in robots if one != robot)
+                doubt = f"; of two clocks alone, {other}'s clock may be the wrong one"
             camera, wheels = self.clocks.get((robot, "camera")), self.clocks.get((robot, "wheels"))
             first = camera or wheels
             if first is not None:
-                said += _told(f"{robot}'s clock", first)
+                said += _told(f"{robot}'s clock", first, doubt)
             if camera and wheels and not camera.agrees(wheels):
-                said += _told(f"the clock of {robot}'s odometry", wheels)
+                said += _told(f"the clock of {robot}'s odometry", wheels, doubt)
         return said
 
 
@@ -83,8 +88,8 @@ def _error(clock: SensorClock | None, time: float) -> float:
     return next((one.error(time) for one in reversed(clock.segments) if time >= one.start), 0.0)
 
 
-def _told(name: str, clock: SensorClock) -> Iterator[str]:
-    known = f"by motion in {clock.stances} stance{'s' * (clock.stances != 1)}"
+def _told(name: str, clock: SensorClock, doubt: str) -> Iterator[str]:
+    known = f"by motion in {clock.stances} stance{'s' * (clock.stances != 1)}{doubt}"
     remedy = "the stamps were corrected; synchronise the robots' computers"
     first = clock.segments[0]
     if first.offset:
