@@ -41,10 +41,10 @@ unit: $(VENV)/installed-dev
 unit-and-types: $(VENV)/installed-dev
 	@$(MAKE) --no-print-directory -j3 ordinary realtime types
 
-ordinary:
+ordinary: $(VENV)/installed-dev
 	$(NICE) $(BIN)/pytest --numprocesses 3 --dist loadfile -m "not realtime" tests
 
-realtime:
+realtime: $(VENV)/installed-dev
 	@$(BIN)/pytest -p no:cacheprovider -m realtime >$(VENV)/realtime.log 2>&1; code=$$?; cat $(VENV)/realtime.log; exit $$code
 else
 unit: $(VENV)/installed-dev

@@ -4,8 +4,6 @@ import json
 import operator
 import os
 import re
-import subprocess
-import sys
 from functools import partial
 from types import SimpleNamespace
 
@@ -274,12 +272,6 @@ def test_a_bad_value_is_one_sentence(arguments, what, tmp_path, capsys, monkeypa
 def test_a_place_with_experiments_takes_another(tmp_path):
     (tmp_path / "fig4.json").write_text("{}")
     require_output_folder(tmp_path, "fig5")
-
-
-def test_importing_the_command_draws_nothing():
-    script = "import sys, coloc_graph.experiments; sys.exit('matplotlib' in sys.modules and 'matplotlib imported')"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_fig_4_may_be_asked_for_a_few_cells():

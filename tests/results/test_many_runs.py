@@ -26,8 +26,9 @@ def runs(tmp_path_factory, short, copied):
     """Two runs, and one that is none."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "deep").mkdir(parents=True)
-    shutil.copy(short, folder / "a.mcap")
-    copied(short, folder / "deep" / "b.mcap", stances=open_run(short).stances[:2])
+    stances = open_run(short).stances
+    copied(short, folder / "a.mcap", stances=stances[:1])
+    copied(short, folder / "deep" / "b.mcap", stances=stances[1:2])
     (folder / "bad.mcap").write_bytes(Path(short).read_bytes()[:2000])
     return folder
 
