@@ -303,6 +303,9 @@ def table(made: dict[str, Mission], found: dict[str, list[Outcome]], fps: float)
     first = next(iter(found))
     bases = [first, *(["b2"] if "b2" in found and first != "b2" else [])]
     for name, runs in found.items():
+        if not runs:
+            print(f"{name:8} no seeds yet: there was no time for one", flush=True)
+            continue
         mission = made[name]
         promised = promised_ratio(runs, mission.end_sigma)
         ratios = {
