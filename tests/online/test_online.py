@@ -46,6 +46,7 @@ def mission(tmp_path_factory, request):
         m.relay.mend()
         in_mid_stance(1)  # once more
         time.sleep(1.5)
+        m.wait_moving()
         m.killed_at = time.time()
         m.coordinator.kill()
         m.coordinator.wait()
