@@ -172,7 +172,8 @@ def test_a_run_that_went_through_a_bag_is_solved_as_it_was(imported, recorded):
         other = before.estimate.trajectories[name]
         off = np.abs(trajectory.positions - other.positions).max()
         assert off < 2e-4, name  # half a window off each stance's ends; a tenth of a sigma
-        np.testing.assert_allclose(trajectory.covariances, other.covariances, atol=0.5 * other.covariances.max())
+        # errors that a stance shares are learnt from two stances, within a factor of two
+        np.testing.assert_allclose(trajectory.covariances, other.covariances, atol=other.covariances.max())
 
 
 def test_odometry_may_have_its_errors_stated(recorded, bring_in):
