@@ -196,10 +196,14 @@ class LinearSystem:
         return np.where(self.keys.free, step, 0.0)
 
     def summed_up(self, gone: Index) -> "Summary":
-        """Eliminate some keys and return their marginal on the others."""
-        ordering = gtsam.Ordering()
-        for key in gone.tolist():
-            ordering.push_back(key)
+        """Eliminate some keys and return their marginal on the others.
+
+        They are in the order of the whole graph: one robot after the other would tie all poses of the others.
+        """
+        whole, ordering, some = self.ordering(), gtsam.Ordering(), set(gone.tolist())
+        for key in (int(whole.at(n)) for n in range(whole.size())):
+            if key in some:
+                ordering.push_back(key)
         try:
             _, rest = self._whole().eliminatePartialMultifrontal(ordering)
         except RuntimeError as failure:
