@@ -15,6 +15,8 @@ import numpy as np
 from monte_carlo import MemoryRun, over_seeds, simulated
 
 from coloc_graph.backend import Bump, joint
+from coloc_graph.backend.batch import faults_of
+from coloc_graph.backend.blame import bumps_of
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.pipeline.incremental import StanceSolver
 from coloc_graph.run import Detections
@@ -70,7 +72,7 @@ def one_seed(seed: int) -> dict[str, bool]:
         return solver
 
     def bumps(solver: StanceSolver) -> tuple[Bump, ...]:
-        return solver.estimator.bumps(solver.estimator.faults())
+        return bumps_of(faults_of(solver.estimator.method, solver.estimator.graph), solver.estimator.graph)
 
     def named(solver: StanceSolver) -> bool:
         return any((b.stay_put.robot, b.stay_put.after) == (anchor, k) for b in bumps(solver))

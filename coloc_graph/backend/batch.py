@@ -12,6 +12,7 @@ from coloc_graph.backend.blame import (
     SEARCHED,
     SIGMAS_ALONE,
     TESTED,
+    Fault,
     WarmStart,
     bumps_of,
     find_faults,
@@ -228,3 +229,8 @@ def _innovation(fit: Fit, link: Link) -> Agreement:
     if not all(map(fit.values.exists, factor.keys())):
         return UNCHECKED
     return innovation([factor], fit.values, fit.marginals.joint(list(factor.keys())))
+
+
+def faults_of(method: Method, graph: PoseGraph) -> tuple[Fault, ...]:
+    """Find what explains that a graph contradicts itself, the most significant first."""
+    return with_stack(len(graph.nodes), lambda: find_faults(method, graph, None)[0])

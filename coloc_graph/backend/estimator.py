@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend import checkpoint
 from coloc_graph.backend.batch import joint, smooth
-from coloc_graph.backend.blame import Fault, bumps_of, find_faults
 from coloc_graph.backend.calibration import Variables
 from coloc_graph.backend.checkpoint import Base, Entry, WaitingStance, base_of
 from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
-from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstimate, rejection_of
+from coloc_graph.backend.estimate import Estimate, Rejection, StanceEstimate, rejection_of
 from coloc_graph.backend.factors import Factors, Method, require_robot_models
 from coloc_graph.backend.fixed_lag import LAG, MAX_STANCES_PER_LAG
 from coloc_graph.backend.graph import (
@@ -34,7 +33,6 @@ from coloc_graph.backend.graph import (
 from coloc_graph.backend.insertion import InsertionPlan, InsertionPlanner
 from coloc_graph.backend.isam2_graph import Isam2Graph, rebuilt
 from coloc_graph.backend.landmarks import StaticPose, landmarks_of, map_positions, positions_of
-from coloc_graph.backend.solver import with_stack
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError, MeasurementError
 from coloc_graph.measurements import Measurement, Node, Range, RelativePose, Sighting
@@ -252,15 +250,6 @@ class Estimator:
         """
         optimised = joint if self.robot_models else smooth
         return optimised(self.graph, start=self._live.values() if self._live.tied else None)
-
-    def faults(self) -> tuple[Fault, ...]:
-        """Find what explains contradictions, by all inputs, rejected ones included; takes a few batch fits."""
-        graph = self.graph
-        return with_stack(len(graph.nodes), lambda: find_faults(self.method, graph, None)[0])
-
-    def bumps(self, faults: Iterable[Fault]) -> tuple[Bump, ...]:
-        """Return the bumps among `faults`."""
-        return bumps_of(faults, self.graph)
 
     def add(
         self, stance: Stance, measurements: Iterable[Measurement] = (), *, after: int | None = None

@@ -1,6 +1,5 @@
 """Measure the homography and the relative pose between two observers in one stance, from images or detections."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -24,8 +23,15 @@ from coloc_graph.frontend.homography.plane_view import (
     view_of_plane,
 )
 from coloc_graph.frontend.homography.refinement import Criterion
+from coloc_graph.frontend.homography.scatter import spread_of
 from coloc_graph.frontend.landmarks import SeenLandmarks
-from coloc_graph.frontend.pairing.clock_offset import ClockOffset, find_offset, fit_at_offset, require_searchable
+from coloc_graph.frontend.pairing.clock_offset import (
+    NOT_OBSERVABLE,
+    ClockOffset,
+    find_offset,
+    fit_at_offset,
+    require_searchable,
+)
 from coloc_graph.frontend.pairing.correspondence import (
     PAIRING_WINDOW,
     Correspondences,
@@ -48,13 +54,8 @@ from coloc_graph.team import Camera, Markers, Team
 
 Array = NDArray[np.float64]
 
-MAX_SIGMA_RATIO = 0.5  # of a clock offset to its prior, above which the offset counts as not observed
 LITTLE_IN_COMMON = 30  # points below which two of many observers may be left unmeasured without a warning
 WELL_EXPLAINED = 0.8  # share of inliers from which on no other tracks are tried
-NOT_OBSERVABLE = (
-    "the clock offset is not observable, since the mover drove at constant speed: let it stop and go "
-    "(the offset stays at its prior, `clock_sigma`, which the poses of movers that they sighted contain)"
-)
 
 #: Source of the marker plane's distance.
 Scale = Literal["heights", "span"]
@@ -163,12 +164,6 @@ class _Seen:
             return one.camera, other.camera
         down = other.mount.R_body_camera.T @ np.array([0.0, 0.0, -1.0])
         return view_of_plane(one.camera, self.plane.N), view_of_plane(other.camera, down)
-
-    @property
-    def spread(self) -> float:
-        """Standard deviation of the logarithms of stances' variances; 0 where no camera's noise is known."""
-        noises = (self.team[name].camera.centre_noise for name in (self.robot_i, self.robot_j))
-        return math.sqrt(sum(one.spread**2 for one in noises if one is not None) / 2)
 
 
 def little_in_common(measured: HomographyMeasurement, stance: Stance) -> bool:
@@ -312,7 +307,7 @@ def _measured_from(seen: _Seen, found: Correspondences, team: Team) -> PairMeasu
     again = partial(_measured_from, seen, found)
     found = with_noise(found, seen.cameras, now.cameras)
     try:
-        made = _measured(now, found, fit_homography(found.pairs, seen.options.criterion, now.spread))
+        made = _measured(now, found, fit_homography(found.pairs, seen.options.criterion, spread_of(*now.cameras)))
     except DegenerateGeometry as why:
         made = PairMeasurement(_unusable(seen.stance, seen.robot_i, seen.robot_j, found, str(why)), None, found)
     return replace(made, with_team=again)
@@ -329,7 +324,7 @@ def _measure_at_offset(
     seen, found = replace(seen, team=team or seen.team), rough
     try:
         tracks = PairedTracks(seen.tracks_i, seen.tracks_j, chosen, *seen.cameras)
-        clock = fit_at_offset(tracks, offset, seen.options.criterion, seen.spread)
+        clock = fit_at_offset(tracks, offset, seen.options.criterion, spread_of(*seen.cameras))
         found = clock.found
         made = _measured(seen, found, clock.fit, clock.offset, clock.by_offset)
     except DegenerateGeometry as why:
@@ -361,13 +356,12 @@ def _measured(
     measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
     measurement = replace(measurement, share=own, doubt=doubt)
     if offset is not None:
-        said = seen.team.clock_sigma
         measurement = replace(
             measurement,
             time_offset=offset.value,
             time_offset_sigma=offset.sigma,
             by_time_offset=by_offset,
-            warning=NOT_OBSERVABLE if offset.sigma > MAX_SIGMA_RATIO * said else None,
+            warning=None if offset.is_observed(seen.team.clock_sigma) else NOT_OBSERVABLE,
         )
     measurement = measured_between_cameras(measurement, *seen.cameras)
     if seen.options.scale == "span":

@@ -6,6 +6,8 @@ from concurrent.futures import Future
 from typing import TypeVar
 
 from coloc_graph.backend import Bump
+from coloc_graph.backend.batch import faults_of
+from coloc_graph.backend.blame import bumps_of
 from coloc_graph.backend.cause import to_check
 from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.frontend import FrontendOptions, StanceTracks
@@ -129,9 +131,9 @@ def enter_stance(
         raise RobotError(f"stance {stance.index} cannot enter the estimate: {error}") from error
     if not one.estimate.rejected and one.estimate.agreement.p_value() > CONTRADICTED:
         return one
-    faults = solver.estimator.faults()
+    faults = faults_of(solver.estimator.method, solver.estimator.graph)
     seen = [fault for fault in faults if any(cause.is_seen_in(stance.index) for cause in fault.causes)]
-    bumped = [bump for bump in solver.estimator.bumps(faults) if bump.stay_put.after == stance.index]
+    bumped = [bump for bump in bumps_of(faults, solver.estimator.graph) if bump.stay_put.after == stance.index]
     if retake and seen:
         solver.withdraw()
         causes = seen[0].causes

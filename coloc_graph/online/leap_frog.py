@@ -16,7 +16,7 @@ from coloc_graph.online.journal import row_of, row_of_entered
 from coloc_graph.online.leap_planner import Situation, StancePlan, StancePlanner
 from coloc_graph.online.mission import MissionOptions, roles
 from coloc_graph.online.mission_log import MissionLog
-from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateChange, StateMachine
+from coloc_graph.online.mission_states import NEXT_STATES, WAITING, MissionState, StateChange, StateMachine
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.stance_attempt import OUT_OF_VIEW, StanceAttempt
 from coloc_graph.online.visibility import InView, Precision
@@ -34,16 +34,6 @@ COLLECT_TIME = 30.0  # longest time until the last images have come [s]
 HOLD_TIME = 120.0  # longest time until what is wrong is put right [s]
 CALM = 0.5  # robots are well for this time before the mission goes on [s]
 RECOVER_PERIOD = 1.0  # robots that stopped for a reason are told to recover after this time [s]
-
-#: States in which all robots stand and wait: nothing that happens to them there voids a stance.
-_WAITING = {
-    MissionState.GATHERING,
-    MissionState.SYNCHRONISING,
-    MissionState.HOLDING,
-    MissionState.PLANNING,
-    MissionState.COLLECTING,
-    MissionState.ESTIMATING,
-}
 
 
 class LeapFrog:
@@ -93,7 +83,6 @@ class LeapFrog:
         self._missing: tuple[str, ...] = ()  # observers that did not see the mover in the last attempt
         self._captures = machine.time_ns() // 1_000_000  # capture numbers are unique across coordinators
         self._recovered = -math.inf
-        self._warned: set[str] = set()
         self._steps = {
             MissionState.GATHERING: self._gather,
             MissionState.SYNCHRONISING: self._synchronise,
@@ -143,10 +132,7 @@ class LeapFrog:
         text = f"stance {self._index}: {self.states.now}"
         if self.states.now in (MissionState.CAPTURING, MissionState.TURNING_BACK) and self.attempt is not None:
             found = self.attempt.precision
-            if found is not None:
-                text += f", {found.points} points"
-                if not found.why:
-                    text += f", {1e3 * found.place:.1f} mm, {math.degrees(found.heading):.2f} deg"
+            text += "" if found is None else f", {found}"
         return text
 
     # states
@@ -327,7 +313,9 @@ class LeapFrog:
         self._registry.follow(one)
         self._decisions.take(one, self._registry.poses())
         self._log.note("entered", **row_of_entered(one), latency=round(latency, 4))
-        self._note_warnings(one)
+        # what another attempt cannot cure: clocks and wheels that are wrong
+        outliers = [f"the {other.measurement} was rejected: it is {other.reason}" for other in one.estimate.rejected]
+        self._log.warn([*one.warnings, *outliers])
         if self._on_stance is not None:
             self._on_stance(one)
         self._failures, self.attempt = 0, None
@@ -360,7 +348,7 @@ class LeapFrog:
 
     def _trouble(self) -> str | None:
         """Describe why the present state cannot go on; None if it can."""
-        if self.states.now in _WAITING:
+        if self.states.now in WAITING:
             return None
         for name, robot in self._registry.robots.items():
             why = robot.trouble(drives=self._plan is not None and self._plan.drives(name, self.mover))
@@ -400,14 +388,6 @@ class LeapFrog:
             self._log.note("bumped", robot=robot, text=text)
         if reasons:
             raise RobotError("; ".join(reasons.values()))
-
-    def _note_warnings(self, one: EnteredStance) -> None:
-        """Note what another attempt cannot cure: clocks and wheels that are wrong, once each."""
-        outliers = [f"the {other.measurement} was rejected: it is {other.reason}" for other in one.estimate.rejected]
-        for text in (*one.warnings, *outliers):
-            if text not in self._warned:
-                self._warned.add(text)
-                self._log.note("warning", text=text)
 
     # the stance
 

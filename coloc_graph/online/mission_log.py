@@ -2,7 +2,7 @@
 
 import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -24,6 +24,7 @@ class MissionLog:
 
     def __init__(self, path: Path, now: Callable[[], float]) -> None:
         self._path, self._now = path, now
+        self._warned: set[str] = set()
         self._file = machine.opened(path.open("a", encoding="utf-8"))
 
     def note(self, what: str, **more: object) -> None:
@@ -42,6 +43,13 @@ class MissionLog:
             raise RunError(
                 f"{self._path}: cannot be written ({error.strerror}); check the folder and the space on the disk"
             ) from error
+
+    def warn(self, texts: Iterable[str]) -> None:
+        """Add a line for each warning that was not in the log yet."""
+        for text in texts:
+            if text not in self._warned:
+                self._warned.add(text)
+                self.note("warning", text=text)
 
     def __enter__(self) -> Self:
         return self

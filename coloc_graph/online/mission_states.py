@@ -43,6 +43,17 @@ NEXT_STATES: dict[MissionState, tuple[MissionState, ...]] = {
 }
 
 
+#: States in which all robots stand and wait: nothing that happens to them there voids a stance.
+WAITING = {
+    MissionState.GATHERING,
+    MissionState.SYNCHRONISING,
+    MissionState.HOLDING,
+    MissionState.PLANNING,
+    MissionState.COLLECTING,
+    MissionState.ESTIMATING,
+}
+
+
 @dataclass(frozen=True)
 class StateChange:
     """A state that began at `time` [s, monotonic clock] in a stance, and the reason."""

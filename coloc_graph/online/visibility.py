@@ -170,6 +170,10 @@ class Precision:
     heading: float
     why: str = ""
 
+    def __str__(self) -> str:
+        known = "" if self.why else f", {1e3 * self.place:.1f} mm, {math.degrees(self.heading):.2f} deg"
+        return f"{self.points} points{known}"
+
     def suffices(self, options: MissionOptions) -> bool:
         """Return whether the precision is what a mission asks for."""
         return (

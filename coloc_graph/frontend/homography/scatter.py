@@ -11,6 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.team import Camera
+
 Array = NDArray[np.float64]
 
 OUTLYING = 3.0  # standard deviations from the run's scatter beyond which a fit is judged by itself
@@ -40,6 +42,12 @@ def variance_factor(chi2: float, dof: float, spread: float) -> float:
         return chi2 / dof
     share = spread**2 / (spread**2 + chance)
     return math.exp(share * (math.log(chi2 / dof) + 1 / dof) + share * chance / 2)
+
+
+def spread_of(camera_i: Camera, camera_j: Camera) -> float:
+    """Return the standard deviation of the logarithms of fits' variances; 0 where no camera's noise is known."""
+    noises = camera_i.centre_noise, camera_j.centre_noise
+    return math.sqrt(sum(one.spread**2 for one in noises if one is not None) / 2)
 
 
 def learn_spread(chi2: Array, dof: Array, level: float, median: float, factor: float) -> tuple[float, float]:

@@ -4,8 +4,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
-from coloc_graph.frontend.pairing.clock_offset import DISAGREEMENT, ClockOffset, fuse
-from coloc_graph.frontend.stance import MAX_SIGMA_RATIO, NOT_OBSERVABLE, PairMeasurement
+from coloc_graph.frontend.pairing.clock_offset import DISAGREEMENT, NOT_OBSERVABLE, ClockOffset, fuse
+from coloc_graph.frontend.stance import PairMeasurement
 
 
 def share_clock_offsets(
@@ -43,7 +43,7 @@ def share_clock_offsets(
                 f"the stances disagree on the clock offset of {pair[0]} and {pair[1]} ({min(values):.1f} to "
                 f"{max(values):.1f} ms): the clocks drift or were set during the run; synchronise them, or split it"
             )
-        if fused[pair].sigma > MAX_SIGMA_RATIO * clock_sigma:
+        if not fused[pair].is_observed(clock_sigma):
             warnings.append(f"{pair[0]} and {pair[1]}: {NOT_OBSERVABLE}")
     shared = []
     for one in measurements:

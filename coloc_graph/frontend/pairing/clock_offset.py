@@ -37,6 +37,11 @@ Array = NDArray[np.float64]
 Used = NDArray[np.bool_]
 
 MAX_CLOCK_SIGMA = 0.25  # s, of clocks whose offset is searched for
+NOT_OBSERVABLE = (
+    "the clock offset is not observable, since the mover drove at constant speed: let it stop and go "
+    "(the offset stays at its prior, `clock_sigma`, which the poses of movers that they sighted contain)"
+)
+MAX_SIGMA_RATIO = 0.5  # of a clock offset to its prior, above which the offset counts as not observed
 SEARCH_SIGMAS = 4.0  # standard deviations of the prior within which the offset is searched
 MAX_SEARCH_STEPS = 41  # offsets that are tried at most
 NOISE_SIGMAS = 4.0  # standard deviations of noise that the information on the offset must exceed
@@ -49,6 +54,10 @@ class ClockOffset:
 
     value: float
     sigma: float
+
+    def is_observed(self, clock_sigma: float) -> bool:
+        """Return whether it is known better than from its prior."""
+        return self.sigma <= MAX_SIGMA_RATIO * clock_sigma
 
     def reversed(self) -> "ClockOffset":
         """Return the offset clock_i - clock_j."""
