@@ -66,7 +66,7 @@ def test_what_it_expects_at_the_start_it_finds_at_the_end(straight):
     first = mission.promises[0].belief
     expected = planner.next(first, 60.0 - mission.plan.stances[0].duration).expected
     found = math.hypot(mission.end_sigma, HEADING_ARM * mission.heading_sigma)
-    assert found == pytest.approx(expected, rel=0.06)
+    assert found == pytest.approx(expected, rel=0.1)
 
 
 def test_no_second_that_is_left_is_free_to_spend(straight):

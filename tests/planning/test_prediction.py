@@ -11,7 +11,7 @@ from coloc_graph.evaluation import align
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.batch import solve
 from coloc_graph.pipeline.options import SolveOptions
-from coloc_graph.planning.belief import Belief, leap_model, updated
+from coloc_graph.planning.belief import WHEELS, Belief, leap_model, updated
 from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.mission import best_stance, leap_frog
 from coloc_graph.planning.prediction import Predictor
@@ -36,9 +36,9 @@ def estimated(plan, folder, seed, imperfections=FIELD, **options):
     return world, solve(open_run(folder / f"{seed}.mcap"), SolveOptions("joint", **options)).estimate
 
 
-def predicted(plan, team, **options):
+def predicted(plan, team, *, odometry=True):
     start = Belief.start(team, {**plan.stances[0].standing, "C": (1.5, 0.0, 0.0)})
-    return Predictor(team, fps=10.0, **options).of_plan(start, plan)
+    return Predictor(team, fps=10.0, wheels=WHEELS if odometry else None).of_plan(start, plan)
 
 
 @pytest.mark.parametrize(("gait", "seconds"), [(Gait(0.8, 0.6, 10.0), 16.0), (PAPER, 6.0)])
