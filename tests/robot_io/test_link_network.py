@@ -246,7 +246,7 @@ def test_5_percent_loss_50_ms_jitter_and_cuts_lose_nothing(network, lengths):
     print(f"    {sent['sent']} sent, came: {len(heard['samples'])} samples, {len(heard['wheels'])} wheels")
     for kind in ("samples", "wheels"):
         assert heard[kind] == list(range(len(heard[kind])))
-        assert len(heard[kind]) == sent["sent"] > 500
+        assert len(heard[kind]) == sent["sent"] > 200
     assert heard["missed"] == 0
     asked = {number: begin for number, begin, _, _ in heard["asked"]}
     done = [number for number, _ in sent["done"]]
