@@ -135,6 +135,8 @@ def test_the_layout_is_written_beside_it_and_nothing_is_overwritten(exported, re
     assert "exists" in capsys.readouterr().err
     assert main(["export", "g2o", str(result), "--out", str(exported) + "x", "--layout"]) == 2
     assert "--layout applies to foxglove" in capsys.readouterr().err
+    assert main(["export", "g2o", str(result), "--out", str(exported) + "x", "--truth"]) == 2
+    assert "--truth applies to tum and ros2" in capsys.readouterr().err
 
 
 def test_truth_is_exported_as_tum(result, tmp_path, capsys):

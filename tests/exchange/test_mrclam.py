@@ -52,7 +52,10 @@ def test_commands_are_followed_to_where_they_lead(made, tmp_path):
 
 
 def test_without_a_map_the_landmarks_positions_are_in_the_truth_alone(made, tmp_path):
-    import_mrclam(made.path, tmp_path / "run.mcap", map_known=False)
+    command = ["import", "mrclam", str(made.path), "--out", str(tmp_path / "run.mcap")]
+    assert main(command) == 0
+    assert all(one.position for one in open_run(tmp_path / "run.mcap").team.landmarks)
+    assert main([*command, "--map-unknown", "--force"]) == 0
     assert all(one.position is None for one in open_run(tmp_path / "run.mcap").team.landmarks)
     true = read_true_team(tmp_path / "run.mcap")
     assert true.landmarks[0].position == pytest.approx(LANDMARKS[6])
