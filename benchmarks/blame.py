@@ -150,7 +150,7 @@ def bumped(run: MemoryRun, fault: Fault) -> MemoryRun:
     )
     moved = replace(path, times=times, knots=knots)
     made = type(run)(replace(world, paths={**world.paths, fault.robot: moved}, captures=captures))
-    made.bumped_before = fault.stance  # type: ignore[attr-defined]
+    made.bumped_before = fault.stance
     for robot in run.team.names:  # no wheel feels it
         made._odometry[robot] = list(run.odometry(robot))
     return made
@@ -199,7 +199,7 @@ def accusations(solution: Solution) -> list[set[tuple[str, str]]]:
         for bump in solution.estimate.bumped
     ]
     said += [
-        {one for cause in (Cause((rejection.measurement,)), *rejection.alternative) for one in accused(cause)}  # type: ignore[arg-type]
+        {one for cause in (Cause((rejection.measurement,)), *rejection.alternative) for one in accused(cause)}
         for rejection in solution.estimate.rejected
     ]
     for sentence in solution.warnings:
@@ -292,7 +292,7 @@ def world_of(seed: int, variant: str = "usual") -> MemoryRun:
 
 def healthy_world(number: int, variant: str) -> list[dict[str, Any]]:
     """Solve a world without a fault, and return its accusations and warnings as one row."""
-    solution = solve(world_of(number, variant), SolveOptions())  # type: ignore[arg-type]
+    solution = solve(world_of(number, variant), SolveOptions())
     said = [sorted(one) for one in accusations(solution)]
     return [{"kind": "healthy", "world": number, "said": said, "innocent": bool(said), "warnings": solution.warnings}]
 
@@ -300,8 +300,8 @@ def healthy_world(number: int, variant: str) -> list[dict[str, Any]]:
 def faulty_world(number: int, variant: str) -> list[dict[str, Any]]:
     """Return one row for each fault of runs with one fault of each kind, or two, drawn in the same world."""
     world = world_of(number, variant)
-    batch.measure_stance = measure = Measured()  # type: ignore[assignment]
-    healthy = solve(world, SolveOptions()).estimate  # type: ignore[arg-type]
+    batch.measure_stance = measure = Measured()
+    healthy = solve(world, SolveOptions()).estimate
     singles = [(kind,) for kind in (SEEN_KINDS if variant == "images" else KINDS)]
     return [row for kinds in (PAIRS if variant == "two" else singles)
             for row in faulted(world, healthy, measure, number, kinds)]  # fmt: skip
@@ -323,7 +323,7 @@ def faulted(
         effect_alone = effect(with_faults(world, [fault]), healthy, measure)
         rows.append({**row, "size": round(fault.size, 3), "effect": effect_alone, "of": list(kinds)})
     try:
-        solution = solve(with_faults(world, faults), SolveOptions())  # type: ignore[arg-type]
+        solution = solve(with_faults(world, faults), SolveOptions())
     except Exception as error:  # one failure must not end the others
         return [{**row, "error": f"{type(error).__name__}: {error}"} for row in rows]
     said = [sorted(one) for one in accusations(solution)]

@@ -79,10 +79,10 @@ def one_seed(seed: int) -> dict[str, bool]:
 
     healthy = up_to(k + 1)
     bumped = up_to(k)
-    said = bumped.enter(pushed, run.stances[k]).estimate  # type: ignore[arg-type]
+    said = bumped.enter(pushed, run.stances[k]).estimate
     wrong = up_to(k)
     good = wrong.measure(run, run.stances[k])
-    bad = wrong.measure(pushed, run.stances[k])  # type: ignore[arg-type]
+    bad = wrong.measure(pushed, run.stances[k])
     mixed = (replace(a, relative_pose=b.relative_pose, homography=b.homography) for a, b in zip(good, bad, strict=True))
     wrong.enter(run, run.stances[k], tuple(mixed))
     wrong.enter(run, run.stances[k + 1])

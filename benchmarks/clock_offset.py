@@ -97,7 +97,7 @@ def _steady(world: World, motion: str, seed: int) -> Path:
 def measured(world: World, clock_sigma: float) -> tuple[PairMeasurement, ...]:
     """All stances' measurements with one offset, the clocks said to agree to `clock_sigma` [s]."""
     run = MemoryRun(replace(world, team=msgspec.structs.replace(world.team, clock_sigma=clock_sigma)))
-    every = [measure_pair(run, stance, *stance.observers, FrontendOptions()) for stance in run.stances]  # type: ignore[arg-type]
+    every = [measure_pair(run, stance, *stance.observers, FrontendOptions()) for stance in run.stances]
     return share_clock_offsets(every, clock_sigma)[0]
 
 
@@ -146,7 +146,7 @@ def row_of(name: str, seeds: int) -> dict[str, float]:
     """The figures of one motion."""
     runs = over_seeds(partial(one_seed, name=name), range(seeds))
     off, sigma = (np.array([run[key] for run in runs]) for key in ("offset_ms", "sigma_ms"))
-    alone = np.array([one for run in runs for one in run["alone"]]).reshape(-1, 2)  # type: ignore[attr-defined]
+    alone = np.array([one for run in runs for one in run["alone"]]).reshape(-1, 2)
     row = {
         "offset_rms_ms": _rms(off),
         "offset_sigma_ms": float(sigma.mean()),

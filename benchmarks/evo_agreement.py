@@ -129,7 +129,7 @@ def rows_of(evo_dir: Path, n: int, folder: Path) -> list[dict[str, object]]:
         for alignment, options in ALIGNED.items():
             if name == "team" and alignment == "reference":
                 continue
-            one = of_files([str(folder / f"{name}.est")], [str(folder / f"{name}.true")], alignment)  # type: ignore[arg-type]
+            one = of_files([str(folder / f"{name}.est")], [str(folder / f"{name}.true")], alignment)
             (robot,) = one.estimated
             at = align(one.estimated, one.truth, one.reference, on_floor=False, alignment=one.alignment)[robot]
             distance, angle = absolute_errors(one.estimated[robot].T_world_body, at)
@@ -139,7 +139,7 @@ def rows_of(evo_dir: Path, n: int, folder: Path) -> list[dict[str, object]]:
                 continue
             for length in DISTANCES if alignment == "none" else (2.0,):
                 for source in ("estimate", "truth"):
-                    both = relative_errors(one.estimated[robot].T_world_body, at, length, source)  # type: ignore[arg-type]
+                    both = relative_errors(one.estimated[robot].T_world_body, at, length, source)
                     pairs = ["--pairs_from_reference"] if source == "truth" else []
                     delta = ["-d", str(length), "-u", "m", "--all_pairs", *pairs, *options]
                     what = f"RPE {length:g} m, pairs of the {source}, {alignment}"
@@ -187,7 +187,7 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         rows = rows_of(options.evo.resolve(), options.poses, Path(folder))
-    worst = {case: max(row["difference"] for row in rows if row["case"] == case) for case in {r["case"] for r in rows}}  # type: ignore[type-var]
+    worst = {case: max(row["difference"] for row in rows if row["case"] == case) for case in {r["case"] for r in rows}}
     if options.json:
         print(json.dumps({"rows": rows, "largest_difference": worst}, indent=1))
     else:

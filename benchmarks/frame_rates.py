@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import msgspec
 import numpy as np
@@ -46,7 +47,7 @@ class Scene:
     step: float  # median step of a light [px]
 
     path = Path("scene")
-    planes = {}  # noqa: RUF012
+    planes: ClassVar[dict] = {}  # none is stated
 
     def has_detections(self, robot: str) -> bool:
         """As `Run`."""
@@ -97,7 +98,7 @@ def _sized(team: Team, width: int, fps: float) -> Team:
 def measured(fps: float, speed: float, width: int, seed: int) -> dict[str, object]:
     """Measure one stance: used or the reason, errors [m], [deg], and steps [px]."""
     one = scene(fps, speed, width, seed)
-    made = measure_pair(one, one.stance, "A", "B", FrontendOptions())  # type: ignore[arg-type]
+    made = measure_pair(one, one.stance, "A", "B", FrontendOptions())
     row: dict[str, object] = {"fps": fps, "speed": speed, "width": width, "seed": seed, "step": one.step,
                               "within": one.within, "unusable": made.homography.unusable}  # fmt: skip
     if made.relative_pose is not None:
@@ -140,9 +141,9 @@ def _line(rows: list[dict[str, object]]) -> str:
     used = [row for row in rows if "error_m" in row]
     if not rows:
         return "none"
-    swaps = sum(row["error_m"] > 0.02 or row["error_deg"] > 2 for row in used)  # type: ignore[operator]
+    swaps = sum(row["error_m"] > 0.02 or row["error_deg"] > 2 for row in used)
     off = 1e3 * float(np.median([row["error_m"] for row in used])) if used else float("nan")
-    step = float(np.median([row["step"] for row in rows]))  # type: ignore[call-overload]
+    step = float(np.median([row["step"] for row in rows]))
     return f"median step {step:.1f} px, {len(used)} of {len(rows)} used, median error {off:.2f} mm, swaps {swaps}"
 
 

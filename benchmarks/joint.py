@@ -285,11 +285,11 @@ def draw(table: dict[str, list[dict[str, float]]], path: Path) -> None:
 def speed() -> dict[str, float]:
     """Seconds to solve 40 stances from tracks; milliseconds of an update at stance 40 and about stance 1000."""
     run = MemoryRun(simulated("hallway", 0, points=250, stances=40, imperfections=WRONG))
-    solve(run, SolveOptions("joint"))  # type: ignore[arg-type]  # what is drawn when it is asked for is then there
+    solve(run, SolveOptions("joint"))  # what is drawn when it is asked for is then there
     seconds = []
     for _ in range(5):
         started = time.perf_counter()
-        solution = solve(run, SolveOptions("joint"))  # type: ignore[arg-type]
+        solution = solve(run, SolveOptions("joint"))
         seconds.append(time.perf_counter() - started)
     figures = {"batch_40_s": min(seconds), "backend_40_s": solution.seconds_backend}
     _, updates = replay(solution.estimate.graph, "joint")

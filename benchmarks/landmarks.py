@@ -76,7 +76,7 @@ def of_seed(seed: int, mode: str, length: float, laps: int) -> Outcome:
     what = scenario("landmarks", length=length, laps=laps, rng=stream(seed, "formation"))
     world = build_world(what, seed=seed, points=100, imperfections=FIELD, known=mode == "known")
     run = MemoryRun(world) if mode != "none" else blind(MemoryRun(world))
-    solution = solve(run, SolveOptions())  # type: ignore[arg-type]
+    solution = solve(run, SolveOptions())
     estimate = solution.estimate
     true = align(estimate.trajectories, truth_of(world), "A", on_floor=True)
     accuracy = evaluate(estimate.trajectories, true, on_floor=True)

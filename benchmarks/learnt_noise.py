@@ -81,7 +81,7 @@ def simple_blobs(image: NDArray[np.uint8]) -> tuple[Array, Array, NDArray[np.boo
     p.blobColor, p.minArea, p.maxArea = 255, 4, 400
     p.filterByCircularity = p.filterByConvexity = p.filterByInertia = False
     p.minThreshold, p.maxThreshold, p.thresholdStep, p.minDistBetweenBlobs = 40, 220, 10, 3
-    uv = np.array([one.pt for one in cv2.SimpleBlobDetector_create(p).detect(image)])  # type: ignore[attr-defined]
+    uv = np.array([one.pt for one in cv2.SimpleBlobDetector_create(p).detect(image)])
     return uv, np.tile(1e-4 * np.eye(2), (len(uv), 1, 1)), np.zeros(len(uv), bool)
 
 

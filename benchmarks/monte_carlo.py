@@ -96,7 +96,7 @@ def simulated(name: str, seed: int, *, points: int, **options: Any) -> World:
 
 def solved(world: World, options: SolveOptions) -> tuple[Solution, Accuracy]:
     """A world solved and compared with its truth."""
-    solution = solve(MemoryRun(world), options)  # type: ignore[arg-type]
+    solution = solve(MemoryRun(world), options)
     return solution, compared(world, solution.estimate.trajectories)
 
 

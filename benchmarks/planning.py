@@ -121,7 +121,7 @@ def outcome(seed: int, plan: Plan, fps: float, depth: str, floor_plan: FloorPlan
     """Simulate a seed that follows a plan, solve it and compare with its truth."""
     try:
         scenario = planned(plan, stream(seed, "formation"), floor_plan)
-        world = build_world(scenario, seed=seed, fps=fps, imperfections=WRONG, depth=depth)  # type: ignore[arg-type]
+        world = build_world(scenario, seed=seed, fps=fps, imperfections=WRONG, depth=depth)
         solution = solved(world, SolveOptions("joint"))[0] if depth == "tracks" else from_images(world)
     except ColocError as error:
         return Outcome(failed=str(error), stances=len(plan.stances))

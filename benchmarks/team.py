@@ -72,7 +72,7 @@ class Figures:
 def of_seed(seed: int, robots: int, stances: int) -> Figures:
     """One run, solved whole and as a tree."""
     world = world_of(robots, stances, seed)
-    solution = solve(MemoryRun(world), SolveOptions())  # type: ignore[arg-type]
+    solution = solve(MemoryRun(world), SolveOptions())
     graph = solution.estimate.graph
     tied = {id(step.link) for step in spanning_tree(graph, graph.links)}
     alone = joint(replace(graph, measurements=tuple(m for m in graph.measurements if id(m) in tied)), reject=False)
@@ -156,7 +156,7 @@ def blinking_seed(seed: int, robots: int, stances: int, clock: float) -> list[di
         world = build_team_world(what, seed=seed, points=2000, imperfections=wrong, team=team)
         run = MemoryRun(world)
         with patch.object(stance_solver, "StanceTracks", StanceTracks if blinks else Coloured):
-            solution = solve(run, SolveOptions())  # type: ignore[arg-type]
+            solution = solve(run, SolveOptions())
         rms, promised, anees = _errors(solution.estimate, world)
         poses = [m.relative_pose for m in solution.measurements if m.relative_pose is not None]
         row = {"square": rms**2, "promised": promised**2, "anees": anees, "homographies": solution.used,
@@ -171,7 +171,7 @@ def _whose(run: MemoryRun, world: World) -> dict[str, float]:
     """Count samples of tracks of the right robot, of none, and of a wrong one."""
     right = undecided = wrong = 0
     for k, stance in enumerate(run.stances):
-        tracks = StanceTracks(run, stance)  # type: ignore[arg-type]
+        tracks = StanceTracks(run, stance)
         for seen in observe(world, k):
             for track in tracks.of(seen.robot):
                 middle = len(track) // 2
@@ -201,7 +201,7 @@ def sized(robots: int, stances: int) -> dict[str, float]:
     run = MemoryRun(world)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     clock = [time.process_time()]  # of this process alone, whatever else the machine does
-    solution = solve(run, SolveOptions(), lambda *_: clock.append(time.process_time()))  # type: ignore[arg-type]
+    solution = solve(run, SolveOptions(), lambda *_: clock.append(time.process_time()))
     measured, taken = clock[-1] - clock[0], time.process_time() - clock[0]
     accuracy = _errors(solution.estimate, world)
     return {

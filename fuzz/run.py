@@ -83,14 +83,14 @@ def inside(name: str, out: Path, options: list[str]) -> int:
     import atheris
 
     with atheris.instrument_imports(include=["coloc_graph", "rosbags", "tomllib", "yaml"]):
-        from fuzz import targets
+        from fuzz import seeds, targets
 
     from coloc_graph.errors import ColocError
 
     target = targets.TARGETS[name]
     corpus = out / "corpus" / name
     corpus.mkdir(parents=True, exist_ok=True)
-    for number, seed in enumerate(targets.seeds(name)):
+    for number, seed in enumerate(seeds.seeds(name)):
         (corpus / f"seed-{number}").write_bytes(seed)
 
     def one(data: bytes) -> None:

@@ -205,7 +205,8 @@ def _mapping(loader: Any, node: Any) -> Any:
     return loader.construct_mapping(node, deep=True)
 
 
-_OpenCvLoader.add_constructor("tag:yaml.org,2002:opencv-matrix", _mapping)
+for _tag in ("opencv-matrix", "opencv-nd-matrix"):  # the latter is of an array of one dimension
+    _OpenCvLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _mapping)
 
 
 def _fields(path: Path, chain_camera: str | None) -> Mapping[str, Any]:

@@ -7,6 +7,7 @@ inverse of the information, with the homography eliminated, is the Cramer-Rao bo
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_solve, cholesky
@@ -15,7 +16,7 @@ from coloc_graph.frontend.homography.refinement import projection
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.clock_offset import ClockOffset
 from coloc_graph.frontend.tracks.tracking import Track
-from coloc_graph.geometry.lie import sl3_exp
+from coloc_graph.geometry.lie import sl3_exp, sl3_normalise
 from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]
@@ -61,7 +62,10 @@ def refine_wheel_offset(
     def driven(offset: float) -> Array:
         return _placed(wheels.moved(middle, times + offset), points)
 
-    offset, H = start, _homography(driven(start), x)
+    H, _ = cv2.findHomography(driven(start), x)
+    if H is None:
+        return None
+    offset, H = start, sl3_normalise(H)
     for number in range(STEPS):
         z = driven(offset)
         predicted, by_z, by_h = projection(H, z)
@@ -116,17 +120,3 @@ def _between(wheels: WheelTrack, times: Array, points: Array) -> Array:
     at = [_placed(wheels.moved(times, node), points) for node in nodes]
     curved = [np.abs(a - 2 * b + c) for a, b, c in (at[:3], at[1:])]
     return np.asarray(np.maximum(*curved) / 8)
-
-
-def _homography(z: Array, x: Array) -> Array:
-    """Homography that takes z (n, 2) to x (n, 2), by its linear equations."""
-    T = np.array([np.eye(3), np.eye(3)])
-    for one, own in zip(T, (z, x), strict=True):
-        scale = 1 / max(float(own.std()), 1e-9)
-        one[:2] = np.column_stack([scale * np.eye(2), -scale * own.mean(axis=0)])
-    ones = np.ones((len(z), 1))
-    a, b = np.hstack([z, ones]) @ T[0].T, np.hstack([x, ones]) @ T[1].T
-    zero = np.zeros_like(a)
-    rows = np.vstack([np.hstack([a, zero, -b[:, :1] * a]), np.hstack([zero, a, -b[:, 1:2] * a])])
-    H = np.linalg.inv(T[1]) @ np.linalg.svd(rows)[2][-1].reshape(3, 3) @ T[0]
-    return np.asarray(H / np.cbrt(np.linalg.det(H)))

@@ -34,10 +34,10 @@ cam1:
 
 
 def opencv_file(path, D, names=("image_width", "image_height", "camera_matrix", "distortion_coefficients"), **more):
-    """A file as OpenCV's calibration sample writes it."""
+    """A file as OpenCV's calibration sample writes it; OpenCV 5 has another tag for arrays of one dimension."""
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("calibration_time", "Sun 29 Nov 2026")
-    for name, value in zip(names, (640, 480, K, np.reshape(D, (-1, 1))), strict=True):
+    for name, value in zip(names, (640, 480, K, np.asarray(D)), strict=True):
         storage.write(name, value)
     for name, value in more.items():
         storage.write(name, value)
@@ -55,9 +55,11 @@ def opencv_file(path, D, names=("image_width", "image_height", "camera_matrix", 
     ],
 )
 def test_an_opencv_calibration_is_read_to_the_bit(tmp_path, suffix, D, distortion):
-    camera, warnings = read_camera_info(opencv_file(tmp_path / f"a.{suffix}", np.array(D, float)))
-    assert (camera.K == K).all() and (camera.width, camera.height) == (640, 480)
-    assert camera.distortion == distortion and camera.model == "pinhole" and warnings == ()
+    for shape in ((-1,), (-1, 1), (1, -1)):
+        written = opencv_file(tmp_path / f"a.{suffix}", np.reshape(np.array(D, float), shape))
+        camera, warnings = read_camera_info(written)
+        assert (camera.K == K).all() and (camera.width, camera.height) == (640, 480)
+        assert camera.distortion == distortion and camera.model == "pinhole" and warnings == ()
 
 
 def test_opencv_s_fisheye_and_its_older_names_are_read(tmp_path):

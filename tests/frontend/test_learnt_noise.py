@@ -112,6 +112,16 @@ def test_noise_is_found_whatever_is_stated(hallway, tmp_path, factor):
     assert sum(one.chi2 for one in used) / sum(one.dof for one in used) == pytest.approx(1, abs=0.15)
 
 
+def test_noise_that_changes_the_typical_centre_by_less_than_a_hundredth_is_the_same(hallway):
+    belief = NoiseBelief.of(open_run(hallway).team)
+    learnt = replace(belief, points=np.full(3, 500), typical=np.tile([0.09, 0.0], (3, 1)))
+    assert not learnt.differs_from(learnt)
+    floor = np.eye(len(belief.mean))[1]  # of the first camera
+    for change, differs in ((0.1, False), (3.0, True)):
+        other = replace(learnt, mean=learnt.mean + change * floor)
+        assert other.differs_from(learnt) == differs
+
+
 def test_a_short_run_keeps_what_is_stated_and_is_wide(hallway, tmp_path):
     run = open_run(hallway)
     nothing, one = NoiseBelief.of(run.team), solve(run, SolveOptions(odometry=False)).noise

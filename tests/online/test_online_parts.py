@@ -1,5 +1,6 @@
 """Parts of the online system: course, formation, driving, pose tracking, record, states."""
 
+import json
 import math
 import time
 from dataclasses import replace
@@ -20,7 +21,7 @@ from coloc_graph.online.motion import Follower
 from coloc_graph.online.odometry_restart import DROVE, STOOD, JoinedOdometry
 from coloc_graph.online.pose_tracker import PoseTracker
 from coloc_graph.online.record import Record, continued
-from coloc_graph.online.visibility import InView
+from coloc_graph.online.visibility import InView, Precision
 from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
 from coloc_graph.planning.course import Course
 from coloc_graph.run import Detections, OdometrySample, Stance, open_run
@@ -427,3 +428,19 @@ def test_states_follow_each_other_as_drawn():
 def test_a_log_on_a_full_disk_is_an_error_in_a_sentence():
     with MissionLog(Path("/dev/full"), lambda: 0.0) as log, pytest.raises(RunError, match="full: cannot be written"):
         log.note("state")
+
+
+def test_a_warning_is_in_the_log_once(tmp_path):
+    with MissionLog(tmp_path / "mission.jsonl", lambda: 1.5) as log:
+        log.warn(["the clock of B is wrong", "the wheels of C are wrong"])
+        log.warn(["the clock of B is wrong"])
+    lines = [json.loads(line) for line in (tmp_path / "mission.jsonl").read_text().splitlines()]
+    assert [(one["what"], one["text"]) for one in lines] == [
+        ("warning", "the clock of B is wrong"),
+        ("warning", "the wheels of C are wrong"),
+    ]
+
+
+def test_a_precision_is_told_where_a_pair_is_measured():
+    assert str(Precision(40, 0.0123, 0.01)) == "40 points, 12.3 mm, 0.57 deg"
+    assert str(Precision(4, math.inf, math.inf, "too few points")) == "4 points"
