@@ -63,8 +63,9 @@ def test_the_spread_of_fits_is_found(spread):
     median, factor = learn_spread(chi2, dof, 0.1, 0.2, 3.0)
     assert abs(np.log(median / spread)) < 2.5 * np.log(factor)
     assert factor < (2.5 if spread < 0.2 else 1.2)
-    # a first fit cannot tell a noisy fit from a noisy run
+    # a first fit cannot tell a noisy fit from a noisy run, unless the run's noise is known
     assert learn_spread(chi2[:1], dof[:1], 4.0, 0.2, 3.0) == pytest.approx((0.2, 3.0), rel=0.3)
+    assert learn_spread(np.array([4 * 62.0]), dof[:1], 1e-4, 0.2, 3.0)[0] > 0.4
 
 
 def test_a_fit_gets_its_own_variance_as_far_as_fits_differ():

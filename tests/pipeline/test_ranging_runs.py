@@ -131,6 +131,8 @@ def test_without_a_map_robots_and_landmarks_are_found_up_to_where_the_map_lies(u
     sigmas = np.array([np.sqrt(np.trace(one.covariance_xy_yaw[:2, :2])) for one in landmarks.values()])
     assert np.all(np.hypot(*off.T) < 3 * sigmas)
     assert np.median(np.hypot(*off.T)) < 0.1
+    (gauge,) = ranging_graph(solution.estimate, unmapped.team).priors
+    assert gauge.name == "R0" and isinstance(gauge.value, gtsam.Pose2)
     known = solution.estimate.calibration.of_team(unmapped.team).landmarks[0]
     assert known.position == pytest.approx(next(iter(landmarks.values())).planar[:2])
 

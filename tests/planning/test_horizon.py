@@ -81,14 +81,17 @@ def test_no_second_that_is_left_is_free_to_spend(straight):
     assert (fall < -0.003).all()
 
 
-def test_another_leap_is_chosen_only_if_its_planned_drive_promises_less_than_the_gait_s(straight):
+def test_another_leap_is_chosen_only_if_its_planned_drive_promises_less_than_the_gait_s(straight, monkeypatch):
     planner, mission = straight
     seconds, belief = 60.0 - mission.plan.stances[0].duration, mission.promises[0].belief
     grown = planner._expand(Node(belief, mission.plan.stances[0].standing, seconds, 0.0), (), in_lane=False)
     own = next(node for node in sorted(grown, key=lambda node: node.score) if node.by_gait)
-    others = [replace(node, score=0.0) for node in grown if not node.by_gait and node.choices[0][2] < 5.0]
-    variance, node, *_ = planner._finalist(belief, seconds, [*others[:1], own])
+    worst = max((node for node in grown if not node.by_gait), key=lambda node: node.score)
+    guessed = [replace(worst, score=0.0), own]
+    variance, node, *_ = planner._finalist(belief, seconds, guessed)
     assert node is own, "a guess of 0 must not decide"
+    monkeypatch.setattr("coloc_graph.planning.horizon.PREFERRED", 1e-9)
+    assert planner._finalist(belief, seconds, guessed)[1] is guessed[0]
     assert math.sqrt(variance) == pytest.approx(planner.next(belief, seconds).expected, rel=0.1)
 
 
