@@ -28,6 +28,7 @@ WEIGHED = 2  # iterations after which the covariance changes no more
 MAX_MISFIT = 9.0  # chi2 by degree of freedom above which it is not one motion that both saw
 MIN_SIGMA = 1e-3  # an offset is known no better: stamps are of no exact instant [s]
 STEP = 0.05  # half the time between two positions that tell a speed [s]
+MAX_H_STEP = 1.0  # change of a coordinate of the homography in one iteration beyond which the points leave it open
 MAX_CHANGE = 0.15  # change of the offset beyond which the search before was wrong [s]
 
 
@@ -80,12 +81,13 @@ def refine_wheel_offset(
             weighted = cho_solve((factor, True), np.column_stack([J, residual]))
             normal = J.T @ weighted[:, :9]
             step = np.linalg.solve(normal, J.T @ weighted[:, 9])
-            sigma = float(np.sqrt(np.linalg.inv(normal)[8, 8]))
+            variance = float(np.linalg.inv(normal)[8, 8])
         except np.linalg.LinAlgError:
             return None
-        H, offset = H @ sl3_exp(step[:8]), offset + float(step[8])
-        if not abs(offset - start) < MAX_CHANGE:
+        if not (variance > 0 and np.abs(step[:8]).max() < MAX_H_STEP and abs(offset + step[8] - start) < MAX_CHANGE):
             return None
+        sigma = float(np.sqrt(variance))
+        H, offset = H @ sl3_exp(step[:8]), offset + float(step[8])
         if number >= WEIGHED and abs(step[8]) < 0.01 * sigma:
             break
     misfit = float(residual @ weighted[:, 9]) / (len(residual) - 9)

@@ -87,6 +87,24 @@ def test_wheels_are_timed_to_the_bound_that_is_predicted():
     assert low < np.square(off).sum() < high
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 5])
+def test_wheels_are_not_timed_by_a_track_of_something_else(seed):
+    """A reflection that wanders while the robot drives straight: a homography of all its points is sought in vain."""
+    rng, team = np.random.default_rng(seed), reference_team()
+    instants, times = np.arange(-1.0, 21.0, 0.05), np.linspace(1.0, 19.0, 60)
+    path = Path(
+        instants,
+        np.column_stack([1.5 + 0.03 * instants, 0.01 * instants, np.full_like(instants, 0.3)]),
+        instants[:1],
+        np.zeros((1, 2)),
+    )
+    wheels = odometry(path, [(0.0, 20.0)], rng).records("C", -1.0, 21.0, 0.0)
+    uv = np.array([160.0, 120.0]) + np.cumsum(rng.standard_normal((60, 2)), axis=0)
+    wandering = Track("A", "", times, uv, np.broadcast_to(0.09 * np.eye(2), (60, 2, 2)), np.zeros(60))
+    point = team["C"].markers.p_body[0][:2]
+    assert refine_wheel_offset([(wandering, point)], WheelTrack("C", wheels), team["A"].camera, 0.0) is None
+
+
 def test_an_offset_that_leaves_the_paths_apart_is_none():
     """As odometry of another point of the body than the one that carries the marker."""
     pairs = seen(np.random.default_rng(1), 0.3)

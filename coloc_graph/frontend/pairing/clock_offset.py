@@ -44,6 +44,7 @@ NOT_OBSERVABLE = (
 MAX_SIGMA_RATIO = 0.5  # of a clock offset to its prior, above which the offset counts as not observed
 SEARCH_SIGMAS = 4.0  # standard deviations of the prior within which the offset is searched
 MAX_SEARCH_STEPS = 41  # offsets that are tried at most
+MAX_H_STEP = 1.0  # change of a coordinate of a homography in one iteration beyond which the points leave it open
 NOISE_SIGMAS = 4.0  # standard deviations of noise that the information on the offset must exceed
 DISAGREEMENT = 1e-3  # p-value below which stances are reported to disagree on the offset
 
@@ -168,6 +169,8 @@ def fit_at_offset(
         # the robust fit takes points as independent; those interpolated from the same samples are not
         for iterations in range(1, 11):
             step = np.asarray(np.linalg.solve(system.by_H, system.score_H), float)
+            if not np.abs(step).max() < MAX_H_STEP:
+                raise DegenerateGeometry("the points do not determine a homography: it diverges from their robust fit")
             H = H @ sl3_exp(step)
             system = _System(tracks, at, H, kept, system.moved(step))
             if step @ system.by_H @ step < 1e-12:
@@ -306,6 +309,8 @@ def _evidence(
             return None
         step = float(np.clip(score / information, -prior.sigma, prior.sigma))
         h = np.asarray(np.linalg.solve(system.by_H, system.score_H + system.by_H_offset * step), float)
+        if not np.abs(h).max() < MAX_H_STEP:
+            return None
         z_all[which] = system.moved(h, step, speed)
         H, offset = H @ sl3_exp(h), offset + step
         if abs(offset - prior.value) > 1.5 * SEARCH_SIGMAS * prior.sigma:
@@ -355,7 +360,7 @@ def _robust(H: Array, pairs: PointPairs) -> tuple[Array, float]:
         w = (gate / (gate + squared)) ** 2
         normal = np.einsum("n,nka,nkb->ab", w, A, weighted[..., :8])
         step, *_ = np.linalg.lstsq(normal, np.einsum("n,nka,nk->a", w, A, weighted[..., 8]), rcond=1e-14)
-        if not np.abs(step).max() < 1.0:
+        if not np.abs(step).max() < MAX_H_STEP:
             break
         H = H @ sl3_exp(step)
     squared = squared_residuals(H, pairs)
