@@ -88,7 +88,8 @@ def write_atomically(path: Path, data: str | bytes, *, synchronise: bool = False
     synchronise
         Synchronise the content to the disk before the file gets its name.
     """
-    path = path.resolve()
+    if path.is_symlink():
+        path = path.resolve()
     file, part = open_part(path)
     try:
         with os.fdopen(file, "wb") as stream:

@@ -152,10 +152,7 @@ def rigid_path(
     """
     images = [_moving(one, still) for still in [_static_cells(seen)] for one in seen]
     lights = np.array([len(one.uv) for one in images], np.int64)
-    each = [_rows(images, camera, plane, span) for plane in planes]
-    fits = [sum(float(np.exp(-row[3].min())) for row in rows) for rows in each]
-    best = int(np.argmax(fits))
-    rows = each[best] if fits[best] > CLEARLY_MORE * fits[0] else each[0]
+    rows = _rows(images, camera, planes, span)
     chosen = _likeliest(rows, span)
     own = [(images[row[0]], row[1][n], row[2][n]) for row, n in zip(rows, chosen, strict=True)]
     path = RigidPath(
@@ -176,24 +173,42 @@ def rigid_path(
 _Row = tuple[int, NDArray[np.int64], Array, Array]
 
 
-def _rows(images: Sequence[Detections], camera: Camera, plane: Plane, span: float) -> list[_Row]:
-    """Pairs of lights that are a span apart on a plane, image by image."""
-    # two axes of the plane make metric coordinates on it
+def _rows(images: Sequence[Detections], camera: Camera, planes: Sequence[Plane], span: float) -> list[_Row]:
+    """Pairs of lights that are a span apart on the plane that explains most images, image by image."""
+    counts = [len(one.uv) for one in images]
+    of_count = {count: np.triu_indices(count, 1) for count in set(counts)}
+    sizes = [len(of_count[count][0]) for count in counts]
+    shown = np.flatnonzero(sizes)  # images with two lights or more
+    if not len(shown):
+        return []
+    first = np.cumsum([0, *counts])
+    a, b = (np.concatenate([first[n] + of_count[counts[n]][side] for n in shown]) for side in range(2))
+    starts = np.cumsum([0, *(sizes[n] for n in shown)])
+    rays = camera.rays(np.concatenate([one.uv for one in images]))
+    each = [_on_plane_a_span_apart(rays, plane, a, b, span) for plane in planes]
+    fits = [float(np.maximum.reduceat(np.exp(-costs), starts[:-1]).sum()) for _, costs in each]
+    best = int(np.argmax(fits))
+    places, costs = each[best] if fits[best] > CLEARLY_MORE * fits[0] else each[0]
+    rows: list[_Row] = []
+    for number, start, end in zip(shown.tolist(), starts[:-1], starts[1:], strict=True):
+        good = start + np.flatnonzero(np.isfinite(costs[start:end]))
+        if len(good):
+            pairs = np.stack([a[good], b[good]], axis=1)
+            rows.append((number, pairs - first[number], places[pairs], costs[good]))
+    return rows
+
+
+def _on_plane_a_span_apart(
+    rays: Array, plane: Plane, a: NDArray[np.int64], b: NDArray[np.int64], span: float
+) -> tuple[Array, Array]:
+    """Metric coordinates (n, 2) of rays on a plane, and costs (m,) of pairs of them, infinite if no span apart."""
     axes = across(plane.N)
     if np.cross(*axes) @ plane.N < 0:
         axes = axes[::-1]  # the same way round in every camera
-    rows: list[_Row] = []
-    for number, one in enumerate(images):
-        if len(one.uv) < 2:
-            continue
-        places = on_plane(camera.rays(one.uv), plane) @ axes.T
-        a, b = np.triu_indices(len(places), 1)
-        off = np.linalg.norm(places[a] - places[b], axis=1) / span - 1
-        good = np.flatnonzero(np.abs(off) < SPAN_TOLERANCE)  # not of NaN, above the horizon
-        if len(good):
-            pairs = np.stack([a[good], b[good]], axis=1)
-            rows.append((number, pairs, places[pairs], 0.5 * np.square(off[good] / SPAN_SCALE)))
-    return rows
+    places = on_plane(rays, plane) @ axes.T
+    off = np.linalg.norm(places[a] - places[b], axis=1) / span - 1
+    near = np.abs(off) < SPAN_TOLERANCE  # not of NaN, above the horizon
+    return places, np.where(near, 0.5 * np.square(off / SPAN_SCALE), np.inf)
 
 
 def _static_cells(seen: Sequence[Detections]) -> NDArray[np.int64]:

@@ -54,6 +54,8 @@ def arc(left: float, right: float, base: float) -> tuple[float, float, float]:
 
 def arc_covariance(left: float, right: float, base: float) -> Array:
     """Covariance (3, 3) of `arc`, with independent errors `SLIP` and `ENCODER` of each wheel."""
+    if not (left or right):
+        return np.zeros((3, 3))
     per_metre = SLIP**2 + ENCODER**2
     var_left, var_right = per_metre * abs(left), per_metre * abs(right)
     forward, turned = (left + right) / 2, (right - left) / base
@@ -166,7 +168,8 @@ class EncoderOdometry:
             unknown = 1e-3 * MAX_WHEEL_SPEED * self._elapsed
         self._before, self._elapsed, self._left_out = after, 0.0, 0
         covariance = arc_covariance(left, right, wheels.base)
-        covariance += np.diag(np.square([unknown, unknown, 2 * unknown / wheels.base]))
+        if unknown:
+            covariance += np.diag(np.square([unknown, unknown, 2 * unknown / wheels.base]))
         return arc(left, right, wheels.base), covariance
 
 

@@ -153,8 +153,9 @@ class Wheels(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
     def of(cls, sample: OdometrySample, *, session: str, number: int, stamp: int, frame: str = "") -> "Wheels":
         """Message of a sample taken at `stamp` [ns]."""
         x, y, yaw = map(float, sample.pose)
-        upper = sample.covariance[np.triu_indices(3)].tolist()
-        return cls(session=session, number=number, stamp=stamp, frame=frame, pose=(x, y, yaw), covariance=tuple(upper))
+        (xx, xy, xt), (_, yy, yt), (_, _, tt) = sample.covariance.tolist()
+        upper = xx, xy, xt, yy, yt, tt
+        return cls(session=session, number=number, stamp=stamp, frame=frame, pose=(x, y, yaw), covariance=upper)
 
     def sample(self, robot: str, time: float) -> OdometrySample:
         """Record of this message, at a time [UTC s]."""
@@ -399,9 +400,8 @@ def decode(data: bytes, kind: type[M]) -> M:
 
 
 def _symmetric(upper: tuple[float, ...]) -> "np.ndarray[Any, np.dtype[np.float64]]":
-    C = np.zeros((3, 3))
-    C[np.triu_indices(3)] = upper
-    return np.triu(C) + np.triu(C, 1).T
+    xx, xy, xt, yy, yt, tt = upper
+    return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
 
 
 def _short(*texts: str) -> None:
