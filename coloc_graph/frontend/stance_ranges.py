@@ -21,6 +21,7 @@ Index = NDArray[np.int64]
 WINDOW = 2.0  # s of samples that are averaged while a robot drives; at 0.2 m/s the geometry hardly changes in them
 OUTLIER_SIGMAS = 3.0  # standard deviations from the median of its window above which a sample is left out
 MIN_SAMPLES = 4  # samples of a window, of fewer an outlier cannot be told
+NO_ODOMETRY = "{} drives and has no odometry then"
 MIN_NOISE_SAMPLES = 50  # samples from which on their own scatter says how noisy they are
 
 
@@ -189,7 +190,7 @@ def _links_of_pair(
         places = _places(standing[name], wheels.get(name), times)
         missing = known & ~places.known
         if missing.any():
-            unused[f"{name} drives and has no odometry then"] += int(missing.sum())
+            unused[NO_ODOMETRY.format(name)] += int(missing.sum())
         known &= places.known
         ends.append(places)
     kept = np.flatnonzero(known)

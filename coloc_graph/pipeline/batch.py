@@ -7,7 +7,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from coloc_graph.backend import Estimate, PoseGraph, chain, diagnose, joint, smooth
-from coloc_graph.backend.planar import LAG, IncrementalKeyframes, Latest, optimise_keyframes
+from coloc_graph.backend.planar import (
+    LAG,
+    NONE_LOCATED,
+    UNLOCATED,
+    IncrementalKeyframes,
+    Latest,
+    optimise_keyframes,
+)
 from coloc_graph.errors import EstimationError
 from coloc_graph.frontend import PairMeasurement, UnusedSighting, describe_unused, share_clock_offsets
 from coloc_graph.frontend.keyframes import keyframes_of
@@ -340,13 +347,8 @@ def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_up
     else:
         estimate = optimise_keyframes(run.team, keyframes)
     if not estimate.trajectories:
-        raise EstimationError(
-            f"{run.path}: no robot can be localised: a robot must observe at least two landmarks with known positions"
-        )
-    missing = dict.fromkeys(
-        (name for name in keyframes.robots if name not in estimate.trajectories),
-        "it must be measured together with two robots or landmarks of known positions",
-    )
+        raise EstimationError(f"{run.path}: {NONE_LOCATED}")
+    missing = dict.fromkeys((name for name in keyframes.robots if name not in estimate.trajectories), UNLOCATED)
     warnings = [*keyframes.warnings, *warnings_of_ranges(estimate)]
     return _Solved(estimate, warnings, seconds, (), tuple(updates), online, missing)
 

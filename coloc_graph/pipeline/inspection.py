@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from coloc_graph.backend.planar import NONE_LOCATED, unlocated
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.frontend.landmarks import describe_unused, sight_landmarks
@@ -17,7 +18,8 @@ from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW, correspo
 from coloc_graph.frontend.pairing.plane_check import implausible
 from coloc_graph.frontend.stance import little_in_common
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_plane
-from coloc_graph.pipeline.contents import kind_of, unused_in
+from coloc_graph.pipeline.contents import kind_of, unused_in, unused_ranges
+from coloc_graph.pipeline.ranges import unusable_ranges
 from coloc_graph.run import Detections, Run, Stance
 from coloc_graph.team import Landmark
 
@@ -69,6 +71,7 @@ def inspect(run: Run) -> list[Finding]:
         findings += [Finding("run", str(one)) for one in unused_in(run)]
         if kind_of(run) == "ranges":
             return [*findings, *_ranging_findings(run)]
+        findings += [Finding("run", f"at least {one}") for one in unused_ranges(unusable_ranges(run))]
     except InputError as why:
         findings.append(Finding("run", str(why).removeprefix(f"{run.path}: ")))
     if run.stances and run.team.reference not in run.stances[0].observers:
@@ -90,9 +93,13 @@ def _ranging_findings(run: Run) -> list[Finding]:
             findings.append(Finding(robot, "the team states no range sensor: give the robot a [robots.ranging]"))
     if not findings:
         try:
-            said = keyframes_of(run).warnings
+            keyframes = keyframes_of(run)
+            without = unlocated(run.team, keyframes)
+            said = [*keyframes.warnings, *(f"robot {robot} has no pose: {why}" for robot, why in without.items())]
+            if len(without) == len(run.team.names):
+                said = [*keyframes.warnings, NONE_LOCATED]
         except InputError as why:
-            said = (str(why),)
+            said = [str(why)]
         findings += [Finding("run", one.removeprefix(f"{run.path}: ")) for one in said]
     if not any(landmark.position is not None for landmark in run.team.landmarks):
         findings.append(

@@ -11,7 +11,7 @@ from coloc_graph.backend import Estimate
 from coloc_graph.backend.graph import PoseKeys
 from coloc_graph.backend.landmarks import ALWAYS
 from coloc_graph.frontend import WheelTrack
-from coloc_graph.frontend.stance_ranges import StanceRanges, Standing, locate_landmarks, ranges_of_stances
+from coloc_graph.frontend.stance_ranges import NO_ODOMETRY, StanceRanges, Standing, locate_landmarks, ranges_of_stances
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Sighting
 from coloc_graph.run import OdometrySample, Ranges, Run, Stance
@@ -19,6 +19,8 @@ from coloc_graph.team import Team
 
 #: T_world_body (4, 4) by robot, of the robots that have a pose at a stance.
 Poses = Mapping[str, Any]
+
+OUTSIDE = "they are from before the first stance, or after the last"
 
 
 def ranges_of_run(run: Run, estimate: Estimate, *, odometry: bool) -> StanceRanges:
@@ -40,6 +42,44 @@ def ranges_of_run(run: Run, estimate: Estimate, *, odometry: bool) -> StanceRang
     recorded = {robot: list(run.ranges(robot)) for robot in run.team.names}
     landmarks = {name: one.T_world_body.matrix() for name, one in estimate.landmarks.items()}
     return place_ranges(run.team, standing, wheels, recorded, graph.stances, landmarks)
+
+
+def unusable_ranges(run: Run) -> StanceRanges:
+    """Count the ranges and bearings that no estimate of a run with stances can use, wherever its robots are."""
+    stances, team = run.stances, run.team
+    if team.floor is None or not run.has_ranges:
+        return StanceRanges((), {})
+    stands = {
+        stance.index: dict.fromkeys({*stance.observers, *stance.anchors} - {*stance.movers}) for stance in stances
+    }
+    standing = standing_of(stances, stands, {})
+    unused: Counter[str] = Counter()
+    bearings = 0
+    for robot in team.names:
+        sensor = team[robot].ranging
+        rows = [
+            (one.time, target, np.isfinite(bearing))
+            for one in run.ranges(robot)
+            for target, bearing in zip(one.targets, _bearings(one), strict=True)
+        ] if sensor is not None else []  # fmt: skip
+        for target in dict.fromkeys(target for _, target, _ in rows):
+            times, seen = np.array([(time, seen) for time, to, seen in rows if to == target]).T
+            used = (times >= stances[0].start) & (times <= stances[-1].end)
+            unused[OUTSIDE] += int(np.count_nonzero(~used))
+            for name in (one for one in (robot, target) if one in team.names):
+                spans = np.array([(one.start, one.end) for one in standing.get(name, ())]).reshape(-1, 2)
+                still = ((spans[:, 0] <= times[:, None]) & (times[:, None] <= spans[:, 1])).any(axis=1)
+                if not run.topics.get(f"/{name}/odometry"):
+                    unused[NO_ODOMETRY.format(name)] += int(np.count_nonzero(used & ~still))
+                used &= still
+            assert sensor is not None
+            measures = sensor.bearing_sigma_deg > 0 or sensor.across_sigma > 0
+            bearings += int(np.count_nonzero(seen.astype(bool) & ~(used & measures)))
+    return StanceRanges((), {why: count for why, count in unused.items() if count}, bearings)
+
+
+def _bearings(one: Ranges) -> Any:
+    return one.range * np.nan if one.bearing is None else one.bearing
 
 
 def standing_of(
@@ -93,7 +133,7 @@ def place_ranges(
             continue  # `contents.unused_in` names them
         of_sensors.append(records)
         within[robot] = [one for one in records if stances[0].start <= one.time <= stances[-1].end]
-        unused["they are from before the first stance, or after the last"] += _count(records) - _count(within[robot])
+        unused[OUTSIDE] += _count(records) - _count(within[robot])
     wheels = {robot: WheelTrack(robot, samples) for robot, samples in odometry.items()}
     known = {name: T for name, T in landmarks.items() if T is not None}
     recorded_of = Counter(target for records in within.values() for one in records for target in one.targets)

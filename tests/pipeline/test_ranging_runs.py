@@ -24,6 +24,8 @@ from coloc_graph.exchange.range_graph import factors_of, key_of, values_of
 from coloc_graph.exchange.ranging_graph import ranging_graph
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.pipeline.batch import SolveOptions, solve
+from coloc_graph.pipeline.inspection import Finding, inspect
+from coloc_graph.pipeline.ranges import of_targets
 from coloc_graph.results.writer import assess, assess_online, write_result
 from coloc_graph.run import OdometrySample, Ranges, atomic_run, open_run
 from coloc_graph.team import Landmark, Ranging, Robot, Team
@@ -367,8 +369,19 @@ def test_ranges_where_there_is_no_odometry_are_left_out_and_counted(tmp_path, ca
 def test_one_landmark_alone_places_nobody(tmp_path, capsys):
     path = write(tmp_path / "run.mcap")
     assert main(["solve", str(path), "--out", str(tmp_path / "result")]) == 2
-    assert "a robot must observe at least two landmarks" in capsys.readouterr().err
+    why = "no robot can be localised: a robot must observe at least two landmarks with known positions, several times"
+    assert why in capsys.readouterr().err
     assert not (tmp_path / "result").exists()
+    main(["info", str(path)])
+    assert f"run: {why}" in capsys.readouterr().out
+
+
+def test_a_robot_that_nothing_ties_is_named_by_info_as_by_solve(run, copied, tmp_path):
+    others = {"R1", "R2", *(one.name for one in run.team.landmarks)}
+    records = [one for robot in ("R1", "R2") for one in of_targets(run.ranges(robot), others)]
+    alone = open_run(copied(run.path, tmp_path / "run.mcap", more=records[:150]))
+    (why,) = solve(alone).without_pose.values()
+    assert Finding("run", f"robot R3 has no pose: {why}") in inspect(alone)
 
 
 def test_a_robot_needs_a_camera_or_a_sensor_of_ranges():

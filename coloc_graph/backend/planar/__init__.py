@@ -4,14 +4,17 @@
 """
 
 from coloc_graph.backend.planar.batch import optimise_keyframes
-from coloc_graph.backend.planar.filter import Filtered, filter_forward
+from coloc_graph.backend.planar.filter import NONE_LOCATED, UNLOCATED, Filtered, filter_forward, unlocated
 from coloc_graph.backend.planar.incremental import LAG, IncrementalKeyframes, Latest
 
 __all__ = [
     "LAG",
+    "NONE_LOCATED",
+    "UNLOCATED",
     "Filtered",
     "IncrementalKeyframes",
     "Latest",
     "filter_forward",
     "optimise_keyframes",
+    "unlocated",
 ]

@@ -29,6 +29,11 @@ Array = NDArray[np.float64]
 INNOVATION_GATE = 18.4  # squared Mahalanobis distance (two dimensions, p-value 1e-4) above which one is rejected
 INITIAL_SIGMAS = (0.15, 0.15, 0.1)  # m, m, rad: of a robot's initial pose
 LANDMARK_SIGMA = 30.0  # m: of a landmark's initial position
+#: Reason for which a robot has no pose, and for which none has.
+UNLOCATED = "it must be measured together with two robots or landmarks of known positions"
+NONE_LOCATED = (
+    "no robot can be localised: a robot must observe at least two landmarks with known positions, several times"
+)
 
 
 @dataclass(eq=False)
@@ -99,6 +104,16 @@ class Models:
 def filter_forward(team: Team, keyframes: Keyframes) -> Filtered:
     """Run the filter over all keyframes and measurements."""
     return Filter(team, keyframes).run()
+
+
+def unlocated(team: Team, keyframes: Keyframes) -> dict[str, str]:
+    """Return the reason by robot that no measurements locate; it ends as soon as all are located."""
+    one = Filter(team, keyframes)
+    for index in range(len(keyframes.measured)):
+        if len(one.out.placed_at) == len(keyframes.robots):
+            break
+        one.take(index)
+    return dict.fromkeys((name for n, name in enumerate(keyframes.robots) if n not in one.out.placed_at), UNLOCATED)
 
 
 class Filter:
