@@ -18,7 +18,7 @@ from coloc_graph.backend import Bump, joint
 from coloc_graph.backend.batch import faults_of
 from coloc_graph.backend.blame import bumps_of
 from coloc_graph.geometry.lie import floor_pose
-from coloc_graph.pipeline.incremental import StanceSolver
+from coloc_graph.pipeline.incremental import IncrementalSolver
 from coloc_graph.run import Detections
 from coloc_graph.simulation import Imperfections
 
@@ -65,16 +65,16 @@ def one_seed(seed: int) -> dict[str, bool]:
     T = floor_pose(far * np.cos(way), far * np.sin(way), turned)
     pushed = Pushed(run, anchor, run.stances[k].start, T)
 
-    def up_to(end: int) -> StanceSolver:
-        solver = StanceSolver(run.team)
+    def up_to(end: int) -> IncrementalSolver:
+        solver = IncrementalSolver(run.team)
         for stance in run.stances[:end]:
             solver.enter(run, stance)
         return solver
 
-    def bumps(solver: StanceSolver) -> tuple[Bump, ...]:
+    def bumps(solver: IncrementalSolver) -> tuple[Bump, ...]:
         return bumps_of(faults_of(solver.estimator.method, solver.estimator.graph), solver.estimator.graph)
 
-    def named(solver: StanceSolver) -> bool:
+    def named(solver: IncrementalSolver) -> bool:
         return any((b.stay_put.robot, b.stay_put.after) == (anchor, k) for b in bumps(solver))
 
     healthy = up_to(k + 1)

@@ -26,7 +26,10 @@ import numpy as np
 from monte_carlo import MemoryRun, anees_interval, over_seeds, rms_interval, simulated, solved, truth_of
 from msgspec.structs import replace as with_fields
 
-from coloc_graph.backend import replay
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+
+from whole_graph import replay
+
 from coloc_graph.evaluation import align
 from coloc_graph.geometry.lie import se3_inverse, so3_log
 from coloc_graph.pipeline.batch import SolveOptions, solve

@@ -22,6 +22,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from copy import copy
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `coloc` does, before numpy is there
@@ -31,7 +32,11 @@ import numpy as np
 from monte_carlo import MemoryRun, anees_interval, over_seeds, simulated, truth_of
 from numpy.typing import NDArray
 
-from coloc_graph.backend import Estimate, Method, PoseGraph, chain, joint, replay, smooth
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+
+from whole_graph import replay
+
+from coloc_graph.backend import Estimate, Method, PoseGraph, chain, joint, smooth
 from coloc_graph.backend.calibration import is_calibration
 from coloc_graph.backend.estimate import make_estimate
 from coloc_graph.backend.factors import factors_for

@@ -16,7 +16,6 @@ from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstima
 from coloc_graph.backend.estimator import Estimator  # noqa: E402
 from coloc_graph.backend.factors import Method  # noqa: E402
 from coloc_graph.backend.graph import PoseGraph, StayPut  # noqa: E402
-from coloc_graph.backend.replay import replay  # noqa: E402
 
 __all__ = [
     "Bump",
@@ -32,7 +31,6 @@ __all__ = [
     "chain",
     "diagnose",
     "joint",
-    "replay",
     "smooth",
     "with_height_sigma",
 ]  # fmt: skip

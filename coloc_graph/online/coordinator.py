@@ -23,7 +23,7 @@ from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import MissionState
 from coloc_graph.online.resume import restore
 from coloc_graph.online.robot_registry import RobotRegistry
-from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
+from coloc_graph.pipeline.incremental import EnteredStance, IncrementalSolver
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import read_floor_map
 from coloc_graph.robot_io.link.messages import Event, Sample, Status, Wheels
@@ -91,7 +91,7 @@ class Coordinator:
         floor_map = None if options.map_path is None else read_floor_map(options.map_path)
         self._on_status, self._status_time = on_status, 0.0
         self._inbox = Inbox()
-        self._solver = StanceSolver(team, options.solve)
+        self._solver = IncrementalSolver(team, options.solve)
         with contextlib.ExitStack() as undo:
             # the folder and the port are taken before anything of an earlier mission is touched
             held = undo.enter_context(MissionFolder(folder, resume=resume))

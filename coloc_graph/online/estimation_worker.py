@@ -14,7 +14,7 @@ from coloc_graph.frontend import FrontendOptions, StanceTracks
 from coloc_graph.machine import machine
 from coloc_graph.online.record import Record
 from coloc_graph.online.visibility import Precision, precision
-from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver, measure_stance
+from coloc_graph.pipeline.incremental import EnteredStance, IncrementalSolver, measure_stance
 from coloc_graph.run import Recorded, Stance
 from coloc_graph.run.recorded import Restated
 
@@ -31,7 +31,7 @@ class EstimationWorker:
     whatever kind is a `RobotError`: it voids a stance, not a mission.
     """
 
-    def __init__(self, record: Recorded, solver: StanceSolver) -> None:
+    def __init__(self, record: Recorded, solver: IncrementalSolver) -> None:
         self._record, self._solver = record, solver
         self._worker = machine.new_worker("measuring")
         self._judging: Future[Precision] | None = None
@@ -93,7 +93,7 @@ class EstimationWorker:
 
 
 def enter_stance(
-    solver: StanceSolver,
+    solver: IncrementalSolver,
     record: Recorded,
     stance: Stance,
     tracks: StanceTracks | None = None,

@@ -19,7 +19,7 @@ from coloc_graph.backend import StanceEstimate
 from coloc_graph.errors import ColocError, RunError
 from coloc_graph.online.estimation_worker import enter_stance
 from coloc_graph.online.record import Excerpt
-from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
+from coloc_graph.pipeline.incremental import EnteredStance, IncrementalSolver
 from coloc_graph.run import Run, Stance
 
 Counts = Mapping[str, tuple[int, int]]
@@ -125,7 +125,7 @@ class Journal:
         self._detections = {name: list(run.detections(name)) for name in run.team.names}
         self._odometry = {name: list(run.odometry(name)) for name in run.team.names}
 
-    def enter(self, solver: StanceSolver) -> Iterator[tuple[Attempt, EnteredStance]]:
+    def enter(self, solver: IncrementalSolver) -> Iterator[tuple[Attempt, EnteredStance]]:
         """Enter all stances; yield each that has entered, as the estimate was then."""
         for attempt in self.attempts:
             if not attempt.recorded:

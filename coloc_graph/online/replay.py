@@ -6,7 +6,7 @@ from pathlib import Path
 
 from coloc_graph.errors import InputError, RunError
 from coloc_graph.online.journal import Journal, digest_of, read_attempts
-from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
+from coloc_graph.pipeline.incremental import EnteredStance, IncrementalSolver
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.run import open_run
 
@@ -50,5 +50,5 @@ def replay(folder: str | Path, options: SolveOptions | None = None) -> Iterator[
     run = open_run(record)
     if not run.stances:
         raise RunError(f"{record}: no stance has entered the estimate: there is nothing to replay")
-    for attempt, one in Journal(run, read_attempts(log)).enter(StanceSolver(run.team, options)):
+    for attempt, one in Journal(run, read_attempts(log)).enter(IncrementalSolver(run.team, options)):
         yield ReplayedStance(one, attempt.digest == digest_of(one.estimate) if attempt.digest else None)

@@ -6,14 +6,14 @@ from pathlib import Path
 
 from coloc_graph.online.journal import Journal, read_attempts
 from coloc_graph.online.robot_registry import RobotRegistry
-from coloc_graph.pipeline.incremental import StanceSolver
+from coloc_graph.pipeline.incremental import IncrementalSolver
 from coloc_graph.run import Run, Stance
 
 log = logging.getLogger(__name__)
 
 
 def restore(
-    before: Run, log_path: Path, solver: StanceSolver, registry: RobotRegistry, stop: threading.Event
+    before: Run, log_path: Path, solver: IncrementalSolver, registry: RobotRegistry, stop: threading.Event
 ) -> list[Stance]:
     """Enter the stances of an earlier run as they entered then, and set the robots' poses; return the stances.
 

@@ -40,8 +40,8 @@ from coloc_graph.pipeline.explanations import (
 )
 from coloc_graph.pipeline.incremental import (
     EnteredStance,
+    IncrementalSolver,
     OdometryAndSightings,
-    StanceSolver,
     measure_stance,
 )
 from coloc_graph.pipeline.lever_arm import LeverArm, find_lever_arms, with_lever_arms
@@ -55,7 +55,7 @@ from coloc_graph.run import Run, Stance
 from coloc_graph.run.recorded import Restated
 from coloc_graph.team import Team
 
-__all__ = ["METHODS", "EnteredStance", "Progress", "Solution", "SolveOptions", "StanceSolver", "solve"]
+__all__ = ["METHODS", "EnteredStance", "IncrementalSolver", "Progress", "Solution", "SolveOptions", "solve"]
 
 log = logging.getLogger(__name__)
 
@@ -308,7 +308,7 @@ def _graph_of(
 
 def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: OnUpdate | None) -> _Solved:
     """Solve one stance after the other."""
-    solver = StanceSolver(run.team, options)
+    solver = IncrementalSolver(run.team, options)
     for stance in run.stances:
         measured = solver.measure(run, stance, measure(stance, solver.noise.used(run.team)))
         one = solver.enter(run, stance, measured, solver.ranges_before(run, stance))

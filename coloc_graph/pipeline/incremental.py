@@ -176,7 +176,7 @@ class EnteredStance:
     warnings: tuple[str, ...] = ()
 
 
-class StanceSolver:
+class IncrementalSolver:
     """Incremental solver: measures each stance when it is over, and adds it to an estimator.
 
     Parameters

@@ -7,8 +7,9 @@ import gtsam
 import numpy as np
 import pytest
 from teams import fed, graph_of_team, largest_difference, of_stance, team_of
+from whole_graph import replay
 
-from coloc_graph.backend import Estimator, replay, smooth
+from coloc_graph.backend import Estimator, smooth
 from coloc_graph.errors import EstimationError, InputError, MeasurementError
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Odometry, RelativePose, Sighting

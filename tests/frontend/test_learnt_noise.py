@@ -10,7 +10,7 @@ from coloc_graph.backend.shared_noise import SharedNoise
 from coloc_graph.frontend.homography.noise_components import NoiseEvidence, learn_components
 from coloc_graph.frontend.homography.scatter import learn_spread, variance_factor
 from coloc_graph.frontend.learnt_noise import NoiseBelief, measure_alone
-from coloc_graph.pipeline.batch import SolveOptions, StanceSolver, solve
+from coloc_graph.pipeline.batch import IncrementalSolver, SolveOptions, solve
 from coloc_graph.results.writer import write_result
 from coloc_graph.run import RunWriter, open_run
 from coloc_graph.simulation import Imperfections, simulate
@@ -172,7 +172,7 @@ def test_stance_by_stance_learns_about_the_same_as_all_at_once(hallway, tmp_path
 
 def test_a_stance_that_is_withdrawn_takes_what_it_taught_with_it(hallway):
     run = open_run(hallway)
-    solver = StanceSolver(run.team, SolveOptions(odometry=False))
+    solver = IncrementalSolver(run.team, SolveOptions(odometry=False))
     beliefs = []
     for stance in run.stances[:2]:
         solver.enter(run, stance)

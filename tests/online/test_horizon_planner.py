@@ -12,7 +12,7 @@ from coloc_graph.online.leap_planner import Situation
 from coloc_graph.online.mission import in_world
 from coloc_graph.online.record import Record
 from coloc_graph.online.robot_registry import RobotRegistry
-from coloc_graph.pipeline.incremental import StanceSolver, measure_stance
+from coloc_graph.pipeline.incremental import IncrementalSolver, measure_stance
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.plan import Plan, PlannedStance
@@ -96,7 +96,7 @@ def test_a_stance_that_came_makes_the_team_better_known_and_spends_its_time(miss
     with atomic_run(tmp_path / "came.mcap", mission.team) as writer:
         record(world, writer, "tracks")
     run = open_run(tmp_path / "came.mcap")
-    solver = StanceSolver(mission.team)
+    solver = IncrementalSolver(mission.team)
     (stance,) = run.stances
     pairs = solver.measure(run, stance, measure_stance(run, stance, solver.options))
     entered = solver.enter(run, stance, pairs)

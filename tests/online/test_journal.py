@@ -12,7 +12,7 @@ from coloc_graph.online.journal import Attempt, Journal, read_attempts
 from coloc_graph.online.record import Record
 from coloc_graph.online.resume import restore
 from coloc_graph.online.robot_registry import RobotRegistry
-from coloc_graph.pipeline.incremental import StanceSolver
+from coloc_graph.pipeline.incremental import IncrementalSolver
 from coloc_graph.run import open_run
 
 MISSION = Path(__file__).parents[1] / "missions" / "recorded" / "continued-after-a-kill"
@@ -29,7 +29,7 @@ def attempts():
 
 
 def entered(run, attempts):
-    return [one.stance.index for _, one in Journal(run, attempts).enter(StanceSolver(run.team))]
+    return [one.stance.index for _, one in Journal(run, attempts).enter(IncrementalSolver(run.team))]
 
 
 def test_a_stance_of_whose_data_the_record_lost_a_part_does_not_enter_again(run, attempts):
@@ -60,7 +60,7 @@ def test_a_continued_mission_has_its_robots_where_the_estimate_says(tmp_path, ru
                 record.take(one)
         starts = dict.fromkeys(run.team.names, (50.0, 50.0, 1.0))
         registry = RobotRegistry(record, starts, lambda _: lambda stamp: stamp, 0, {})
-        stances = restore(run, MISSION / "mission.jsonl", StanceSolver(run.team), registry, threading.Event())
+        stances = restore(run, MISSION / "mission.jsonl", IncrementalSolver(run.team), registry, threading.Event())
         assert stances == list(run.stances)
         rows = [json.loads(line) for line in (MISSION / "mission.jsonl").read_text().splitlines()]
         last = [row for row in rows if row["what"] == "entered"][-1]
@@ -69,4 +69,4 @@ def test_a_continued_mission_has_its_robots_where_the_estimate_says(tmp_path, ru
             np.testing.assert_allclose((x, y), np.array(last["poses"][name])[:2, 3], atol=1e-3)
         stop = threading.Event()
         stop.set()
-        assert restore(run, MISSION / "mission.jsonl", StanceSolver(run.team), registry, stop) == []
+        assert restore(run, MISSION / "mission.jsonl", IncrementalSolver(run.team), registry, stop) == []

@@ -20,7 +20,7 @@ from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import MissionState
 from coloc_graph.online.record import Record
 from coloc_graph.online.robot_registry import RobotRegistry
-from coloc_graph.pipeline.incremental import StanceSolver
+from coloc_graph.pipeline.incremental import IncrementalSolver
 from coloc_graph.planning.course import Course
 from coloc_graph.robot_io.link.messages import Capture, Drive, EndCapture, Event, Halt, Reply, Status, Wheels
 from coloc_graph.run import Stance
@@ -52,7 +52,7 @@ class Mission:
         self.record = Record(folder / "run.mcap", self.team)
         starts, waypoints = in_world(self.team, "C", OPTIONS.goals)
         self.registry = RobotRegistry(self.record, starts, lambda _: lambda stamp: stamp, 0, self.inbox.status_times)
-        self.worker = EstimationWorker(self.record, StanceSolver(self.team))
+        self.worker = EstimationWorker(self.record, IncrementalSolver(self.team))
         self.commander = Commander(self.link, self.registry, 0.3, lambda _: None)
         self.log = MissionLog(folder / "mission.jsonl", self.registry.utc)
         self.formation = Formation(Course(waypoints), roles(self.team, None)[1])

@@ -22,7 +22,7 @@ from coloc_graph.online.odometry_restart import DROVE, STOOD, JoinedOdometry
 from coloc_graph.online.pose_tracker import PoseTracker
 from coloc_graph.online.record import Record, continued
 from coloc_graph.online.visibility import InView, Precision
-from coloc_graph.pipeline.incremental import EnteredStance, StanceSolver
+from coloc_graph.pipeline.incremental import EnteredStance, IncrementalSolver
 from coloc_graph.planning.course import Course
 from coloc_graph.run import Detections, OdometrySample, Stance, open_run
 from coloc_graph.simulation.rig import reference_team
@@ -264,7 +264,7 @@ def test_an_anchor_that_was_pushed_is_named_and_its_stance_comes_again(tmp_path,
         return record
 
     seen = open_run(copied(hallway, tmp_path / "run.mcap", change=pushed, stances=run.stances[:6]))
-    solver = StanceSolver(seen.team)
+    solver = IncrementalSolver(seen.team)
     measuring = EstimationWorker(seen, solver)
 
     def entered(one, retake=False):
@@ -389,7 +389,7 @@ def answer(ask):
 def test_a_stance_that_measures_nothing_and_a_fault_are_errors_of_the_stance(tmp_path, record, why):
     team = reference_team()
     stance = Stance(0, 1e9, 1e9 + 2, ("A", "B"), ("C",))
-    solver = StanceSolver(team)
+    solver = IncrementalSolver(team)
     with record(tmp_path / "run.mcap", team) as kept:
         measuring = EstimationWorker(kept, solver)
         assert measuring.judged() is None and measuring.entered() is None and not measuring.judging

@@ -130,7 +130,7 @@ def test_incrementally_a_team_comes_out_the_same(ten, ten_solved):
 
 
 def test_what_is_saved_of_a_team_knows_what_its_pairs_share(ten, tmp_path):
-    solver = stance_solver.StanceSolver(ten.team)
+    solver = stance_solver.IncrementalSolver(ten.team)
     for stance in ten.stances[:2]:
         solver.enter(ten, stance)
     shares = [m.homography.share for m in solver.estimator.graph.relative_poses]

@@ -14,8 +14,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from teams import graph_of_team, team_of
+from whole_graph import replay
 
-from coloc_graph.backend import replay, smooth
+from coloc_graph.backend import smooth
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.lie import floor_pose

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import viser
 from browser import browser, client_of, page_of, pixel_of, place_of, until  # noqa: F401  fixtures
+from whole_graph import replay
 
-from coloc_graph.backend import replay
 from coloc_graph.cli import main
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.viewer import LivePoses, LiveStance, Viewer, empty_scene, scene_of_result, scene_of_solution, video
