@@ -42,7 +42,7 @@ unit-and-types: $(VENV)/installed-dev
 	@$(MAKE) --no-print-directory -j3 ordinary realtime types
 
 ordinary: $(VENV)/installed-dev
-	$(NICE) $(BIN)/pytest --numprocesses 3 --dist loadfile -m "not realtime" tests
+	$(NICE) $(BIN)/pytest --numprocesses 3 --dist loadfile --no-loadscope-reorder -m "not realtime" tests
 
 realtime: $(VENV)/installed-dev
 	@$(BIN)/pytest -p no:cacheprovider -m realtime >$(VENV)/realtime.log 2>&1; code=$$?; cat $(VENV)/realtime.log; exit $$code

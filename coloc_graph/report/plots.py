@@ -10,6 +10,7 @@ from collections.abc import Iterable
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -270,7 +271,8 @@ def _residual_legend(any_bad: bool) -> list[Line2D | Patch]:
 def figure_svg(figure: Figure, name: str = "figure") -> str:
     """Return the figure as an <svg> element for HTML: ids begin with `name`, nothing refers outside."""
     out = io.StringIO()
-    figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    # drawn once: `savefig` would draw twice, the first time for the layout, which drawing makes anyway
+    FigureCanvasSVG(figure).print_svg(out, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     svg = out.getvalue()
     svg = svg[svg.index("<svg") :].strip()
     svg = re.sub(r"\s*<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
