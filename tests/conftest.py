@@ -36,11 +36,31 @@ def pytest_ignore_collect(collection_path, config):
 
 #: Files that take longest, which begin first: a process that begins one of them last would be waited for.
 DEAREST = (
-    "test_missions.py test_experiments.py test_notebooks.py test_viewer_browser.py test_many_runs.py test_teams.py "
-    "test_cli.py test_viewer.py test_ranging_runs.py test_estimator.py test_ranges.py test_outputs.py test_joint.py "
-    "test_site.py test_docs.py test_horizon.py test_many_robots.py test_benchmarks.py test_ros_import.py test_link.py "
-    "test_link_network.py test_landmark_sightings.py test_import_tracks.py test_coordinator_process.py"
-).split()
+    "test_missions.py",
+    "test_experiments.py",
+    "test_notebooks.py",
+    "test_viewer_browser.py",
+    "test_many_runs.py",
+    "test_teams.py",
+    "test_cli.py",
+    "test_viewer.py",
+    "test_ranging_runs.py",
+    "test_estimator.py",
+    "test_ranges.py",
+    "test_outputs.py",
+    "test_joint.py",
+    "test_site.py",
+    "test_docs.py",
+    "test_horizon.py",
+    "test_many_robots.py",
+    "test_benchmarks.py",
+    "test_ros_import.py",
+    "test_link.py",
+    "test_link_network.py",
+    "test_landmark_sightings.py",
+    "test_import_tracks.py",
+    "test_coordinator_process.py",
+)
 ALLOCATIONS = 50_000  # objects more than freed, after which the garbage collector looks at the youngest
 
 

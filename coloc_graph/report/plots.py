@@ -271,8 +271,9 @@ def _residual_legend(any_bad: bool) -> list[Line2D | Patch]:
 def figure_svg(figure: Figure, name: str = "figure") -> str:
     """Return the figure as an <svg> element for HTML: ids begin with `name`, nothing refers outside."""
     out = io.StringIO()
+    metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
     # drawn once: `savefig` would draw twice, the first time for the layout, which drawing makes anyway
-    FigureCanvasSVG(figure).print_svg(out, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    FigureCanvasSVG(figure).print_svg(out, metadata=metadata)  # type: ignore[no-untyped-call]
     svg = out.getvalue()
     svg = svg[svg.index("<svg") :].strip()
     svg = re.sub(r"\s*<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
