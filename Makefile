@@ -110,11 +110,13 @@ $(VENV)/made:
 	$(PYTHON) -m venv $(VENV)
 	@touch $@
 
-$(VENV)/installed: $(VENV)/made pyproject.toml
+KERNEL := setup.py $(wildcard kernel/*)
+
+$(VENV)/installed: $(VENV)/made pyproject.toml $(KERNEL)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
 	@touch $@
 
-$(VENV)/installed-%: $(VENV)/made pyproject.toml
+$(VENV)/installed-%: $(VENV)/made pyproject.toml $(KERNEL)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[$*]'
 	@touch $(VENV)/installed $@
 

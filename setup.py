@@ -1,4 +1,4 @@
-"""Version check in words, and the package page: README with links that lead to the repository.
+"""Version check in words, the compiled kernel, and the package page: README with links that lead to the repository.
 
 pip, left alone, says that no GTSAM can be found. The address of the repository is that of whoever publishes: the
 workflow gives it as PROJECT_URL. Without one, links to files of the repository are written as their text alone.
@@ -9,7 +9,7 @@ import re
 import sys
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import Extension, setup
 from setuptools.command.sdist import sdist
 
 PARTS = ("frontend", "backend", "robot_io")  # links at the root to folders of the package
@@ -55,7 +55,21 @@ LINKS = {
     "Issues": f"{URL}/issues",
 }
 
+# C with the limited API, rather than numba or Cython: docs/detection.md. Without a compiler, or with COLOC_PURE=1, the
+# package is pure Python that computes the same, more slowly.
+KERNEL = Extension(
+    "coloc_graph.frontend._kernel",
+    [f"kernel/{name}.c" for name in ("components", "filters", "module", "spots")],
+    depends=["kernel/kernel.h"],
+    extra_compile_args=["-O3", "-std=c11", "-g0"],
+    py_limited_api=True,
+    optional=True,
+)
+PURE = bool(os.environ.get("COLOC_PURE"))
+
 setup(
+    ext_modules=[] if PURE else [KERNEL],
+    options={} if PURE else {"bdist_wheel": {"py_limited_api": "cp311"}},
     cmdclass={"sdist": SdistWithLinks},
     long_description=package_page((Path(__file__).parent / "README.md").read_text(encoding="utf-8"), URL),
     long_description_content_type="text/markdown",

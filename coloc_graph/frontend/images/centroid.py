@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.frontend.compiled import kernel
 from coloc_graph.frontend.images.background import without_background
 from coloc_graph.frontend.images.sharp_spots import centres_of_mass, sharp_spots
 
@@ -88,6 +89,15 @@ def measure_spots(
         Centre, covariance and shape of each spot.
     """
     n, side = len(light), light.shape[2]
+    if kernel is not None:
+        first = None if begin is None else np.concatenate([begin[0], begin[1].reshape(n, 4)], axis=1)
+        signal, out, inner = np.empty((n, side, side)), np.empty((n, 13)), np.ascontiguousarray(inner)
+        light, size = np.ascontiguousarray(light, np.float64), np.ascontiguousarray(size, np.int64)
+        kernel.measure_spots(n, side, light, size, inner, first, signal, out, levels, shot_gain)
+        matrix = out[:, 2:10].reshape(n, 2, 2, 2)
+        return Spots(
+            out[:, :2], matrix[:, 0], matrix[:, 1], out[:, 10], signal, signal * inner, out[:, 11], out[:, 12] > 0
+        )
     signal, noise = without_background(light, size, inner, levels)
     inner_signal = signal * inner
     start = rough_shape(inner)
@@ -129,7 +139,7 @@ def measure_spots(
     covariance = gains @ covariance @ gains.mT / np.maximum(total * total, 1e-9)[:, None, None]
     sharp, fits = sharp_spots(shape, start)
     if len(sharp):
-        mass, own = centres_of_mass(signal[sharp], inner[sharp], noise[sharp], shot_gain)
+        mass, own = centres_of_mass(signal[sharp], size[sharp], inner[sharp], noise[sharp], shot_gain)
         centre[:, sharp] = np.where(fits, (centre[:, sharp] + mass) / 2, mass)
         covariance[sharp] = np.where(fits[:, None, None], (covariance[sharp] + own) / 2, own)
     found = (total > 0) & np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(centre).all(axis=0)

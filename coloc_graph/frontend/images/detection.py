@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from coloc_graph.frontend.images.centroid import at_points, axes, long_axis
 from coloc_graph.frontend.images.components import (
-    MAX_LED_SIZE,
     Bounds,
     Box,
     bounds_of,
+    bright_pixels,
     components,
-    cut_off,
     deblending_group,
+    find_bright,
     window_of,
 )
 from coloc_graph.frontend.images.deblending import measure_lights
@@ -34,7 +34,6 @@ Pixels = NDArray[np.uint8]
 Light = NDArray[np.uint8] | NDArray[np.float32]
 
 BORDER = 20  # px around a search box that are examined; more than the radius of the largest blob and its margin
-RIM = 4  # px around a search box that are examined first
 MAX_PADDED_PIXELS = 1 << 16  # windows are padded to a larger size while all together hold no more pixels
 MIN_CONTRAST = 4.0  # of a blob's peak, in standard deviations of the noise around it
 MAX_LIGHTS = 200  # lights of an image that are measured, the largest ones
@@ -72,8 +71,7 @@ class _Group(NamedTuple):
     light: Light
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Candidate:
+class Candidate(NamedTuple):
     """Blob before it is measured.
 
     Attributes
@@ -166,50 +164,33 @@ class Detector:
         u0, v0 = (max(box[0] - BORDER, 0), max(box[1] - BORDER, 0)) if box else (0, 0)
         light = self.light(image[v0 : box[3] + BORDER, u0 : box[2] + BORDER] if box else image)
         t = self.threshold
-        if box is None:
-            area = (0, 0, light.shape[1], light.shape[0])
-        else:  # the box and a rim; what is cut by the rim is looked at again with all that is around
-            left, top = max(box[0] - RIM - u0, 0), max(box[1] - RIM - v0, 0)
-            area = (left, top, min(box[2] + RIM - u0, light.shape[1]), min(box[3] + RIM - v0, light.shape[0]))
-        part = light[area[1] : area[3], area[0] : area[2]]
-        # some fifty pixels tell the median to a grey level, and a small list is sorted faster than an array
-        coarse = max(1, min(part.shape) // 6)
-        few = sorted(part[::coarse, ::coarse].ravel().tolist())
-        level = float(few[len(few) // 2]) + t.levels
-        above = cv2.threshold(light, level, 255, cv2.THRESH_BINARY)[1].astype(np.uint8, copy=False)
-        blobs = components(above[area[1] : area[3], area[0] : area[2]])
-        if box is not None and any(cut_off(blob, area, light.shape) for blob in blobs):
-            area = (0, 0, light.shape[1], light.shape[0])
-            blobs = components(above)
-        every = blobs if area == (0, 0, light.shape[1], light.shape[0]) else None
-        blobs = [one for one in blobs if t.min_area <= one.pixels <= t.max_area]
-        left_out = max(len(blobs) - MAX_LIGHTS, 0)
+        area = (0, 0, light.shape[1], light.shape[0])
+        if box is not None:
+            area = (box[0] - u0, box[1] - v0, box[2] - u0, box[3] - v0)
+        level, bright = find_bright(light, area, t.levels, t.min_area, t.max_area)
+        left_out = max(len(bright) - MAX_LIGHTS, 0)
         if left_out:
-            blobs = sorted(blobs, key=lambda one: -one.pixels)[:MAX_LIGHTS]
+            bright = sorted(bright, key=lambda one: -one[1])[:MAX_LIGHTS]
         found = []
         groups: dict[Bounds, _Group] = {}
-        for (left, top, width, height), pixels, (x, y) in blobs:
-            left, top = left + area[0], top + area[1]
-            u, v = x + area[0] + u0, y + area[1] + v0
-            if box is not None and not (box[0] - 1 <= u < box[2] + 1 and box[1] - 1 <= v < box[3] + 1):
-                continue
-            own, touched = (left, top, width, height), False
-            group = groups.get(own)
+        every = None
+        for own, pixels, (u, v), window, crowded in bright:
+            group, touched = groups.get(own), False
             if group is None:
-                window, boxes = window_of(own, light.shape), [own]
-                around = above[window[1] : window[3], window[0] : window[2]]
-                if max(width, height) <= MAX_LED_SIZE and cv2.countNonZero(around) > pixels:  # another light there
-                    every = components(above) if every is None else every
+                boxes = [own]
+                if crowded:
+                    every = components(bright_pixels(light, level)) if every is None else every
                     boxes = deblending_group(own, every, light.shape)
                     touched = not boxes
                     boxes = boxes or [own]
                     window = window_of(bounds_of(boxes), light.shape)
                 group = _Group(boxes, window, light[window[1] : window[3], window[0] : window[2]].copy())
                 groups |= dict.fromkeys(boxes, group)
+            left, top, width, height = own
             clipped = left + u0 <= 0 or top + v0 <= 0
             clipped |= left + u0 + width >= image.shape[1] or top + v0 + height >= image.shape[0]
             number, corner = group.boxes.index(own), (u0 + group.window[0], v0 + group.window[1])
-            found.append(Candidate((u, v), pixels, group, number, corner, level, clipped, touched))
+            found.append(Candidate((u + u0, v + v0), pixels, group, number, corner, level, clipped, touched))
         return found, left_out
 
     def measure(self, candidates: Sequence[Candidate]) -> tuple[Blobs, NDArray[np.bool_]]:

@@ -34,13 +34,16 @@ def sharp_spots(shape: Array, rough: Array) -> tuple[NDArray[np.intp], NDArray[n
     return sharp, fits[sharp]
 
 
-def centres_of_mass(light: Array, inner: NDArray[np.bool_], noise: Array, shot_gain: float) -> tuple[Array, Array]:
+def centres_of_mass(
+    light: Array, size: NDArray[np.int64], inner: NDArray[np.bool_], noise: Array, shot_gain: float
+) -> tuple[Array, Array]:
     """Compute the centres of mass of bright pixels and those beside them.
 
     Parameters
     ----------
-    light, inner
-        Windows without background (n, s, s) [grey levels], and their bright pixels.
+    light, size, inner
+        Windows without background (n, s, s) [grey levels], their sizes without padding (n, 2) [px: u, v], and their
+        bright pixels.
     noise
         Standard deviation of a dark pixel, (n,) [grey levels].
     shot_gain
@@ -57,9 +60,10 @@ def centres_of_mass(light: Array, inner: NDArray[np.bool_], noise: Array, shot_g
     column = near.copy()
     near[:, :, 1:] |= column[:, :, :-1]
     near[:, :, :-1] |= column[:, :, 1:]
+    at = np.arange(light.shape[2], dtype=float)
+    near &= (at < size[:, 1:])[:, :, None] & (at < size[:, :1])[:, None, :]
     lit = np.maximum(light, 0.0) * near
     total = np.maximum(lit.sum(axis=(1, 2)), 1e-9)
-    at = np.arange(light.shape[2], dtype=float)
     centre = np.array([lit.sum(axis=1) @ at, lit.sum(axis=2) @ at]) / total
     x, y = (at - one[:, None] for one in centre)
     variance = near * (noise * noise)[:, None, None] + shot_gain * lit

@@ -12,6 +12,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.frontend.compiled import kernel
+
 Array = NDArray[np.float64]
 
 #: Symmetric matrix (2, 2) as its entries xx, xy, yy.
@@ -162,7 +164,8 @@ class PointFilters:
 
     def add(self, u: float, v: float, covariance: Symmetric) -> None:
         """Add a point with unknown velocity."""
-        self.points.append(PointFilter(u, v, covariance, self._velocity_sigma**2))
+        new = PointFilter if kernel is None else kernel.PointFilter
+        self.points.append(new(u, v, covariance, self._velocity_sigma**2))
 
     def keep(self, which: Iterable[bool]) -> None:
         """Remove all points but those of a mask (n,)."""

@@ -1,0 +1,9 @@
+"""The compiled kernel of the front end (C, in kernel/), or None where it is not built: the same numbers, sooner."""
+
+from contextlib import suppress
+from importlib import import_module
+from typing import Any
+
+kernel: Any = None
+with suppress(ImportError):  # there was no C compiler when the package was installed
+    kernel = import_module("coloc_graph.frontend._kernel")
