@@ -17,7 +17,7 @@ import numpy as np
 
 from coloc_graph import SolveOptions, open_run, solve
 from coloc_graph.exchange.g2o_writer import write_g2o
-from coloc_graph.exchange.gtsam_files import unpack_gtsam, write_gtsam
+from coloc_graph.exchange.gtsam_files import gtsam_files, unpack_gtsam, write_gtsam
 from coloc_graph.simulation import Imperfections, simulate
 
 STARTS = np.array([0.01, 0.01, 0.02, 0.05, 0.05, 0.02])  # rad, m: sigmas of the errors of the initial poses
@@ -64,7 +64,7 @@ def of_g2o(estimate, folder: Path) -> tuple[int, float]:
 
 def of_factors(estimate, folder: Path) -> tuple[int, float, float]:
     """Iterations of the script on the exported factors, and its largest differences in sigmas, and of sigmas."""
-    write_gtsam(estimate, folder / "factors.zip")
+    write_gtsam(gtsam_files(estimate), folder / "factors.zip")
     unpack_gtsam(folder / "factors.zip", folder / "factors")
     subprocess.run([sys.executable, "-c", BARE, folder / "factors", folder / "out.npz"], check=True, cwd=folder)
     out = np.load(folder / "out.npz")

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     if Path(args.result).suffix in (".pyfg", ".jrl", ".g2o") and Path(args.result).is_file():
         raise InputError(f"{args.result} is exported to pyfg or jrl only: give the result of `coloc solve`")
     result = read_result(args.result)
-    if result.is_ranging and args.format in ("g2o", "gtsam", "dot", "pyfg", "jrl"):
+    if result.is_ranging and args.format in ("g2o", "dot", "pyfg", "jrl"):
         return _ranging(result, args.format, out)
     if args.format in ("pyfg", "jrl"):
         return _range_graph(args, out, result)
@@ -116,13 +116,11 @@ def _left_out(pose_graph: Path) -> str:
 
 def _ranging(result: "Result", form: str, out: Path) -> int:
     """Write the graph of a ranging run."""
-    import shutil
-
     from coloc_graph.errors import InputError
     from coloc_graph.exchange.jrl import read_jrl
     from coloc_graph.exchange.pyfg import write_pyfg
     from coloc_graph.exchange.range_graph_files import letters_of
-    from coloc_graph.exchange.ranging_graph import planar_dot, planar_g2o, planar_gtsam, without_bearings
+    from coloc_graph.exchange.ranging_graph import planar_dot, planar_g2o, without_bearings
     from coloc_graph.results.folder import RANGING_GRAPH
     from coloc_graph.run.atomic_file import write_atomically
 
@@ -137,6 +135,7 @@ def _ranging(result: "Result", form: str, out: Path) -> int:
     match form:
         case "jrl":
             write_atomically(out, source.read_bytes())
+            said = "errors of wheels and sensors are as estimated and exact; gtsam holds them with their uncertainty"
         case "pyfg":
             graph, said = without_bearings(graph)
             write_pyfg(graph, out)
@@ -146,12 +145,6 @@ def _ranging(result: "Result", form: str, out: Path) -> int:
         case "dot":
             write_atomically(out, planar_dot(graph, robots, landmarks))
             said = "one box is all poses of a robot, and the edges are counts"
-        case "gtsam":
-            if out.is_dir():
-                shutil.rmtree(out)  # an earlier export, as was checked
-            out.mkdir()
-            for name, text in planar_gtsam(graph, robots, landmarks).items():
-                (out / name).write_text(text, encoding="utf-8")
     names = ", ".join(f"{letter} = {robot}" for letter, robot in robots.items()) if form in ("pyfg", "jrl") else ""
     print("; ".join(part for part in (f"wrote {out}", said, names and f"robots {names}") if part))
     return 0

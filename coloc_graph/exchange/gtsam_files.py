@@ -7,6 +7,7 @@ GTSAM has no factors for, are linearised at the optimum: `LinearContainerFactor`
 import csv
 import io
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import gtsam
@@ -97,10 +98,10 @@ def _keys(estimate: Estimate) -> str:
     return out.getvalue()
 
 
-def write_gtsam(estimate: Estimate, path: Path) -> None:
-    """Write the files of an estimate for GTSAM as a zip archive, the same bytes for the same estimate."""
+def write_gtsam(files: Mapping[str, str], path: Path) -> None:
+    """Write the files of an estimate for GTSAM, by name, as a zip archive, the same bytes for the same estimate."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, text in gtsam_files(estimate).items():
+        for name, text in files.items():
             member = zipfile.ZipInfo(name, EPOCH)
             member.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(member, text)

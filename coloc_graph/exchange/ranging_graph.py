@@ -1,12 +1,11 @@
 """The graph of a ranging run for other programs: odometry, and bearings and ranges as those of calibrated sensors.
 
-Errors of wheels and sensors are taken as estimated. A measurement becomes the bearing and range of its target from the
-robot's body, with the covariance that noise, correlation in time and robust weight leave it: one with the gradient of
-the original, so that the optimum is the estimate. Outliers are left out.
+Errors of wheels and sensors are taken as estimated, without their uncertainty (`ranging_factors` has it).
+A measurement becomes the bearing and range of its target from the robot's body, with the covariance that noise,
+correlation in time and robust weight leave it: one with the gradient of the original, so that the optimum is the
+estimate. Outliers are left out.
 """
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 from coloc_graph.backend import Estimate
 from coloc_graph.backend.planar.factors import CAUCHY, GAUGE_SIGMA
 from coloc_graph.backend.sensor_model import RANGING, Sensors, WheelsModel
-from coloc_graph.exchange.gtsam_files import SCRIPT
 from coloc_graph.exchange.range_graph import (
     LANDMARK,
     BearingRangeValue,
@@ -27,11 +25,7 @@ from coloc_graph.exchange.range_graph import (
     RangeGraph,
     RangeValue,
     RelativeValue,
-    factors_of,
     is_landmark,
-    is_pose,
-    key_of,
-    values_of,
 )
 from coloc_graph.exchange.range_graph_files import letters_of
 from coloc_graph.geometry.lie import rotation_z, se3_inverse, yaw
@@ -175,22 +169,6 @@ def planar_g2o(graph: RangeGraph, robots: dict[str, str]) -> tuple[str, str]:
 
 def _pose(pose: gtsam.Pose2) -> str:
     return " ".join(repr(float(number)) for number in (pose.x(), pose.y(), pose.theta()))
-
-
-def planar_gtsam(graph: RangeGraph, robots: dict[str, str], landmarks: Iterable[str]) -> dict[str, str]:
-    """Return the files of a graph for GTSAM, as `gtsam_files` does, with GTSAM's own planar factors."""
-    out, marks = io.StringIO(), dict(enumerate(landmarks))
-    rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(["key", "kind", "of"])
-    for name, value in graph.initial.items():
-        of = f"{robots[name[0]]}@{name[1:]}" if is_pose(value) else f"landmark {marks[int(name[1:])]}"
-        rows.writerow([key_of(name), "planar pose" if is_pose(value) else "position", of])
-    return {
-        "graph.txt": factors_of(graph).serialize(),
-        "values.txt": values_of(graph.initial).serialize(),
-        "keys.csv": out.getvalue(),
-        "solve.py": SCRIPT.read_text(encoding="utf-8"),
-    }
 
 
 def planar_dot(graph: RangeGraph, robots: dict[str, str], landmarks: Iterable[str]) -> str:

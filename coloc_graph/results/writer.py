@@ -17,9 +17,10 @@ from coloc_graph.errors import ColocError
 from coloc_graph.evaluation import Accuracy, accuracy_json, align, evaluate, usual_alignment
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o_writer import write_g2o
-from coloc_graph.exchange.gtsam_files import write_gtsam
+from coloc_graph.exchange.gtsam_files import gtsam_files, write_gtsam
 from coloc_graph.exchange.jrl import write_jrl
 from coloc_graph.exchange.landmarks import landmark_rows, landmarks_csv, map_row
+from coloc_graph.exchange.ranging_factors import ranging_gtsam_files
 from coloc_graph.exchange.ranging_graph import ranging_graph
 from coloc_graph.exchange.tum import write_tum
 from coloc_graph.geometry.trajectory import Trajectory
@@ -129,9 +130,10 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
                 write_tum(trajectory, part / "online" / f"{robot}.tum")
         if estimate.is_ranging:
             write_jrl(ranging_graph(estimate, solution.run.team), part / RANGING_GRAPH)
+            write_gtsam(ranging_gtsam_files(estimate, solution.run.team), part / GTSAM_FACTORS)
         else:
             write_g2o(estimate, part / "graph.g2o")
-            write_gtsam(estimate, part / GTSAM_FACTORS)
+            write_gtsam(gtsam_files(estimate), part / GTSAM_FACTORS)
             (part / "graph.dot").write_text(to_dot(estimate.graph), encoding="utf-8")
         (part / MEASUREMENTS).write_text(measurement_table(solution), encoding="utf-8")
         if estimate.landmarks:

@@ -13,7 +13,7 @@ from coloc_graph.backend.factors import Factors
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
 from coloc_graph.exchange.g2o_writer import write_g2o
-from coloc_graph.exchange.gtsam_files import unpack_gtsam, write_gtsam
+from coloc_graph.exchange.gtsam_files import gtsam_files, unpack_gtsam, write_gtsam
 from coloc_graph.exchange.relative_edges import UPRIGHT, relative_edges
 from coloc_graph.simulation import Imperfections, simulate
 
@@ -51,7 +51,7 @@ def test_a_stock_optimiser_returns_to_our_poses_of_graph_g2o(estimate, tmp_path)
 
 
 def test_a_bare_script_gets_our_poses_and_covariances(estimate, tmp_path):
-    write_gtsam(estimate, tmp_path / "factors.zip")
+    write_gtsam(gtsam_files(estimate), tmp_path / "factors.zip")
     unpack_gtsam(tmp_path / "factors.zip", tmp_path / "out")
     spec = importlib.util.spec_from_file_location("solve_factors", tmp_path / "out" / "solve.py")
     script = importlib.util.module_from_spec(spec)

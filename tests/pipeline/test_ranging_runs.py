@@ -21,6 +21,7 @@ from coloc_graph.exchange.g2o import read_g2o
 from coloc_graph.exchange.mrclam import import_mrclam
 from coloc_graph.exchange.pyfg import read_pyfg
 from coloc_graph.exchange.range_graph import factors_of, key_of, values_of
+from coloc_graph.exchange.ranging_factors import ranging_gtsam_files
 from coloc_graph.exchange.ranging_graph import ranging_graph
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.pipeline.batch import SolveOptions, solve
@@ -411,7 +412,7 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     assert len(rows) == 1 + summary["measurements"]["used"] + summary["measurements"]["rejected"]
     assert {one.name for one in out.iterdir()} == {
         *("summary.json", "config.toml", "team.toml", "report.html", "landmarks.csv", "measurements.csv"),
-        *("trajectories", "online", "graph.jrl"),
+        *("trajectories", "online", "graph.jrl", "factors.zip"),
     }
     report = (out / "report.html").read_text()
     assert "the map of the landmarks" in report
@@ -454,7 +455,26 @@ def test_what_stands_in_a_result(run, folder, capsys, tmp_path):
     assert "measurements.csv is damaged" in capsys.readouterr().err
 
 
-def test_factors_for_gtsam_have_the_estimate_as_optimum(run, batch):
+def test_factors_for_gtsam_have_the_estimate_as_optimum_and_its_covariances(run, batch):
+    text = ranging_gtsam_files(batch.estimate, run.team)
+    factors, exact = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    factors.deserialize(text["graph.txt"])
+    exact.deserialize(text["values.txt"])
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")
+    isam = gtsam.ISAM2(parameters)
+    isam.update(factors, exact)
+    assert np.nanmax(np.abs(batch.estimate.ranging.residuals)) > 4.0  # robust weights are active
+    for robot, letter in zip(run.team.names, "Rab", strict=True):
+        trajectory = batch.estimate.trajectories[robot]
+        for n in range(0, len(trajectory), 9):
+            x, y, yaw = isam.calculateEstimatePose2(key := key_of(f"{letter}{n}")).localCoordinates(exact.atPose2(key))
+            sigmas = np.sqrt(trajectory.covariances[n].diagonal()[[3, 4, 2]])
+            assert np.all(np.abs([x, y, yaw]) < 0.02 * sigmas)
+            np.testing.assert_allclose(np.sqrt(isam.marginalCovariance(key).diagonal()), sigmas, rtol=0.005)
+
+
+def test_the_graph_of_a_ranging_run_has_the_estimate_as_optimum(run, batch):
     graph = ranging_graph(batch.estimate, run.team)
     start = values_of(graph.initial)
     found = gtsam.LevenbergMarquardtOptimizer(factors_of(graph), start).optimize()
