@@ -32,7 +32,7 @@ class Fit:
     """A graph at its optimum.
 
     `links` are the last of its `factors`, in that order; in the context `batched` those in Python are evaluated in
-    batches.
+    batches. Joint covariances of the ends of `links` and of those that it is `without` take no search.
     """
 
     graph: PoseGraph
@@ -42,6 +42,7 @@ class Fit:
     values: gtsam.Values
     iterations: int
     batched: BatchedFactors
+    without: tuple[Link, ...] = ()
 
     @cached_property
     def chi2(self) -> float:
@@ -53,7 +54,15 @@ class Fit:
     def marginals(self) -> Marginals:
         """Marginal covariances."""
         with self.batched, self.batched.held(self.values):
-            return Marginals(self.factors.linearize(self.values), size_of)
+            linear = self.factors.linearize(self.values)
+        for link in self.without:
+            # no information, but its ends then share a clique
+            i, j = map(self.graph.pose_keys.key, link.ends)
+            if i != j and self.values.exists(i) and self.values.exists(j):
+                nothing = np.zeros((1, 6))
+                unit = gtsam.noiseModel.Unit.Create(1)
+                linear.push_back(gtsam.JacobianFactor(i, nothing, j, nothing, np.zeros(1), unit))
+        return Marginals(linear, size_of)
 
     @cached_property
     def dof(self) -> int:
@@ -141,7 +150,7 @@ def fit_graph(
             if others is not None and factors.error(others) < factors.error(values):
                 values = others
             others = None
-            many = len(graph.robots) >= MANY_ROBOTS
+            many = len(graph.robots) >= MANY_ROBOTS or len(links) > ALL_TESTED
             values, used = optimise(factors, values, roughly_first=many, held=batched.held)
         iterations += used
         # spans are linearised at the mounts known before: once more where the estimate is elsewhere

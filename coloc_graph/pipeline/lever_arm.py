@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from coloc_graph.backend import Estimate, Estimator, PoseGraph, StanceEstimate, joint, smooth
-from coloc_graph.backend.batch import REJECTION_PRICE
 from coloc_graph.backend.blame import EQUAL_CHI2
+from coloc_graph.backend.outliers import REJECTION_PRICE
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.lie import floor_pose, se3_between, se3_inverse
 from coloc_graph.measurements import Measurement, Odometry, Sighting

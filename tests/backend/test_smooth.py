@@ -17,9 +17,10 @@ from coloc_graph.backend.chi2_test import Agreement
 from coloc_graph.backend.factors import Factors
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.optimize import fit_graph
+from coloc_graph.backend.outliers import gnc_outliers
 from coloc_graph.backend.solver import with_stack
 from coloc_graph.errors import EstimationError
-from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.measurements import Odometry, RelativePose, Sighting
 from coloc_graph.run import Stance
 from coloc_graph.team import Slip
@@ -90,11 +91,13 @@ def test_even_a_third_of_the_homographies_may_be_wrong():
 
 
 def test_right_measurements_that_are_doubted_are_taken_back(monkeypatch):
-    module = sys.modules["coloc_graph.backend.batch"]
     team = team_of(6, 8, seed=1, wrong=0.1)
     right = [m for m in team.measurements if isinstance(m, RelativePose) and m not in team.wrong]
-    genuine = module._outliers
-    monkeypatch.setattr(module, "_outliers", lambda fit: genuine(fit) | {id(m): m for m in right[::9]})
+
+    def with_right_ones(graph):
+        return gnc_outliers(graph) | {id(m): m for m in right[::9]}
+
+    monkeypatch.setattr(sys.modules["coloc_graph.backend.batch"], "gnc_outliers", with_right_ones)
     estimate = smooth(graph_of_team(team))
     assert {id(r.measurement) for r in estimate.rejected} == set(map(id, team.wrong))
 
@@ -102,15 +105,16 @@ def test_right_measurements_that_are_doubted_are_taken_back(monkeypatch):
 @pytest.fixture
 def large(monkeypatch):
     """Graphs of a few links are taken for large ones, in which the search goes on from where the fit was."""
-    batch, fit = (sys.modules[f"coloc_graph.backend.{name}"] for name in ("batch", "optimize"))
+    batch, fit, outliers = (sys.modules[f"coloc_graph.backend.{name}"] for name in ("batch", "optimize", "outliers"))
     monkeypatch.setattr(batch, "ALL_TESTED", 0)
     monkeypatch.setattr(fit, "ALL_TESTED", 0)
     monkeypatch.setattr(batch, "MIN_FIT_P_VALUE", 0.0)
-    monkeypatch.setattr(batch, "_outliers", lambda fit: pytest.fail("all is searched anew"))
+    monkeypatch.setattr(outliers, "ALL_TESTED", 0)
+    monkeypatch.setattr(batch, "gnc_outliers", lambda *_: pytest.fail("all is searched anew"))
 
 
 def test_in_a_large_graph_a_few_wrong_homographies_are_found_from_where_the_fit_was(large, monkeypatch):
-    team = team_of(6, 12, seed=4, wrong=0.04)
+    team = team_of(5, 8, seed=4, wrong=0.06)
     assert 1 < len(team.wrong) < 8
     graph = graph_of_team(team)
     estimate = smooth(graph)
@@ -185,6 +189,27 @@ def test_a_bumped_anchor_is_found_and_named_and_no_homography_is_blamed(size, re
     assert f"robot {robot} was bumped between stances 5 and 6" in str(found)
     # before and after are two places now
     assert not estimate.pose(robot, 5).equals(estimate.pose(robot, 6), 0.02)
+
+
+def test_of_a_large_team_a_bump_is_told_from_many_wrong_homographies(monkeypatch):
+    for name in ("batch", "optimize", "outliers"):
+        monkeypatch.setattr(sys.modules[f"coloc_graph.backend.{name}"], "ALL_TESTED", 100)
+    monkeypatch.setattr(sys.modules["coloc_graph.backend.batch"], "gnc_outliers", lambda *_: pytest.fail("dear"))
+    team = team_of(8, 12, seed=5, wrong=0.12, sightings=False)
+    graph = graph_of_team(team)
+    stay = next(one for one in graph.stay_puts if one.after == 6)
+    bump, key = floor_pose(0.06, -0.05, 0.12), graph.key(stay.robot, 6)
+    made, wrong = [], set()
+    for m in team.measurements:
+        i, j = (node[1] >= 6 and graph.pose_keys.key(node) == key for node in m.ends)
+        is_wrong, T = m in team.wrong, m.T_i_j
+        T = se3_inverse(bump) @ T if i else T @ bump if j else T
+        m = replace(m, T_before_after=T) if isinstance(m, Odometry) else replace(m, T_i_j=T)
+        made.append(m)
+        wrong |= {id(m)} if is_wrong else set()
+    estimate = smooth(graph_of_team(team, made))
+    assert {id(one.measurement) for one in estimate.rejected} == wrong and len(wrong) > 12
+    assert [(one.stay_put.robot, one.stay_put.after) for one in estimate.bumped] == [(stay.robot, 6)]
 
 
 def test_a_healthy_team_has_neither_bumps_nor_refusals():
