@@ -114,7 +114,7 @@ def large(monkeypatch):
 
 
 def test_in_a_large_graph_a_few_wrong_homographies_are_found_from_where_the_fit_was(large, monkeypatch):
-    team = team_of(5, 8, seed=4, wrong=0.06)
+    team = team_of(6, 9, seed=4, wrong=0.05)
     assert 1 < len(team.wrong) < 8
     graph = graph_of_team(team)
     estimate = smooth(graph)
@@ -195,7 +195,7 @@ def test_of_a_large_team_a_bump_is_told_from_many_wrong_homographies(monkeypatch
     for name in ("batch", "optimize", "outliers"):
         monkeypatch.setattr(sys.modules[f"coloc_graph.backend.{name}"], "ALL_TESTED", 100)
     monkeypatch.setattr(sys.modules["coloc_graph.backend.batch"], "gnc_outliers", lambda *_: pytest.fail("dear"))
-    team = team_of(8, 12, seed=5, wrong=0.12, sightings=False)
+    team = team_of(10, 10, seed=4, wrong=0.12, sightings=False)
     graph = graph_of_team(team)
     stay = next(one for one in graph.stay_puts if one.after == 6)
     bump, key = floor_pose(0.06, -0.05, 0.12), graph.key(stay.robot, 6)
