@@ -16,12 +16,13 @@ from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreemen
 from coloc_graph.backend.estimate import Bump, Rejection, rejection_of
 from coloc_graph.backend.factors import Method
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
+from coloc_graph.backend.landmarks import OnMap
 from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
 from coloc_graph.backend.solver import robust_parameters
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.lie import se3_inverse, yaw
 from coloc_graph.geometry.se2 import wrap
-from coloc_graph.measurements import Range, RelativePose, Sighting
+from coloc_graph.measurements import Measurement, Range, RelativePose, Sighting
 
 REJECTION_PRICE = 30.0  # chi2 that one more outlier must explain
 MAX_ROUNDS = 20  # rounds of rejecting the worst links and taking back those that then agree
@@ -49,9 +50,9 @@ class Found:
         return tuple(rejection_of(link, self.off[key]) for key, link in self.links.items())
 
     @property
-    def links(self) -> dict[int, Link]:
+    def links(self) -> dict[int, Measurement | OnMap]:
         """The rejected links, in the order of the graph, by identity."""
-        links = (*self.graph.measurements, *self.graph.on_map)
+        links: tuple[Measurement | OnMap, ...] = (*self.graph.measurements, *self.graph.on_map)
         return {id(link): link for link in links if id(link) in self.off}
 
     @property
@@ -69,7 +70,7 @@ def parallel_outliers(graph: PoseGraph) -> dict[int, Link]:
     for link in graph.relative_poses:
         i, j = map(graph.pose_keys.key, link.ends)
         parallel[min(i, j), max(i, j)].append(link)
-    found = {}
+    found: dict[int, Link] = {}
     for (first, _), links in parallel.items():
         if len(links) < MIN_PARALLEL:
             continue
@@ -115,7 +116,7 @@ def gnc_outliers(graph: PoseGraph, fit: Fit | None = None) -> dict[int, Link]:
     return {id(fit.links[index]): fit.links[index] for index in suspects if weights[first + index] < 0.5}
 
 
-def find_outliers(method: Method, graph: PoseGraph, first: dict[int, Link], start: gtsam.Values | None) -> Found:
+def find_outliers(method: Method, graph: PoseGraph, first: Mapping[int, Link], start: gtsam.Values | None) -> Found:
     """Find the outliers of a graph, from those of graduated non-convexity and, in a small graph, also from none.
 
     The set with fewer rejections for the same fit is the likelier cause. In a large graph anchors are then tried whose
@@ -131,13 +132,13 @@ def find_outliers(method: Method, graph: PoseGraph, first: dict[int, Link], star
     return found
 
 
-def _search(method: Method, graph: PoseGraph, suspected: dict[int, Link], start: gtsam.Values | None) -> Found:
+def _search(method: Method, graph: PoseGraph, suspected: Mapping[int, Link], start: gtsam.Values | None) -> Found:
     """Reject the worst links and take back those that then agree, in turns; start from those `suspected`.
 
     One link is rejected a round, of a large graph one of those at each pose. What alone ties a pose is taken back too,
     up to `SIGMAS_ALONE`.
     """
-    suspected, at_rejection, alone = dict(suspected), dict[int, Agreement](), set[int]()
+    suspected, at_rejection, alone = dict[int, Link](suspected), dict[int, Agreement](), set[int]()
     # ends when a set repeats, or after the last round
     for left in reversed(range(MAX_ROUNDS)):
         try:

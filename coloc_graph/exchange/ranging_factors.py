@@ -6,6 +6,7 @@ uncertainty. Measurements keep the robust weights of their residuals, outliers t
 
 import csv
 import io
+from collections.abc import Callable
 
 import gtsam
 import numpy as np
@@ -137,5 +138,6 @@ class _Portable:
             for slot, block in parts:
                 is_pose = slot[0] < poses
                 columns += [[self._keys[key] for key in slot.tolist()], block @ self._turns[slot] if is_pose else block]
+            make: Callable[..., gtsam.JacobianFactor] = gtsam.JacobianFactor
             for one in zip(*columns, -rows.residuals[index], strict=True):
-                self._graph.add(gtsam.LinearContainerFactor(gtsam.JacobianFactor(*one, noise), self._values))
+                self._graph.add(gtsam.LinearContainerFactor(make(*one, noise), self._values))
