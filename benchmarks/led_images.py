@@ -2,7 +2,7 @@
 
     python benchmarks/led_images.py [--data DIR] [--out PICTURE.png]
 
-An LED's core saturates the sensor and is compact; a reflection is dimmer, or drawn out, or much larger.
+The detector tells them by probability; the last line of a picture is the least certain of either kind.
 """
 
 import argparse
@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from coloc_graph.frontend import Blobs, detect_leds
-from coloc_graph.run import Flag
+from coloc_graph.frontend import detect_leds
+from coloc_graph.frontend.images.light_kinds import LED_PROBABILITY
 
 ROOT = Path(__file__).resolve().parents[1]
 #: LED cores that a person sees in each picture [px], read off by eye.
@@ -27,12 +27,6 @@ SEEN = {
     "0004": "231,128 397,130 327,156 478,169 132,175 504,228 351,246 135,253 450,276 49,284 257,297 534,319 439,332 "
     "294,355 140,380",
 }
-
-
-def cores(blobs: Blobs) -> np.ndarray:
-    """Return the mask (n,) of blobs that are LED cores."""
-    bright = ((blobs.flags & Flag.SATURATED) != 0) & ((blobs.flags & (Flag.BLURRED | Flag.CLIPPED)) == 0)
-    return bright & (blobs.area < 3 * np.median(blobs.area[bright]))
 
 
 def main() -> int:
@@ -49,12 +43,13 @@ def main() -> int:
     for path in paths:
         image = cv2.imread(str(path), cv2.IMREAD_COLOR)
         blobs = detect_leds(image)
-        core = cores(blobs)
+        core = blobs.led > LED_PROBABILITY
         seen = np.array([[float(x) for x in place.split(",")] for place in SEEN[path.stem].split()])
         near = np.linalg.norm(seen[:, None] - blobs.uv[core][None], axis=2) < 6.0
         print(
             f"{path.name}: {near.any(axis=1).sum()} of {len(seen)} LED cores found, {(~near.any(axis=0)).sum()} more "
-            f"called a core, {(~core).sum()} other lights told by flag or size"
+            f"called a core, {(~core).sum()} other lights; probability of the doubtfullest core "
+            f"{blobs.led[core].min():.2f}, and of another light {blobs.led[~core].max(initial=0.0):.2f}"
         )
         for missed in seen[~near.any(axis=1)]:
             print(f"  missed {missed}")

@@ -7,6 +7,7 @@ covariances and flags (`Flag`).
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import groupby
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ from coloc_graph.frontend.images.components import (
     window_of,
 )
 from coloc_graph.frontend.images.deblending import measure_lights
+from coloc_graph.frontend.images.light_kinds import Forms, forms_of_records, forms_of_windows, led_probability
 from coloc_graph.run.messages import Flag
 from coloc_graph.team import Camera, Markers
 
@@ -44,7 +46,8 @@ DIP = 0.8  # brightness between two spots, as a share of the darker one, below w
 class Blobs:
     """Blobs of one image: `uv` (n, 2) [px], `covariance` (n, 2, 2) [px^2], `flags`, `peak`, `area` (n,).
 
-    `left_out` lights of the image were not measured, since it has more than `MAX_LIGHTS`.
+    `left_out` lights of the image were not measured, since it has more than `MAX_LIGHTS`. `looks` are those of all
+    blobs of the image, and `numbers` (n,) are the blobs' rows in it.
     """
 
     uv: Array
@@ -53,13 +56,33 @@ class Blobs:
     peak: Array
     area: Array
     left_out: int = 0
+    looks: "Looks | None" = None
+    numbers: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.uv)
 
+    @property
+    def led(self) -> Array:
+        """Probabilities (n,) that they are LEDs, and no reflections or lamps, by their looks in the image."""
+        if self.looks is not None and self.numbers is not None:
+            return self.looks.led[self.numbers]
+        return led_probability(self.recorded_forms())
+
+    def recorded_forms(self, levels: float = 35.0) -> Forms:
+        """Forms as far as peaks and areas tell them, above `levels` [grey levels]."""
+        return forms_of_records(self.peak, self.area, (self.flags & Flag.BLURRED) != 0, levels)
+
     def __getitem__(self, which: NDArray[np.bool_]) -> "Blobs":
         return Blobs(
-            self.uv[which], self.covariance[which], self.flags[which], self.peak[which], self.area[which], self.left_out
+            self.uv[which],
+            self.covariance[which],
+            self.flags[which],
+            self.peak[which],
+            self.area[which],
+            self.left_out,
+            self.looks,
+            None if self.numbers is None else self.numbers[which],
         )
 
 
@@ -104,6 +127,18 @@ class Candidate(NamedTuple):
     touched: bool
 
 
+class Looks:
+    """Looks of all lights of one image; what they are is computed when it is asked for."""
+
+    def __init__(self, detector: "Detector", candidates: Sequence[Candidate]) -> None:
+        self._detector, self._candidates = detector, candidates
+
+    @cached_property
+    def led(self) -> Array:
+        """Probabilities (n,) that they are LEDs."""
+        return led_probability(self._detector.forms(self._candidates))
+
+
 @dataclass(frozen=True)
 class Threshold:
     """Thresholds on the brightness, size and shape of a blob."""
@@ -138,10 +173,22 @@ class Detector:
         """Detect and measure the blobs of an image, or those with their centre in `box`."""
         found, left_out = self._found(image, box)
         blobs, real = self.measure(found)
+        looks = Looks(self, [one for one, kept in zip(found, real.tolist(), strict=True) if kept])
+        blobs = replace(blobs, looks=looks, numbers=np.cumsum(real) - 1)
         if box is not None:
             u, v = blobs.uv.T
             real &= (u >= box[0] - 0.5) & (v >= box[1] - 0.5) & (u < box[2] - 0.5) & (v < box[3] - 0.5)
         return replace(blobs[real], left_out=left_out)
+
+    def forms(self, candidates: Sequence[Candidate]) -> Forms:
+        """Measure the forms of candidates, by which LEDs are told from other lights."""
+        t, levels = self.threshold, np.array([one.level for one in candidates])
+        light = np.zeros((0, 1, 1)) if not candidates else _padded([one.group.light for one in candidates])[0]
+        boxes = [one.group._replace(boxes=one.group.boxes[one.number : one.number + 1]) for one in candidates]
+        inner = _in_boxes(light.shape[1], boxes) if candidates else np.zeros((0, 1, 1), bool)
+        inner &= light > levels[:, None, None]
+        background = levels - t.levels
+        return forms_of_windows(light - background[:, None, None], inner, t.levels, t.saturation - background)
 
     def light(self, part: Pixels) -> Light:
         """Return the light of markers in a part of an image, (h, w) [grey levels]: brightness, or chroma of the hue."""

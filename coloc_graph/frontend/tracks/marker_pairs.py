@@ -17,6 +17,7 @@ MIN_SHARED_PART = 0.5  # of the shorter track, during which two markers of a rob
 CLEARLY_MORE = 1.05  # ratio of the samples that two planes explain above which the second is preferred
 MIN_SHARED_SAMPLES = 8  # of two tracks, to be grouped if there is a choice
 MOMENT = 0.02  # s, overlap of two tracks that does not count as being seen at the same time
+PAIR_ODDS = 20.0  # factor of the odds that two lights are LEDs which move a span apart on the marker plane
 
 
 #: Indices of two tracks of one camera that may be two markers of one robot, and indices (n, 2) of shared samples.
@@ -140,7 +141,7 @@ def markers_of_movers(
         return [replace(track, body=0) for track in moving] if alone else moving
     bodies = [{index} for index in range(len(moving))]
     of = list(range(len(moving)))
-    for a, b, shared in sorted(bound, key=lambda one: -len(one[2])):
+    for a, b, shared in sorted(bound, key=lambda one: -len(one[2]) * _likely(moving[one[0]]) * _likely(moving[one[1]])):
         joined = bodies[of[a]] | bodies[of[b]]
         if len({moving[n].mover for n in joined} - {""}) > 1:
             continue
@@ -152,9 +153,20 @@ def markers_of_movers(
             of[index] = of[a]
     every = {n for n, body in enumerate(of) if len(bodies[body]) > 1}
     if movers == 1 and _two_at_once(moving, every):
-        return [replace(moving[n], body=0) for n in sorted(every)]
+        return [_marker(moving[n], 0) for n in sorted(every)]
     robots = sorted({body for body in of if len(bodies[body]) > 1}, key=lambda body: min(bodies[body]))
-    return [replace(track, body=robots.index(of[n])) for n, track in enumerate(moving) if of[n] in robots]
+    return [_marker(track, robots.index(of[n])) for n, track in enumerate(moving) if of[n] in robots]
+
+
+def _likely(track: Track) -> float:
+    """Weight of a track where pairs are formed: a track that looks like no LED has half of another's."""
+    return 1.0 if np.isnan(track.led) else (1 + track.led) / 2
+
+
+def _marker(track: Track, body: int) -> Track:
+    """The track as a marker of a robot: that it moves as one makes an LED likelier than its looks."""
+    odds = PAIR_ODDS * track.led / max(1 - track.led, 1e-9)
+    return replace(track, body=body, led=odds / (1 + odds))
 
 
 def merge_named(tracks: Sequence[Track]) -> list[Track]:

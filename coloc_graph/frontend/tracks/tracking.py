@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from coloc_graph.frontend.images.detection import Blobs, Candidate, Detector, Pixels
+from coloc_graph.frontend.images.light_kinds import Forms, track_probability
 from coloc_graph.frontend.tracks.blink_filter import BlinkFilter
 from coloc_graph.frontend.tracks.kalman import PointFilters, Symmetric
 from coloc_graph.run.messages import Flag, Image
@@ -39,6 +40,7 @@ MAX_FACTOR = 100.0  # by which the acceleration may grow
 FASTER = 2.0  # a new light's velocity is up to this times those of the lights that are tracked
 REACH_SIGMAS = 3.0  # standard deviations of a light's position that the patch holds
 ROUGH_EXTENT = 2.0  # px by which an extent of approximate centres may be too small
+LOOKED_AT = 12  # samples of a track by whose looks it is called an LED or not
 MIN_PIECE = 4  # samples of a piece on which both directions of time agree
 ROUGH_SIGMA = 0.5  # px, of a candidate's approximate centre
 ROUGH: Symmetric = (ROUGH_SIGMA**2, 0.0, ROUGH_SIGMA**2)
@@ -70,6 +72,8 @@ class Track:
         Times of images in which the marker was expected and not detected, (k,) [s].
     saturated
         True for samples whose core is at the sensor's limit, (n,); None if it is unknown.
+    led
+        Probability that it is an LED, and no reflection or lamp, by its looks; NaN if it is unknown.
     """
 
     robot: str
@@ -82,6 +86,7 @@ class Track:
     mover: str = ""
     missed: Array = field(default_factory=lambda: np.zeros(0))
     saturated: NDArray[np.bool_] | None = None
+    led: float = math.nan
 
     def __len__(self) -> int:
         return len(self.times)
@@ -200,6 +205,7 @@ class MarkerTracker:
         self._ended: list[_Live] = []
         self._parked: list[_Live] = []
         self._taken: list[tuple[Array, Array, float, bool]] = []
+        self._forms: list[Forms] = []  # of the taken detections, image by image
         self._searched = -math.inf  # when the full frame was searched last
         # as `_advance` took them
         self._images: list[tuple[float, list[Place], list[Symmetric], Sequence[Candidate | int]]] = []
@@ -220,6 +226,7 @@ class MarkerTracker:
         whole = blobs[(blobs.flags & UNRELIABLE) == 0]
         numbers = range(len(self._taken), len(self._taken) + len(whole))
         saturated = (whole.flags & Flag.SATURATED) != 0
+        self._forms.append(whole.recorded_forms())
         self._taken += zip(whole.uv, whole.covariance, whole.peak.tolist(), saturated.tolist(), strict=True)
         places: list[Place] = [(u, v) for u, v in whole.uv.tolist()]
         covariances: list[Symmetric] = [(xx, xy, yy) for (xx, xy), (_, yy) in whole.covariance.tolist()]
@@ -253,11 +260,16 @@ class MarkerTracker:
     def _measured(self, lives: Sequence[_Live]) -> list[Track]:
         candidates = [one for live in lives for one in live.samples if isinstance(one, Candidate)]
         if not candidates:
-            return [self._track(live, [self._taken[one] for one in live.samples]) for live in lives]  # type: ignore[index]
+            return self._of_taken(lives)
         blobs, real = self._detector.measure(candidates)
         real &= (blobs.flags & UNRELIABLE) == 0
+        looks = [_some(live.samples) for live in lives]
+        led = track_probability(
+            self._detector.forms([one for some in looks for one in some if isinstance(one, Candidate)]),
+            [len(some) for some in looks],
+        )
         tracks, begin = [], 0
-        for live in lives:
+        for live, probability in zip(lives, led, strict=True):
             own = slice(begin, begin + len(live.samples))
             begin = own.stop
             good = real[own]
@@ -271,14 +283,28 @@ class MarkerTracker:
                     blobs.peak[own][good],
                     missed=_between(live),
                     saturated=(blobs.flags[own][good] & Flag.SATURATED) != 0,
+                    led=probability,
                 )
             )
         return [track for track in tracks if len(track)]
 
-    def _track(self, live: _Live, samples: list[tuple[Array, Array, float, bool]]) -> Track:
-        uv, covariance, peak, saturated = zip(*samples, strict=True)
-        fields = np.array(live.times), np.array(uv), np.array(covariance), np.array(peak)
-        return Track(self.robot, "", *fields, missed=_between(live), saturated=np.array(saturated))
+    def _of_taken(self, lives: Sequence[_Live]) -> list[Track]:
+        """Tracks of detections that were taken from elsewhere."""
+        if not lives:
+            return []
+        looks = [_some(live.samples) for live in lives]
+        every = Forms(*(np.concatenate(one) for one in zip(*self._forms, strict=True)))
+        rows = np.array([one for some in looks for one in some])
+        led = track_probability(Forms(*(one[rows] for one in every)), [len(some) for some in looks])
+        tracks = []
+        for live, probability in zip(lives, led, strict=True):
+            uv, covariance, peak, saturated = zip(*(self._taken[one] for one in live.samples), strict=True)  # type: ignore[index]
+            fields = np.array(live.times), np.array(uv), np.array(covariance), np.array(peak)
+            track = Track(
+                self.robot, "", *fields, missed=_between(live), saturated=np.array(saturated), led=probability
+            )
+            tracks.append(track)
+        return tracks
 
     @property
     def _scale(self) -> float:
@@ -504,6 +530,12 @@ class MarkerTracker:
         return any(
             max(abs(place[0] - track.uv[-1][0]), abs(place[1] - track.uv[-1][1])) < STILL_PX for track in self._parked
         )
+
+
+def _some(samples: Sequence[Candidate | int]) -> list[Candidate | int]:
+    """Up to `LOOKED_AT` samples, evenly spread."""
+    step = max(len(samples) // LOOKED_AT, 1)
+    return list(samples[::step][:LOOKED_AT])
 
 
 def _between(live: _Live) -> Array:
