@@ -298,6 +298,16 @@ def moved(graph: PoseGraph, stay: StayPut) -> PoseGraph:
     return replace(graph, stances=stances)
 
 
+def as_stated(graph: PoseGraph, bumps: Iterable[Bump]) -> PoseGraph:
+    """Return the graph in which anchors that were bumped stayed put, as is stated: the inverse of `moved`."""
+    stays = {(one.stay_put.robot, one.stay_put.after) for one in bumps}
+    stances = tuple(
+        replace(stance, anchors=(*stance.anchors, *(r for r, after in stays if after == stance.index)))
+        for stance in graph.stances
+    )
+    return replace(graph, stances=stances) if stays else graph
+
+
 def _with_fault(graph: PoseGraph, best: _Tried, others: list[_Tried]) -> PoseGraph:
     """Return the graph with a bumped anchor freed; what may be wrong instead is as uncertain as it then is off."""
     for one in (best, *others):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from coloc_graph.backend import Estimate, Estimator, PoseGraph, StanceEstimate, joint, smooth
-from coloc_graph.backend.blame import EQUAL_CHI2
+from coloc_graph.backend.blame import EQUAL_CHI2, as_stated
 from coloc_graph.backend.outliers import REJECTION_PRICE
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.lie import floor_pose, se3_between, se3_inverse
@@ -99,7 +99,8 @@ def _best_arm(
             continue
         arm = _arm(without, robot, ways)
         if arm is not None:
-            moved = solve(with_lever_arms(estimate.graph, {robot: arm}))
+            # a bump may be the arm's, and one that is not must be found again
+            moved = solve(with_lever_arms(as_stated(estimate.graph, estimate.bumped), {robot: arm}))
             cost = _implausibility(moved)
             if best is None or cost < best[0]:
                 best = cost, arm, moved

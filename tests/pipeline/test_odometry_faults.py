@@ -8,7 +8,7 @@ from teams import ate, fed, graph_of_team, team_of
 
 from coloc_graph.backend import smooth
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
-from coloc_graph.measurements import Odometry
+from coloc_graph.measurements import Odometry, RelativePose, Sighting
 from coloc_graph.pipeline.lever_arm import find_lever_arms, mend_lever_arms
 from coloc_graph.pipeline.odometry_checks import checked
 from coloc_graph.run import OdometrySample, Stance
@@ -60,9 +60,18 @@ def test_odometry_that_hangs_while_its_robot_moves_is_not_used_there_and_told():
     assert max(one.covariance[0, 0] for one in mended if 10 <= one.time <= 15) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("arm", [(0.4, 0.0), (-0.3, 0.1)])
-def test_odometry_of_another_point_of_the_body_is_found_and_moved_to_it(arm):
-    team = team_of(3, 14, 2)
+def pushed(measurements, node, T):
+    """The measurements where a robot was pushed by T before a stance in which it stood, and drove on from there."""
+    for m in measurements:
+        i, j = (np.linalg.inv(T) if end == node else np.eye(4) for end in m.ends)
+        name = {Odometry: "T_before_after", Sighting: "T_observer_seen", RelativePose: "T_i_j"}[type(m)]
+        yield replace(m, **{name: i @ m.T_i_j @ np.linalg.inv(j)})
+
+
+@pytest.mark.parametrize(("arm", "bumped"), [((0.4, 0.0), False), ((-0.3, 0.1), True)])
+def test_odometry_of_another_point_of_the_body_is_found_and_moved_to_it(arm, bumped):
+    """Also beside a bump, which is still told."""
+    team = team_of(3, 11, 2)
     T = floor_pose(*arm, 0.0)
     made = [
         replace(m, T_before_after=se3_inverse(T) @ m.T_before_after @ T)
@@ -70,11 +79,15 @@ def test_odometry_of_another_point_of_the_body_is_found_and_moved_to_it(arm):
         else m
         for m in team.measurements
     ]
+    if bumped:
+        made = pushed(made, ("A", 6), floor_pose(0.3, -0.1, 0.2))
     arms, mended = find_lever_arms(smooth(graph_of_team(team, made)), smooth)
     assert list(arms) == ["B"] and (arms["B"].x, arms["B"].y) == pytest.approx(arm, abs=0.1)
     assert "the odometry of B is not that of its body's origin" in str(arms["B"])
-    assert not mended.rejected and not mended.bumped
-    assert ate(mended, team) < 1.5 * ate(smooth(graph_of_team(team)), team)
+    assert not mended.rejected
+    assert [(one.stay_put.robot, one.stay_put.after) for one in mended.bumped] == ([("A", 6)] if bumped else [])
+    if not bumped:
+        assert ate(mended, team) < 1.5 * ate(smooth(graph_of_team(team)), team)
 
 
 def test_odometry_of_another_point_is_moved_to_the_body_stance_by_stance():
