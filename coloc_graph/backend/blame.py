@@ -29,7 +29,7 @@ MAX_FAULTS = 4  # faults that are searched for one after the other
 MANY_FAULTS = 4.0  # chi2 left, in units of what the likeliest of `MAX_FAULTS` explains, from which many are wrong
 MAX_FITTED = 6  # causes that are fitted in each round, the likeliest
 MAX_GROUPS = 20  # groups of measurements that are tested together in each round, the worst
-MIN_GAIN = 0.5  # part of the largest predicted decrease of chi2 from which a cause is fitted
+MIN_GAIN = 0.5  # part of the largest predicted decrease of chi2 from which a cause is fitted in any case
 GROUP_PRICE = 30.0  # chi2 that several measurements must explain beyond one of them
 EQUAL_CHI2 = 9.0  # two causes explain equally well if chi2 differs by less
 SIGMAS_ALONE = 12.0  # a measurement that alone ties a pose is kept up to this: a wrong one is off by many more
@@ -239,8 +239,11 @@ def _fitted(method: Method, fit: Fit, suspects: list[tuple[Cause, Agreement]]) -
     tied = len(fit.graph.disconnected(fit.values.keys()))
     most = 2 if len(fit.links) > ALL_TESTED else MAX_FITTED
     warm = WarmStart(fit.graph, fit.values, ())
-    worth = [one for one in suspects[:most] if one[1].chi2 > MIN_GAIN * suspects[0][1].chi2]
-    for cause, tested in worth:
+    least = np.inf
+    for cause, tested in suspects[:most]:
+        # what a cause explains is predicted by one step: where none of the likely ones is all, others are fitted
+        if tested.chi2 <= MIN_GAIN * suspects[0][1].chi2 and least < GROUP_PRICE:
+            break
         freed = _without(fit.graph, cause)
         try:
             other = fit_graph(method, freed, warm.start(freed))
@@ -249,7 +252,9 @@ def _fitted(method: Method, fit: Fit, suspects: list[tuple[Cause, Agreement]]) -
         if len(freed.disconnected(other.values.keys())) > tied and tested.sigmas < SIGMAS_ALONE:
             continue
         gained = Agreement(max(fit.chi2 - other.chi2, 0.0), max(fit.dof - other.dof, 1))
-        yield _Tried(cause, gained, freed, other)
+        tried = _Tried(cause, gained, freed, other)
+        least = min(least, tried.cost)
+        yield tried
 
 
 def _equal(tried: list[_Tried], scale: float) -> tuple[_Tried, list[_Tried]]:
