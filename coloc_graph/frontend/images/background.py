@@ -16,6 +16,7 @@ Counts = NDArray[np.int64]
 
 STEP_CONTRAST = 4.0  # least height of a step, in standard deviations of a pixel's noise
 STEP_SHARE = 8  # a step leaves at least one in this many of the border's pixels on either side
+SATURATED = 250.0  # grey level from which a light is saturated
 REACH = 2  # px around a spot's bright pixels that its light may reach
 
 
@@ -50,6 +51,9 @@ def _subtract(light: Array, inner: NDArray[np.bool_], levels: float) -> tuple[Ar
     """Light less background (n, h, w), and the standard deviation of a pixel's noise (n,)."""
     signal, noise, sides = _without_coons_patch(light, levels)
     rows, step = _steps(sides, noise, light.shape[1:])
+    # the halo of a saturated light reaches the border of its window, and is no step
+    dim = light[rows].max(axis=(1, 2), initial=0.0) < SATURATED
+    rows, step = rows[dim], step[dim]
     if len(rows):
         stepped, without_step, _ = _without_coons_patch(light[rows] - step, levels)
         around = _around(inner[rows])
