@@ -2,17 +2,19 @@
 
     python benchmarks/planning.py [--seeds 40]           a straight 7.2 m at depth tracks, equal images in all
     python benchmarks/planning.py --images 8             the same from rendered images
-    python benchmarks/planning.py --on L --seconds 5     on with walls: L, U, pillars, rooms
+    python benchmarks/planning.py --on L                 on with walls: L, U, pillars, rooms
+    python benchmarks/planning.py --robots 4             a larger team
     python benchmarks/planning.py --safety 1000 --on L   how near robots come to each other and to walls
     python benchmarks/planning.py --length 21.5          a longer way
+    python benchmarks/planning.py --promises             what the plans promise, without simulating them
     python benchmarks/planning.py --keep f.jsonl --for 280  a part, to which later ones with more seeds add theirs
     python benchmarks/planning.py --fps 30 --seconds 1.67  as many images, and less time to drive
 
 The mover drives its way at 0.2 m/s, robots hide what is behind them, and stop where their leaps slip to (1 cm and
 1 cm for each metre, 1 deg). Mounts are wrong by 1 deg and 5 mm, the span by 0.1 mm, the floor by 0.1 deg (one sigma).
 b0 is the paper's formation with its patrol, b1 the same with the best l and theta of Fig. 4, b2 the best fixed gait
-with its patrol; b3 is greedy by information, b4 by the common view, b5 by chance (all from the best gait's start);
-`gait` is the best gait with designed drives, `horizon` the receding horizon, `from b0` the same from the paper's start.
+with its patrol; b3 is greedy by information, b4 by the common view, b5 by chance; `gait` is the best gait with designed
+drives, `horizon` the receding horizon, `from b0` the same from the paper's start (planning_baselines.py).
 """
 
 import argparse
@@ -29,31 +31,23 @@ from pathlib import Path
 
 import numpy as np
 from monte_carlo import over_seeds, solved, truth_of
+from planning_baselines import NAMES, Scene, missions
 
 from coloc_graph.errors import ColocError
 from coloc_graph.evaluation import align
 from coloc_graph.pipeline.batch import Solution, SolveOptions, solve
-from coloc_graph.planning.belief import Belief
-from coloc_graph.planning.course import Course
-from coloc_graph.planning.formation import PAPER, Gait
-from coloc_graph.planning.gaits import GaitSearch
-from coloc_graph.planning.horizon import Horizon, Objective
-from coloc_graph.planning.mission import Mission, leap_frog, stances_of
+from coloc_graph.planning.mission import Mission
 from coloc_graph.planning.plan import Plan
-from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.route import route
 from coloc_graph.planning.slip import stop_sigma
 from coloc_graph.run import atomic_run, open_run
 from coloc_graph.simulation import Imperfections, World, build_world, record, reference_team
 from coloc_graph.simulation.floor_plans import FLOOR_PLANS, FloorPlan
 from coloc_graph.simulation.planned import planned
-from coloc_graph.simulation.rig import stated_team
-from coloc_graph.simulation.world import stream
-from coloc_graph.team import Team
+from coloc_graph.simulation.rig import MILD_LENS, stated_team
+from coloc_graph.simulation.world import Depth, stream
 
 WRONG = Imperfections(mount_sigma_deg=1.0, height_sigma=0.005, span_sigma=1e-4, floor_sigma_deg=0.1)
-PAIR = "A", "B"
-MOVER = "C"
 LENGTH = 7.2  # m
 BOOTSTRAPS = 2000
 RADIUS = 0.17  # of a Create [m]
@@ -63,8 +57,8 @@ RADIUS = 0.17  # of a Create [m]
 class Outcome:
     """Outcome of one run.
 
-    Errors of A's and B's last poses [m], [deg], the sigma of the positions that the estimator states [m], the number of
-    void stances and of all, and why it `failed`.
+    Errors of the observers' last poses [m], [deg], the sigma of the positions that the estimator states [m], the number
+    of void stances and of all, and why it `failed`.
     """
 
     end: tuple[float, ...] = ()
@@ -75,59 +69,20 @@ class Outcome:
     failed: str = ""
 
 
-def missions(
-    team: Team, fps: float, seconds: float, only: Sequence[str], length: float, floor_plan: FloorPlan | None
-) -> dict[str, Mission]:
-    """Plans of all baselines, with as many images as the paper's formation takes in stances of these `seconds`."""
-    predictor = Predictor(team, fps, floor_map=None if floor_plan is None else floor_plan.floor_map())
-    goals = ((length, 0.0),) if floor_plan is None else floor_plan.goals
-    course = Course(((0.0, 0.0), *goals))
-    capture = seconds * stances_of(PAPER, course.length)
-    search = GaitSearch(predictor if floor_plan is None else Predictor(team, fps), course.length, PAIR, MOVER)
-    ranked = search.ranked(capture=capture)
-
-    def fixed(gait: Gait) -> Mission:
-        each = capture / stances_of(gait, length)
-        return leap_frog(predictor, gait, length, each, PAIR, MOVER, designed=False)
-
-    def horizon(objective: Objective, start: Gait) -> Mission:
-        planner = Horizon(predictor, course, PAIR, MOVER, capture, objective=objective, gait=ranked[0][0].gait)
-        poses = {"A": start.stop(0), "B": start.stop(1), MOVER: (1.5, 0.0, 0.0)}
-        if floor_plan is not None:
-            poses = {**planner.starts(), MOVER: (1.5, 0.0, 0.0)}
-        return planner.mission(Belief.start(team, poses))
-
-    if floor_plan is not None:
-        # a fixed gait knows no corners: the best one's leaps are those of b5 and of the horizon
-        objectives: dict[str, Objective] = {"b3": "information", "b4": "view", "b5": "random", "horizon": "goal"}
-        return {name: horizon(one, PAPER) for name, one in objectives.items() if name in only or not only}
-    by_patrol = [fixed(one.gait) for one, _ in ranked[:12]]
-    best, by_gait = search.planned(ranked)
-    made = {
-        "b0": lambda: fixed(PAPER),
-        "b1": lambda: fixed(Gait.of_paper(0.6, 40.0)),
-        "b2": lambda: min(by_patrol, key=lambda mission: mission.end_sigma),
-        "b3": lambda: horizon("information", best),
-        "b4": lambda: horizon("view", best),
-        "b5": lambda: horizon("random", best),
-        "gait": lambda: by_gait,
-        "horizon": lambda: horizon("goal", best),
-        "from b0": lambda: horizon("goal", PAPER),
-    }
-    return {name: plan() for name, plan in made.items() if name in only or not only}
-
-
-def outcome(seed: int, plan: Plan, fps: float, depth: str, floor_plan: FloorPlan | None = None) -> Outcome:
+def outcome(
+    seed: int, plan: Plan, fps: float, depth: Depth, names: tuple[str, ...], floor_plan: FloorPlan | None
+) -> Outcome:
     """Simulate a seed that follows a plan, solve it and compare with its truth."""
     try:
         scenario = planned(plan, stream(seed, "formation"), floor_plan)
-        world = build_world(scenario, seed=seed, fps=fps, imperfections=WRONG, depth=depth)
+        team = reference_team(MILD_LENS if depth == "images" else (), names=names)
+        world = build_world(scenario, seed=seed, fps=fps, imperfections=WRONG, depth=depth, team=team)
         solution = solved(world, SolveOptions("joint"))[0] if depth == "tracks" else from_images(world)
     except ColocError as error:
         return Outcome(failed=str(error), stances=len(plan.stances))
     true = align(solution.estimate.trajectories, truth_of(world), "A", on_floor=True)
     end, heading, variance = [], [], []
-    for robot in PAIR:
+    for robot in plan.observers:
         T, q = solution.estimate.trajectories[robot].T_world_body[-1], true[robot][-1]
         covariances = solution.estimate.trajectories[robot].covariances
         assert covariances is not None
@@ -149,7 +104,7 @@ def from_images(world: World) -> Solution:
 
 
 def rms(outcomes: Sequence[Outcome], what: str) -> float:
-    """RMS over runs and both robots."""
+    """RMS over runs and observers."""
     return math.sqrt(np.mean([np.square(getattr(one, what)).mean() for one in outcomes if not one.failed]))
 
 
@@ -345,6 +300,15 @@ def table(made: dict[str, Mission], found: dict[str, list[Outcome]], fps: float)
     return rows
 
 
+def promised(mission: Mission) -> str:
+    """Promise of a mission, in one line."""
+    heading = math.degrees(mission.heading_sigma)
+    return (
+        f"{len(mission.plan.stances):3} stances {mission.capture_time:5.0f} s of images {mission.duration:5.0f} s  "
+        f"end {1e3 * mission.end_sigma:5.1f} mm  heading {heading:.3f} deg"
+    )
+
+
 def interval(found: tuple[float, float, float]) -> str:
     """A ratio with its interval."""
     return f"{found[0]:.2f} ({found[1]:.2f}-{found[2]:.2f})"
@@ -361,7 +325,9 @@ def main() -> int:
     parser.add_argument("--length", type=float, default=LENGTH, help="length of the way [m]")
     parser.add_argument("--on", choices=FLOOR_PLANS, help="floor with walls")
     parser.add_argument("--safety", type=int, default=0, metavar="DRAWS")
-    parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--robots", type=int, choices=range(3, 7), default=3, help="of the team; the last drives")
+    parser.add_argument("--only", nargs="*", default=[], choices=NAMES, metavar="PLAN", help=", ".join(NAMES))
+    parser.add_argument("--promises", action="store_true", help="print what plans promise, and simulate none")
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="outcomes of earlier parts, to which this one adds")
     parser.add_argument("--for", dest="seconds_left", type=float, default=math.inf, help="begin no more after this [s]")
@@ -370,15 +336,20 @@ def main() -> int:
     until = time.monotonic() + args.seconds_left
     depth, seeds = ("images", args.images) if args.images else ("tracks", args.seeds)
     floor_plan = None if args.on is None else FLOOR_PLANS[args.on]
-    team = stated_team(reference_team(), WRONG)
-    made = missions(team, args.fps, args.seconds, args.only, args.length, floor_plan)
+    names = tuple("ABCDEF"[: args.robots])
+    team = stated_team(reference_team(names=names), WRONG)
+    made = missions(Scene.of(team, args.fps, args.seconds, args.length, floor_plan), args.only)
     found: dict[str, object]
-    if args.safety:
+    if args.promises:
+        found = {name: promised(mission) for name, mission in made.items()}
+        for name, text in found.items():
+            print(f"{name:8} {text}", flush=True)
+    elif args.safety:
         found = {name: safety(mission, args.safety, floor_plan) for name, mission in made.items()}
         for name, text in found.items():
             print(f"{name:8} {text}", flush=True)
     else:
-        work = partial(outcome, fps=args.fps, depth=depth, floor_plan=floor_plan)
+        work = partial(outcome, fps=args.fps, depth=depth, names=names, floor_plan=floor_plan)
         every = range(args.first, args.first + seeds)
         runs = outcomes(made, every, Kept(args.keep), work, until, args.processes)
         found = table(made, runs, args.fps)

@@ -93,6 +93,7 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.planning.belief import WHEELS
     from coloc_graph.planning.formation import PAPER
     from coloc_graph.planning.gaits import PAPER_SECONDS, GaitSearch
+    from coloc_graph.planning.least_time import least_time
     from coloc_graph.planning.mission import stances_of
     from coloc_graph.planning.plan import write_plan
     from coloc_graph.planning.prediction import Predictor
@@ -119,14 +120,22 @@ def run(args: argparse.Namespace) -> int:
         return _along(args, predictor, observers, mover)
     pair = observers[0], observers[1]
     search = GaitSearch(predictor, args.length, pair, mover)
-    capture = PAPER_SECONDS * stances_of(PAPER, args.length) if args.time is None and args.sigma_end is None else None
-    time = search.shortest(args.sigma_end) if args.sigma_end is not None else args.time
-    gait, best = search.planned(search.ranked(time=time, capture=capture))
-    paper = search.of_paper(time=time, capture=capture)
+    if args.sigma_end is not None:
+        gait, best = least_time(
+            lambda time: search.planned(search.ranked(time=time)), args.sigma_end, search.shortest(args.sigma_end)
+        )
+        if best.end_sigma > args.sigma_end:
+            raise search.unreached(args.sigma_end, best.end_sigma, best.duration, gait)
+        paper = search.of_paper(time=best.duration)
+    else:
+        # without a time, as many images as the paper's formation takes
+        capture = PAPER_SECONDS * stances_of(PAPER, args.length) if args.time is None else None
+        gait, best = search.planned(search.ranked(time=args.time, capture=capture))
+        paper = search.of_paper(time=args.time, capture=capture)
     if args.sigma_end is not None:
         asked = f"the end known to {1e3 * args.sigma_end:g} mm"
     else:
-        asked = f"{args.time / 60:.1f} min" if args.time is not None else f"{capture:.0f} s of images"
+        asked = f"{args.time / 60:.1f} min" if args.time is not None else f"{best.capture_time:.0f} s of images"
     rows = [("the best plan", gait, best)] + ([("the paper's formation", PAPER, paper)] if paper is not None else [])
     if args.json:
         print_json({name: figures(one, mission) for name, one, mission in rows})
@@ -138,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
         )
         print("end and heading: promised standard deviations of the observers' last poses")
         if paper is None:
-            print(f"the paper's formation takes longer than {time / 60:.1f} min with its leaps alone")
+            print(f"the paper's formation takes longer than {best.duration / 60:.1f} min with its leaps alone")
     if args.poses is not None:
         write_plan(best.plan, args.poses)
     if args.draw is not None:
@@ -158,25 +167,37 @@ def _along(args: argparse.Namespace, predictor: "Predictor", observers: tuple[st
     from coloc_graph.planning.belief import Belief
     from coloc_graph.planning.course import Course
     from coloc_graph.planning.floor_map import read_floor_map
+    from coloc_graph.planning.gaits import GaitSearch
     from coloc_graph.planning.horizon import Horizon
+    from coloc_graph.planning.least_time import least_time
     from coloc_graph.planning.plan import write_plan
 
-    if args.sigma_end is not None:
-        raise InputError("--sigma-end is of straight ways of two observers: give --time instead")
     if not 0 < args.pace < 1e4:
         raise InputError(f"--pace is {args.pace}; give seconds of the mission a metre, above 0")
     if args.map is not None:
         predictor = replace(predictor, floor_map=read_floor_map(args.map))
     course = Course(((0.0, 0.0), *(args.goal or [(args.length, 0.0)])))
-    seconds = args.pace * course.length if args.time is None else args.time
-    horizon = Horizon(predictor, course, observers, mover, seconds, timed=True)
-    starts = horizon.starts()
-    best = horizon.mission(Belief.start(predictor.team, {**starts, mover: (1.5, 0.0, 0.0)}))
-    if args.json:
-        print_json({"the plan": figures(horizon.gait, best)})
+
+    def planned(time: float) -> "tuple[Gait, Mission]":
+        horizon = Horizon(predictor, course, observers, mover, time, timed=True)
+        start = {**horizon.starts(), mover: (1.5, 0.0, 0.0)}
+        return horizon.gait, horizon.mission(Belief.start(predictor.team, start))
+
+    if args.sigma_end is not None:
+        search = GaitSearch(predictor, course.length, (observers[0], observers[1]), mover)
+        gait, best = least_time(planned, args.sigma_end, search.shortest(args.sigma_end))
+        if best.end_sigma > args.sigma_end:
+            raise search.unreached(args.sigma_end, best.end_sigma, best.duration, gait)
+        asked = f"the end known to {1e3 * args.sigma_end:g} mm"
     else:
-        print(f"{course.length:.1f} m in {seconds / 60:.1f} min; {', '.join(observers)} observe, {mover} moves")
-        print_table(_HEADER, [_row("the plan", horizon.gait, best, predictor.fps)])
+        seconds = args.pace * course.length if args.time is None else args.time
+        gait, best = planned(seconds)
+        asked = f"{seconds / 60:.1f} min"
+    if args.json:
+        print_json({"the plan": figures(gait, best)})
+    else:
+        print(f"{course.length:.1f} m with {asked}; {', '.join(observers)} observe, {mover} moves")
+        print_table(_HEADER, [_row("the plan", gait, best, predictor.fps)])
         print("leap, abreast and toe-in: those by which the rest of the way is expected to go")
     if args.poses is not None:
         write_plan(best.plan, args.poses)
@@ -185,7 +206,7 @@ def _along(args: argparse.Namespace, predictor: "Predictor", observers: tuple[st
 
         plan_figure([("the plan", best)], predictor.floor_map).savefig(args.draw, dpi=130)
     if args.view:
-        _edit(args, predictor, best, horizon.goal)
+        _edit(args, predictor, best, course.points[-1])
     return 0
 
 

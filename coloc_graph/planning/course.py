@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar
 
+MAX_LENGTH = 200.0  # longest way that is planned at once [m]
+
 
 @dataclass(frozen=True)
 class Course:
@@ -18,6 +20,8 @@ class Course:
         steps = [math.dist(a, b) for a, b in zip(self.points, self.points[1:], strict=False)]
         if not steps or min(steps) < 0.1 or not all(map(math.isfinite, steps)):
             raise InputError("a course goes from where the team stands to a goal at least 0.1 m away: give other goals")
+        if sum(steps) > MAX_LENGTH:
+            raise InputError(f"a course of {sum(steps):g} m is too long for one plan: give up to {MAX_LENGTH:g} m")
 
     @property
     def length(self) -> float:

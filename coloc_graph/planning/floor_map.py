@@ -116,7 +116,9 @@ def _is_number(value: Any) -> bool:
 
 
 def _number(path: Path, fields: dict[str, Any], name: str, low: float, high: float) -> float:
-    value: Any = fields.get(name)
+    if name not in fields:
+        raise InputError(f"{path} is not a map: it has no `{name}`; {REMEDY}")
+    value: Any = fields[name]
     if not _is_number(value) or not low <= float(value) <= high:
         raise InputError(f"{path}: `{name}` is {value!r}; give a number from {low:g} to {high:g}")
     return float(value)

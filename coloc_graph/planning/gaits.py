@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar, between
-from coloc_graph.planning.belief import Belief, leap_model, updated
+from coloc_graph.planning.belief import OBSERVER, POSE, Belief, leap_model, updated
+from coloc_graph.planning.course import MAX_LENGTH
 from coloc_graph.planning.drive import effective_seconds
 from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.mission import Mission, leap_frog, leap_time, stances_of
@@ -28,6 +29,9 @@ REFINED = 5  # number of gaits whose drives are planned
 MIN_STANCE_DURATION = 4.0  # least duration of a stance [s]
 PAPER_SECONDS = 5.0  # duration of a stance of the paper's gait, where nothing is asked for [s]
 MAX_MISSION_DURATION = 3600.0  # time of a mission above which a wanted sigma is given up [s]
+_FIRST, _SECOND, _MARKERS = np.split(np.arange(2 * OBSERVER + 2), (OBSERVER, 2 * OBSERVER))
+#: Variables of a pair in the order of `StanceModel`, by which of the pair is the anchor.
+ANCHOR_FIRST = np.concatenate([_FIRST, _SECOND, _MARKERS]), np.concatenate([_SECOND, _FIRST, _MARKERS])
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,8 @@ class GaitSearch:
     ) -> None:
         if not (math.isfinite(length) and length > 0):
             raise InputError(f"a way of {length} m is none: give a length above 0 m")
+        if length > MAX_LENGTH:
+            raise InputError(f"a way of {length:g} m is too long for one plan: give up to {MAX_LENGTH:g} m")
         self.predictor, self.length, self.pair, self.mover = predictor, length, pair, mover
         if gaits is None:
             # leaps with which the middle of the pair comes to the end in a whole number of stances
@@ -120,42 +126,47 @@ class GaitSearch:
 
     def end_sigma(self, candidate: Candidate, seconds: float) -> float:
         """Return the sigma of the last positions [m] that stances of this duration are expected to bring."""
-        gait, names = candidate.gait, (*self.pair, self.mover)
-        seconds = float(effective_seconds(seconds, self.predictor.speed))
-        places = self._stop(gait, 0), self._stop(gait, 1), (1.5, 0.0, 0.0)
-        belief = Belief.start(self.predictor.team, dict(zip(names, places, strict=True)))
-        P = belief.covariance
-        rows = [belief.rows((self.pair[k], self.pair[1 - k]), self.mover) for k in (0, 1)]
-        n = stances_of(gait, self.length)
-        for k in range(n):
-            if k:
-                F, Q = candidate.leaps[(k + 1) % 2]
-                at = belief.index(self.pair[(k + 1) % 2])
-                pose = slice(at, at + 6)
-                P[pose] = F @ P[pose]
-                P[:, pose] = P[:, pose] @ F.T
-                P[pose, pose] += Q
-            P = updated(P, rows[k % 2], seconds * candidate.information[k % 2])
-        poses = {self.pair[k % 2]: self._stop(gait, k) for k in (n - 1, n)} | {self.mover: (0.0, 0.0, 0.0)}
-        poses = {name: poses[name] for name in names}
-        return replace(belief, poses=poses, covariance=P).position_sigma(self.pair)
+        return float(self.end_sigmas([candidate], np.array([seconds]))[0])
+
+    def end_sigmas(self, candidates: Sequence[Candidate], seconds: Array) -> Array:
+        """Return the sigmas (n,) of the last positions [m] of candidates with stances of `seconds` (n,)."""
+        belief = Belief.start(self.predictor.team, dict.fromkeys((*self.pair, self.mover), (0.0, 0.0, 0.0)))
+        rows = belief.rows(self.pair, self.mover)
+        start = belief.covariance[rows[:, None], rows]
+        seconds = effective_seconds(seconds, self.predictor.speed)
+        stances = np.array([stances_of(one.gait, self.length) for one in candidates], int)
+        found = np.empty(len(candidates))
+        for number in np.unique(stances).tolist():
+            some = np.flatnonzero(stances == number).tolist()
+            P = np.repeat(start[None], len(some), axis=0)
+            information = np.array([candidates[n].information for n in some]) * seconds[some][:, None, None, None]
+            F, Q = (np.array([[leap[i] for leap in candidates[n].leaps] for n in some]) for i in (0, 1))
+            for k in range(number):
+                anchor, leaper = k % 2, (k + 1) % 2
+                if k:
+                    pose = slice(OBSERVER * leaper, OBSERVER * leaper + POSE)
+                    P[:, pose] = F[:, leaper] @ P[:, pose]
+                    P[:, :, pose] = P[:, :, pose] @ F[:, leaper].mT
+                    P[:, pose, pose] += Q[:, leaper]
+                P = updated(P, ANCHOR_FIRST[anchor], information[:, anchor])
+            numbers = np.array([3, 4, OBSERVER + 3, OBSERVER + 4])
+            found[some] = np.sqrt(P[:, numbers, numbers].sum(axis=1) / 2)
+        return found
 
     def ranked(self, time: float | None = None, capture: float | None = None) -> list[tuple[Candidate, float]]:
         """Return candidates with the duration of their stances [s], the best first.
 
         Missions take a whole `time` [s], or the same `capture` time [s] in which images are taken.
         """
-        found = []
-        for one in self.candidates:
-            if capture is not None:
-                seconds = capture / stances_of(one.gait, self.length)
-            else:
-                assert time is not None
-                seconds = self.seconds(one, time)
-            if seconds >= MIN_STANCE_DURATION or capture is not None:
-                found.append((self.end_sigma(one, seconds), one, seconds))
-        found.sort(key=lambda each: each[0])
-        return [(one, seconds) for _, one, seconds in found]
+        if capture is not None:
+            seconds = capture / np.array([stances_of(one.gait, self.length) for one in self.candidates])
+            some = np.arange(len(seconds))
+        else:
+            assert time is not None
+            seconds = np.array([self.seconds(one, time) for one in self.candidates])
+            some = np.flatnonzero(seconds >= MIN_STANCE_DURATION)
+        sigmas = self.end_sigmas([self.candidates[n] for n in some.tolist()], seconds[some])
+        return [(self.candidates[n], float(seconds[n])) for n in some[np.argsort(sigmas, kind="stable")].tolist()]
 
     def best(self, seconds: float, *, timed: bool) -> Candidate:
         """Return the best gait of a mission with these `seconds` of images, or, if `timed`, of the whole mission.
@@ -202,31 +213,41 @@ class GaitSearch:
         return leap_frog(self.predictor, PAPER, self.length, seconds, self.pair, self.mover, designed=False)
 
     def shortest(self, sigma: float) -> float:
-        """Return the time [s] in which some gait promises a sigma of its end [m].
+        """Return the time [s] in which some gait is expected to bring a sigma of its end [m].
 
         Raises
         ------
         InputError
             If none does within an hour; the message says what the best one is, and what would help.
         """
-        self.candidates = [one for one, _ in self.ranked(time=MAX_MISSION_DURATION)][:40]
         low, high = 10.0, MAX_MISSION_DURATION
-        if not self._reaches(sigma, high):
+        left = self._reaching(sigma, high, self.candidates)
+        if not left:
             best, seconds = self.ranked(time=high)[0]
-            reached = self.end_sigma(best, seconds)
-            raise InputError(
-                f"no plan reaches {1e3 * sigma:g} mm at the end of {self.length:g} m: the best one promises "
-                f"{1e3 * reached:.1f} mm in {MAX_MISSION_DURATION / 60:.0f} min (leaps of {best.gait.leap:g} m); "
-                f"{self._remedy(best, seconds)} would help most"
-            )
+            raise self.unreached(sigma, self.end_sigma(best, seconds), high, best.gait)
         while high / low > 1.03:
             middle = math.sqrt(low * high)
-            low, high = (low, middle) if self._reaches(sigma, middle) else (middle, high)
+            if found := self._reaching(sigma, middle, left):
+                left, high = found, middle
+            else:
+                low = middle
         return high
 
-    def _reaches(self, sigma: float, time: float) -> bool:
-        ranked = self.ranked(time=time)
-        return bool(ranked) and self.end_sigma(*ranked[0]) <= sigma
+    def _reaching(self, sigma: float, time: float, candidates: Sequence[Candidate]) -> list[Candidate]:
+        """Candidates that bring a sigma [m] in a whole `time` [s]."""
+        seconds = np.array([self.seconds(one, time) for one in candidates])
+        some = np.flatnonzero(seconds >= MIN_STANCE_DURATION)
+        sigmas = self.end_sigmas([candidates[n] for n in some.tolist()], seconds[some])
+        return [candidates[n] for n in some[sigmas <= sigma].tolist()]
+
+    def unreached(self, sigma: float, reached: float, time: float, gait: Gait) -> InputError:
+        """Error that says that no plan reaches a sigma [m], what a `gait` has reached in a `time` [s], and a remedy."""
+        own = GaitSearch(self.predictor, self.length, self.pair, self.mover, gaits=(gait,)).candidates[0]
+        return InputError(
+            f"no plan reaches {1e3 * sigma:g} mm at the end of {self.length:.3g} m: the best one promises "
+            f"{1e3 * reached:.1f} mm in {time / 60:.0f} min (leaps of {gait.leap:.2f} m); "
+            f"{self._remedy(own, max(self.seconds(own, time), MIN_STANCE_DURATION))} would help most"
+        )
 
     def _remedy(self, candidate: Candidate, seconds: float) -> str:
         """Return which tolerance of the team costs most at the end."""

@@ -115,10 +115,9 @@ class Horizon:
         self.observers, self.seconds, self.objective, self.depth = tuple(observers), seconds, objective, depth
         self._rng = np.random.default_rng(0) if rng is None else rng
         if predictor.floor_map is not None:
-            for way in (course.length, 0.0):
-                x, y, _ = course.at(way)
+            for n, (x, y) in enumerate(course.points):
                 if not predictor.floor_map.clear(np.array([x, y]), 0.2):
-                    what = "the goal" if way else "the start"
+                    what = "the goal" if n else "the start"
                     raise InputError(f"{what} at {x:.2f}, {y:.2f} is in a wall or beyond the map: give another one")
         first, *others = combinations(self.observers, 2)
         rollout = Rollout(predictor, course, first, mover, seconds, gait, timed=timed)

@@ -107,8 +107,8 @@ def stated_team(team: Team, imperfections: Imperfections) -> Team:
 
     def stated(robot: Robot) -> Robot:
         # a camera's noise must be above 0 for a detection to have a covariance
-        camera = replace(robot.camera, noise_px=detection_sigma(imperfections))
-        mount = replace(
+        camera = robot.camera_if_any and replace(robot.camera, noise_px=detection_sigma(imperfections))
+        mount = robot.mount_if_any and replace(
             robot.mount,
             height_sigma=imperfections.height_sigma,
             tilt_sigma_deg=imperfections.mount_sigma_deg,
@@ -136,10 +136,10 @@ def true_team(stated: Team, rng: np.random.Generator) -> Team:
 
     def drawn(robot: Robot) -> Robot:
         height, tilt, roll, span = rng.standard_normal(4).tolist()
-        m = robot.mount
+        m = robot.mount_if_any
         # drawn last and if wanted only: the other draws of a seed stay
-        yaw = float(rng.standard_normal()) if m.yaw_sigma_deg else 0.0
-        mount = replace(
+        yaw = float(rng.standard_normal()) if m is not None and m.yaw_sigma_deg else 0.0
+        mount = m and replace(
             m,
             height=m.height + height * m.height_sigma,
             tilt_deg=m.tilt_deg + tilt * m.tilt_sigma_deg,

@@ -13,11 +13,22 @@ from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.gaits import GaitSearch
 from coloc_graph.planning.plan import read_plan
 from coloc_graph.planning.prediction import Predictor
+from coloc_graph.run import open_run
 from coloc_graph.simulation import Imperfections, reference_team
 from coloc_graph.simulation.rig import stated_team
 from coloc_graph.team import write_team
 
 FIELD = Imperfections(mount_sigma_deg=1.0, height_sigma=0.005, span_sigma=1e-4, floor_sigma_deg=0.1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_gaits():
+    """Compare fewer gaits than a user does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("coloc_graph.planning.gaits.LEAPS", (0.4, 0.8))
+        patch.setattr("coloc_graph.planning.gaits.ABREAST", (0.5,))
+        patch.setattr("coloc_graph.planning.gaits.TOE_INS", (25.0,))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +65,15 @@ def test_the_best_plan_promises_more_than_the_paper_s_and_is_written_and_drawn(t
     assert picture.read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.parametrize("way", [["--length", "1.2"], ["--goal", "1.2,0"]])
+def test_a_wanted_sigma_is_kept_by_the_planned_drives_and_decides_the_time_alone(team, capsys, way):
+    assert main(["plan", team, *way, "--fps", "10", "--sigma-end", "2.5mm", "--json"]) == 0
+    found = next(iter(json.loads(capsys.readouterr().out).values()))
+    assert 0.0018 < found["end_sigma"] <= 0.0025
+    # by far fewer images than the paper's formation takes
+    assert found["capture_seconds"] < 0.7 * 35.0
+
+
 def test_a_tighter_sigma_takes_a_longer_mission():
     gaits = [Gait(0.5, 0.6, 10.0), Gait(1.0, 0.5, 25.0)]
     predictor = Predictor(stated_team(reference_team(), FIELD), 10.0)
@@ -77,7 +97,8 @@ def test_a_tighter_sigma_takes_a_longer_mission():
         (["--mover", "X"], "there is no robot X in the team: name one of A, B, C"),
         (["--length", "-2"], "a way of -2.0 m is none"),
         (["--map", "map.yaml"], "a map needs a goal on it"),
-        (["--goal", "2,0", "--sigma-end", "5mm"], "--sigma-end is of straight ways of two observers"),
+        (["--goal", "1e6,0"], "a course of 1e\\+06 m is too long for one plan: give up to 200 m"),
+        (["--length", "1e9"], "a way of 1e\\+09 m is too long for one plan: give up to 200 m"),
         (["--goal", "2,0", "--time", "9s"], "9 s are too short for 2.0 m: give a longer time"),
         (["--goal", "2"], "`2` is not a waypoint"),
         (["--goal", "2,0", "--map", "none.yaml"], "none.yaml"),
@@ -119,5 +140,16 @@ def test_a_plan_along_goals_keeps_off_the_walls_of_a_map(team, tmp_path, capsys)
     places = np.array([pose[:2] for stance in plan.stances for pose in stance.standing.values()])
     assert np.abs(places[:, 1]).max() < 0.75
     assert places[-2:, 0].mean() == pytest.approx(2.0, abs=0.5)
-    assert main(["plan", team, "--goal", "2,3", "--map", str(tmp_path / "map.yaml")]) == 2
-    assert "the goal at 2.00, 3.00 is in a wall or beyond the map" in capsys.readouterr().err
+    for goals in (["--goal", "2,3"], ["--goal", "2,3", "--goal", "4,0"]):
+        assert main(["plan", team, *goals, "--map", str(tmp_path / "map.yaml")]) == 2
+        assert "the goal at 2.00, 3.00 is in a wall or beyond the map" in capsys.readouterr().err
+
+
+def test_a_team_whose_mover_has_no_camera_follows_its_plan(tmp_path, capsys):
+    team, plan, out = (str(tmp_path / name) for name in ("team.toml", "plan.csv", "run.mcap"))
+    assert main(["team", "new", "A", "B", "C", "--no-camera", "C", "--out", team]) == 0
+    assert main(["plan", team, "--length", "1", "--fps", "10", "--time", "30s", "--poses", plan]) == 0
+    assert main(["simulate", "hallway", "--plan", plan, "--team", team, "--fps", "10", "--out", out]) == 0
+    run = open_run(out)
+    assert len(run.stances) > 1
+    assert run.team["C"].camera_if_any is None
