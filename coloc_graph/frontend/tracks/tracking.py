@@ -36,7 +36,7 @@ OVERLAP_PX = 6.0  # px between two lights that may be seen as one
 RIM = 3.0  # px from the border of the image, within which a missed light has left it
 WIDTH = 320.0  # px, width of images that the options are of
 ADAPTATION = 0.05  # of the logarithm of the acceleration, an image, by the mean normalised innovation less 1
-MAX_FACTOR = 100.0  # by which the acceleration may grow
+MAX_GROWTH = math.log(100.0)  # of the logarithm of the acceleration
 FASTER = 2.0  # a new light's velocity is up to this times those of the lights that are tracked
 REACH_SIGMAS = 3.0  # standard deviations of a light's position that the patch holds
 ROUGH_EXTENT = 2.0  # px by which an extent of approximate centres may be too small
@@ -197,6 +197,7 @@ class MarkerTracker:
         self.robot, self._size = robot, size
         self._detector = detector
         self._options = options or TrackerOptions()
+        self._scale = 1.0 if size is None else size[0] / WIDTH  # of the images to those that the options are of
         self._filters = PointFilters(self._options.acceleration, self._options.jerk, self._options.speed)
         self._growth = 0.0  # logarithm of the factor of the acceleration that was seen
         self._moved([], [])
@@ -214,7 +215,8 @@ class MarkerTracker:
         """Take in the next image."""
         dt = 0.0 if self._filters.time is None else image.time - self._filters.time
         self._filters.predict(image.time)
-        self._size = image.pixels.shape[1], image.pixels.shape[0]
+        height, width = image.pixels.shape[:2]
+        self._size, self._scale = (width, height), width / WIDTH
         full = self._search_all(image.time)
         found = self._detector.find(image.pixels) if full else self._in_patches(image.pixels, dt)
         found = [one for one in found if not one.clipped]
@@ -306,23 +308,17 @@ class MarkerTracker:
             tracks.append(track)
         return tracks
 
-    @property
-    def _scale(self) -> float:
-        """Width of the images, by that which the options are of."""
-        return 1.0 if self._size is None else self._size[0] / WIDTH
-
     def _moved(self, squared: Sequence[float], speeds: Sequence[float]) -> None:
         """Adapt to the motion of confirmed tracks: squared normalised innovations, and squared speeds [px^2/s^2]."""
-        options, scale = self._options, self._scale
+        options, scale, faster = self._options, self._scale, 0.0
         if squared:
-            innovation = sum(min(one, GATE) for one in squared) / (2 * len(squared))
+            innovation = sum([min(one, GATE) for one in squared]) / (2 * len(squared))
             growth = self._growth + ADAPTATION * (innovation - 1)
-            self._growth = min(max(growth, 0.0), math.log(MAX_FACTOR))
-        faster = FASTER * math.sqrt(sum(speeds) / len(speeds)) if speeds else 0.0
+            self._growth = min(max(growth, 0.0), MAX_GROWTH)
+            faster = FASTER * math.sqrt(sum(speeds) / len(speeds))
+        more = math.exp(self._growth / 2) * scale
         self._filters.set_motion(
-            options.acceleration * scale**2 * math.exp(self._growth),
-            options.jerk * scale * math.exp(self._growth / 2),
-            max(options.speed * scale, faster),
+            options.acceleration * more * more, options.jerk * more, max(options.speed * scale, faster)
         )
 
     def _search_all(self, time: float) -> bool:
@@ -341,12 +337,10 @@ class MarkerTracker:
             u, v = round(point.u), round(point.v)
             box = (max(u - half, 0), max(v - half, 0), min(u + half, width), min(v + half, height))
             if box[2] - box[0] >= 3 and box[3] - box[1] >= 3:
-                # overlapping patches see a blob twice
-                found += [
-                    one
-                    for one in self._detector.find(pixels, box)
-                    if all(max(abs(one.uv[0] - o.uv[0]), abs(one.uv[1] - o.uv[1])) > 0.5 for o in found)
-                ]
+                more = self._detector.find(pixels, box)
+                if found:  # overlapping patches see a blob twice
+                    more = [one for one in more if not any(_close(one.uv, other.uv, 0.5) for other in found)]
+                found += more
         return found
 
     def _advance(
@@ -359,23 +353,23 @@ class MarkerTracker:
         births: bool,
     ) -> None:
         self._images.append((time, places, covariances, samples))
-        free = range(len(places))
         if self._parked:
-            free = [index for index, place in enumerate(places) if not self._is_parked(place)]  # type: ignore[assignment]
+            free = [n for n, (u, v) in enumerate(places) if not self._is_parked(u, v)]
+            places, covariances = [places[n] for n in free], [covariances[n] for n in free]
+            samples = [samples[n] for n in free]
         self._blink.predict(time)
-        assigned, doubtful = self._assigned([places[index] for index in free], [covariances[index] for index in free])
+        assigned, doubtful = self._assigned(places, covariances)
         self._miss(time, [row for row, _ in assigned])
         for row, column in assigned:
-            index = free[column]
-            self._filters.points[row].update(*places[index], covariances[index])
-            self._live[row].take(time, places[index], samples[index])
+            self._filters.points[row].update(*places[column], covariances[column])
+            self._live[row].take(time, places[column], samples[column])
         if births:
             taken = {column for _, column in assigned} | doubtful
-            new = [index for column, index in enumerate(free) if column not in taken]
-            for index in new:
-                self._filters.add(*places[index], covariances[index])
+            new = [column for column in range(len(places)) if column not in taken]
+            for column in new:
+                self._filters.add(*places[column], covariances[column])
                 self._live.append(_Live())
-                self._live[-1].take(time, places[index], samples[index])
+                self._live[-1].take(time, places[column], samples[column])
             if new:
                 self._blink.add(len(new))
             self._searched = time
@@ -397,40 +391,39 @@ class MarkerTracker:
                 track.score += one
             return [], set()
         near: dict[tuple[int, int], _Near] = {}
+        jerk, false = filters.jerk, math.log(options.clutter / self._scale**2)
         for row, (point, one) in enumerate(zip(filters.points, seen, strict=True)):
-            gain = math.log(one / options.clutter * self._scale**2)
             for column, ((u, v), covariance) in enumerate(zip(places, covariances, strict=True)):
-                compared = point.compare(u, v, covariance, filters.jerk, GATE)
+                compared = point.compare(u, v, covariance, jerk, GATE)
                 if compared is not None:
                     squared, density, jerked = compared
                     off = min(squared, jerked + JERK_PENALTY)
-                    near[row, column] = _Near(
-                        squared, off < squared, gain + density + 0.5 * (squared - off), missed[row]
-                    )
+                    gain = math.log(one) - false + density + 0.5 * (squared - off)
+                    near[row, column] = _Near(squared, off < squared, gain, missed[row])
         assigned, doubtful = self._most_likely(near, len(places))
-        of_track = dict(assigned)
-        for row, one in enumerate(missed):
-            is_seen = row in of_track
-            if is_seen and self._live[row].confirmed and self._live[row].score < 0:
-                self._begin_anew(row)  # not seen for long enough to be anything
-            track = self._live[row]
-            track.misses += not is_seen
-            track.score = min(track.score + (near[row, of_track[row]].gain if is_seen else one), 2 * CONFIRMED)
-            track.confirmed |= track.score > CONFIRMED
         squares, speeds = [], []
         for row, column in assigned:
-            point = filters.points[row]
-            if near[row, column].jerked:
-                point.allow_jerk(filters.jerk)
-            if self._live[row].confirmed:
-                squares.append(near[row, column].squared)
+            point, one = filters.points[row], near[row, column]
+            if self._live[row].confirmed and self._live[row].score < 0:
+                self._begin_anew(row)  # not seen for long enough to be anything
+            track = self._live[row]
+            track.score = min(track.score + one.gain, 2 * CONFIRMED)
+            track.confirmed |= track.score > CONFIRMED
+            if one.jerked:
+                point.allow_jerk(jerk)
+            if track.confirmed:
+                squares.append(one.squared)
                 speeds.append(point.du**2 + point.dv**2)
+        if len(assigned) < len(self._live):
+            for row in set(range(len(self._live))).difference([row for row, _ in assigned]):
+                self._live[row].misses += 1
+                self._live[row].score += missed[row]
         self._moved(squares, speeds)
         return assigned, doubtful
 
     def _most_likely(self, near: dict[tuple[int, int], "_Near"], count: int) -> tuple[list[tuple[int, int]], set[int]]:
         """Return the most likely assignment of `count` detections to tracks they are `near`, and what is doubtful."""
-        if len({row for row, _ in near}) == len(near) == len({column for _, column in near}):
+        if len(near) <= 1 or len({row for row, _ in near}) == len(near) == len({column for _, column in near}):
             return [pair for pair, one in near.items() if one.worth > AMBIGUOUS], set()
         # log ratio to a missed marker and a false detection
         worth, close = np.zeros((len(self._live), count)), np.zeros((len(self._live), count), bool)
@@ -451,6 +444,8 @@ class MarkerTracker:
         """Record that all but some tracks are not seen, except those that may overlap with another."""
         self._blink.update(seen, self._options.detected)
         points = self._filters.points
+        if len(seen) == len(points):
+            return
         for row in set(range(len(points))).difference(seen):
             own = points[row]
             beside = (max(abs(one.u - own.u), abs(one.v - own.v)) < OVERLAP_PX for one in points)
@@ -526,10 +521,13 @@ class MarkerTracker:
             return False
         return bool(np.ptp(np.array(track.uv[first:]), axis=0).max() < STILL_PX)
 
-    def _is_parked(self, place: tuple[float, float]) -> bool:
-        return any(
-            max(abs(place[0] - track.uv[-1][0]), abs(place[1] - track.uv[-1][1])) < STILL_PX for track in self._parked
-        )
+    def _is_parked(self, u: float, v: float) -> bool:
+        return any(_close((u, v), track.uv[-1], STILL_PX) for track in self._parked)
+
+
+def _close(one: Place, other: Place, limit: float) -> bool:
+    """Return whether two places differ by less than a limit along either axis [px]."""
+    return abs(one[0] - other[0]) < limit and abs(one[1] - other[1]) < limit
 
 
 def _some(samples: Sequence[Candidate | int]) -> list[Candidate | int]:
