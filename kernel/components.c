@@ -68,8 +68,8 @@ PyObject *find_bright(PyObject *module, PyObject *args)
     if (!PyArg_ParseTuple(args, "O(iiii)dLL", &object, &box.left, &box.top, &box.right, &box.bottom, &levels,
                           &min_area, &max_area)) return NULL;
     if (PyObject_GetBuffer(object, &view, PyBUF_STRIDED_RO) < 0) return NULL;
-    if (view.ndim != 2 || view.itemsize != 1 || (view.shape[1] > 1 && view.strides[1] != 1) || view.shape[0] < 1
-        || view.shape[1] < 1 || view.shape[0] * view.shape[1] > INT32_MAX / 2) {
+    if (view.ndim != 2 || view.itemsize != 1 || (view.shape[1] > 1 && view.strides[1] != 1)
+        || view.shape[0] * view.shape[1] > INT32_MAX / 2) {
         PyErr_SetString(PyExc_ValueError, "the light is an array (h, w) of bytes with rows in one piece");
         goto end;
     }

@@ -170,10 +170,10 @@ def _raw(message: Any) -> NDArray[np.uint8]:
     channels = {"mono8": 1, "bgr8": 3}.get(message.encoding)
     if channels is None:
         raise MalformedError(f"`encoding` is `{message.encoding}`; it must be mono8 or bgr8")
-    width, height, step = message.width, message.height, message.step
-    if not width or not height or step < width * channels or len(message.data) != step * height:
-        raise MalformedError(f"{len(message.data)} bytes of `data` are not {width} x {height} {message.encoding}")
-    rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * channels]
+    width, height, step, data = message.width, message.height, message.step, message.data
+    if not width or not height or step < width * channels or len(data) != step * height:
+        raise MalformedError(f"{len(data)} bytes of `data` are not {width} x {height} {message.encoding}")
+    rows = np.frombuffer(data, np.uint8).reshape(height, step)[:, : width * channels]
     return rows.reshape((height, width) if channels == 1 else (height, width, 3)).copy()
 
 
@@ -182,15 +182,16 @@ def _decompress(message: Any) -> NDArray[np.uint8]:
 
     if message.format not in ("jpeg", "png"):
         raise MalformedError(f"`format` is `{message.format}`; it must be jpeg or png")
-    header = read_image_header(message.data)
+    data = message.data  # a copy each time
+    header = read_image_header(data)
     if header is None:
         raise MalformedError(f"`data` is not a {message.format}")
     if header.bits != 8 or header.channels not in (1, 3):
         raise MalformedError(f"`data` has {header}; it must be 8-bit grey or BGR")
-    if why := too_large(header, message.data):
+    if why := too_large(header, data):
         raise MalformedError(f"`data` {why}")
     try:
-        pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except (cv2.error, MemoryError) as error:
         raise MalformedError(f"`data` is not a {message.format}") from error
     if pixels is None:

@@ -85,4 +85,5 @@ def test_what_does_not_fit_is_refused():
     for image in (np.zeros((3, 4, 3), np.uint8), np.zeros((4, 4)), np.zeros((4, 4), np.uint8)[:, ::-1]):
         with pytest.raises(ValueError):
             kernel.find_bright(image, (0, 0, 4, 4), 35.0, 1, 9)
-    assert kernel.find_bright(np.zeros((4, 4), np.uint8), (9, 9, 9, 9), np.nan, 1, 9)[1] == []
+    for size in ((4, 4), (0, 4), (4, 0)):
+        assert kernel.find_bright(np.zeros(size, np.uint8), (9, 9, 9, 9), np.nan, 1, 9)[1] == []
