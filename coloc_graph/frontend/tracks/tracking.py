@@ -403,16 +403,16 @@ class MarkerTracker:
         assigned, doubtful = self._most_likely(near, len(places))
         squares, speeds = [], []
         for row, column in assigned:
-            point, one = filters.points[row], near[row, column]
+            point, taken = filters.points[row], near[row, column]
             if self._live[row].confirmed and self._live[row].score < 0:
                 self._begin_anew(row)  # not seen for long enough to be anything
             track = self._live[row]
-            track.score = min(track.score + one.gain, 2 * CONFIRMED)
+            track.score = min(track.score + taken.gain, 2 * CONFIRMED)
             track.confirmed |= track.score > CONFIRMED
-            if one.jerked:
+            if taken.jerked:
                 point.allow_jerk(jerk)
             if track.confirmed:
-                squares.append(one.squared)
+                squares.append(taken.squared)
                 speeds.append(point.du**2 + point.dv**2)
         if len(assigned) < len(self._live):
             for row in set(range(len(self._live))).difference([row for row, _ in assigned]):
