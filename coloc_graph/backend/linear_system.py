@@ -190,9 +190,8 @@ class LinearSystem:
 
     def _step(self, found: gtsam.VectorValues, ordering: gtsam.Ordering) -> Array:
         step = np.zeros(len(self.keys.free))
-        for n in range(ordering.size()):
-            key = int(ordering.at(n))
-            step[self.keys.span(key)] = found.at(key)
+        keys = np.sort(np.array([ordering.at(n) for n in range(ordering.size())], int))
+        step[np.isin(self.keys.of, keys)] = found.vector()  # in the order of the keys
         return np.where(self.keys.free, step, 0.0)
 
     def summed_up(self, gone: Index) -> "Summary":

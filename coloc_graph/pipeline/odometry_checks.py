@@ -4,7 +4,7 @@ A recording whose odometry is right is passed on as it is.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,19 +26,40 @@ MIN_HUNG = 5  # samples of a stance that do not change where its driver hangs
 BREAKS_NAMED = 3  # jumps of one robot that are told one by one
 
 
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Odometry of a robot: `times` (n,), `poses` (n, 3) and `covariances` (n, 3, 3) of increments."""
+
+    robot: str
+    times: Array
+    poses: Array
+    covariances: Array
+
+    @classmethod
+    def of(cls, robot: str, samples: Sequence[OdometrySample]) -> "Samples":
+        """Stack samples."""
+        poses = np.array([one.pose for one in samples]).reshape(-1, 3)
+        covariances = np.array([one.covariance for one in samples]).reshape(-1, 3, 3)
+        return cls(robot, np.array([one.time for one in samples]), poses, covariances)
+
+    def between(self, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
+        """Yield the samples from `start` to `end` [UTC s]."""
+        first = 0 if start is None else int(np.searchsorted(self.times, start))
+        until = len(self.times) if end is None else int(np.searchsorted(self.times, end, side="right"))
+        for n, time in enumerate(self.times[first:until].tolist(), start=first):
+            yield OdometrySample(self.robot, time, self.poses[n], self.covariances[n])
+
+
 class CheckedRun:
-    """A recording whose odometry was checked; all else is as it is recorded. `warnings` tell what was mended."""
+    """A recording with checked odometry; all else is as it is recorded. `warnings` tell what was mended."""
 
     def __init__(self, run: Any) -> None:
         self._run = run
-        self._mended: dict[str, list[OdometrySample]] = {}
+        self._odometry: dict[str, Samples] = {}
         said: list[str] = []
         for robot in run.team.names:
-            samples = list(run.odometry(robot))
-            mended, sentences = checked(robot, samples, run.stances)
-            if sentences:
-                self._mended[robot] = mended
-                said += sentences
+            self._odometry[robot], sentences = checked(Samples.of(robot, list(run.odometry(robot))), run.stances)
+            said += sentences
         self.warnings = (*run.warnings, *said)
 
     def __getattr__(self, name: str) -> Any:
@@ -46,37 +67,28 @@ class CheckedRun:
 
     def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
         """Odometry, as `Recorded`."""
-        if robot not in self._mended:
-            yield from self._run.odometry(robot, start, end)
-            return
-        for one in self._mended[robot]:
-            if (start is None or one.time >= start) and (end is None or one.time <= end):
-                yield one
+        return self._odometry[robot].between(start, end)
 
 
-def checked(
-    robot: str, samples: Sequence[OdometrySample], stances: Sequence[Stance]
-) -> tuple[list[OdometrySample], list[str]]:
+def checked(samples: Samples, stances: Sequence[Stance]) -> tuple[Samples, list[str]]:
     """Mend one robot's odometry.
 
     Parameters
     ----------
-    robot : str
-        Its name.
-    samples : sequence of OdometrySample
-        All of them, in the order of time.
+    samples : Samples
+        All of it, in the order of time.
     stances : sequence of Stance
         Those in which it is a mover tell whether its odometry hangs.
 
     Returns
     -------
-    list of OdometrySample, list of str
-        The samples, and a sentence on each fault; none where nothing is wrong.
+    Samples, list of str
+        The odometry, and a sentence on each fault; none where nothing is wrong.
     """
-    if len(samples) < 2:
-        return list(samples), []
-    times, poses = np.array([one.time for one in samples]), np.array([one.pose for one in samples])
-    covariances = np.array([one.covariance for one in samples])
+    robot, times, poses = samples.robot, samples.times, samples.poses
+    if len(times) < 2:
+        return samples, []
+    covariances = samples.covariances.copy()
     breaks = find_breaks(times, poses)
     said = [
         f"the odometry of {robot} {one}; the jump is cut out, and what it may hide is in the uncertainty"
@@ -103,10 +115,7 @@ def checked(
                 f"the odometry of {robot} does not change in stance {stance.index}, in which it moves: it is not used "
                 "there; check its driver"
             )
-    if not said:
-        return list(samples), []
-    columns = zip(samples, mended, covariances, strict=True)
-    return [replace(one, pose=pose, covariance=covariance) for one, pose, covariance in columns], said
+    return Samples(robot, times, mended, covariances) if said else samples, said
 
 
 def _says_nothing(covariances: Array) -> NDArray[np.bool_]:

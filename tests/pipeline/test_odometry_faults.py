@@ -10,7 +10,7 @@ from coloc_graph.backend import smooth
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.measurements import Odometry, RelativePose, Sighting
 from coloc_graph.pipeline.lever_arm import find_lever_arms, mend_lever_arms
-from coloc_graph.pipeline.odometry_checks import checked
+from coloc_graph.pipeline.odometry_checks import Samples, checked
 from coloc_graph.run import OdometrySample, Stance
 
 STANCE = Stance(0, 10.0, 15.0, ("A", "B"), ("C",))
@@ -27,14 +27,19 @@ def samples(jump=0.0, covariance=SMALL, hung=False):
     return made
 
 
+def faults_of(recorded):
+    mended, said = checked(Samples.of("C", recorded), [STANCE])
+    return list(mended.between()), said
+
+
 def test_odometry_that_is_right_is_passed_on_as_it_is():
-    mended, said = checked("C", samples(), [STANCE])
+    mended, said = faults_of(samples())
     assert not said
     assert all(np.array_equal(a.pose, b.pose) for a, b in zip(mended, samples(), strict=True))
 
 
 def test_a_jump_is_cut_out_and_told():
-    mended, (sentence,) = checked("C", samples(jump=0.5), [STANCE])
+    mended, (sentence,) = faults_of(samples(jump=0.5))
     assert "the odometry of C jumped by 0.5" in sentence
     assert mended[-1].pose[0] == pytest.approx(0.1 * 19.9, abs=0.02)
     assert max(one.covariance[0, 0] for one in mended) > 1e-4
@@ -49,13 +54,13 @@ def test_a_jump_is_cut_out_and_told():
     ],
 )
 def test_covariances_that_say_nothing_are_replaced_and_told(covariance, told):
-    mended, (sentence,) = checked("C", samples(covariance=covariance), [STANCE])
+    mended, (sentence,) = faults_of(samples(covariance=covariance))
     assert told in sentence and "the odometry of C" in sentence
     assert sum(one.covariance[0, 0] for one in mended[1:]) == pytest.approx(0.02**2 * 2, rel=0.1)
 
 
 def test_odometry_that_hangs_while_its_robot_moves_is_not_used_there_and_told():
-    mended, sentences = checked("C", samples(hung=True), [STANCE])
+    mended, sentences = faults_of(samples(hung=True))
     assert any("does not change in stance 0" in one for one in sentences)
     assert max(one.covariance[0, 0] for one in mended if 10 <= one.time <= 15) == pytest.approx(1.0)
 

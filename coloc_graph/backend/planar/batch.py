@@ -11,7 +11,7 @@ from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.linear_system import Optimum, Rows, gauss_newton
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.factors import KeyframeFactors, State, robust
-from coloc_graph.backend.planar.filter import NONE_LOCATED, Filtered, Models, filter_forward
+from coloc_graph.backend.planar.filter import INITIAL_PERIOD, NONE_LOCATED, Filtered, Models, filter_forward
 from coloc_graph.backend.planar.summary import OUTLIER, Found, measured_off, ranging_estimate
 from coloc_graph.backend.sensor_calibration import SensorErrors
 from coloc_graph.errors import EstimationError
@@ -44,7 +44,7 @@ def optimise_keyframes(team: Team, keyframes: Keyframes, *, calibrate_noise: boo
     EstimationError
         No robot can be localised, or the optimisation does not converge.
     """
-    filtered = filter_forward(team, keyframes)
+    filtered = filter_forward(team, keyframes, period=INITIAL_PERIOD)
     models = Models(team, keyframes)
     if not filtered.placed_at:
         raise EstimationError(NONE_LOCATED)

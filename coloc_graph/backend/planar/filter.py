@@ -27,6 +27,7 @@ from coloc_graph.team import Ranging, Team, Wheels
 Array = NDArray[np.float64]
 
 INNOVATION_GATE = 18.4  # squared Mahalanobis distance (two dimensions, p-value 1e-4) above which one is rejected
+INITIAL_PERIOD = 1.0  # s between measurements of one target by one robot, for initial values
 INITIAL_SIGMAS = (0.15, 0.15, 0.1)  # m, m, rad: of a robot's initial pose
 LANDMARK_SIGMA = 30.0  # m: of a landmark's initial position
 #: Reason for which a robot has no pose, and for which none has.
@@ -101,14 +102,14 @@ class Models:
         return bool(np.isfinite(self.map).any())
 
 
-def filter_forward(team: Team, keyframes: Keyframes) -> Filtered:
-    """Run the filter over all keyframes and measurements."""
-    return Filter(team, keyframes).run()
+def filter_forward(team: Team, keyframes: Keyframes, *, period: float = 0.0) -> Filtered:
+    """Run the filter over all keyframes and measurements; `period` as of `Filter`."""
+    return Filter(team, keyframes, period).run()
 
 
 def unlocated(team: Team, keyframes: Keyframes) -> dict[str, str]:
     """Return the reason by robot that no measurements locate; it ends as soon as all are located."""
-    one = Filter(team, keyframes)
+    one = Filter(team, keyframes, INITIAL_PERIOD)
     for index in range(len(keyframes.measured)):
         if len(one.out.placed_at) == len(keyframes.robots):
             break
@@ -117,9 +118,13 @@ def unlocated(team: Team, keyframes: Keyframes) -> dict[str, str]:
 
 
 class Filter:
-    """EKF whose state is the robots, their calibration errors and the landmarks."""
+    """EKF whose state is the robots, their calibration errors and the landmarks.
 
-    def __init__(self, team: Team, keyframes: Keyframes) -> None:
+    A target is used by a robot once a `period` [s] when both have poses: initial values need no more.
+    """
+
+    def __init__(self, team: Team, keyframes: Keyframes, period: float = 0.0) -> None:
+        self._period, self._used_at = period, dict[tuple[int, int], float]()
         self.keyframes, self.models = keyframes, Models(team, keyframes)
         robots, landmarks = len(keyframes.robots), len(keyframes.landmarks)
         self._robots = robots
@@ -170,12 +175,21 @@ class Filter:
         """Process the next measurement."""
         m = self.keyframes.measured
         robot, target = int(m.robot[index]), int(m.target[index])
-        range_, bearing = float(m.range[index]), float(m.bearing[index])
+        range_, bearing, time = float(m.range[index]), float(m.bearing[index]), float(m.time[index])
+        if time - self._used_at.get((robot, target), -math.inf) < self._period:
+            return
         self._go(robot, int(m.keyframe[index]))
         if target < self._robots:
             self._go(target, int(m.target_keyframe[index]))
         if self._ready(robot, target, range_, bearing):
             self.out.used[index] = self._update(robot, target, range_, bearing, m.share[index].tolist())
+            if self.out.used[index]:
+                self._used_at[robot, target] = time
+
+    @property
+    def is_complete(self) -> bool:
+        """True if all robots and landmarks have initial values."""
+        return all(self._placed) and bool(self._known.all())
 
     def landmark(self, number: int) -> Array | None:
         """Return the position (2,) of a landmark [m]; None while it is not known."""
@@ -229,10 +243,12 @@ class Filter:
         model = self.models.wheels[robot]
         of_errors = slice(self._wheels + WHEELS * robot, self._wheels + WHEELS * (robot + 1))
         at = slice(3 * robot, 3 * robot + 3)
-        while self._at[robot] < k:
-            step = self._at[robot]
+        first = self._at[robot]
+        if first >= k:
+            return
+        deltas, derivatives = model.steps(slice(first, k), self.mean[of_errors])
+        for step, delta, by_errors in zip(range(first, k), deltas.tolist(), derivatives, strict=True):
             self._at[robot] += 1
-            delta, by_errors = model.step(step, self.mean[of_errors])
             if not self._placed[robot]:
                 self._own[robot] = compose(self._own[robot], delta)
                 continue

@@ -15,7 +15,7 @@ from coloc_graph.backend.linear_system import LinearSystem, Summary
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.batch import found_landmarks, in_body
 from coloc_graph.backend.planar.factors import KeyframeFactors, State, robust
-from coloc_graph.backend.planar.filter import Filter
+from coloc_graph.backend.planar.filter import INITIAL_PERIOD, Filter
 from coloc_graph.backend.planar.summary import Found, ranging_estimate
 from coloc_graph.backend.planar.trajectory import trajectory
 from coloc_graph.backend.sensor_calibration import SensorErrors
@@ -74,7 +74,7 @@ class IncrementalKeyframes:
         self, team: Team, keyframes: Keyframes, *, lag: float = LAG, calibrating: float = CALIBRATION_TIME
     ) -> None:
         self.keyframes, self._lag, self._calibrating = keyframes, lag, calibrating
-        self._filter = Filter(team, keyframes)
+        self._filter = Filter(team, keyframes, INITIAL_PERIOD)
         self._factors = factors = KeyframeFactors(keyframes, self._filter.models)
         self._state = State(np.full((len(factors), 3), np.nan), factors.start())
         self._entered = [0] * len(keyframes.robots)  # number of keyframes of each that were added
@@ -93,7 +93,8 @@ class IncrementalKeyframes:
         """Add all measurements before a time [UTC s], and return the newest poses."""
         m = self.keyframes.measured
         while self._next < len(m) and m.time[self._next] < time:
-            self._filter.take(self._next)
+            if not self._filter.is_complete:
+                self._filter.take(self._next)
             self._next += 1
         before = list(self._entered)
         self._enter_robots(time)
