@@ -163,6 +163,13 @@ def short_solution(short):
 
 
 @pytest.fixture(scope="session")
+def short_result(short_solution, short):
+    """The result of the short run on disk; tests read it, or copy it, and leave it alone."""
+    write_result(short_solution, short.parent / "result")
+    return short.parent / "result"
+
+
+@pytest.fixture(scope="session")
 def result(solutions, hallway):
     """A result on disk beside the hallway; tests read it and leave it alone."""
     out = hallway.parent / "result"

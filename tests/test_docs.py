@@ -37,7 +37,7 @@ ELSEWHERE = {
     "ros": "tests/exchange",
     "wheels": "tests/robot_io",
 }
-LONG = {"landmarks", "data-set"}  # for `make test-long`
+LONG = {"landmarks", "data-set", "many-runs"}  # for `make test-long`
 PAGES = [
     pytest.param(path.stem, marks=[pytest.mark.long] * (path.stem in LONG))
     for path in sorted(DOCS.glob("*.md"))

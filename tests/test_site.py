@@ -25,7 +25,7 @@ ROUNDING = 0.25  # relative difference from the figures of docs/data-set.md abov
 SHELL = re.compile(r"^```sh\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 #: Examples that take more than a few seconds of CPU, and what pages that use them.
 LONG_EXAMPLES = {"best_formation", "many_runs", "two_videos", "honest_covariances"}
-LONG_PAGES = {"first-result", "two-videos", "covariances", "plan", "dask"}
+LONG_PAGES = {"first-result", "evo", "two-videos", "covariances", "plan", "dask"}
 #: Pages with the same first commands, which run in one folder and run these once.
 TOGETHER = {"first-result", "evo"}
 TUTORIALS = [*sorted((DOCS / "start").glob("*.md")), *sorted((DOCS / "concepts").glob("*.md"))]

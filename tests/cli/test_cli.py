@@ -179,13 +179,11 @@ def test_the_demo_goes_all_the_way(call, tmp_path, monkeypatch):
     assert (tmp_path / "demo" / "hallway.mcap").is_file()
 
 
-def test_the_installed_command_and_the_module_are_the_same(short):
-    a = coloc("info", short, "--json")
-    b = subprocess.run(
-        [sys.executable, "-m", "coloc_graph.cli", "info", short, "--json"], capture_output=True, text=True
-    )
+def test_the_installed_command_and_the_module_are_the_same():
+    a = coloc("solve", "--help")
+    b = subprocess.run([sys.executable, "-m", "coloc_graph.cli", "solve", "--help"], capture_output=True, text=True)
     assert (a.returncode, a.stderr) == (b.returncode, b.stderr) == (0, "")
-    assert a.stdout == b.stdout and json.loads(a.stdout)["stances"] == 3
+    assert a.stdout == b.stdout and a.stdout.startswith("usage: coloc solve")
 
 
 def test_a_bad_argument_is_exit_code_2_in_a_real_process(tmp_path):
@@ -215,11 +213,11 @@ def test_interrupting_ends_with_130_and_leaves_nothing(tmp_path):
         # a shell's background job ignores SIGINT, and hands that on
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
-    end = time.monotonic() + 30
+    end = time.monotonic() + 120
     while not list(tmp_path.glob("run.mcap.*.part")) and time.monotonic() < end:
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=120)
     assert process.returncode == 130
     assert err.splitlines()[-1] == "coloc: interrupted" and "Traceback" not in err and out == ""
     assert list(tmp_path.iterdir()) == []

@@ -16,21 +16,19 @@ from coloc_graph.exchange.ros_poses import T_of, ros_covariance
 from coloc_graph.geometry.lie import se3_exp, so3_exp, so3_log
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.results.folder import read_result
-from coloc_graph.results.writer import assess, write_result
+from coloc_graph.results.writer import assess
 from coloc_graph.run.schemas import to_ns
 from coloc_graph.team import write_team
 
 
 @pytest.fixture(scope="module")
-def result(short_solution, tmp_path_factory):
-    out = tmp_path_factory.mktemp("ros") / "result"
-    write_result(short_solution, out)
-    return out
+def result(short_result):
+    return short_result
 
 
 @pytest.fixture(scope="module")
-def bag(result):
-    path = result.parent / "result.mcap"
+def bag(result, tmp_path_factory):
+    path = tmp_path_factory.mktemp("ros") / "result.mcap"
     assert main(["export", "ros2", str(result), "--out", str(path)]) == 0
     return path
 

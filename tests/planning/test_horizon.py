@@ -111,8 +111,8 @@ def test_a_target_that_failed_is_not_tried_again(straight):
 
 
 def test_round_a_corner_all_stand_clear_of_walls_and_of_each_other():
-    floor_map = corridor(2.0, corner=2.5)
-    planner = horizon(Course(((0.0, 0.0), (2.5, 0.0), (2.5, 2.0))), 80.0, floor_map)
+    floor_map = corridor(2.0, corner=2.0)
+    planner = horizon(Course(((0.0, 0.0), (2.0, 0.0), (2.0, 1.4))), 50.0, floor_map)
     mission = planner.mission(start(planner.predictor.team))
     assert planner.arrived(mission.plan.stances[-1].standing)
     for stance, promise in zip(mission.plan.stances, mission.promises, strict=True):

@@ -97,14 +97,13 @@ def test_the_config_says_everything_that_was_used(result, solutions):
     assert msgspec.convert(config["team"], Team) == solutions["joint"].run.team
 
 
-def test_the_same_input_gives_the_same_bytes_but_for_the_seconds(short, tmp_path):
-    for name in ("one", "two"):
-        write_result(solve(open_run(short)), tmp_path / name)
-    one, two = (contents(tmp_path / name) for name in ("one", "two"))
+def test_the_same_input_gives_the_same_bytes_but_for_the_seconds(short, short_result, tmp_path):
+    write_result(solve(open_run(short)), tmp_path / "again")
+    one, two = contents(short_result), contents(tmp_path / "again")
     summaries = [json.loads(files.pop("summary.json")) for files in (one, two)]
     assert one == two
     for summary in summaries:
-        del summary["seconds"]
+        del summary["seconds"], summary["run"]
     assert summaries[0] == summaries[1] and list(summaries[0]) == list(summaries[1])
 
 
@@ -118,18 +117,17 @@ def test_a_result_reads_back(result, solutions, hallway):
             assert np.array_equal(getattr(again, name), getattr(trajectory, name)), name
 
 
-def test_a_result_and_its_run_may_be_moved_together(short, short_solution, tmp_path):
-    (tmp_path / "here").mkdir()
-    moved_run = tmp_path / "here" / "run.mcap"
-    moved_run.write_bytes(short.read_bytes())
-    write_result(solve(open_run(moved_run)), tmp_path / "here" / "out")
-    (tmp_path / "here").rename(tmp_path / "there")
-    assert read_result(tmp_path / "there" / "out").run_path.samefile(tmp_path / "there" / "run.mcap")
+def test_a_result_and_its_run_may_be_moved_together(short, short_result, tmp_path):
+    there = tmp_path / "there"
+    there.mkdir()
+    shutil.copy(short, there / short.name)
+    shutil.copytree(short_result, there / "out")
+    assert read_result(there / "out").run_path.samefile(there / short.name)
 
 
-def test_an_earlier_result_is_replaced_whole(short_solution, solutions, tmp_path):
+def test_an_earlier_result_is_replaced_whole(short_solution, result, tmp_path):
     out = tmp_path / "out"
-    write_result(solutions["joint"], out)
+    shutil.copytree(result, out)
     (out / "trajectories" / "Z.tum").write_text("of an earlier team")
     write_result(short_solution, out)
     assert set(contents(out)) == FILES
@@ -137,19 +135,15 @@ def test_an_earlier_result_is_replaced_whole(short_solution, solutions, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_a_result_goes_to_an_empty_folder_a_deep_one_the_present_one_and_through_a_link(
-    short_solution, tmp_path, monkeypatch
-):
-    (tmp_path / "empty").mkdir()
+def test_a_result_goes_to_a_deep_folder_the_present_empty_one_and_through_a_link(short_solution, tmp_path, monkeypatch):
     (tmp_path / "present").mkdir()
     (tmp_path / "target").mkdir()
     (tmp_path / "link").symlink_to("target")
-    write_result(short_solution, tmp_path / "empty")
     write_result(short_solution, tmp_path / "a" / "b" / "c")
     write_result(short_solution, tmp_path / "link")
     monkeypatch.chdir(tmp_path / "present")
     write_result(short_solution, ".")
-    for name in ("empty", "a/b/c", "target", "present"):
+    for name in ("a/b/c", "target", "present"):
         assert set(contents(tmp_path / name)) == FILES, name
     assert (tmp_path / "link").is_symlink()
 
@@ -167,11 +161,12 @@ def test_a_folder_that_is_something_else_is_refused_and_stays_as_it_was(short_so
     assert contents(tmp_path) == {"thesis/chapter.txt": b"years of work", "file": b"a file"}
 
 
-def test_nothing_half_written_is_left_and_the_earlier_result_stands(short_solution, tmp_path, monkeypatch):
+def test_nothing_half_written_is_left_and_the_earlier_result_stands(
+    short_solution, short_result, tmp_path, monkeypatch
+):
     import coloc_graph.report
 
-    out = tmp_path / "out"
-    write_result(short_solution, out)
+    out = shutil.copytree(short_result, tmp_path / "out")
     before = contents(tmp_path)
 
     def full_disk(*_):
@@ -240,9 +235,8 @@ def test_what_is_no_result_is_refused_in_words(tmp_path, summary, words):
     assert str(tmp_path) in str(refusal.value) and "\n" not in str(refusal.value)
 
 
-def test_a_result_knows_its_run_by_content(short, hallway, short_solution, tmp_path):
-    write_result(short_solution, tmp_path / "out")
-    read = read_result(tmp_path / "out")
+def test_a_result_knows_its_run_by_content(short, hallway, short_result, tmp_path):
+    read = read_result(short_result)
     read.require_run(short)
     copy, cut = tmp_path / "copy.mcap", tmp_path / "cut.mcap"
     copy.write_bytes(short.read_bytes())
@@ -250,7 +244,7 @@ def test_a_result_knows_its_run_by_content(short, hallway, short_solution, tmp_p
     cut.write_bytes(short.read_bytes()[: ends[1] + 100])
     read.require_run(copy)
     read.require_run(cut)
-    with pytest.raises(InputError, match=r"hallway.mcap is not the run of the result .*out"):
+    with pytest.raises(InputError, match=r"hallway.mcap is not the run of the result .*result"):
         read.require_run(hallway)
     with pytest.raises(InputError, match=r"no longer at .*gone.mcap: give --run RUN"):
         read.require_run(tmp_path / "gone.mcap")
@@ -266,8 +260,8 @@ def test_runs_of_two_seeds_have_two_ids_and_one_of_the_same_seed_has_one(tmp_pat
     assert ids[0] == ids[2] != ids[1]
 
 
-def test_a_result_of_a_version_without_ids_is_taken_as_it_is(short, hallway, short_solution, tmp_path):
-    write_result(short_solution, tmp_path / "out")
+def test_a_result_of_a_version_without_ids_is_taken_as_it_is(hallway, short_result, tmp_path):
+    shutil.copytree(short_result, tmp_path / "out")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     del summary["run_id"]
     (tmp_path / "out" / "summary.json").write_text(json.dumps(summary))

@@ -554,9 +554,7 @@ def test_bad_input_is_one_sentence(make, result, tmp_path, capsys):
     assert words in err and err.startswith("coloc: ") and err.count("\n") == 1
 
 
-def test_another_result_is_compared_and_one_of_another_run_refused(scene, result, short_solution, tmp_path):
-    from coloc_graph.results.writer import write_result
-
+def test_another_result_is_compared_and_one_of_another_run_refused(scene, result, short_result):
     both = with_other(scene, result)
     assert [layer.aside for layer in both.layers] == [False, False, True]
     assert frame_of(scene, ViewState()) and both.beside.edges is both.other_edges
@@ -588,9 +586,8 @@ def test_another_result_is_compared_and_one_of_another_run_refused(scene, result
     assert np.array_equal(*np.split(error_curves(both)[1], 2))
     text = inspect.robot_report(both, 1, 4)
     assert "| joint |" in text and "result: joint" in text
-    write_result(short_solution, tmp_path / "other")
     with pytest.raises(InputError, match="is not the run of the result"):
-        with_other(scene, tmp_path / "other")
+        with_other(scene, short_result)
 
 
 def test_sightings_and_odometry_are_read_back_as_what_they_were(scene, solutions):
