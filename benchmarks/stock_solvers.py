@@ -1,6 +1,7 @@
 """Our graphs in GTSAM's own optimiser: by how much its poses and sigmas differ from ours.
 
     python benchmarks/stock_solvers.py [--stances 40] [--only NAME]
+    python benchmarks/stock_solvers.py --mrclam DIR     a ranging run instead
 
 Of each run `graph.g2o` is read by GTSAM's readG2o, and `coloc export gtsam` by a program that imports nothing of
 coloc-graph; both begin at perturbed poses.
@@ -18,6 +19,8 @@ import numpy as np
 from coloc_graph import SolveOptions, open_run, solve
 from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.exchange.gtsam_files import gtsam_files, unpack_gtsam, write_gtsam
+from coloc_graph.exchange.mrclam import import_mrclam
+from coloc_graph.exchange.ranging_factors import ranging_gtsam_files
 from coloc_graph.simulation import Imperfections, simulate
 
 STARTS = np.array([0.01, 0.01, 0.02, 0.05, 0.05, 0.02])  # rad, m: sigmas of the errors of the initial poses
@@ -31,11 +34,13 @@ import numpy as np
 import solve
 graph, values, names = solve.load()
 found, iterations = solve.solve(graph, solve.perturbed(values, names, 0.05))
-covariances = solve.covariances(graph, found)
-keys = [key for key, (kind, _) in names.items() if kind == "pose"]
+keys = [key for key, (kind, _) in names.items() if "pose" in kind]
+keys = keys[:: -(-len(keys) // 1000)]
+covariances = solve.covariances(graph, found, keys)
 assert "coloc_graph" not in sys.modules and iterations > 0
-np.savez(sys.argv[2], keys=np.array(keys, np.uint64), T=[found.atPose3(key).matrix() for key in keys],
-         C=[covariances[key] for key in keys], iterations=iterations)
+at = found.atPose3 if names[keys[0]][0] == "pose" else found.atPose2
+np.savez(sys.argv[2], keys=np.array(keys, np.uint64), T=[at(key).matrix() for key in keys],
+         C=[covariances[key] for key in keys], of=[names[key][1] for key in keys], iterations=iterations)
 """
 
 
@@ -78,12 +83,42 @@ def of_factors(estimate, folder: Path) -> tuple[int, float, float]:
     return int(out["iterations"]), float(off), float(ratio)
 
 
+def of_mrclam(data: Path, folder: Path) -> None:
+    """Print the differences of the script on the factors of a ranging run, in sigmas, and of sigmas."""
+    import_mrclam(data, folder / "run.mcap")
+    run = open_run(folder / "run.mcap")
+    estimate = solve(run).estimate
+    write_gtsam(ranging_gtsam_files(estimate, run.team), folder / "factors.zip")
+    unpack_gtsam(folder / "factors.zip", folder / "factors")
+    subprocess.run([sys.executable, "-c", BARE, folder / "factors", folder / "out.npz"], check=True, cwd=folder)
+    out = np.load(folder / "out.npz")
+    rows = {of: n for n, of in enumerate(out["of"].tolist())}
+    print("| robot | iterations | off by | sigmas differ by |\n|---|---|---|---|")
+    for robot, one in estimate.trajectories.items():
+        named = [f"{robot}@{number}" for number in estimate.ranging.numbers[robot].tolist()]
+        own = [n for n, of in enumerate(named) if of in rows]  # a thousand of all robots' poses
+        there = [rows[named[n]] for n in own]
+        sigmas = np.sqrt(one.covariances[own][:, [3, 4, 2], [3, 4, 2]])
+        theirs = np.sqrt(np.diagonal(out["C"][there], axis1=1, axis2=2))
+        T = np.linalg.inv(one.T_world_body[own][:, [0, 1, 3]][:, :, [0, 1, 3]]) @ out["T"][there]
+        off = np.column_stack([T[:, 0, 2], T[:, 1, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
+        print(
+            f"| {robot} | {out['iterations']} | {np.abs(off / sigmas).max():.4f} sigma "
+            f"| {100 * np.abs(theirs / sigmas - 1).max():.3f} % |"
+        )
+
+
 def main() -> None:
     """Measure and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--stances", type=int, default=40, help="number of stances (default: 40)")
     parser.add_argument("--only", metavar="NAME", help="measure this run only, as `landmarks` (default: all)")
+    parser.add_argument("--mrclam", type=Path, metavar="DIR", help="folder of a dataset of MR.CLAM")
     args = parser.parse_args()
+    if args.mrclam is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            of_mrclam(args.mrclam, Path(folder))
+        return
     print("| run | method | g2o: iterations | off by | factors: iterations | off by | sigmas differ by |")
     print("|---|---|---|---|---|---|---|")
     for name, scenario, more in runs(args.stances):
