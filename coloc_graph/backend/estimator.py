@@ -19,6 +19,7 @@ from coloc_graph.backend.chi2_test import UNCHECKED, Agreement
 from coloc_graph.backend.estimate import Estimate, Rejection, StanceEstimate, rejection_of
 from coloc_graph.backend.factors import Factors, Method, require_robot_models
 from coloc_graph.backend.fixed_lag import LAG, MAX_STANCES_PER_LAG
+from coloc_graph.backend.forgetting import Past, require_all
 from coloc_graph.backend.graph import (
     Link,
     PoseGraph,
@@ -69,6 +70,10 @@ class Estimator:
         estimates, while their measurements go on to count, linearised; so a stance costs the same in a run of any
         length. A measurement of an older pose that comes late makes all of them variables again, which takes as long
         as a batch estimate.
+    forgets : bool
+        Forget what is older than the lag, with either method, so that memory stays bounded in a mission of any length.
+        Poses that leave the lag are dropped, measurements of them are refused, and what needs all measurements (a batch
+        estimate, a checkpoint, removing something) is not available once something was forgotten.
 
     Raises
     ------
@@ -91,10 +96,12 @@ class Estimator:
         robot_models: Mapping[str, Robot] | None = None,
         landmarks: Mapping[str, Landmark] | None = None,
         lag: int = LAG,
+        *,
+        forgets: bool = False,
     ) -> None:
         if lag < 1:
             raise EstimationError(f"a lag of {lag} stances leaves no pose to estimate: give 1 or more")
-        self.lag = lag
+        self.lag, self.forgets = lag, forgets
         self.reference, self.robots, self.floor, self.slips = reference, tuple(robots), floor, dict(slips or {})
         self.robot_models, self.landmarks = dict(robot_models or {}), dict(landmarks or {})
         self._on_map = map_positions(self.landmarks)
@@ -105,8 +112,12 @@ class Estimator:
         self._waiting: dict[int, WaitingStance] = {}
         self._begin(Base())
 
-    def _begin(self, base: Base) -> None:
+    def _begin(self, base: Base | Past) -> None:
         """Hold the stances and measurements of `base`, optimised in batch, and nothing else."""
+        self._past: Past | None = None  # since it forgot something, instead of the base
+        if isinstance(base, Past):
+            self._go_back(base)
+            return
         self._base, self._journal = base, list[Entry]()  # inputs since the base, in their order
         self._pose_keys = PoseKeys(self.robots, self.slips, self.landmarks)
         self._stances: dict[int, Stance] = {}
@@ -128,7 +139,54 @@ class Estimator:
             inside = set(map(id, links))
             self._disconnected = [one for one in kept.links if id(one) not in inside and len(set(self._keys(one))) == 2]
 
-    def _replay(self, base: Base, journal: Iterable[Entry]) -> None:
+    def _go_back(self, past: Past) -> None:
+        """Return to the state in which something was forgotten last."""
+        self._past, self._journal = past, []
+        self._pose_keys, self._stances = past.pose_keys.kept(), dict(past.stances)
+        self._log, self._rejected, self._newly = list(past.log), dict(past.rejected), set(past.newly)
+        self._disconnected, self._instants = list(past.disconnected), dict(past.instants)
+        factors_of = self._new_factors()
+        if factors_of.variables is not None:
+            factors_of.variables.anchors.update(past.anchors)
+        self._live = Isam2Graph.again(factors_of, past.factors, past.values, past.tied)
+
+    def _forget(self) -> None:
+        """Drop everything of the poses that were marginalised."""
+        live = self._live
+        if not self.forgets or not live.marginalised:
+            return
+        live.forget()
+        recent = set(islice(reversed(self._stances), self.lag))
+        nodes = {
+            (robot, index)
+            for robot in self.robots
+            for index in self._stances
+            if index in recent or self._pose_keys.find((robot, index)) in live.tied
+        }
+        kept = {index for _, index in nodes}
+        self._stances = {index: stance for index, stance in self._stances.items() if index in kept}
+        self._pose_keys = self._pose_keys.kept(nodes)
+        self._log = [one for one in self._log if all(node in self._pose_keys for node in one.ends)]
+        there = set(map(id, self._log))
+        self._rejected = {key: one for key, one in self._rejected.items() if key in there}
+        self._instants = {node: time for node, time in self._instants.items() if node in nodes}
+        self._disconnected = [one for one in self._disconnected if all(node in self._pose_keys for node in one.ends)]
+        self._journal = []
+        variables = live.factors_of.variables
+        self._past = Past(
+            *live.begun,
+            frozenset(live.tied),
+            {} if variables is None else dict(variables.anchors),
+            self._pose_keys.kept(),
+            dict(self._stances),
+            tuple(self._log),
+            dict(self._rejected),
+            dict(self._instants),
+            frozenset(self._newly),
+            tuple(self._disconnected),
+        )
+
+    def _replay(self, base: Base | Past, journal: Iterable[Entry]) -> None:
         """Repeat all inputs in their order, which gives the same numbers.
 
         ISAM2 linearises each pose where it was when it came, so that no batch gives the same numbers.
@@ -140,7 +198,8 @@ class Estimator:
     @contextmanager
     def _all_or_nothing(self) -> Iterator[None]:
         """Restore the estimator where the body of the `with` fails or is interrupted."""
-        base, journal, count, early = self._base, self._journal, len(self._journal), dict(self._waiting)
+        base, journal, early = self._past or self._base, self._journal, dict(self._waiting)
+        count = len(journal)
         self._changed = False
         try:
             yield
@@ -151,10 +210,11 @@ class Estimator:
             raise
 
     @classmethod
-    def of(cls, team: Team, method: Method = "joint", lag: int = LAG) -> "Estimator":
+    def of(cls, team: Team, method: Method = "joint", lag: int = LAG, *, forgets: bool = False) -> "Estimator":
         """Return the estimator of a team: with its mounts to be calibrated, or of poses alone (`smooth`)."""
         robot_models = {robot.name: robot for robot in team.robots} if method == "joint" else None
-        return cls(team.reference, team.names, team.floor, slips_of(team), robot_models, landmarks_of(team), lag)
+        known = team.reference, team.names, team.floor, slips_of(team), robot_models, landmarks_of(team)
+        return cls(*known, lag, forgets=forgets)
 
     @property
     def method(self) -> Method:
@@ -188,7 +248,8 @@ class Estimator:
 
     @property
     def graph(self) -> PoseGraph:
-        """Graph of all inputs; `EstimationError` while there is no stance."""
+        """Graph of all inputs; `EstimationError` while there is no stance, or where some were forgotten."""
+        require_all(self._past, "return the graph of all inputs")
         return PoseGraph(
             self.reference, self.robots, self.stances, self.measurements, self.floor, self.slips, self.robot_models,
             self.landmarks, self._on_map,
@@ -280,7 +341,8 @@ class Estimator:
         """
         taken = tuple(measurements)
         follows = stance.index - 1 if after is None else after
-        if stance.index in self._stances or stance.index in self._waiting:
+        forgotten = self._past is not None and stance.index < max(self._stances)
+        if forgotten or stance.index in self._stances or stance.index in self._waiting:
             raise MeasurementError(
                 f"stance {stance.index} was added before: add it once, and late measurements by `insert`"
             )
@@ -372,6 +434,7 @@ class Estimator:
 
         Measurements are named by identity.
         """
+        require_all(self._past, "remove anything")
         measurements = tuple(one for one in self._log if id(one) not in gone)
         rejected = {key: one for key, one in self._rejected.items() if key not in gone}
         self._changed = True
@@ -387,6 +450,7 @@ class Estimator:
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint atomically, from which `resume` continues."""
+        require_all(self._past, "write a checkpoint")
         team = self.reference, self.robots, self.floor, self.slips, self.robot_models, self.landmarks, self.lag
         came = self._base, tuple(self._journal), tuple(self._waiting.values())
         checkpoint.write(checkpoint.Checkpoint(*team, *came), Path(path))
@@ -443,7 +507,9 @@ class Estimator:
         self._disconnected = plan.disconnected
         said = self._at(next(reversed(self._stances.values())), rejected, agreement)
         seen = {one.seen for one in taken if isinstance(one, Sighting)}
-        return replace(said, residuals=tuple(map(self.residual, taken)), landmarks=self.static_poses(seen))
+        said = replace(said, residuals=tuple(map(self.residual, taken)), landmarks=self.static_poses(seen))
+        self._forget()
+        return said
 
     def _new_map_positions(self, taken: Iterable[Measurement]) -> tuple[Link, ...]:
         """Positions on the map of the landmarks that are sighted for the first time."""
@@ -457,12 +523,24 @@ class Estimator:
     def _checked(self, taken: Sequence[Measurement]) -> dict[Node, float]:
         """Check the ends of measurements and return the times at which moving robots were sighted."""
         for measured in taken:
+            if self._past is not None:
+                self._require_kept(measured)
             require_ends(measured, self._pose_keys, self._stances)
         return instants_of(taken, self._stances, self._instants)
 
+    def _require_kept(self, measured: Measurement) -> None:
+        """Raise `MeasurementError` where a measurement is of a pose that was forgotten."""
+        for robot, index in measured.ends:
+            if robot in self.robots and (robot, index) not in self._pose_keys and index < max(self._stances):
+                raise MeasurementError(
+                    f"the {measured} is of the pose of {robot} in stance {index}, which was forgotten: it left the lag "
+                    f"of {self.lag} stances"
+                )
+
     def _plan(self, links: list[Link]) -> InsertionPlan:
-        reference = self._pose_keys.key((self.reference, next(iter(self._stances))))
         live = self._live
+        # before anything is tied, nothing was forgotten
+        reference = -1 if live.tied else self._pose_keys.key((self.reference, next(iter(self._stances))))
         return InsertionPlanner(live.factors_of, self._keys, live.tied, reference, live.pose, live.errors).sort(links)
 
     def _update(self, plan: InsertionPlan) -> tuple[tuple[Rejection, ...], Agreement]:
@@ -475,18 +553,19 @@ class Estimator:
         return tuple(_rejection(link, off) for link, off in outcome.rejected), outcome.agreement
 
     def _marginalise(self) -> None:
-        """Marginalise the poses of old stances where mounts are calibrated."""
+        """Marginalise the poses of old stances where mounts are calibrated, or the past is forgotten."""
         most = ceil(MAX_STANCES_PER_LAG * self.lag)
         recent = list(islice(reversed(self._stances), most))
-        if not self.robot_models or len(recent) < most:
+        if not (self.robot_models or self.forgets) or len(recent) < most:
             return
         key, live = self._pose_keys.key, self._live
+        find = self._pose_keys.find
         keep = {key((robot, index)) for robot in self.robots for index in recent[: self.lag]}
-        if not {key((robot, recent[-1])) for robot in self.robots} & live.tied - live.marginalised.keys() - keep:
+        if not {find((robot, recent[-1])) for robot in self.robots} & live.tied - live.marginalised.keys() - keep:
             return
         for robot in self.robots:
             # a robot that was not seen for long is seen again, or its odometry goes on
-            keys = (key((robot, index)) for index in reversed(self._stances))
+            keys = (find((robot, index)) for index in reversed(self._stances))
             keep.update(islice((one for one in keys if one in live.tied), 1))
         live.marginalise(keep | set(self._pose_keys.static().values()))
 
@@ -503,7 +582,7 @@ class Estimator:
         if robot not in self.robots:
             raise EstimationError(f"robot {robot} is not in the team ({', '.join(self.robots)})")
         for index in reversed(self._stances) if stance is None else (stance,):
-            if index in self._stances and (key := self._pose_keys.key((robot, index))) in self._live.tied:
+            if (key := self._pose_keys.find((robot, index))) is not None and key in self._live.tied:
                 return key
         raise EstimationError(f"robot {robot} has no pose{'' if stance is None else f' at stance {stance}'}")
 

@@ -1,7 +1,8 @@
 """Pose graph of a team: one pose per robot and move, stay-put constraints, and measurements between them."""
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -118,6 +119,17 @@ class PoseKeys:
         for robot in self._numbers:
             del self._keys[robot, stance.index]
             self._moves[robot] = 0 if before is None else gtsam.mrsymbolIndex(self._keys[robot, before.index])
+
+    def kept(self, nodes: Set[Node] | None = None) -> "PoseKeys":
+        """Return a copy with the keys of some nodes alone, or of all; later stances go on from all moves."""
+        keys = copy(self)
+        keys._moves = dict(self._moves)
+        keys._keys = {node: key for node, key in self._keys.items() if nodes is None or node in nodes}
+        return keys
+
+    def find(self, node: Node) -> int | None:
+        """Return GTSAM's key of a robot at a stance; None where it has none."""
+        return self._keys.get(node)
 
     @staticmethod
     def stays(robot: str, before: Stance, after: Stance) -> bool:

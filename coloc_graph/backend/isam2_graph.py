@@ -60,6 +60,23 @@ class Isam2Graph:
         self._latest = _batch([])  # factors of the last insertion
         self._made: dict[int, tuple[Link, gtsam.NonlinearFactor]] = {}  # their links and factors, by a link's identity
         self.isam = self._new_isam()
+        #: Factors and values with which it began, after poses were marginalised.
+        self.begun = gtsam.NonlinearFactorGraph(), gtsam.Values()
+
+    @classmethod
+    def again(
+        cls, factors_of: Factors, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, tied: Collection[int]
+    ) -> "Isam2Graph":
+        """Return the graph that began with some factors and values, as after `marginalise`."""
+        graph = cls(factors_of)
+        graph._begin_with(factors, values)
+        graph.tied = set(tied)
+        return graph
+
+    def forget(self) -> None:
+        """Drop the poses that were marginalised."""
+        self.tied -= self.marginalised.keys()
+        self.marginalised, self._former = {}, {}
 
     def _new_isam(self) -> gtsam.ISAM2:
         return gtsam.ISAM2(isam_parameters(calibrates=self.factors_of.variables is not None))
@@ -234,7 +251,7 @@ class Isam2Graph:
 
     def _begin_with(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         """Hold these factors and variables, and nothing else."""
-        self.isam, self._batched = self._new_isam(), {}
+        self.isam, self._batched, self.begun = self._new_isam(), {}, (factors, values)
         self._update(factors, values)
         self._calibrated = calibrations_in(values)
 

@@ -8,7 +8,7 @@ import pytest
 
 from coloc_graph.backend import Estimator
 from coloc_graph.backend.chain import spanning_tree
-from coloc_graph.errors import EstimationError
+from coloc_graph.errors import EstimationError, MeasurementError
 from coloc_graph.measurements import Odometry, Sighting
 from coloc_graph.pipeline.batch import solve
 from coloc_graph.run import open_run
@@ -27,14 +27,14 @@ def graph(tmp_path_factory):
     return solve(open_run(path)).estimate.graph
 
 
-def fed(graph, lag, late=(), stances=STANCES):
+def fed(graph, lag, late=(), stances=STANCES, **options):
     """Estimator of a graph's stances in their order; measurements in `late` are left out."""
     by_stance = defaultdict(list)
     for one in graph.measurements:
         if one not in late:
             by_stance[max(stance for _, stance in one.ends)].append(one)
     estimator = Estimator(
-        graph.reference, graph.robots, graph.floor, graph.slips, graph.robot_models, graph.landmarks, lag
+        graph.reference, graph.robots, graph.floor, graph.slips, graph.robot_models, graph.landmarks, lag, **options
     )
     before = None
     for stance in graph.stances[:stances]:
@@ -124,3 +124,40 @@ def test_two_robots_are_composed_by_what_ties_them_before_each_by_its_own_odomet
 def test_a_lag_of_nothing_is_refused(graph):
     with pytest.raises(EstimationError, match="a lag of 0 stances"):
         fed(graph, 0)
+
+
+@pytest.mark.parametrize("method", ["joint", "smooth"])
+def test_what_is_older_than_the_lag_can_be_forgotten_and_changes_no_pose(graph, short, method, tmp_path):
+    if method == "smooth":
+        graph = replace(graph, robot_models={})
+        short = fed(graph, LAG)
+    found = fed(graph, LAG, forgets=True)
+    assert len(found.stances) < 2 * LAG and len(found.measurements) < 0.6 * len(graph.measurements)
+    robots = graph.robots
+    before = {robot: found.pose(robot).matrix() for robot in robots}
+    for robot in robots:
+        if method == "joint":  # the same numbers, with and without what was forgotten
+            np.testing.assert_array_equal(before[robot], short.pose(robot).matrix())
+            np.testing.assert_array_equal(found.covariance(robot), short.covariance(robot))
+        assert in_sigmas(found, short, robot) < 0.02
+    last = graph.stances[-1]
+    wrong = [replace(m, covariance=-m.covariance) for m in graph.measurements if isinstance(m, Odometry)][-1]
+    following = replace(last, index=last.index + 1, anchors=last.observers[:1])
+    failing = found._live
+    failing.enter = lambda _: 1 / 0
+    with pytest.raises(EstimationError, match="was restored"):
+        found.add(following, after=last.index)
+    assert found._live is not failing  # it was made anew, from where it forgot last
+    for robot in robots:
+        np.testing.assert_allclose(before[robot], found.pose(robot).matrix(), atol=1e-12)
+    with pytest.raises(MeasurementError):
+        found.insert(wrong)
+    with pytest.raises(MeasurementError, match="which was forgotten: it left the lag of 5 stances"):
+        found.insert(next(m for m in graph.measurements if isinstance(m, Odometry)))
+    with pytest.raises(MeasurementError, match="was added before"):
+        found.add(graph.stances[1], after=0)
+    with pytest.raises(EstimationError, match="has no pose at stance 1"):
+        found.pose(graph.reference, 1)
+    for refused in (found.estimate, found.withdraw, lambda: found.save(tmp_path / "x"), lambda: found.graph):
+        with pytest.raises(EstimationError, match="it has forgotten all before stance"):
+            refused()
