@@ -6,6 +6,7 @@ localization and mapping dataset", IJRR 30(8), 2011.
 """
 
 import heapq
+import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -40,7 +41,9 @@ RANGING = Ranging(
     place_sigma=0.05,
 )
 #: Their odometry is made of commands, which the wheels carry out a moment later and not fully.
-WHEELS = Wheels(delay=0.1, scale_sigma=0.1, turn_scale_sigma=0.1, delay_sigma=0.1)
+#: A body's x axis is that of the reflectors on it, which are put there by eye.
+WHEELS = Wheels(delay=0.1, scale_sigma=0.1, turn_scale_sigma=0.1, delay_sigma=0.1, direction_sigma_deg=0.6)
+LANDMARK_SIGMA = 0.02  # m, of the middle of the barcode that cameras see from the point that was surveyed
 # accumulated errors of ten seconds; those of a single step are smaller, since errors are correlated
 ALONG = (0.08, 0.004)  # m per root of a metre, of a second: odometry noise along the path
 ACROSS = (0.012, 0.002)  # m per root of a metre, of a second: across the path
@@ -188,7 +191,7 @@ def _landmarks(folder: Path, codes: dict[int, int], robots: list[int]) -> dict[i
 def _team(subjects: list[int], positions: dict[int, Array], names: dict[int, str]) -> Team:
     robots = tuple(Robot(name=names[n], ranging=RANGING, wheels=WHEELS) for n in subjects)
     landmarks = tuple(
-        Landmark(name=names[n], position=(float(x), float(y)), position_sigma=float(sigma))
+        Landmark(name=names[n], position=(float(x), float(y)), position_sigma=math.hypot(sigma, LANDMARK_SIGMA))
         for n, (x, y, sigma) in positions.items()
     )
     return Team(reference=robots[0].name, robots=robots, floor=Floor(), landmarks=landmarks)

@@ -78,6 +78,9 @@ class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         Time by which the motion is later than reported, as of odometry made of commands [s].
     scale_sigma, turn_scale_sigma, delay_sigma : float
         Tolerances; a number with one is estimated along with the poses.
+    direction_sigma_deg : float
+        Tolerance of the body's x axis from the direction in which the wheels drive. Nothing measured shows it: it is
+        part of each heading's uncertainty.
     """
 
     scale: float = 1.0
@@ -86,10 +89,11 @@ class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     scale_sigma: float = 0.0
     turn_scale_sigma: float = 0.0
     delay_sigma: float = 0.0
+    direction_sigma_deg: float = 0.0
 
     def __post_init__(self) -> None:
         require_finite(self)
         for name in ("scale", "turn_scale"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
-        require_not_negative(self, ("scale_sigma", "turn_scale_sigma", "delay_sigma"))
+        require_not_negative(self, ("scale_sigma", "turn_scale_sigma", "delay_sigma", "direction_sigma_deg"))

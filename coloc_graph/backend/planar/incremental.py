@@ -263,6 +263,10 @@ class IncrementalKeyframes:
             there = np.isfinite(self._online[own, 0])
             if there.any():
                 found[name] = trajectory(
-                    name, self.keyframes.times[robot][there], self._online[own][there], self._online_C[own][there]
+                    name,
+                    self.keyframes.times[robot][there],
+                    self._online[own][there],
+                    self._online_C[own][there],
+                    factors.models.wheels[robot].wheels.direction_sigma_deg,
                 )
         return found

@@ -64,7 +64,8 @@ def ranging_estimate(
         disconnected += [(name, number) for number in np.flatnonzero(~there).tolist()]
         if not there.any():
             continue
-        trajectories[name] = trajectory(name, times[there], poses[there], covariances[there])
+        unsure = models.wheels[robot].wheels.direction_sigma_deg
+        trajectories[name] = trajectory(name, times[there], poses[there], covariances[there], unsure)
         numbers[name] = np.flatnonzero(there)
         steps = factors.steps(found.state, own[:-1]).residuals
         chi2 += float(np.nansum(steps**2))
