@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from teams import graph_of_team, planar_nees, team_of
 
-from coloc_graph.backend import smooth
+from coloc_graph.backend import blame, smooth
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.measurements import Odometry, RelativePose, Sighting
 
@@ -52,6 +52,25 @@ def test_wrong_odometry_is_named_alone_or_beside_a_bump_and_no_innocent_robot_al
     last = team.stances[-1].index
     for node in (node for node in team.T_world_body if node[1] == last):
         assert planar_nees(estimate, team, node) < 30
+
+
+def test_a_cause_that_one_step_underrates_is_fitted_where_no_likelier_one_explains_all(monkeypatch):
+    team = team_of(4, 6, 0)
+    made, bad = with_wrong_odometry(team, np.random.default_rng(0))
+    predicted = blame._suspects
+
+    def underrated(fit):
+        rated = [
+            (cause, replace(one, chi2=0.1 * one.chi2) if bad in cause.links else one) for cause, one in predicted(fit)
+        ]
+        return sorted(rated, key=lambda pair: -pair[1].chi2)
+
+    monkeypatch.setattr(blame, "_suspects", underrated)
+    estimate = smooth(graph_of_team(team, made))
+    named = [one.measurement for one in estimate.rejected] + [
+        link for bump in estimate.bumped for cause in bump.alternative for link in cause.links
+    ]
+    assert any(one is bad for one in named)
 
 
 @pytest.mark.parametrize("robots", [3, 4])
