@@ -16,6 +16,7 @@ from coloc_graph.team import Team
 
 T = TypeVar("T", Detections, OdometrySample)
 
+LATER = 1e-6  # time by which a late image is put after the last one [s]
 MEMORY = 600.0  # newest part of the run that is kept in memory too [s]
 
 
@@ -59,7 +60,8 @@ class Excerpt(_InMemory):
 class Record(_InMemory):
     """A run that is written while it is measured, and read as `run.Recorded`; a context manager.
 
-    A late sample gets the time of the last one of its kind, since time does not run backwards in a run.
+    A late sample of odometry gets the time of the last one, and a late image a time right after the last one: time does
+    not run backwards in a run, and images of one robot with the same stamp count once.
     """
 
     def __init__(self, path: str | Path, team: Team) -> None:
@@ -85,8 +87,8 @@ class Record(_InMemory):
         with self._lock:
             self._counts[one.robot][isinstance(one, OdometrySample)] += 1
             if isinstance(one, Detections):
-                return self._into(self._detections[one.robot], one)
-            return self._into(self._odometry[one.robot], one)
+                return self._into(self._detections[one.robot], one, LATER)
+            return self._into(self._odometry[one.robot], one, 0.0)
 
     def moves(self, robot: str, time: float, moving: bool) -> None:
         """Record whether a robot moves, if that has changed."""
@@ -129,8 +131,8 @@ class Record(_InMemory):
         rolled = [kept[-1].time for kept in self._odometry.values() if kept]
         return max([*seen, *rolled], default=0.0)
 
-    def _into(self, kept: list[T], one: T) -> T:
-        time = max(self.rounded(one.time), kept[-1].time if kept else 0.0)
+    def _into(self, kept: list[T], one: T, later: float) -> T:
+        time = max(self.rounded(one.time), self.rounded(kept[-1].time + later) if kept else 0.0)
         one = replace(one, time=time)
         self._writer.write(one)
         kept.append(one)

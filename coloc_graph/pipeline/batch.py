@@ -29,7 +29,7 @@ from coloc_graph.pipeline.clocks import (
     misfit,
     unknown_clocks,
 )
-from coloc_graph.pipeline.contents import Unused, require_applicable, unused_in, unused_ranges
+from coloc_graph.pipeline.contents import Unused, repeated_in, require_applicable, unused_in, unused_ranges
 from coloc_graph.pipeline.explanations import (
     implausible_planes,
     reasons,
@@ -139,6 +139,7 @@ def solve(
             if options.incremental
             else _or_by_clocks(run, options, measure, _in_batch(run, options, measure))
         )
+    unused = (*unused, *repeated_in(recorded), *solved.unused)
     return Solution(
         run=recorded,
         options=options,
@@ -146,7 +147,7 @@ def solve(
         measurements=solved.measured,
         warnings=(
             *run.warnings,
-            *(str(one) for one in (*unused, *solved.unused) if not one.requested),
+            *(str(one) for one in unused if not one.requested),
             *solved.warnings,
             *(
                 f"robot {robot} has no pose: {why}"
@@ -157,7 +158,7 @@ def solve(
         seconds_frontend=solved.seconds_frontend,
         seconds_backend=time.perf_counter() - started - solved.seconds_frontend,
         seconds_updates=solved.seconds_updates,
-        unused=(*unused, *solved.unused),
+        unused=unused,
         online=solved.online,
         without_pose=solved.without_pose,
         noise=solved.noise,

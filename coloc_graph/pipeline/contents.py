@@ -95,6 +95,16 @@ def unused_ranges(found: StanceRanges) -> tuple[Unused, ...]:
     return tuple(unused)
 
 
+def repeated_in(run: Run) -> tuple[Unused, ...]:
+    """Return the images and detections that were left out as a run was read: each has the stamp of one before."""
+    unused = []
+    for topic, count in run.repeated.items():
+        _, robot, kind = topic.split("/")
+        why = f"of messages of {robot} with the same stamp the first counts; see that each is recorded once"
+        unused.append(Unused(kind, count, _noun(count, NOUNS[kind]), why))
+    return tuple(unused)
+
+
 def require_applicable(run: Run, options: SolveOptions) -> Kind:
     """Return the kind of measurements that a run is solved by; `InputError` where an option does not apply to it."""
     kind = kind_of(run)

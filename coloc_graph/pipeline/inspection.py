@@ -18,7 +18,7 @@ from coloc_graph.frontend.pairing.correspondence import PAIRING_WINDOW, correspo
 from coloc_graph.frontend.pairing.plane_check import implausible
 from coloc_graph.frontend.stance import little_in_common
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_plane
-from coloc_graph.pipeline.contents import kind_of, unused_in, unused_ranges
+from coloc_graph.pipeline.contents import kind_of, repeated_in, unused_in, unused_ranges
 from coloc_graph.pipeline.ranges import unusable_ranges
 from coloc_graph.run import Detections, Run, Stance
 from coloc_graph.team import Landmark
@@ -80,7 +80,7 @@ def inspect(run: Run) -> list[Finding]:
         )
     for before, stance in zip((None, *run.stances), run.stances, strict=False):
         findings += _stance_findings(run, before, stance)
-    return findings
+    return [*findings, *(Finding("run", str(one)) for one in repeated_in(run))]
 
 
 def _ranging_findings(run: Run) -> list[Finding]:

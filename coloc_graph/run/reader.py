@@ -44,7 +44,8 @@ class Run:
     Notes
     -----
     The methods that iterate yield the messages of one robot in the order of time, from `start` to `end`, both included
-    [UTC s]; only a few chunks are in memory at any time. They raise `RunError` where the file is damaged.
+    [UTC s]; only a few chunks are in memory at any time. They raise `RunError` where the file is damaged. Of images and
+    detections of one robot with the same stamp the first is yielded, and the others are counted in `repeated`.
     """
 
     path: Path
@@ -56,6 +57,7 @@ class Run:
     start: float | None
     end: float | None
     _index: Index = field(repr=False)
+    _repeated: dict[str, set[tuple[int, int]]] = field(default_factory=dict, repr=False, compare=False)
 
     def __repr__(self) -> str:
         seconds = 0.0 if self.start is None or self.end is None else self.end - self.start
@@ -64,12 +66,12 @@ class Run:
 
     def images(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Image]:
         """Yield the images of a robot's camera."""
-        items = self._items(robot, "image", start, end)
+        items = self._once(*self._items(robot, "image", start, end))
         return decoded(self._index, items, lambda item: decode.decode_image(robot, item.ns, item.schema, item.data))
 
     def detections(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[Detections]:
         """Yield the detections in the images of a robot's camera, one record per image."""
-        items = self._items(robot, "detections", start, end)
+        items = self._once(*self._items(robot, "detections", start, end))
         return decoded(self._index, items, lambda item: decode.decode_detections(robot, item.ns, item.data))
 
     def odometry(self, robot: str, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
@@ -98,6 +100,11 @@ class Run:
         return clocks
 
     @property
+    def repeated(self) -> dict[str, int]:
+        """Number of messages by topic that were left out as they were read: they repeat the stamp of one before."""
+        return {topic: len(which) for topic, which in self._repeated.items()}
+
+    @property
     def has_ranges(self) -> bool:
         """True if any robot has range and bearing measurements."""
         return any(self._count(robot, "ranges") for robot in self.team.names)
@@ -120,6 +127,21 @@ class Run:
         first = 0 if start is None else _clamped_ns(start)
         last = None if end is None else _clamped_ns(end)
         return topic, read_topic(self._index, topic, first, last)
+
+    def _once(self, topic: str, items: Iterator[Item]) -> tuple[str, Iterator[Item]]:
+        """Leave out messages with the stamp of the one before."""
+
+        def once() -> Iterator[Item]:
+            before, repeats = -1, 0
+            for item in items:
+                repeats = repeats + 1 if item.ns == before else 0
+                if repeats:
+                    self._repeated.setdefault(topic, set()).add((item.ns, repeats))
+                else:
+                    yield item
+                before = item.ns
+
+        return topic, once()
 
 
 def open_run(path: str | Path) -> Run:

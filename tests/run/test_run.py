@@ -16,6 +16,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from coloc_graph.errors import RunError
 from coloc_graph.geometry.lie import floor_pose, rotation_x, rotation_y, rotation_z, se3
+from coloc_graph.pipeline.contents import repeated_in
 from coloc_graph.run import (
     Detections,
     Flag,
@@ -76,6 +77,23 @@ def test_an_image_without_markers_is_not_the_same_as_no_image(tmp_path):
         writer.write(nothing)
     (found,) = open_run(tmp_path / "run.mcap").detections("A")
     assert same(found, nothing)
+
+
+def test_of_images_with_the_same_stamp_the_first_counts(tmp_path):
+    """As in bags whose publisher was started twice; a time of its own each needs whoever interpolates."""
+    with atomic_run(tmp_path / "run.mcap", make.team()) as writer:
+        for n, time in enumerate([1.0, 2.0, 2.0, 2.0, 3.0]):
+            pixels = np.full((40, 60), n, np.uint8)
+            writer.write(Image("A", time, pixels))
+            one = np.array([[n, 0.0]]), np.eye(2)[None], ("",), np.zeros(1, np.uint8), np.ones(1), np.ones(1)
+            writer.write(Detections("B", time, *one))
+    run = open_run(tmp_path / "run.mcap")
+    assert run.repeated == {}
+    for _ in range(2):  # what is read twice is counted once
+        assert [one.uv[0, 0] for one in run.detections("B")] == [0, 1, 4]
+        assert [round(one.pixels.mean()) for one in run.images("A", 1.5, 2.5)] == [1]
+    assert run.repeated == {"/B/detections": 2, "/A/image": 2}
+    assert next(str(one) for one in repeated_in(run)).startswith("2 detection records not used: of messages of B")
 
 
 def test_every_flag_survives(tmp_path):
