@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from coloc_graph.cli.import_ import _offsets
 from coloc_graph.errors import InputError
 from coloc_graph.exchange.recording_offsets import RecordedTracks, recording_offset
 from coloc_graph.frontend import Detector, MarkerTracker
@@ -43,3 +44,10 @@ def test_recordings_of_different_motions_are_refused_in_words():
     )
     with pytest.raises(InputError, match=r"when the recordings of A and B began is not said.*--offset"):
         recording_offset(TEAM, a, b)
+
+
+@pytest.mark.parametrize("given", ["B", "B=", "B=soon", "B=nan", "B=inf", "B=1e9", "B=-1e9"])
+def test_an_offset_that_is_no_time_is_one_sentence(given):
+    with pytest.raises(InputError, match=f"--offset: `{given}` is no ROBOT=SECONDS"):
+        _offsets(["A=0.5", given])
+    assert _offsets(["A=0.5", "B=-9e8"]) == {"A": 0.5, "B": -9e8}

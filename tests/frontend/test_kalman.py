@@ -67,7 +67,13 @@ def test_what_changes_its_speed_at_once_is_nearer_in_units_of_that():
     variance = point.p[0] + 0.01
     assert density == pytest.approx(-np.log(2 * np.pi * variance) - 0.5 * squared, rel=1e-6)
     assert point.compare(50.0, 0.0, R, 60.0, 25.0) is None
+    before = point.p, point.b, point.w
     point.allow_jerk(60.0)
+    dt = filters.time - 1.95  # since the last measurement
+    change = 60.0**2 * np.array([dt * dt, dt, 1.0])
+    for old, new, added in zip(before, (point.p, point.b, point.w), change, strict=True):
+        covariance, diagonal = np.subtract(new, old), [0, -1]
+        assert covariance[diagonal] == pytest.approx([added, added], rel=1e-6) and not covariance[1:-1].any()
     point.update(5.0, 0.0, R)
     assert point.du == pytest.approx(100.0, rel=0.1)
 

@@ -7,6 +7,7 @@ import logging
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -101,7 +102,15 @@ def test_stamps_are_of_the_clock_that_was_given(video):
 
 def test_how_far_a_clock_is_ahead():
     assert clock_ahead(machine.monotonic_ns) == 0
-    assert clock_ahead(lambda: time.monotonic_ns() - 123_000_000) == pytest.approx(-123e6, abs=1e5)
+    assert clock_ahead(lambda: time.monotonic_ns() - 123_000_000) == pytest.approx(-123e6, abs=5e7)
+
+
+def test_how_far_a_clock_is_ahead_is_read_where_nothing_came_between(monkeypatch):
+    own = iter([0, 400_000, 500_000, 560_000, 600_000, 900_000, 910_000, 990_000, 1_000_000, 1_070_000])
+    other = iter([7_000_000, 7_530_000, 7_900_000, 7_950_000, 8_100_000])
+    monkeypatch.setattr("coloc_graph.robot_io.camera.source.machine", SimpleNamespace(monotonic_ns=own.__next__))
+    assert clock_ahead(other.__next__) == 7_000_000  # of the second reading, 60 us apart
+    assert next(own, None) is None
 
 
 def test_images_of_another_size_than_the_teams_are_refused(tmp_path):

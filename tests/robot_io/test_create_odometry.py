@@ -9,6 +9,7 @@ from coloc_graph.robot_io.create.odometry import (
     DeltaOdometry,
     EncoderOdometry,
     Odometer,
+    _held,
     arc,
     arc_covariance,
     ticks_between,
@@ -35,6 +36,15 @@ def test_an_arc_by_hand():
         ]).T  # fmt: skip
         expected = J @ np.diag([1e-4 * abs(wheel), 1e-4 * abs(other)]) @ J.T
         np.testing.assert_allclose(arc_covariance(wheel, other, 0.2), expected, atol=2e-7)
+
+
+def test_a_distance_that_a_coarse_count_allows_is_the_requested_one_with_its_error():
+    # 3 % of the requested distance and 0.05 of a count; a uniform error of a count at most
+    assert _held(0.0105, 10, 1e-3) == pytest.approx((0.0105, 1e-3 / 12**0.5))
+    assert _held(0.0045, 4, 1e-3) == pytest.approx((0.0045, 0.03 * 0.0045 + 0.05 * 1e-3))
+    assert _held(0.0, 0, 1e-3) == pytest.approx((0.0, 0.05 * 1e-3))
+    # and beyond what the count allows the middle of that
+    assert _held(0.02, 10, 1e-3) == pytest.approx((0.0105, 1e-3 / 12**0.5))
 
 
 def test_counts_that_no_wheel_can_reach_are_left_out():

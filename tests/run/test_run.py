@@ -115,6 +115,12 @@ def test_times_come_back_to_the_last_bit(seconds):
     assert abs(schemas.to_ns(seconds) - seconds * 10**9) < 300
 
 
+@pytest.mark.parametrize("seconds", [-1e-9, 2.0**63 / 1e9, 1e18, math.inf, math.nan])
+def test_times_that_a_file_cannot_hold_are_refused(seconds):
+    with pytest.raises(RunError, match="cannot be recorded; give UTC seconds"):
+        schemas.to_ns(seconds)
+
+
 def test_truth_is_kept_from_a_run_and_given_to_evaluation(tmp_path):
     path = tmp_path / "run.mcap"
     poses = [

@@ -87,6 +87,7 @@ class Mission:
     def time_to_stand(self, name: str, timeout: float = 3.0) -> None:
         """Measure for how long wheels are seen to turn on: when it was last asked for, and they did."""
         began = asked = time.monotonic()
+        self.stops[name] = 0.0
         while self.fastest() > 0 and asked - began < timeout:
             self.stops[name] = asked - began
             time.sleep(0.01)
