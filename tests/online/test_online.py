@@ -7,12 +7,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from online_mission import Mission
+from online_mission import TEAM, Mission
 
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.results.writer import assess
 from coloc_graph.run import open_run
-from coloc_graph.simulation.simulated_team import field_team
 
 pytestmark = pytest.mark.realtime
 #: How many stances, or with --whole, and before which an anchor is pushed then.
@@ -154,7 +153,7 @@ def test_it_is_as_accurate_as_the_same_record_in_batch(mission):
 
 
 def test_robots_keep_records_of_their_own(mission):
-    team = field_team()
+    team = TEAM
     for name in team.names:
         runs = [open_run(path) for path in sorted((mission.folder / "field" / "robots").glob(f"{name}-*.mcap"))]
         begun_anew = "BC" if mission.stances >= WHOLE else "C"

@@ -11,6 +11,8 @@ from tcp_relay import Relay
 
 from coloc_graph.simulation.simulated_team import SimulatedTeam, field_team, free_address
 
+TEAM = field_team(fps=10.0)  # images cost most of the time of processors
+
 
 class Mission:
     """A coordinator and three robots, each in a process of its own, the robots behind a relay that can be cut."""
@@ -19,9 +21,7 @@ class Mission:
         self.folder, self.stances = folder, stances
         self.listen = free_address()
         self.relay = Relay(int(self.listen.rpartition(":")[2]))
-        self.field = SimulatedTeam(
-            field_team(), folder / "field", connect=f"tcp/127.0.0.1:{self.relay.port}", seed=seed
-        )
+        self.field = SimulatedTeam(TEAM, folder / "field", connect=f"tcp/127.0.0.1:{self.relay.port}", seed=seed)
         self.coordinator: subprocess.Popen | None = None
         self.stops: dict[str, float] = {}
 
