@@ -97,6 +97,9 @@ def test_the_evidence_decides_how_many_coefficients_there_are(rng, lens, coeffic
     assert len(found.camera.distortion) == coefficients
     assert [trial.coefficients for trial in found.trials] == [0, 4, 5, 8]
     assert [trial.coefficients for trial in found.trials if trial.rejected is None] == [coefficients]
+
+
+def test_coefficients_that_are_asked_for_are_not_decided_on(rng):
     asked = calibrate_camera(held(rng, 12), BOARD, 5)
     assert len(asked.camera.distortion) == 5 and len(asked.trials) == 1
 

@@ -126,10 +126,10 @@ def mutated(rng, data):
     return bytes(out)
 
 
-def test_twenty_thousand_damaged_frames_in_random_pieces():
+def test_five_thousand_damaged_frames_in_random_pieces():
     rng = random.Random(7)
     wrong = counted = 0
-    for n in range(20_000):
+    for n in range(5_000):
         kind = bool(n % 2)
         original, clean = frame(kind, LEFT_TICKS=rng.randrange(65536)), frame(kind)
         damaged = mutated(rng, original)
@@ -148,8 +148,8 @@ def test_twenty_thousand_damaged_frames_in_random_pieces():
         if damaged and len(found) == 4:  # no frame was made of the damaged bytes
             assert decoder.bad >= 1, (n, damaged)
             counted += 1
-    assert counted > 10_000
-    assert wrong < 200  # an eight-bit checksum misses one in 256
+    assert counted > 2_500
+    assert wrong < 60  # an eight-bit checksum misses one in 256
 
 
 def test_noise_is_no_frames():
