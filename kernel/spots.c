@@ -140,6 +140,9 @@ static double without_background(Window *s, double levels)
 {
     int h = s->h, w = s->w, reach = 2 /* REACH */;
     double noise = without_coons_patch(s, NULL, levels, s->signal, s->stride);
+    for (int i = 0; i < h; i++)
+        for (int j = 0; j < w; j++)
+            if (!(s->light[i * s->stride + j] < 250.0 /* SATURATED */)) return noise;
     if (!find_step(s, noise)) return noise;
     double stepped_noise = without_coons_patch(s, s->step, levels, s->other, w), better = 0;
     char *row = (char *)s->work, *column = (char *)s->ring; /* True where the spot's light reaches */
