@@ -94,7 +94,7 @@ def test_who_publishes_never_waits(monkeypatch):
         began = time.monotonic()
         for _ in range(3 * ros_live.CAPACITY):
             publisher.publish_poses(1.0, {"A": np.eye(4)})
-        assert time.monotonic() - began < 0.5
+        assert time.monotonic() - began < 0.2 * ros_live.CAPACITY  # waiting would take three times as long
         assert publisher._waiting.qsize() <= ros_live.CAPACITY and publisher._dropped >= ros_live.CAPACITY
         monkeypatch.setattr(ros_live, "LAST_WAIT", 0.01)
         while not publisher._waiting.empty():

@@ -240,7 +240,7 @@ def test_noise_holds_nothing_and_does_not_take_long():
         assert len(detect_leds(np.clip(rng.normal(20, sigma, (240, 320)), 0, 255).astype(np.uint8))) == 0
     begin = time.process_time()
     assert len(detect_leds(rng.integers(0, 256, (240, 320)).astype(np.uint8))) == 0
-    assert time.process_time() - begin < 2.0
+    assert time.process_time() - begin < 10.0
 
 
 def test_spots_measured_together_are_as_they_are_alone():

@@ -77,7 +77,7 @@ class Mission:
         """Send a signal; time until the process has ended [s], and its exit code."""
         began = time.monotonic()
         self.process.send_signal(number)
-        code = self.process.wait(20.0)
+        code = self.process.wait(60.0)
         return time.monotonic() - began, code
 
     def close(self):
@@ -147,7 +147,7 @@ def test_a_second_program_of_a_robot_is_told_and_ends_and_one_after_it_is_admitt
 def test_a_signal_ends_a_mission_of_which_nobody_reads_the_output(mission):
     mission.wait_for("looking")
     seconds, code = mission.end(signal.SIGINT)  # ignored when it was started, as in the background
-    assert code == 1 and seconds < 8.0
+    assert code == 1 and seconds < 30.0
     run = open_run(mission.folder / "mission" / "run.mcap")
     assert not run.warnings and sum(1 for _ in run.odometry("A")) > 10
 
@@ -163,7 +163,7 @@ def test_a_signal_ends_a_mission_that_waits_for_its_robots(tmp_path):
         time.sleep(0.5)
         assert one.process.poll() is None
         seconds, code = one.end(signal.SIGTERM)
-        assert code == 1 and seconds < 8.0
+        assert code == 1 and seconds < 30.0
     finally:
         one.close()
 
@@ -176,7 +176,7 @@ def test_log_messages_that_nobody_reads_are_dropped_counted_and_never_waited_for
     began = time.monotonic()
     for n in range(CAPACITY + 100):
         logger.warning("message %d", n)
-    assert time.monotonic() - began < 5.0
+    assert time.monotonic() - began < 30.0
     text = b""
 
     def read():

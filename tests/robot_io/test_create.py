@@ -27,7 +27,7 @@ pytestmark = pytest.mark.realtime
 STOPPED = STAND_WITHIN
 
 
-def until(met, timeout=3.0):
+def until(met, timeout=20.0):
     """Whether it comes true in time."""
     deadline = time.monotonic() + timeout
     while not met():
@@ -278,7 +278,7 @@ def test_a_stop_has_the_last_word_over_a_drive_that_is_under_way(create, robot):
         thread.start()
         time.sleep(0.001 * n)
         create.emergency_stop(f"test {n}")
-        thread.join(timeout=2.0)
+        thread.join(timeout=20.0)
         assert not thread.is_alive()
         assert until(lambda: robot._body.wanted == (0.0, 0.0), 0.1)
         create.recover()
@@ -358,7 +358,7 @@ def test_the_end_of_its_process_stops_the_wheels(robot, how):
             since = time.monotonic()
             child.send_signal(getattr(signal, how, signal.SIGTERM))
         stopped_after(robot, since)
-        out, err = child.communicate(timeout=10)
+        out, err = child.communicate(timeout=30)
     finally:
         child.kill()
         child.wait()
@@ -380,7 +380,7 @@ def driving_process(robot, **more):
         yield child
     finally:
         child.kill()
-        child.communicate(timeout=5)
+        child.communicate(timeout=30)
 
 
 @pytest.mark.parametrize("group", [False, True])
@@ -459,8 +459,9 @@ def test_deadlines_are_shorter_the_faster_it_drives(create, robot, speed):
     def reaction():
         before = time.monotonic()
         create.drive(speed, 0.0, 0.5)
-        assert create._deadline - before <= reaction_time(speed) + 1e-3
-        return create._deadline - before
+        deadline = create._deadline
+        assert deadline <= time.monotonic() + reaction_time(speed)  # the last sign of life was before now
+        return deadline - before
 
     assert until(lambda: reaction() > reaction_time(speed) - 0.1)
     before = time.monotonic()
@@ -484,7 +485,7 @@ def test_opened_outside_the_main_thread_it_says_what_will_not_stop_it(robot, cap
     opened = []
     thread = threading.Thread(target=lambda: opened.append(Create(robot.port, 2).open()))
     thread.start()
-    thread.join(timeout=3.0)
+    thread.join(timeout=30.0)
     try:
         assert "signals will not stop" in caplog.text
         set_off(opened[0], robot)
@@ -654,5 +655,5 @@ def test_the_emulator_as_a_program():
             create.drive(0.1, 0.0)
     finally:
         child.send_signal(signal.SIGINT)
-        child.communicate(timeout=5)
+        child.communicate(timeout=30)
     assert child.returncode == 0

@@ -158,7 +158,7 @@ def outsider(address, tls=None):
         session.close()
 
 
-def raw_ask(heard, name, data, timeout=2.0):
+def raw_ask(heard, name, data, timeout=30.0):
     """What a robot answers to bytes; None where nothing comes."""
     for one in heard.link._session.zenoh.get(f"coloc/{name}/command/first", payload=data, timeout=timeout):
         if one.ok is not None:

@@ -313,7 +313,7 @@ def test_hostile_toml_is_one_sentence_at_once(tmp_path, text, says):
         read_team(path)
     assert says in str(refusal.value) and str(path) in str(refusal.value)
     assert "\n" not in str(refusal.value) and len(str(refusal.value)) < 1000
-    assert time.process_time() - began < 2
+    assert time.process_time() - began < 10
 
 
 def test_a_team_with_a_byte_order_mark_is_read_and_utf_16_is_named(tmp_path):
