@@ -144,6 +144,9 @@ static double without_background(Window *s, double levels)
         for (int j = 0; j < w; j++)
             if (!(s->light[i * s->stride + j] < 250.0 /* SATURATED */)) return noise;
     if (!find_step(s, noise)) return noise;
+    for (int i = 0; i < h; i++)
+        for (int j = 0; j < w; j++)
+            if (s->light[i * s->stride + j] >= 250.0) return noise; /* SATURATED */
     double stepped_noise = without_coons_patch(s, s->step, levels, s->other, w), better = 0;
     char *row = (char *)s->work, *column = (char *)s->ring; /* True where the spot's light reaches */
     for (int i = 0; i < h; i++) row[i] = 0;
@@ -168,7 +171,7 @@ static double without_background(Window *s, double levels)
 /* Centres. */
 
 typedef struct {
-    double centre[2], covariance[4], shape[4], flux, noise, found;
+    double centre[2], covariance[4], shape[4], flux, noise, peak, found;
 } Spot;
 
 static void profile(double *out, int n, double centre, double variance)
@@ -271,6 +274,10 @@ static void measure(Window *s, double levels, double shot_gain, const double *be
 {
     spot->noise = without_background(s, levels);
     Symmetric start = rough_shape(s), shape = start;
+    spot->peak = 0;
+    for (int i = 0; i < s->h; i++)
+        for (int j = 0; j < s->w; j++)
+            if (s->inner[i * s->stride + j]) spot->peak = most(spot->peak, s->signal[i * s->stride + j]);
     double u = 0, v = 0, total = 0, gain[4] = {2, 0, 0, 2};
     if (begin) u = begin[0], v = begin[1], shape = (Symmetric){begin[2], begin[3], begin[5]};
     else {
@@ -333,7 +340,7 @@ static int take(PyObject *object, Py_buffer *view, int writable, Py_ssize_t size
 }
 
 /* measure_spots(n, side, light, size, inner, begin, signal, out, levels, shot_gain): see images/centroid.py; `begin` is
-   None or (n, 6): centres and shapes; written are `signal` (n, side, side) and `out` (n, 13), a Spot a row. */
+   None or (n, 6): centres and shapes; written are `signal` (n, side, side) and `out` (n, 14), a Spot a row. */
 PyObject *measure_spots(PyObject *module, PyObject *args)
 {
     enum { LIGHT, SIZE, INNER, BEGIN, SIGNAL, OUT, ARRAYS };
@@ -348,7 +355,7 @@ PyObject *measure_spots(PyObject *module, PyObject *args)
         return NULL;
     }
     const Py_ssize_t square = side * side, item[ARRAYS] = {8, 8, 1, 8, 8, 8};
-    const Py_ssize_t count[ARRAYS] = {n * square, 2 * n, n * square, 6 * n, n * square, 13 * n};
+    const Py_ssize_t count[ARRAYS] = {n * square, 2 * n, n * square, 6 * n, n * square, 14 * n};
     for (int k = 0; k < ARRAYS; k++)
         if (objects[k] != Py_None && take(objects[k], &views[k], k >= SIGNAL, item[k], count[k]) < 0) goto end;
     for (int k = 0; k < ARRAYS; k++)

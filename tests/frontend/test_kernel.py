@@ -74,10 +74,10 @@ def test_filters_are_the_same():
 
 def test_what_does_not_fit_is_refused():
     light, inner, size = np.zeros((2, 11, 11)), np.zeros((2, 11, 11), bool), np.full((2, 2), 11)
-    signal, out = np.empty((2, 11, 11)), np.empty((2, 13))
+    signal, out = np.empty((2, 11, 11)), np.empty((2, 14))
     good = [2, 11, light, size, inner, None, signal, out]
     kernel.measure_spots(*good, 35.0, 0.1)
-    assert not out[:, 12].any()  # darkness
+    assert not out[:, 13].any()  # darkness
     wrong = {0: 3, 1: 12, 2: light[:1], 3: size + 1, 4: light, 5: np.zeros((2, 5)), 6: light[:, ::2], 7: out[:1]}
     for position, value in wrong.items():
         with pytest.raises((ValueError, BufferError)):

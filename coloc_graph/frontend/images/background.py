@@ -3,6 +3,8 @@
 The dark rim of a robot often passes right behind its marker: with a constant background that edge biases the centre by
 0.04 px. A Coons patch between the borders of a window is exact for any sum of a profile in x and one in y; an edge that
 crosses the window aslant, as in the image of a tilted camera or of a fisheye, is a step of its own.
+
+`kernel/spots.c` computes the same, and is changed along with it: `tests/frontend/test_kernel.py` compares them.
 """
 
 from functools import cache

@@ -3,6 +3,8 @@
 The centre is the fixed point of a Gaussian window that takes the spot's own shape (adaptive moments; Bernstein
 and Jarvis, "Shapes and Shears, Stars and Smears", 2002). For a Gaussian spot this is the matched filter, so it
 loses little against the Cramer-Rao bound, and being centred on the spot it has no bias from cut-off tails.
+
+`kernel/spots.c` computes the same, and is changed along with it: `tests/frontend/test_kernel.py` compares them.
 """
 
 from dataclasses import dataclass
@@ -40,8 +42,8 @@ class Spots:
         Sums of their light, (n,) [grey levels].
     signal
         Windows without background, (n, s, s) [grey levels].
-    inner_signal
-        `signal` in the spots' bright pixels, 0 elsewhere, (n, s, s) [grey levels].
+    peak
+        Brightest light without background of the spots' bright pixels, (n,) [grey levels].
     noise
         Standard deviation of a dark pixel, (n,) [grey levels].
     found
@@ -53,7 +55,7 @@ class Spots:
     shape: Array
     flux: Array
     signal: Array
-    inner_signal: Array
+    peak: Array
     noise: Array
     found: NDArray[np.bool_]
 
@@ -91,13 +93,12 @@ def measure_spots(
     n, side = len(light), light.shape[2]
     if kernel is not None:
         first = None if begin is None else np.concatenate([begin[0], begin[1].reshape(n, 4)], axis=1)
-        signal, out, inner = np.empty((n, side, side)), np.empty((n, 13)), np.ascontiguousarray(inner)
+        signal, out, inner = np.empty((n, side, side)), np.empty((n, 14)), np.ascontiguousarray(inner)
         light, size = np.ascontiguousarray(light, np.float64), np.ascontiguousarray(size, np.int64)
         kernel.measure_spots(n, side, light, size, inner, first, signal, out, levels, shot_gain)
         matrix = out[:, 2:10].reshape(n, 2, 2, 2)
-        return Spots(
-            out[:, :2], matrix[:, 0], matrix[:, 1], out[:, 10], signal, signal * inner, out[:, 11], out[:, 12] > 0
-        )
+        flux, noise, peak, found = out[:, 10:].T
+        return Spots(out[:, :2], matrix[:, 0], matrix[:, 1], flux, signal, peak, noise, found > 0)
     signal, noise = without_background(light, size, inner, levels)
     inner_signal = signal * inner
     start = rough_shape(inner)
@@ -146,7 +147,7 @@ def measure_spots(
     # undo the share of a Gaussian spot that a Gaussian window passes
     xx, xy, yy = shape
     flux = total * np.sqrt((4 * xx * yy - xy * xy) / (xx * yy))
-    return Spots(centre.T, covariance, matrices(shape), flux, signal, inner_signal, noise, found)
+    return Spots(centre.T, covariance, matrices(shape), flux, signal, inner_signal.max(axis=(1, 2)), noise, found)
 
 
 def _covariances(signal: Array, noise: Array, centre: Array, shape: Array, size: Counts, shot_gain: float) -> Array:

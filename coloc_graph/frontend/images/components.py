@@ -1,4 +1,7 @@
-"""Bright connected pixels of an image, and the windows in which they are measured."""
+"""Bright connected pixels of an image, and the windows in which they are measured.
+
+`kernel/components.c` computes the same, and is changed along with it: `tests/frontend/test_kernel.py` compares them.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple

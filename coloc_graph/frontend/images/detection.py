@@ -270,14 +270,15 @@ class Detector:
         inner &= (light > levels[:, None, None])[window]
         spots, touching = measure_lights(light, size, inner, window, wanted, t.levels, t.shot_gain)
         inner, n, own = inner[wanted], np.arange(len(candidates)), window[wanted]
-        peak = spots.inner_signal.max(axis=(1, 2))
         pixel = np.minimum(np.maximum(np.rint(spots.centre), 0), size[own] - 1).astype(int)
         # a window that slid off its candidate found no spot there
-        real = spots.found & inner[n, pixel[:, 1], pixel[:, 0]] & (peak >= MIN_CONTRAST * spots.noise)
+        real = spots.found & inner[n, pixel[:, 1], pixel[:, 0]] & (spots.peak >= MIN_CONTRAST * spots.noise)
 
         short, long = axes(spots.shape)
         flags = np.zeros(len(candidates), np.uint8)
-        flags[((light[own] >= t.saturation) & inner).any(axis=(1, 2))] |= np.uint8(Flag.SATURATED)
+        at_limit = light >= t.saturation
+        if at_limit.any():
+            flags[(at_limit[own] & inner).any(axis=(1, 2))] |= np.uint8(Flag.SATURATED)
         flags[[one.clipped for one in candidates]] |= np.uint8(Flag.CLIPPED)
         flags[long > t.elongation * short] |= np.uint8(Flag.BLURRED)
         touching |= [one.touched for one in candidates]
@@ -293,7 +294,7 @@ class Detector:
             touching[drawn_out[dip]] = True
         flags[touching] |= np.uint8(Flag.MERGED)
         corners = np.array([one.corner for one in candidates], float)
-        return spots.centre + corners, spots.covariance, flags, peak, real
+        return spots.centre + corners, spots.covariance, flags, spots.peak, real
 
 
 def _batches(sizes: Sequence[int]) -> list[list[int]]:

@@ -2,6 +2,8 @@
 
 The centre in a window of such a spot's own shape depends on where in a pixel the spot lies, and so does a centre of
 mass, in another way. Sharp spots get the mean of both, and those too sharp for a window the centre of mass.
+
+`kernel/spots.c` computes the same, and is changed along with it: `tests/frontend/test_kernel.py` compares them.
 """
 
 import numpy as np

@@ -4,6 +4,8 @@ The filters are scalar code: of the few points of an image numpy would take twen
 
 Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, 6.2
 (white-noise acceleration).
+
+`kernel/filters.c` computes the same, and is changed along with it: `tests/frontend/test_kernel.py` compares them.
 """
 
 import math
