@@ -14,7 +14,8 @@ The mover drives its way at 0.2 m/s, robots hide what is behind them, and stop w
 1 cm for each metre, 1 deg). Mounts are wrong by 1 deg and 5 mm, the span by 0.1 mm, the floor by 0.1 deg (one sigma).
 b0 is the paper's formation with its patrol, b1 the same with the best l and theta of Fig. 4, b2 the best fixed gait
 with its patrol; b3 is greedy by information, b4 by the common view, b5 by chance; `gait` is the best gait with designed
-drives, `horizon` the receding horizon, `from b0` the same from the paper's start (planning_baselines.py).
+drives, `horizon` the receding horizon, `from b0` the same from the paper's start, `short` the shortest gait that
+promises what b0 does (planning_baselines.py).
 """
 
 import argparse
@@ -31,11 +32,12 @@ from pathlib import Path
 
 import numpy as np
 from monte_carlo import over_seeds, solved, truth_of
-from planning_baselines import NAMES, Scene, missions
+from planning_baselines import MOUNT_SIGMA_DEG, NAMES, Scene, missions, mounted
 
 from coloc_graph.errors import ColocError
 from coloc_graph.evaluation import align
 from coloc_graph.pipeline.batch import Solution, SolveOptions, solve
+from coloc_graph.planning.drive import SETTLE
 from coloc_graph.planning.mission import Mission
 from coloc_graph.planning.plan import Plan
 from coloc_graph.planning.route import route
@@ -302,10 +304,12 @@ def table(made: dict[str, Mission], found: dict[str, list[Outcome]], fps: float)
 
 def promised(mission: Mission) -> str:
     """Promise of a mission, in one line."""
-    heading = math.degrees(mission.heading_sigma)
+    heading, stances = math.degrees(mission.heading_sigma), mounted(mission)
+    standing = sum(SETTLE for time in mission.leap_times if time)
     return (
         f"{len(mission.plan.stances):3} stances {mission.capture_time:5.0f} s of images {mission.duration:5.0f} s  "
-        f"end {1e3 * mission.end_sigma:5.1f} mm  heading {heading:.3f} deg"
+        f"({standing:.0f} s settling)  end {1e3 * mission.end_sigma:5.1f} mm  heading {heading:.3f} deg  "
+        + (f"mounts to {MOUNT_SIGMA_DEG:g} deg " + (f"in {stances} stances" if stances else "never"))
     )
 
 

@@ -16,14 +16,15 @@ import numpy as np
 
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar
-from coloc_graph.planning.belief import Belief
+from coloc_graph.planning.belief import POSE, Belief
 from coloc_graph.planning.clearance import conflicts
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.gaits import ABREAST, LEAPS, TOE_INS, GaitSearch
 from coloc_graph.planning.horizon import ARRIVED, Horizon, Objective
 from coloc_graph.planning.leaps import TO_WALL
-from coloc_graph.planning.mission import Mission, best_stance, leap_time, stances_of
+from coloc_graph.planning.least_time import least_time
+from coloc_graph.planning.mission import Mission, best_stance, stances_of
 from coloc_graph.planning.mover_path import cells, patrol
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import MIN_POINTS, Predictor
@@ -35,8 +36,9 @@ FIG_4 = Gait.of_paper(0.6, 40.0)  # best distance and angle of the paper's Fig. 
 WINDOWS = (0.0, 0.5, 1.0)  # of the direction at a corner, in leaps
 SCREENED = 40  # gaits, the best by evenly spread images, of which patrols are planned where the way is straight
 REFINED = 5  # gaits, the best with their patrols, whose drives are designed
+MOUNT_SIGMA_DEG = 0.05  # sigma of tilts and rolls with which mounts count as known
 MOVER_START = (1.5, 0.0, 0.0)
-NAMES = ("b0", "b1", "b2", "b3", "b4", "b5", "gait", "horizon", "from b0")
+NAMES = ("b0", "b1", "b2", "b3", "b4", "b5", "gait", "horizon", "from b0", "short")
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ class FixedGaits:
         for k in range(number):
             order = [n % many for n in range(k, k + many)]
             leaper = names[order[-1]]
-            times.append(leap_time(belief.poses[leaper], stops[k + many - 1], predictor.speed) if k else 0.0)
+            times.append(predictor.leap_time(belief.poses[leaper], stops[k + many - 1]) if k else 0.0)
             if k:
                 belief = belief.after_leap(leaper, stops[k + many - 1], predictor.wheels)
             standing = {names[n]: belief.poses[names[n]] for n in order}
@@ -188,6 +190,30 @@ class FixedGaits:
         raise InputError("no patrol is clear")
 
 
+def shortest(scene: Scene, sigma: float) -> Mission:
+    """The shortest mission of a gait on a straight way that promises a sigma of its last positions [m].
+
+    Raises
+    ------
+    InputError
+        If no gait does.
+    """
+    if len(scene.course.points) > 2 or len(scene.observers) > 2:
+        raise InputError("the shortest mission is sought on straight ways of two observers")
+    search = GaitSearch(scene.predictor, scene.course.length, scene.observers[:2], scene.mover)
+    return least_time(lambda time: search.planned(search.ranked(time=time)), sigma, search.shortest(sigma))[1]
+
+
+def mounted(mission: Mission) -> int | None:
+    """Number of stances after which all observers' tilts and rolls are known to `MOUNT_SIGMA_DEG`; None if never."""
+    for k, promise in enumerate(mission.promises):
+        belief = promise.belief
+        at = [belief.index(name) + POSE + n for name in mission.plan.observers for n in (1, 2)]
+        if np.sqrt(belief.covariance[at, at].max()) <= math.radians(MOUNT_SIGMA_DEG):
+            return k + 1
+    return None
+
+
 def missions(scene: Scene, only: Sequence[str]) -> dict[str, Mission]:
     """Missions of a scene, by name: those of `only`, all by default; without those that no robot can follow there."""
     fixed = FixedGaits(scene)
@@ -215,6 +241,7 @@ def missions(scene: Scene, only: Sequence[str]) -> dict[str, Mission]:
         "gait": lambda: fixed.best(designed=True),
         "horizon": lambda: horizon("goal"),
         "from b0": lambda: horizon("goal", PAPER),
+        "short": lambda: shortest(scene, fixed.mission(PAPER).end_sigma),
     }
     for name, way in ways.items():
         if only and name not in only:

@@ -45,6 +45,7 @@ class Checks:
         self.pushed = False
         self._coordinators = 0
         self.nees = (0.0, 0)
+        self.ends: tuple[tuple[float, float], ...] = ()
         self._lost_since: dict[str, float | None] = dict.fromkeys(team.names)
         self._numbers: dict[tuple[str, str, type], int] = {}
         self._gaps = 0
@@ -114,7 +115,7 @@ class Checks:
         if self._origin is None:
             self._origin = poses[reference]
         self._newest = one
-        self.nees = 0.0, 0
+        self.nees, self.ends = (0.0, 0), ()
         for name in one.stance.observers:
             if self.pushed or name not in one.estimate.poses or (name == reference and one.stance.index == 0):
                 continue
@@ -122,6 +123,7 @@ class Checks:
             T = one.estimate.poses[name].matrix()
             x, y, yaw = compose(inverse((T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0]))), self._in_world(poses[name]))
             error = np.array([wrap(yaw), x, y])
+            self.ends += ((math.hypot(x, y), abs(float(wrap(yaw)))),)
             if np.linalg.cond(covariance) < WELL_KNOWN:
                 self.nees = self.nees[0] + float(error @ np.linalg.solve(covariance, error)), self.nees[1] + 3
 

@@ -27,6 +27,7 @@ from coloc_graph.simulation.simulated_team import FIELD
 from coloc_graph.team import Team
 
 FPS = 10.0  # images a second of a simulated camera
+PACE = 20.0  # seconds of a mission to the end of a way for each metre, as of `coloc demo`
 LIMIT = 1500.0  # simulated time after which a mission must have ended [s]
 SPAN = 10.0  # time of a stance in which faults are drawn [s]
 MEMORY = "/dev/shm"  # a folder in memory, where there is one
@@ -46,12 +47,15 @@ class Scenario:
         Faults that happen.
     formation
         "paper" or "plan"; see `MissionOptions`.
+    way
+        Length of a mission that goes to its end, as `coloc demo --online` does [m]; 0 for one of some stances.
     """
 
     seed: int
     stances: int = 6
     faults: tuple[Fault, ...] = ()
     formation: str = "paper"
+    way: float = 0.0
 
 
 @dataclass
@@ -74,6 +78,12 @@ class Outcome:
         Hash of all files of the mission.
     nees
         Normalised squared errors of observers' positions and headings, and their degrees of freedom.
+    ends
+        Errors of the observers' last positions [m] and headings [rad].
+    attempts, entered
+        Number of stances that were planned, and of those that entered the estimate.
+    log
+        Exceptions of programs.
     """
 
     scenario: Scenario
@@ -83,13 +93,18 @@ class Outcome:
     cpu: float = 0.0
     digest: str = ""
     nees: tuple[float, int] = (0.0, 0)
+    ends: tuple[tuple[float, float], ...] = ()
+    attempts: int = 0
+    entered: int = 0
     log: list[str] = field(default_factory=list)
 
 
-def scenario_of(seed: int, stances: int = 6, formation: str = "paper", faults: int | None = None) -> Scenario:
+def scenario_of(
+    seed: int, stances: int = 6, formation: str = "paper", faults: int | None = None, way: float = 0.0
+) -> Scenario:
     """Return the mission of a seed, with faults that it draws; every fourth has none."""
     count = (seed % 4) * 2 if faults is None else faults
-    return Scenario(seed, stances, draw_faults(seed, mission_team().names, count, SPAN * stances), formation)
+    return Scenario(seed, stances, draw_faults(seed, mission_team().names, count, SPAN * stances), formation, way)
 
 
 def mission_team() -> Team:
@@ -123,16 +138,13 @@ def run_mission(scenario: Scenario, folder: Path | None = None) -> Outcome:
 
 def _run(scenario: Scenario, scheduler: Scheduler, folder: Path) -> Outcome:
     team = mission_team()
-    options = MissionOptions(
-        goals=((100.0, 0.0),),
-        stances=scenario.stances,
-        place_sigma=0.02,
-        heading_sigma_deg=0.8,
-        least_points=20,
-        speed=0.45,
-        longest=3.0,
-        formation=scenario.formation,  # type: ignore[arg-type]
-    )
+    if scenario.way:
+        goals, own = ((scenario.way, 0.0),), {"speed": 0.4, "pace": PACE}
+    else:
+        goals = ((100.0, 0.0),)
+        own = {"stances": scenario.stances, "place_sigma": 0.02, "heading_sigma_deg": 0.8, "least_points": 20}
+        own |= {"speed": 0.45, "longest": 3.0}
+    options = MissionOptions(goals=goals, formation=scenario.formation, **own)  # type: ignore[arg-type]
     mover, _ = roles(team, None)
     starts, _ = in_world(team, mover, options.goals)
     field_, network = Field(scheduler, team, starts, scenario.seed), Network(scheduler, team.names)
@@ -149,7 +161,8 @@ def _run(scenario: Scenario, scheduler: Scheduler, folder: Path) -> Outcome:
     outcome = Outcome(scenario, str(programs.state or ""), seconds=1e-9 * scheduler.now, log=programs.errors)
     checks.end(folder / "mission", ended)
     outcome.violations = checks.violations
-    outcome.nees = checks.nees
+    outcome.nees, outcome.ends = checks.nees, checks.ends
+    outcome.attempts, outcome.entered = (_rows(folder / "mission", what) for what in ("planned", "entered"))
     for process in programs.processes.values():
         scheduler.kill(process)
     outcome.digest = _digest(folder)
@@ -224,6 +237,12 @@ def _digest(folder: Path) -> str:
         if path.is_file() and not path.name.startswith("."):
             sum_.update(str(path.relative_to(folder)).encode() + path.read_bytes())
     return sum_.hexdigest()
+
+
+def _rows(mission: Path, what: str) -> int:
+    """Number of rows of a kind in the log of a mission."""
+    path = mission / "mission.jsonl"
+    return path.read_text(encoding="utf-8").count(f'"what": "{what}"') if path.exists() else 0
 
 
 def as_json(outcome: Outcome) -> str:

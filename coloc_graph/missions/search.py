@@ -4,6 +4,7 @@ python -m coloc_graph.missions.search --missions 1000
 """
 
 import argparse
+import math
 import os
 import sys
 import time
@@ -13,6 +14,7 @@ from dataclasses import replace
 from itertools import islice
 from multiprocessing import get_context
 
+import numpy as np
 from scipy.stats import chi2
 
 from coloc_graph.missions.mission import Outcome, Scenario, run_mission, scenario_of
@@ -62,27 +64,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--stances", type=int, default=6, help="stances of each (default: 6)")
     parser.add_argument("--faults", type=int, help="faults of each (default: as the seed draws)")
     parser.add_argument("--formation", choices=("paper", "plan"), default="paper", help="as in `coloc coordinate`")
+    parser.add_argument("--way", type=float, default=0.0, metavar="M", help="go to a goal M metres ahead, as the demo")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, help="(default: CPU count)")
     parser.add_argument("--seconds", type=float, default=1e9, help="begin no more missions after this time")
     parser.add_argument("--no-shrink", action="store_true", help="do not shrink the faults of what fails")
     options = parser.parse_args(arguments)
     seeds = range(options.first, options.first + options.missions)
-    scenarios = [scenario_of(seed, options.stances, options.formation, options.faults) for seed in seeds]
+    scenarios = [scenario_of(seed, options.stances, options.formation, options.faults, options.way) for seed in seeds]
     began, simulated, cpu, failed = time.monotonic(), 0.0, 0.0, []
     states: dict[str, int] = {}
-    nees, freedom = 0.0, 0
+    nees, freedom, attempts, entered = 0.0, 0, 0, 0
+    ends: list[tuple[float, float]] = []
     for one in outcomes(scenarios, options.processes, options.seconds):
         simulated, cpu = simulated + one.seconds, cpu + one.cpu
         states[one.state] = states.get(one.state, 0) + 1
         if sum(states.values()) % PROGRESS == 0:
             print(f"{sum(states.values())} missions, {simulated:.0f} s simulated", file=sys.stderr, flush=True)
         nees, freedom = nees + one.nees[0], freedom + one.nees[1]
+        attempts, entered, ends = attempts + one.attempts, entered + one.entered, [*ends, *one.ends]
         if one.violations:
             failed.append(one)
             print(f"seed {one.scenario.seed}: {one.violations[0]}", flush=True)
     print(f"{sum(states.values())} missions, {len(failed)} break a promise; states {states}")
     rate, took = simulated / max(cpu, 1e-9), time.monotonic() - began
     print(f"{simulated:.0f} s simulated in {took:.0f} s; {rate:.1f} s in a second of one core")
+    print(f"{attempts} attempts at stances, of which {entered} entered the estimate")
+    if ends:
+        position, heading = np.sqrt(np.mean(np.square(ends), axis=0))
+        print(f"RMS of the last poses: {1e3 * position:.1f} mm, {math.degrees(heading):.2f} deg")
     if freedom:
         low, high = (float(chi2.ppf(p, freedom)) / freedom for p in (0.0005, 0.9995))
         print(f"NEES per degree of freedom at the end: {nees / freedom:.3f}, in [{low:.3f}, {high:.3f}] if honest")

@@ -17,7 +17,7 @@ from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.horizon import Decision, Horizon
-from coloc_graph.planning.mission import best_stance, leap_time
+from coloc_graph.planning.mission import best_stance
 from coloc_graph.planning.plan import PlannedStance
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.route import clear_way, polyline_length, route
@@ -32,6 +32,8 @@ FIRST_NOISE = 0.1  # noise of a marker centre until a stance has shown it [px]
 PASSING = 0.6  # robots that drive at the same time keep this distance between their ways [m]
 RETRIES = 2  # attempts at a stance before another target is chosen
 SWEEP = (0.35, -0.35, 0.7, -0.7)  # turns with which one that leapt and did not see the mover looks for it [rad]
+OVERHEAD = 4.0  # time of a stance online beside its drive and leap: decision, mover's way, looks, estimate [s]
+MAX_DELAY = 10.0  # a stance that takes this much longer than expected was halted, which costs the rest no time [s]
 MAX_SHARE = 1.5  # a stance counts for at most this share of the information that was expected of it
 
 
@@ -79,7 +81,8 @@ class HorizonPlanner:
                 "others out of the team"
             )
         fps = min(team[name].camera.fps for name in observers)
-        self._predictor = Predictor(team, fps, FIRST_NOISE, CREATE, speed, floor_map, anew=True)
+        self._predictor = Predictor(team, fps, FIRST_NOISE, CREATE, speed, floor_map, OVERHEAD, anew=True)
+        self._ended: float | None = None  # time of the end of the stance before [UTC s]
         self._left = pace * course.length
         self._horizon = Horizon(self._predictor, course, observers, mover, self._left, gait=gait, timed=True)
         self._belief: Belief | None = None
@@ -142,17 +145,16 @@ class HorizonPlanner:
             self._predictor.learn_noise(float(np.median([one.pairs.sigma for one in found])) * focal)
         stood = self._believed(poses if self._belief is None else self._belief.poses).poses
         belief = self._believed(poses)
-        spent = entered.stance.end - entered.stance.start
+        spent = seconds = entered.stance.end - entered.stance.start
         for name in self._observers:
             if name not in entered.stance.anchors and entered.stance.index:
                 # the leap's odometry, about where the robot came to stand
                 target = belief.poses[name]
-                spent += leap_time(stood[name], target, self._predictor.speed)
+                spent += self._predictor.leap_time(stood[name], target)
                 belief = replace(belief, poses={**belief.poses, name: stood[name]}).after_leap(name, target, CREATE)
         anchors = tuple(name for name in self._observers if name in entered.stance.anchors)
         standing = {name: belief.poses[name] for name in (*anchors, *(o for o in self._observers if o not in anchors))}
         driven = tuple((float(x), float(y)) for x, y in self._plan.patrol)
-        seconds = entered.stance.end - entered.stance.start
         self._stood.append(standing)
         came = PlannedStance(standing, anchors, self._mover, driven, seconds)
         information, expected = self._predictor.information(came)
@@ -160,6 +162,9 @@ class HorizonPlanner:
             share = min(points / expected, MAX_SHARE)
             belief = belief.after_stance(tuple(standing), self._mover, share * information)
         self._belief = belief
+        if self._ended is not None:  # what it took, but for long halts
+            spent = min(entered.stance.end - self._ended, spent + MAX_DELAY)
+        self._ended = entered.stance.end
         self._left -= spent
 
     def at_goal(self, poses: Mapping[str, Planar]) -> bool:

@@ -1,4 +1,4 @@
-"""The mover's drive through waypoints in time, as its controller drives it: `Drive`, `drive_through`."""
+"""The mover's drive through waypoints in time, as its controller drives it: `Drive`, `drive_through`, `leap_time`."""
 
 import math
 from dataclasses import dataclass
@@ -6,12 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coloc_graph.geometry.se2 import wrap
+from coloc_graph.geometry.se2 import Planar, between, wrap
 
 Array = NDArray[np.float64]
 
 SPEED = 0.2  # speed of the mover [m/s]
 TURN_RATE = 1.0  # turn rate of a robot that turns on the spot [rad/s]
+SETTLE = 2.0  # time that all robots stand before a stance [s]
 COVERED = 0.84  # drive that brings half of what evenly spread images would bring in its time [m]
 MIN_WAYPOINT_DISTANCE = 1e-6  # waypoints closer to each other are one [m]
 
@@ -26,6 +27,13 @@ class Drive:
     def at(self, t: ArrayLike) -> Array:
         """Return poses (m, 3) at times (m,) [s]; the robot rests at the last knot."""
         return np.stack([np.interp(np.asarray(t, float), self.times, column) for column in self.knots.T], axis=-1)
+
+
+def leap_time(start: Planar, target: Planar, speed: float) -> float:
+    """Return the time for a robot to turn, drive straight and turn to its target, and to stand [s]."""
+    D = between(start, target)
+    first = math.atan2(D[1], D[0])
+    return math.hypot(*D[:2]) / speed + (abs(first) + abs(wrap(D[2] - first))) / TURN_RATE + SETTLE
 
 
 def effective_seconds(seconds: ArrayLike, speed: float) -> Array:

@@ -15,7 +15,7 @@ from coloc_graph.planning.belief import OBSERVER, POSE, Belief, leap_model, upda
 from coloc_graph.planning.course import MAX_LENGTH
 from coloc_graph.planning.drive import effective_seconds
 from coloc_graph.planning.formation import PAPER, Gait
-from coloc_graph.planning.mission import Mission, leap_frog, leap_time, stances_of
+from coloc_graph.planning.mission import Mission, leap_frog, stances_of
 from coloc_graph.planning.mover_path import cells
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.team import Robot, Team
@@ -113,7 +113,7 @@ class GaitSearch:
         D = [between(self._stop(gait, k), self._stop(gait, k + 2)) for k in (0, 1)]
         belief = Belief.start(self.predictor.team, {self.pair[0]: self._stop(gait, 0)})
         leaps = [leap_model(one, belief.floor, self.predictor.wheels) for one in D]
-        taken = leap_time(self._stop(gait, 0), self._stop(gait, 2), self.predictor.speed)
+        taken = self.predictor.leap_time(self._stop(gait, 0), self._stop(gait, 2))
         return Candidate(gait, np.array(information), (leaps[0], leaps[1]), taken)
 
     def _stop(self, gait: Gait, k: int) -> Planar:

@@ -18,7 +18,7 @@ from coloc_graph.planning.drive import effective_seconds
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.gaits import MIN_STANCE_DURATION
 from coloc_graph.planning.leaps import Leaps, possible_leaps
-from coloc_graph.planning.mission import Mission, best_stance, leap_time
+from coloc_graph.planning.mission import Mission, best_stance
 from coloc_graph.planning.mover_path import evenly_seen
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor, Promise
@@ -145,7 +145,7 @@ class Horizon:
             before, stance = belief.poses, decision.stance
             times.append(
                 max(
-                    (leap_time(before[one], stance.standing[one], self.predictor.speed) for one in stance.leapers),
+                    (self.predictor.leap_time(before[one], stance.standing[one]) for one in stance.leapers),
                     default=0.0,
                 )
                 if stances
@@ -313,7 +313,7 @@ class Horizon:
 
     def _spent(self, duration: Any, belief: Belief, leaper: str, target: Planar) -> Any:
         """Return the seconds of the budget that a stance of a `duration` (...) [s] costs."""
-        return duration + (leap_time(belief.poses[leaper], target, self.predictor.speed) if self.timed else 0.0)
+        return duration + (self.predictor.leap_time(belief.poses[leaper], target) if self.timed else 0.0)
 
     @property
     def goal(self) -> tuple[float, float]:

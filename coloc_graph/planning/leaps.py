@@ -12,7 +12,6 @@ from coloc_graph.planning.belief import Belief, leap_model
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
-from coloc_graph.planning.mission import leap_time
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.route import TO_ROBOT, reachable
 
@@ -134,7 +133,7 @@ def possible_leaps(
     Q = np.array([one for _, one in made]).reshape(-1, 6, 6)
     leapt = np.hypot(*(places[:, :2] - np.array(belief.poses[leaper][:2])).T)
     margins = predictor.margins(leapt, (*anchors, leaper))
-    times = np.array([leap_time(belief.poses[leaper], (x, y, w), predictor.speed) for x, y, w in places.tolist()])
+    times = np.array([predictor.leap_time(belief.poses[leaper], (x, y, w)) for x, y, w in places.tolist()])
     return Leaps(leaper, anchors, places, kept, F, Q, margins, np.array(by_gait, bool)[good], times)
 
 

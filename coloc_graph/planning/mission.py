@@ -6,15 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from coloc_graph.errors import InputError
-from coloc_graph.geometry.se2 import Planar, between, wrap
+from coloc_graph.geometry.se2 import Planar
 from coloc_graph.planning.belief import Belief
-from coloc_graph.planning.drive import TURN_RATE
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.mover_path import best_drives, cells, design, patrol
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor, Promise
-
-SETTLE = 2.0  # time that all robots stand before a stance [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +69,6 @@ class Mission:
         return self.capture_time + sum(self.leap_times)
 
 
-def leap_time(start: Planar, target: Planar, speed: float) -> float:
-    """Return the time for a robot to turn, drive straight and turn to its target, and to stand [s]."""
-    D = between(start, target)
-    first = math.atan2(D[1], D[0])
-    return math.hypot(*D[:2]) / speed + (abs(first) + abs(wrap(D[2] - first))) / TURN_RATE + SETTLE
-
-
 def stances_of(gait: Gait, length: float) -> int:
     """Return the number of stances in which the middle of a pair comes to a length [m], but for a tenth of a leap."""
     return max(math.ceil(length / gait.leap + 0.4), 1)
@@ -123,7 +113,7 @@ def leap_frog(
     for k in range(stances_of(gait, length)):
         anchor, leaper = pair[k % 2], pair[(k + 1) % 2]
         target = predictor.stop(gait, pair, k + 1)
-        times.append(leap_time(belief.poses[leaper], target, predictor.speed) if k else 0.0)
+        times.append(predictor.leap_time(belief.poses[leaper], target) if k else 0.0)
         if k:
             belief = belief.after_leap(leaper, target, predictor.wheels)
         standing = {anchor: belief.poses[anchor], leaper: target}

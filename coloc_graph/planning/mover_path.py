@@ -26,6 +26,7 @@ KNOTS = 8  # number of places through which drives are tried, with the outermost
 LONGER = 10  # number of drives through three places that are tried with a fourth
 KEPT = 3  # number of drives that are kept
 SPREAD = 14  # cells of a common view by which stances are compared
+BEND = 0.04  # RMS distance of a view's cells from a line below which they are taken for the line [m]
 SAMPLES = 24  # instants at which a drive is compared with the places
 
 
@@ -166,6 +167,15 @@ def best_drives(
     return [tuple((float(x), float(y)) for x, y in points[paths[n]]) for n in np.argsort(value)[:KEPT].tolist()]
 
 
+def _bends(points: Array, chosen: Array) -> Array:
+    """RMS distance (...) from the line that fits best [m], of points (..., n, 2) that are `chosen` (..., n)."""
+    weight = chosen / np.maximum(chosen.sum(axis=-1, keepdims=True), 1.0)
+    off = points - (weight[..., None] * points).sum(axis=-2, keepdims=True)
+    xx, xy, yy = ((weight * off[..., i] * off[..., j]).sum(axis=-1) for i, j in ((0, 0), (0, 1), (1, 1)))
+    least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+    return np.asarray(np.sqrt(np.maximum(least, 0.0)))
+
+
 def _knots(places: Array, shares: Array) -> list[int]:
     """Places that matter: those with the largest shares, and the outermost ones."""
     left = shares.copy()
@@ -237,7 +247,8 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
     Returns
     -------
     tuple
-        Information (b, d, d), and the number (b,) of cells of the common view.
+        Information (b, d, d), and the number (b,) of cells of the common view, 0 of one that is a line: a drive there
+        determines no homography.
     """
     xy, r = _grid(model, standing[0]), standing.shape[1]
     if free is not None:
@@ -257,7 +268,7 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
     common = seen.all(axis=3).sum(axis=1) >= 2
     away = np.hypot(*np.moveaxis(xy[None, :, None] - standing[:, None, :, :2], -1, 0)).min(axis=2)
     common &= away > CLEARANCE
-    count = common.sum(axis=1)
+    count = np.where(_bends(xy, common) >= BEND, common.sum(axis=1), 0)
     # a few cells of each, spread by a fixed order
     rank = np.random.default_rng(0).permutation(len(xy))
     chosen = np.argsort(np.where(common, rank, len(xy) + rank), axis=1)[:, :SPREAD]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.planning.belief import WHEELS, Belief
-from coloc_graph.planning.drive import SPEED, drive_through, there_and_back
+from coloc_graph.planning.drive import SPEED, drive_through, leap_time, there_and_back
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.plan import Plan, PlannedStance
@@ -51,6 +51,8 @@ class Predictor:
         Speed of the mover and of leaps [m/s].
     floor_map
         Walls; None where there are none.
+    overhead
+        Time that a stance takes beside its drive and its leap [s].
     anew
         True if each stance is planned once it is known where those stand that stay.
     """
@@ -61,6 +63,7 @@ class Predictor:
     wheels: WheelErrors | None = WHEELS
     speed: float = SPEED
     floor_map: FloorMap | None = None
+    overhead: float = 0.0
     anew: bool = False
     _models: dict[tuple[tuple[str, ...], str], StanceModel] = field(default_factory=dict)
 
@@ -77,6 +80,10 @@ class Predictor:
         """Return standing pose number k of a gait, at which the camera, not the body, looks where the gait has it."""
         x, y, yaw = gait.stop(k)
         return x, y, yaw - self.camera_yaw(pair[k % 2])
+
+    def leap_time(self, start: Planar, target: Planar) -> float:
+        """Return the time from the end of a stance to the next one whose leaper drives from start to target [s]."""
+        return leap_time(start, target, self.speed) + self.overhead
 
     def model(self, observers: Sequence[str], mover: str) -> StanceModel:
         """Return the model of a stance of these robots."""

@@ -269,3 +269,18 @@ def test_markers_that_stood_still_are_not_called_a_straight_line():
     uv_i, uv_j = (uv + NOISE * rng.normal(size=uv.shape) for uv in (uv_i, uv_j))
     with pytest.raises(DegenerateGeometry, match="hardly moved"):
         fit_homography(pairs_of(uv_i, uv_j, NOISE))
+
+
+@pytest.mark.parametrize("seed", [22, 34, 50])
+def test_two_markers_on_a_straight_drive_are_both_believed(seed):
+    # two parallel lines: for these seeds MAGSAC++ ends at one line, which many homographies fit
+    rng, sigma, n = np.random.default_rng(seed), 0.001, 45
+    H = np.array([[1.4295, 6.551, 1.0735], [-0.44605, 2.7791, 0.4476], [1.2746, -1.6318, 1.0]])
+    x = np.concatenate([np.linspace(0.195, -0.16, n), np.linspace(0.155, -0.13, n)])
+    y = np.concatenate([np.linspace(-0.104, -0.1153, n), np.linspace(-0.154, -0.1617, n)])
+    at = np.column_stack([x, y, np.ones(2 * n)])
+    seen = at @ H.T
+    x_i = at[:, :2] + sigma * rng.standard_normal((2 * n, 2))
+    x_j = seen[:, :2] / seen[:, 2:] + sigma * rng.standard_normal((2 * n, 2))
+    covariance = np.repeat(sigma**2 * np.eye(2)[None], 2 * n, axis=0)
+    assert fit_homography(PointPairs(x_i, x_j, covariance, covariance)).inliers.sum() > 1.9 * n

@@ -1,6 +1,7 @@
 """Stances of a mission planned by the receding horizon, with a registry and without a network."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -104,6 +105,12 @@ def test_a_stance_that_came_makes_the_team_better_known_and_spends_its_time(miss
     mission.planner.take(entered, poses)
     assert left - mission.planner.seconds_left == pytest.approx(stance.end - stance.start)
     assert mission.planner.belief.position_sigma(("B",)) < 0.01
+    # later ones spend what they take, but a long halt costs the others no time
+    for ends, spent in ((15.0, 15.0), (315.0, 20.0)):
+        left, end = mission.planner.seconds_left, stance.end + ends
+        later = replace(entered, stance=replace(stance, start=end - 10.0, end=end))
+        mission.planner.take(later, poses)
+        assert left - mission.planner.seconds_left == pytest.approx(spent, abs=0.2)
     # the noise of the next stances is that which was seen
     assert mission.planner.noise_px == pytest.approx(0.2, rel=0.2)
 

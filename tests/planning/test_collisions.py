@@ -10,6 +10,7 @@ from coloc_graph.planning.clearance import conflicts
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.horizon import Horizon
+from coloc_graph.planning.mover_path import cells, evenly_seen
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.route import route
 from coloc_graph.planning.slip import stop_sigma
@@ -79,6 +80,15 @@ def test_what_is_planned_through_a_doorway_is_seen_in_a_world_with_those_walls(m
     points = [captures[0].recorded.sum() for captures in world.captures]
     assert min(points) > 30
     assert sum(points) == pytest.approx(sum(promise.points for promise in mission.promises), rel=0.2)
+
+
+def test_a_common_view_that_is_a_line_is_no_stance():
+    predictor = Predictor(stated_team(reference_team(), FIELD), 10.0, floor_map=FLOOR_PLANS["L"].floor_map())
+    model, margins = predictor.model(("B", "A"), "C"), predictor.margins(0.0, ("B", "A"))
+    # before the end of a corridor 0.35 m of floor are left; a track of one marker there is a line
+    end = np.array([(4.22, 4.05, 1.57), (3.77, 4.71, 0.92)])
+    assert len(cells(model, end, margins, predictor.free).places) == 3
+    assert evenly_seen(model, end[None], margins[None], predictor.free)[1] == 0
 
 
 @pytest.mark.parametrize("name", FLOOR_PLANS)

@@ -37,6 +37,7 @@ COLLINEAR_SIGMAS = 5.0  # standard deviations from a line within which points co
 MIN_OFF_LINE = 0.15  # share of the points that must lie off the line
 STRAIGHT = 0.03  # ratio of the spreads across and along below which a track is straight, whatever the noise
 MIN_POINTS = 6  # two equations a point for eight unknowns, and some to check
+MOST = 0.9  # share of the points that agree on a homography where hardly any is wrong
 MAGSAC_SIGMAS = 10.0  # standard deviations up to which MAGSAC++ marginalises the noise
 CORRELATION_SIGMAS = 3.5  # standard deviations, 1 / sqrt(n), above which n residuals count as correlated
 
@@ -106,6 +107,14 @@ def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection", spr
     _require_spread(pairs, sigma)
     H = _magsac(pairs, sigma)
     inliers = _inliers(squared_residuals(H, pairs), np.ones(len(pairs), bool))
+    by_all = None
+    agree = int(inliers.sum())
+    if MIN_POINTS <= agree < MOST * len(pairs) and _on_a_line(_spread(pairs.x_i[inliers], sigma), agree):
+        # it ended at the straight track of one marker, which many homographies fit: all points tell if another is wrong
+        by_all = _by_opencv(pairs, sigma, 0)
+    if by_all is not None:
+        among = _inliers(squared_residuals(by_all, pairs), np.ones(len(pairs), bool))
+        H, inliers = (by_all, among) if among.sum() > inliers.sum() else (H, inliers)
     iterations = 0
     for _ in range(6):
         _require_points(int(inliers.sum()), len(pairs))
@@ -116,7 +125,7 @@ def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection", spr
         before, inliers = inliers, _inliers(squared, inliers)
         if (before == inliers).all():
             break
-    if len(agreeing) < 0.9 * len(pairs):
+    if len(agreeing) < MOST * len(pairs):
         _require_spread(agreeing, sigma)
     chi2, dof = float(squared[before].sum()), 2 * int(before.sum()) - 8
     information = information / variance_factor(chi2, dof, spread)
@@ -236,6 +245,15 @@ def _spread(x: Array, sigma: float) -> _Spread:
     )
 
 
+def _least_off(n: int) -> int:
+    """Number of n points off a line below which they are on it: a few false pairs must not pass for a spread."""
+    return max(4, math.ceil(MIN_OFF_LINE * n))
+
+
+def _on_a_line(spread: _Spread, n: int) -> bool:
+    return spread.off < _least_off(n)
+
+
 def _require_points(n: int, of: int) -> None:
     if n < MIN_POINTS:
         what = f"{n} points are seen by both" if n == of else f"only {n} of {of} points agree on one homography"
@@ -243,11 +261,9 @@ def _require_points(n: int, of: int) -> None:
 
 
 def _require_spread(pairs: PointPairs, sigma: float) -> None:
-    # a few false pairs off a line must not pass for a spread
-    least = max(4, math.ceil(MIN_OFF_LINE * len(pairs)))
     # points on a line in one image are on a line in the other
     spread = _spread(pairs.x_i, sigma)
-    if spread.off < least:
+    if _on_a_line(spread, len(pairs)):
         if spread.along < COLLINEAR_SIGMAS * sigma:
             raise DegenerateGeometry(
                 f"the markers hardly moved (their spread is {spread.along / sigma:.1f} sigma of their noise): "
@@ -258,15 +274,23 @@ def _require_spread(pairs: PointPairs, sigma: float) -> None:
         raise DegenerateGeometry(
             f"{len(pairs)} points are too few or too noisy for a homography: their spread across the best line is "
             f"{spread.across / sigma:.1f} sigma of their noise, and {spread.off} of them lie more than "
-            f"{COLLINEAR_SIGMAS:.0f} sigma off it, where {least} are needed: record more points, spread on the plane, "
-            "or detect them better"
+            f"{COLLINEAR_SIGMAS:.0f} sigma off it, where {_least_off(len(pairs))} are needed: record more points, "
+            "spread on the plane, or detect them better"
         )
 
 
 def _magsac(pairs: PointPairs, sigma: float) -> Array:
-    # in units of the noise: OpenCV's numerics want coordinates of the size of pixels
-    H, _ = cv2.findHomography(pairs.x_i / sigma, pairs.x_j / sigma, cv2.USAC_MAGSAC, MAGSAC_SIGMAS)
-    if H is None or not abs(np.linalg.det(H)) > 1e-12:
+    H = _by_opencv(pairs, sigma, cv2.USAC_MAGSAC)
+    if H is None:
         raise DegenerateGeometry("no homography explains the tracks: let the moving robot turn and drive further")
+    return H
+
+
+def _by_opencv(pairs: PointPairs, sigma: float, method: int) -> Array | None:
+    """Homography by OpenCV's `method`, 0 for least squares over all points; None if there is none."""
+    # in units of the noise: OpenCV's numerics want coordinates of the size of pixels
+    H, _ = cv2.findHomography(pairs.x_i / sigma, pairs.x_j / sigma, method, MAGSAC_SIGMAS)
+    if H is None or not abs(np.linalg.det(H)) > 1e-12:
+        return None
     unit = np.array([1 / sigma, 1 / sigma, 1.0])
     return sl3_normalise(H * unit / unit[:, None])
