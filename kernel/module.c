@@ -1,9 +1,10 @@
 #include "kernel.h"
 
-static int add_types(PyObject *module)
+static int add_names(PyObject *module)
 {
     PyObject *type = PyType_FromSpec(&filter_spec);
-    int failed = !type || PyModule_AddObjectRef(module, "PointFilter", type) < 0;
+    int failed = !type || PyModule_AddObjectRef(module, "PointFilter", type) < 0
+                 || PyModule_AddIntConstant(module, "VERSION", 2) < 0; /* with that of frontend/compiled.py */
     Py_XDECREF(type);
     return failed ? -1 : 0;
 }
@@ -14,7 +15,7 @@ static PyMethodDef functions[] = {
     {NULL},
 };
 
-static PyModuleDef_Slot slots[] = {{Py_mod_exec, add_types}, {0, NULL}};
+static PyModuleDef_Slot slots[] = {{Py_mod_exec, add_names}, {0, NULL}};
 
 static struct PyModuleDef definition = {
     PyModuleDef_HEAD_INIT, .m_name = "_kernel", .m_doc = "Compiled kernel of the front end.", .m_size = 0,

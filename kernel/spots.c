@@ -144,9 +144,6 @@ static double without_background(Window *s, double levels)
         for (int j = 0; j < w; j++)
             if (!(s->light[i * s->stride + j] < 250.0 /* SATURATED */)) return noise;
     if (!find_step(s, noise)) return noise;
-    for (int i = 0; i < h; i++)
-        for (int j = 0; j < w; j++)
-            if (s->light[i * s->stride + j] >= 250.0) return noise; /* SATURATED */
     double stepped_noise = without_coons_patch(s, s->step, levels, s->other, w), better = 0;
     char *row = (char *)s->work, *column = (char *)s->ring; /* True where the spot's light reaches */
     for (int i = 0; i < h; i++) row[i] = 0;
