@@ -506,8 +506,9 @@ class Estimator:
         self._newly = (set() if stance is not None else self._newly) | {id(one.measurement) for one in rejected}
         self._disconnected = plan.disconnected
         said = self._at(next(reversed(self._stances.values())), rejected, agreement)
-        seen = {one.seen for one in taken if isinstance(one, Sighting)}
-        said = replace(said, residuals=tuple(map(self.residual, taken)), landmarks=self.static_poses(seen))
+        seen = self.landmarks.keys() & {one.seen for one in taken if isinstance(one, Sighting)}
+        landmarks = self.static_poses(seen) if seen else {}
+        said = replace(said, residuals=tuple(map(self.residual, taken)), landmarks=landmarks)
         self._forget()
         return said
 
@@ -571,6 +572,8 @@ class Estimator:
 
     def _is_marginalised(self, measurement: Measurement) -> bool:
         """Return whether a measurement is of a pose that is no variable any more."""
+        if not self._live.marginalised:
+            return False
         nodes = (node for node in measurement.ends if node in self._pose_keys)
         return any(self._pose_keys.key(node) in self._live.marginalised for node in nodes)
 

@@ -231,5 +231,4 @@ def _one_step(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsa
 
 def joint_covariance(isam: gtsam.ISAM2, keys: Sequence[int]) -> Array:
     """Return the joint covariance of different variables, in the order given; (6 n, 6 n) for n poses."""
-    joint = isam.jointMarginalCovariance(list(keys))
-    return np.block([[joint.at(a, b) for b in keys] for a in keys])
+    return np.asarray(isam.jointMarginalCovariance(list(keys)).fullMatrix())
