@@ -4,7 +4,7 @@ Residuals and Jacobians of all factors of a kind are evaluated at once in numpy.
 estimated together (a pose, the errors of a sensor) is one key of GTSAM's.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
@@ -77,6 +77,13 @@ class Keys:
     def span(self, key: int) -> slice:
         """Return the variables of a key."""
         return slice(int(self.first[key]), int(self.first[key + 1]))
+
+    def variables(self, keys: Index) -> Index:
+        """Return the variables of some keys, key after key."""
+        sizes = self.sizes[keys]
+        ends = np.cumsum(sizes)
+        begins: Index = np.repeat(self.first[keys] - (ends - sizes), sizes)
+        return begins + np.arange(len(begins))
 
     def blocks(self, rows: Rows) -> Iterator[tuple[Index, list[tuple[Index, Array]]]]:
         """Group factors by the sizes of their keys.
@@ -191,7 +198,7 @@ class LinearSystem:
     def _step(self, found: gtsam.VectorValues, ordering: gtsam.Ordering) -> Array:
         step = np.zeros(len(self.keys.free))
         keys = np.sort(np.array([ordering.at(n) for n in range(ordering.size())], int))
-        step[np.isin(self.keys.of, keys)] = found.vector()  # in the order of the keys
+        step[self.keys.variables(keys)] = found.vector()  # in the order of the keys
         return np.where(self.keys.free, step, 0.0)
 
     def summed_up(self, gone: Index) -> "Summary":
@@ -210,8 +217,7 @@ class LinearSystem:
         kept, left = [int(key) for key in rest.keyVector()], gtsam.Ordering()
         for key in kept:
             left.push_back(key)
-        spans = [np.arange(self.keys.first[key], self.keys.first[key + 1]) for key in kept]
-        columns = np.concatenate([np.empty(0, int), *spans])
+        columns = self.keys.variables(np.array(kept, int))
         information = rest.augmentedHessian(left)[:-1, :-1] if kept else np.empty((0, 0))
         return Summary(rest, tuple(kept), columns, information)
 
@@ -225,9 +231,14 @@ class LinearSystem:
             self._gradient.push_back(gtsam.HessianFactor(key, np.zeros((size, size)), own, 0.0))
             begin += size
 
-    def ordering(self) -> gtsam.Ordering:
-        """Return an order of elimination, for all systems of the same factors; GTSAM's METIS segfaults on some."""
-        return gtsam.Ordering.ColamdGaussianFactorGraph(self.graph)
+    def ordering(self, last: Sequence[int] = ()) -> gtsam.Ordering:
+        """Return an order of elimination, for all systems of the same factors; GTSAM's METIS segfaults on some.
+
+        Keys that are `last` are at the root, where covariances cost least.
+        """
+        if not len(last):
+            return gtsam.Ordering.ColamdGaussianFactorGraph(self.graph)
+        return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(self.graph, list(last))
 
 
 @dataclass(frozen=True, eq=False)

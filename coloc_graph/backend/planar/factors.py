@@ -186,8 +186,7 @@ class KeyframeFactors:
         there = [key for key in range(len(self), len(self.keys.sizes)) if marginals.has(key)]
         C = np.zeros((len(self.free),) * 2)
         if there:
-            at = np.concatenate([np.arange(self.keys.first[key], self.keys.first[key + 1]) for key in there])
-            at -= 3 * len(self)
+            at = self.keys.variables(np.array(there)) - 3 * len(self)
             C[np.ix_(at, at)] = marginals.joint(there)
         return C * self.free * self.free[:, None]
 

@@ -186,7 +186,7 @@ class IncrementalKeyframes:
         measured = self._measured(self._inside)
         self._taken[measured] = True
         system = self._system(self._steps(self._inside), measured)
-        ordering = system.ordering()
+        ordering = system.ordering(self._newest())
         tree = system.eliminated(ordering)
         moved = self._factors.moved(self._state, system.step(tree, ordering))
         self._state.poses[:], self._state.shared[:] = moved.poses, moved.shared
@@ -219,14 +219,15 @@ class IncrementalKeyframes:
         """Keep the estimate of each robot's newest keyframe at its time."""
         solved = self._solved
         assert solved is not None
-        newest = [
-            int(self._factors.first[robot]) + count - 1
-            for robot, (count, had) in enumerate(zip(self._entered, before, strict=True))
-            if count > had
-        ]
-        poses = np.array([one for one in newest if self._inside[one]], int)
+        had = self._factors.first[:-1] + before
+        poses = np.array([one for one in self._newest() if one >= had[self._factors.robot[one]]], int)
         self._online[poses] = self._state.poses[poses]
         self._online_C[poses] = in_body(self._state.poses[poses], solved.covariances(poses))
+
+    def _newest(self) -> list[int]:
+        """Return the newest pose in the window of each robot that has one."""
+        newest = [int(first) + count - 1 for first, count in zip(self._factors.first[:-1], self._entered, strict=True)]
+        return [one for one, count in zip(newest, self._entered, strict=True) if count and self._inside[one]]
 
     def estimate(self) -> Estimate:
         """Return the smoothed estimate of all keyframes that were added."""
