@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
+from coloc_graph.backend.floor_poses import trajectory
 from coloc_graph.backend.landmarks import StaticPose
 from coloc_graph.backend.planar import filter_forward
-from coloc_graph.backend.planar.trajectory import trajectory
 from coloc_graph.evaluation import align, evaluate
 from coloc_graph.exchange.mrclam import import_mrclam
 from coloc_graph.frontend.keyframes import keyframes_of

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -37,7 +37,7 @@ class Rejection:
     reason : str
         Reason in words.
     sigmas : float
-        Distance from all other measurements in standard deviations; NaN of a ranging run, whose weights are robust.
+        Distance from all other measurements in standard deviations; of a ranging run, from the estimate.
     alternative : tuple of Cause
         Other causes that would explain the measurements as well.
     """
@@ -199,21 +199,20 @@ class Estimate:
         Raises
         ------
         EstimationError
-            A node has no pose, or the estimate keeps no joint covariances (`chain`, and ranging runs).
+            A node has no pose, or the estimate has no joint covariances (`chain`, and ranging runs incrementally).
         """
         if not nodes:
             raise EstimationError("name at least one robot and stance to have a covariance")
         if self.method == "chain":
             raise EstimationError("a chain has no joint covariances: it uses some measurements only; use `smooth`")
-        if not isinstance(self.source, PoseGraph):
-            raise EstimationError(
-                "an estimate of a ranging run keeps the covariance of each pose alone, and no joint ones"
-            )
-        for node in nodes:
-            self._at(*node)
-        keys = [self.source.key(*node) for node in nodes]
+        T = {node: self._at(*node)[0] for node in nodes}
+        if isinstance(self.source, RangingProblem):
+            keys: list[Any] = list(nodes)
+            joint = self.source.joint(list(T), np.array(list(T.values())))
+        else:
+            keys = [self.source.key(*node) for node in nodes]
+            joint = self._marginals.joint(list(dict.fromkeys(keys)))
         different = list(dict.fromkeys(keys))
-        joint = self._marginals.joint(different)
         index = np.concatenate([6 * different.index(key) + np.arange(6) for key in keys])
         return np.asarray(joint[np.ix_(index, index)])
 

@@ -1,12 +1,15 @@
 """The measurements of a ranging run as its estimate sees them, in place of a pose graph."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.floor_poses import joint_in_space
+from coloc_graph.backend.marginals import Marginals
+from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Keyframes, Node, RangeBearing
 
 Array = NDArray[np.float64]
@@ -30,6 +33,11 @@ class RangingProblem:
         Factors on the stated standard deviations of ranges and of bearings.
     on_map : bool
         The world is the map of the landmarks; otherwise it is the first robot's first pose.
+    direction_sigmas : (robots,) float
+        Standard deviation [rad] of each body's heading about that in which its wheels drive.
+    solved : callable or None
+        Gives the marginal covariances of all poses, in the order of robots and keyframes; None of an incremental
+        estimate, which has marginalised most.
     """
 
     keyframes: Keyframes
@@ -38,6 +46,8 @@ class RangingProblem:
     outliers: NDArray[np.bool_]
     noise: Array
     on_map: bool
+    direction_sigmas: Array
+    solved: Callable[[], Marginals] | None = None
 
     def __repr__(self) -> str:
         return f"RangingProblem({self.keyframes!r}, {int(self.outliers.sum())} outliers)"
@@ -80,6 +90,25 @@ class RangingProblem:
         """RMS residual of a range and bearing in units of its noise; NaN where it was not used."""
         return float(np.sqrt(np.mean(self.residuals[measurement.row] ** 2)))
 
+    def sigmas(self, row: int) -> float:
+        """Larger residual of a range and bearing, in standard deviations."""
+        return float(np.abs(self.residuals[row]).max())
+
+    def joint(self, nodes: Sequence[Node], T_world_body: Array) -> Array:
+        """Return the joint covariance (6 n, 6 n) of different nodes at (n, 4, 4), in their bodies' tangents."""
+        if self._marginals is None:
+            raise EstimationError("ranging runs have no joint covariances incrementally: solve it in batch")
+        first = dict(zip(self.robots, np.cumsum([0, *map(len, self.keyframes.times)]).tolist(), strict=False))
+        joint = self._marginals.joint([first[robot] + number for robot, number in nodes])
+        whole = joint_in_space(T_world_body, joint)
+        owner = np.array([self.robots.index(robot) for robot, _ in nodes])
+        whole[2::6, 2::6] += (owner[:, None] == owner) * self.direction_sigmas[owner] ** 2
+        return whole
+
+    @cached_property
+    def _marginals(self) -> Marginals | None:
+        return None if self.solved is None else self.solved()
+
     def nodes(self) -> Iterator[Node]:
         """Every keyframe of every robot."""
         for robot, times in zip(self.keyframes.robots, self.keyframes.times, strict=True):
@@ -89,8 +118,7 @@ class RangingProblem:
     def reason(self, row: int) -> str | None:
         """Return why a measurement is not used; None where it is."""
         if self.outliers[row]:
-            worst = float(np.abs(self.residuals[row]).max())
-            return f"an outlier: {worst:.1f} sigmas from the estimate"
+            return f"an outlier: {self.sigmas(row):.1f} sigmas from the estimate"
         if not np.isfinite(self.residuals[row, 0]):
             return "one of its ends has no pose"
         return None

@@ -165,10 +165,29 @@ def test_what_was_read_wrong_is_doubted_and_moves_nothing(run, batch):
         == set(np.flatnonzero(estimate.ranging.outliers))
         == {one.measurement.row for one in estimate.rejected}
     )
-    assert all("an outlier: " in one.reason for one in estimate.rejected)
+    assert all(f"an outlier: {one.sigmas:.1f} sigmas" in one.reason for one in estimate.rejected)
     for robot, trajectory in batch.estimate.trajectories.items():
         off = estimate.trajectories[robot].positions - trajectory.positions
         assert np.sqrt((off**2).sum(axis=1).mean()) < 0.02
+
+
+def test_joint_covariances_are_those_of_each_pose_and_of_the_step_between_them(batch, incremental):
+    estimate = batch.estimate
+    nodes = ("R1", 40), ("R1", 41), ("R2", 40)
+    joint = estimate.joint_covariance((*nodes, nodes[0]))
+    for n, node in enumerate(nodes):
+        own = slice(6 * n, 6 * n + 6)
+        assert np.allclose(joint[own, own], estimate.covariance(*node), rtol=0.02, atol=1e-8)
+    assert np.allclose(joint[18:], joint[:6])
+    # of a step the odometry says more than where it begins and ends
+    a, b = (estimate.pose(*node) for node in nodes[:2])
+    J = np.hstack([-a.between(b).inverse().AdjointMap(), np.eye(6)])
+    step = J @ joint[:12, :12] @ J.T
+    keyframes, own = estimate.ranging.keyframes, estimate.ranging.robots.index("R1")
+    assert np.all(np.diagonal(step)[3:5] < 1.1 * np.diagonal(keyframes.steps[own].covariances[40])[:2])
+    assert np.all(np.diagonal(step)[3:5] < 0.5 * np.diagonal(joint)[9:11])
+    with pytest.raises(EstimationError, match="have no joint covariances incrementally: solve it in batch"):
+        incremental.estimate.joint_covariance(nodes)
 
 
 def test_the_filter_needs_no_first_poses(run):

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.estimate import Estimate
+from coloc_graph.backend.floor_poses import in_body
 from coloc_graph.backend.linear_system import Optimum, Rows, gauss_newton
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.factors import KeyframeFactors, State, robust
@@ -58,7 +59,8 @@ def optimise_keyframes(team: Team, keyframes: Keyframes, *, calibrate_noise: boo
         iterations += fit.optimum.iterations
     taken = np.zeros(len(keyframes.measured), bool)
     taken[fit.problem.measured] = True
-    return ranging_estimate(factors, _found(factors, filtered, fit), taken, iterations, absorbed)
+    marginals = partial(fit.problem.marginals, fit.state)
+    return ranging_estimate(factors, _found(factors, filtered, fit), taken, iterations, absorbed, marginals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +85,10 @@ class _Problem:
         if self.gauge is not None:
             rows.append(self.factors.gauge(state, *self.gauge))
         return rows, cost
+
+    def marginals(self, state: State) -> Marginals:
+        """Return the marginal covariances of all variables at the optimum."""
+        return Marginals(self.factors.system(state, self.rows(state)[0]).graph, self.factors.keys.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,14 +134,6 @@ def _fitted(factors: KeyframeFactors, state: State) -> _Fit:
     problem = _posed(factors, state)
     tolerance = COST_TOLERANCE_PER_POSE * len(factors)
     return _Fit(problem, gauss_newton(state, problem.rows, factors.system, factors.moved, tolerance))
-
-
-def in_body(poses: Array, covariances: Array) -> Array:
-    """Return covariances (n, 3, 3) of poses (n, 3) in their body frames, from those in the world's axes."""
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    R = np.zeros((len(poses), 3, 3))
-    R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = c, s, -s, c, 1.0
-    return np.asarray(R @ covariances @ R.mT)
 
 
 def found_landmarks(

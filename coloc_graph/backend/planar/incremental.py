@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.estimate import Estimate
+from coloc_graph.backend.floor_poses import in_body, trajectory
 from coloc_graph.backend.linear_system import LinearSystem, Summary
 from coloc_graph.backend.marginals import Marginals
-from coloc_graph.backend.planar.batch import found_landmarks, in_body
+from coloc_graph.backend.planar.batch import found_landmarks
 from coloc_graph.backend.planar.factors import KeyframeFactors, State, robust
 from coloc_graph.backend.planar.filter import INITIAL_PERIOD, Filter
 from coloc_graph.backend.planar.summary import Found, ranging_estimate
-from coloc_graph.backend.planar.trajectory import trajectory
 from coloc_graph.backend.sensor_calibration import SensorErrors
 from coloc_graph.geometry.se2 import compose
 from coloc_graph.geometry.trajectory import Trajectory

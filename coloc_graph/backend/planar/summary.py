@@ -1,6 +1,6 @@
 """Estimate of a ranging run from an optimiser's result: `ranging_estimate`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.calibration import Calibration
 from coloc_graph.backend.estimate import Estimate, Rejection
+from coloc_graph.backend.floor_poses import trajectory
 from coloc_graph.backend.landmarks import StaticPose
+from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.factors import KeyframeFactors, State
-from coloc_graph.backend.planar.trajectory import trajectory
 from coloc_graph.backend.ranging import RangingProblem
 from coloc_graph.backend.sensor_calibration import CalibratedSensors, SensorErrors
 from coloc_graph.geometry.lie import floor_pose
@@ -43,11 +44,17 @@ def measured_off(factors: KeyframeFactors, state: State) -> Array:
 
 
 def ranging_estimate(
-    factors: KeyframeFactors, found: Found, taken: NDArray[np.bool_], iterations: int, absorbed: float | None = None
+    factors: KeyframeFactors,
+    found: Found,
+    taken: NDArray[np.bool_],
+    iterations: int,
+    absorbed: float | None = None,
+    marginals: Callable[[], Marginals] | None = None,
 ) -> Estimate:
     """Return the estimate of an optimiser's result by the measurements `taken`.
 
-    `absorbed` are the degrees of freedom of a batch fit beyond the shares; without it there is no chi2.
+    `absorbed` are the degrees of freedom of a batch fit beyond the shares; without it there is no chi2. `marginals`
+    gives those of all variables, by number.
     """
     keyframes, models = factors.keyframes, factors.models
     off = np.where(taken[:, None], measured_off(factors, found.state), np.nan)
@@ -79,7 +86,8 @@ def ranging_estimate(
                 sigma = float(np.sqrt(np.trace(C) / 2))
                 positions[name] = Landmark(name=name, position=tuple(position.tolist()), position_sigma=sigma)
                 dof -= 2
-    problem = RangingProblem(keyframes, numbers, off, outliers, factors.noise, models.map_known)
+    directions = np.deg2rad([each.wheels.direction_sigma_deg for each in models.wheels])
+    problem = RangingProblem(keyframes, numbers, off, outliers, factors.noise, models.map_known, directions, marginals)
     sensors = {
         name: CalibratedSensors(models.team[name], errors, tuple(factors.noise[robot].tolist()))
         for robot, (name, errors) in enumerate(zip(keyframes.robots, found.errors, strict=True))
@@ -93,7 +101,8 @@ def ranging_estimate(
         dof=0.0 if absorbed is None else float(dof) + absorbed + (0 if models.map_known else 3),
         iterations=iterations,
         rejected=tuple(
-            Rejection(problem.measurements[row], problem.reason(row) or "") for row in np.flatnonzero(outliers).tolist()
+            Rejection(problem.measurements[row], problem.reason(row) or "", problem.sigmas(row))
+            for row in np.flatnonzero(outliers).tolist()
         ),
         calibration=Calibration(driven=sensors, landmarks=positions),
         landmarks=landmarks,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from coloc_graph.backend.planar.trajectory import trajectory
+from coloc_graph.backend.floor_poses import trajectory
 
 
 def test_the_direction_of_wheels_is_in_the_headings_alone():
