@@ -40,7 +40,7 @@ class System(Protocol):
         """Return a condition with a lock of its own."""
 
     def queue(self, size: int) -> Any:
-        """Return a queue; 0 is any size."""
+        """Return a queue of at most `size` items; 0 for no limit."""
 
     def thread(self, target: Callable[..., object], name: str, args: tuple[Any, ...]) -> Any:
         """Return a daemon thread."""
@@ -74,7 +74,7 @@ class OperatingSystem:
         return uuid.uuid4().hex
 
     def queue(self, size: int) -> Any:
-        """Return a queue; one for any number of items is the faster one."""
+        """Return a queue of at most `size` items; 0 for no limit, which is faster."""
         return queue.Queue(size) if size else queue.SimpleQueue()
 
     def thread(self, target: Callable[..., object], name: str, args: tuple[Any, ...]) -> threading.Thread:

@@ -41,7 +41,7 @@ class BatchModel(Protocol):
 
 
 class Model(Protocol):
-    """One measurement with its constants. Models of the same `kind` are evaluated in one `batch`."""
+    """One measurement with its constants; models of the same `kind` are evaluated together, in one `batch`."""
 
     @property
     def rows(self) -> int:

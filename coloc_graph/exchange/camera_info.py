@@ -221,7 +221,7 @@ def _fields(path: Path, chain_camera: str | None) -> Mapping[str, Any]:
     elif is_kalibr(fields := _yaml_fields(path, text, _Loader)):
         return of_kalibr(path, fields, chain_camera)
     if chain_camera is not None:
-        raise InputError(f"{path}: is no Kalibr chain of cameras: leave out --chain-camera")
+        raise InputError(f"{path}: is not a Kalibr camera chain: leave out --chain-camera")
     return fields
 
 

@@ -177,7 +177,7 @@ def _find_stances(team: Team, sources: Sequence[ImageSource], moves: Sequence[Mo
             for one in moves
         )
         raise InputError(
-            f"there is no stance: never do two cameras stand while a robot with markers moves ({stood}); state the "
+            f"no stance found: at no time do two cameras stand while a robot with markers moves ({stood}); state the "
             "stances with --stances, and give no images of a robot that only moves"
         )
     return found

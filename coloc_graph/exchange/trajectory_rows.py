@@ -106,6 +106,6 @@ def _of_matrix(path: Path, line: int, values: list[float]) -> list[float]:
     T = np.reshape(values, (3, 4))
     R = T[:, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > MAX_SKEW or np.linalg.det(R) < 0:
-        raise InputError(f"{path}, line {line}: the first three columns of the pose (3, 4) are no rotation")
+        raise InputError(f"{path}, line {line}: the first three columns of the pose (3, 4) are not a rotation matrix")
     w, x, y, z = quaternion(R)
     return [*T[:, 3].tolist(), x, y, z, w]

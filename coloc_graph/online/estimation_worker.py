@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class EstimationWorker:
-    """Judges the precision of a stance that goes on, and enters one that is over, on a thread of its own.
+    """Thread that judges the precision of the stance under way, and enters one that is over into the graph.
 
     Only that thread uses `solver` meanwhile. Each result is returned once, as soon as it is there. A failure of
     whatever kind is a `RobotError`: it voids a stance, not a mission.

@@ -29,7 +29,9 @@ REFINED = 5  # number of gaits whose drives are planned
 MIN_STANCE_DURATION = 4.0  # least duration of a stance [s]
 PAPER_SECONDS = 5.0  # duration of a stance of the paper's gait, where nothing is asked for [s]
 MAX_MISSION_DURATION = 3600.0  # time of a mission above which a wanted sigma is given up [s]
-_FIRST, _SECOND, _MARKERS = np.split(np.arange(2 * OBSERVER + 2), (OBSERVER, 2 * OBSERVER))
+_FIRST = np.arange(OBSERVER)
+_SECOND = OBSERVER + _FIRST
+_MARKERS = 2 * OBSERVER + np.arange(2)
 #: Variables of a pair in the order of `StanceModel`, by which of the pair is the anchor.
 ANCHOR_FIRST = np.concatenate([_FIRST, _SECOND, _MARKERS]), np.concatenate([_SECOND, _FIRST, _MARKERS])
 
@@ -241,7 +243,7 @@ class GaitSearch:
         return [candidates[n] for n in some[sigmas <= sigma].tolist()]
 
     def unreached(self, sigma: float, reached: float, time: float, gait: Gait) -> InputError:
-        """Error that says that no plan reaches a sigma [m], what a `gait` has reached in a `time` [s], and a remedy."""
+        """Return the error of a sigma [m] that no plan reaches: what a `gait` reached in `time` [s], and a remedy."""
         own = GaitSearch(self.predictor, self.length, self.pair, self.mover, gaits=(gait,)).candidates[0]
         return InputError(
             f"no plan reaches {1e3 * sigma:g} mm at the end of {self.length:.3g} m: the best one promises "

@@ -32,7 +32,9 @@ def roles_of(team: Team, mover: str | None = None) -> tuple[tuple[str, ...], str
     if mover is not None and mover not in team.names:
         raise InputError(f"there is no robot {mover} in the team: name one of {', '.join(team.names)}")
     if not marked or (mover is not None and mover not in marked):
-        raise InputError(f"{mover or 'no robot'} carries two markers to be watched by: give the mover two")
+        if mover is None:
+            raise InputError("no robot carries two markers: give the mover two")
+        raise InputError(f"the mover {mover} carries fewer than two markers: give it two, or name another with --mover")
     mover = mover or marked[-1]
     cameras = [robot.name for robot in team.robots if robot.camera_if_any is not None and robot.name != mover]
     cameras.sort(key=lambda name: name != team.reference)
@@ -64,7 +66,7 @@ def best_roles(predictor: Predictor) -> tuple[tuple[str, ...], str, tuple[str, .
             continue
         found.append((round(sigma, 6), number, roles))
     if not found:
-        raise problem or InputError("no robot carries two markers to be watched by: give the mover two")
+        raise problem or InputError("no robot carries two markers: give the mover two")
     return min(found, key=lambda each: each[:2])[2]
 
 

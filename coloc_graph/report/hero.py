@@ -197,7 +197,7 @@ def _scale_bar(axes: Axes, length: float, label: str, at: float = 0.97) -> None:
 
 
 def _connect(figure: Figure, whole: Axes, part: Axes, box: bool) -> None:
-    """Mark the region of a part in the whole, and connect both."""
+    """Outline the region of an inset in the whole figure, and draw lines between both."""
     (left, right), (low, high) = part.get_xlim(), part.get_ylim()
     if box:
         (min_x, max_x), (min_y, max_y) = whole.get_xlim(), whole.get_ylim()

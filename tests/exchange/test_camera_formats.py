@@ -103,7 +103,7 @@ def test_damaged_files_are_one_sentence(tmp_path, text, words):
 
 
 def test_a_camera_of_a_chain_is_asked_of_a_chain_only(tmp_path):
-    with pytest.raises(InputError, match="is no Kalibr chain of cameras: leave out --chain-camera"):
+    with pytest.raises(InputError, match="is not a Kalibr camera chain: leave out --chain-camera"):
         read_camera_info(opencv_file(tmp_path / "a.yml", np.array(FIVE)), chain_camera="cam0")
 
 

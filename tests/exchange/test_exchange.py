@@ -114,7 +114,7 @@ def test_trajectories_of_other_formats_are_read(tmp_path, text):
         ),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "x.tum, line 2: the time 1.0 does not come after 1.0; sort the poses"),
         ("1 0 0 0 1 0 0 0 1 0 0 0\n", "x.tum, line 1: is KITTI's format .* has no times"),
-        ("1 2 0 0 0 1 0 0 0 1 0 0 0\n", "x.tum, line 1: .* are no rotation"),
+        ("1 2 0 0 0 1 0 0 0 1 0 0 0\n", "x.tum, line 1: .* are not a rotation matrix"),
         ("1403636579763555584,1,2,3,1,0,0,0\n", "x.tum, line 1: may be EuRoC's CSV"),
         ("1403636579763 0 0 0 0 0 0 1\n", "x.tum, line 1: the time .* neither in seconds nor in nanoseconds"),
         ("time x\ny z\n", "x.tum, line 1: 8 finite"),

@@ -88,3 +88,13 @@ def test_roles_without_enough_cameras_are_one_sentence():
     blind = new(team, robots=(team["A"], new(team["B"], camera_if_any=None, mount_if_any=None), team["C"]))
     with pytest.raises(InputError, match="needs two robots with cameras besides the mover C"):
         roles_of(blind)
+
+
+def test_a_mover_without_two_markers_is_one_sentence():
+    team = team_of(3)
+    one_light = new(team, robots=(team["A"], new(team["B"], markers=None), team["C"]))
+    with pytest.raises(InputError, match="the mover B carries fewer than two markers: give it two"):
+        roles_of(one_light, "B")
+    nobody = new(team, robots=tuple(new(robot, markers=None) for robot in team.robots))
+    with pytest.raises(InputError, match="no robot carries two markers: give the mover two"):
+        roles_of(nobody)

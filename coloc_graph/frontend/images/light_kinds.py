@@ -173,7 +173,7 @@ def _starts(forms: Forms) -> list[tuple[float, float]]:
 
 
 def _log_density(off: Array, spread: float) -> Array:
-    """Logarithms of normal densities (n,), 0 of what is not known."""
+    """Logarithms of normal densities (n,); 0 where a value is unknown (NaN)."""
     density = -np.log(spread) - np.minimum((off / spread) ** 2 / 2, 2 * CERTAIN)
     return np.asarray(np.nan_to_num(density, nan=0.0))
 
