@@ -78,8 +78,8 @@ def clock_evidence(
         samples = list(run.odometry(mover, stance.start - REACH, stance.end + REACH))
         found: dict[str, ClockOffset] = {}
         for observer, own in tracks.items():
-            camera = None if rough else run.team[observer].camera
-            offset = _camera_to_wheels(own, samples, run.team, mover, camera, alone=len(stance.movers) == 1)
+            camera, alone = run.team[observer].camera, len(stance.movers) == 1
+            offset = _camera_to_wheels(own, samples, run.team, mover, camera, alone=alone, rough=rough)
             if offset is not None:
                 found[observer] = offset
         for observer, offset in found.items():
@@ -93,10 +93,13 @@ def _between_cameras(
 ) -> tuple[ClockOffset, bool] | None:
     """Offset of two cameras' clocks, and True if they take images rarely and at once."""
     best: tuple[ClockOffset, list[tuple[int, int]]] | None = None
-    for chosen in _pairings(seen_i, seen_j):
-        found = search_offset([(_path(seen_i[a]), _path(seen_j[b])) for a, b in chosen])
-        if found is not None and (best is None or found.sigma < best[0].sigma):
-            best = found, chosen
+    for choices in _pairings(seen_i, seen_j):
+        for chosen in choices:
+            found = search_offset([(_path(seen_i[a], camera_i), _path(seen_j[b], camera_j)) for a, b in chosen])
+            if found is not None and (best is None or found.sigma < best[0].sigma):
+                best = found, chosen
+        if best is not None:
+            break
     if best is None:
         return None
     rough, chosen = best
@@ -139,29 +142,35 @@ def _rough(found: Correspondences, slope: Array) -> Correspondences:
     return replace(found, pairs=replace(pairs, covariance_j=wider))
 
 
-def _pairings(seen_i: list[Track], seen_j: list[Track]) -> Iterator[list[tuple[int, int]]]:
-    """Tracks (a, b) that may be the same markers: all those of the same names at once, or two long ones."""
+def _pairings(seen_i: list[Track], seen_j: list[Track]) -> Iterator[list[list[tuple[int, int]]]]:
+    """Choices of tracks (a, b) that may be the same markers, those first that tell most.
+
+    All those of the same names at once; or both long ones, since the path of one marker alone is also like that of the
+    other at another time; or one long one.
+    """
     moving = [[n for n, one in enumerate(seen) if _moves(one)] for seen in (seen_i, seen_j)]
     named = [(a, b) for a in moving[0] for b in moving[1] if seen_i[a].marker and seen_i[a].marker == seen_j[b].marker]
     if named:
-        yield named
+        yield [named]
         return
     long_i, long_j = (
         sorted(numbers, key=lambda n: -len(seen[n].times))[:MAX_UNNAMED_TRACKS]
         for seen, numbers in zip((seen_i, seen_j), moving, strict=True)
     )
-    for a in long_i:
-        for b in long_j:
-            if not (seen_i[a].marker or seen_j[b].marker):
-                yield [(a, b)]
+    if any(seen_i[a].marker for a in long_i) or any(seen_j[b].marker for b in long_j):
+        return
+    if len(long_i) == len(long_j) == MAX_UNNAMED_TRACKS:
+        yield [list(zip(long_i, order, strict=True)) for order in (long_j, long_j[::-1])]
+    yield [[(a, b)] for a in long_i for b in long_j]
 
 
 def _moves(track: Track) -> bool:
     return len(track.times) >= 4 and float(np.ptp(track.uv, axis=0).max()) > MOVED_PX
 
 
-def _path(track: Track) -> TimedPath:
-    return TimedPath(track.times, track.uv)
+def _path(track: Track, camera: Camera) -> TimedPath:
+    """Path of a marker without the distortion of the lens, which is no homography; of a fisheye as it is."""
+    return TimedPath(track.times, camera.normalise(track.uv) if camera.model == "pinhole" else track.uv)
 
 
 def _camera_to_wheels(
@@ -169,11 +178,12 @@ def _camera_to_wheels(
     samples: Sequence[OdometrySample],
     team: Team,
     mover: str,
-    camera: Camera | None,
+    camera: Camera,
     *,
     alone: bool,
+    rough: bool,
 ) -> ClockOffset | None:
-    """Offset of the wheels' clock from the camera's; refined if the camera is given."""
+    """Offset of the wheels' clock from the camera's; refined unless it may be `rough`."""
     markers = team[mover].markers
     if markers is None or len(samples) < 4:
         return None
@@ -196,12 +206,14 @@ def _camera_to_wheels(
     found = [
         (offset, chosen)
         for chosen in choices
-        if (offset := search_offset([(_path(one), paths[n]) for one, n in chosen], max_residual=MAX_WHEEL_ERROR))
+        if (
+            offset := search_offset([(_path(one, camera), paths[n]) for one, n in chosen], max_residual=MAX_WHEEL_ERROR)
+        )
     ]
     if not found:
         return None
     best, chosen = min(found, key=lambda one: one[0].sigma)
-    if camera is not None and camera.model == "pinhole":
+    if not rough and camera.model == "pinhole":
         refined = refine_wheel_offset([(one, points[n]) for one, n in chosen], wheels, camera, best.value)
         if refined is not None:
             return refined

@@ -46,6 +46,23 @@ def test_an_offset_up_to_seconds_is_found_within_its_sigma(offset, rate):
         assert abs(found.value - offset) < 4 * found.sigma
 
 
+def test_a_drive_with_a_long_rest_and_a_glare_is_timed_right():
+    """A homography fits half of a path, where the robot rests, at nearly any offset."""
+    times = np.arange(0.0, 8.5, 0.1)
+    for seed in (1, 3):
+        rng, pairs = np.random.default_rng(seed), []
+        for glare, later in ((15, 0.0), (0, 0.6)):  # two markers, as if one were a moment later on the same path
+            way = 2 * (np.clip(times, 0, 2) + np.clip(times - 6.5, 0, 9)) + later
+            xy = motion(way, np.random.default_rng(seed))
+            moved = np.column_stack([xy, np.ones(len(xy))]) @ H.T
+            other = moved[:, :2] / moved[:, 2:]
+            other[3 : 3 + glare] += rng.uniform(-40, 40, 2)
+            noise = 0.1 * rng.standard_normal((2, *xy.shape))
+            pairs.append((TimedPath(times, xy + noise[0]), TimedPath(times + 1.0, other + noise[1])))
+        found = search_offset(pairs)
+        assert found is not None and abs(found.value - 1.0) < 0.02
+
+
 def test_an_offset_that_the_motion_does_not_tell_is_not_found():
     rng = np.random.default_rng(0)
     times = np.arange(0.0, 20.0, 0.1)

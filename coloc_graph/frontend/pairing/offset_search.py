@@ -5,6 +5,7 @@ that wheels measured to the path in an image. At a wrong offset no homography do
 time. The likelihood of the offset, with the homography and the noise eliminated, tells its value and its sigma.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from coloc_graph.frontend.homography.fit import MEDIAN_CHI2
 from coloc_graph.frontend.pairing.clock_offset import ClockOffset
 
 Array = NDArray[np.float64]
@@ -30,6 +30,8 @@ BASIN = 0.2  # half width of the neighbourhood of the best offset [s]
 INDEPENDENT = 0.25  # share of the points that count: neighbours err alike
 ROUNDS = 3  # rounds of robust weights
 OUTLIER = 3.0  # residuals beyond this, in robust sigmas, count no more
+MOST = 0.8  # share of points that the noise is that of; the rest may be outliers
+MOST_CHI2 = -2 * math.log(1 - MOST)  # chi2 of two degrees of freedom that so many have
 MIN_SIGMA = 2e-3  # an offset is known no better [s]
 
 
@@ -138,7 +140,8 @@ def _log_variance(x: Array, y: Array) -> Array:
         with np.errstate(all="ignore"):
             off = np.nan_to_num(y - p[..., :2] / p[..., 2:], nan=1e3, posinf=1e3, neginf=-1e3)
         squared = np.minimum((off**2).sum(axis=-1), 1e6)
-        scale = np.nanmedian(np.where(seen, squared, np.nan), axis=1) / MEDIAN_CHI2 + 1e-12
+        # of most points, not of half: a homography fits half of a path at nearly any offset
+        scale = np.nanquantile(np.where(seen, squared, np.nan), MOST, axis=1) / MOST_CHI2 + 1e-12
         depth = np.abs(p[..., 2]) / np.maximum(np.median(np.abs(p[..., 2]), axis=1, keepdims=True), 1e-12)
         robust = 1 / (1 + squared / (OUTLIER**2 * scale[:, None]))
         weights = seen * robust**2 / np.maximum(depth**2, 1e-2)
