@@ -67,11 +67,7 @@ class Blobs:
         """Probabilities (n,) that they are LEDs, and no reflections or lamps, by their looks in the image."""
         if self.looks is not None and self.numbers is not None:
             return self.looks.led[self.numbers]
-        return led_probability(self.recorded_forms())
-
-    def recorded_forms(self, levels: float = 35.0) -> Forms:
-        """Forms as far as peaks and areas tell them, above `levels` [grey levels]."""
-        return forms_of_records(self.peak, self.area, (self.flags & Flag.BLURRED) != 0, levels)
+        return led_probability(forms_of_records(self.peak, self.area, (self.flags & Flag.BLURRED) != 0))
 
     def __getitem__(self, which: NDArray[np.bool_]) -> "Blobs":
         return Blobs(

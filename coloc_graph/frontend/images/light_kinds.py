@@ -99,7 +99,7 @@ def forms_of_windows(light: Array, inner: NDArray[np.bool_], levels: float, satu
     )
 
 
-def forms_of_records(peak: Array, area: Array, blurred: NDArray[np.bool_], levels: float) -> Forms:
+def forms_of_records(peak: Array, area: Array, blurred: NDArray[np.bool_], levels: float = 35.0) -> Forms:
     """Forms of recorded lights, from their peaks (n,) [grey levels], areas (n,) [px], and which are drawn out."""
     known = (peak > MIN_LEVELS_RATIO * levels) & (area > 0)
     ratio = np.log(np.where(known, peak, np.e * levels) / levels)
@@ -116,36 +116,35 @@ def forms_of_records(peak: Array, area: Array, blurred: NDArray[np.bool_], level
 def led_log_odds(forms: Forms) -> Array:
     """Logarithms of the odds (n,) that lights of one camera are LEDs."""
     starts = _starts(forms)
-    learnt = [_learnt(forms, *start) for start in starts]
-    return max(learnt, key=lambda one: one[1])[0] if learnt else np.zeros(len(forms.peak))
+    if not starts:
+        return np.zeros(len(forms.peak))
+    odds, likelihood = _learnt(forms, *np.array(starts).T)
+    return np.asarray(odds[np.where(np.isnan(likelihood), -np.inf, likelihood).argmax()])
 
 
-def _learnt(forms: Forms, peak: float, size: float) -> tuple[Array, float]:
-    """Log odds (n,) and the log likelihood of the mixture, from a start of the LEDs' typical peak and size."""
-    width = PEAK_SPREAD
+def _learnt(forms: Forms, peak: Array, size: Array) -> tuple[Array, Array]:
+    """Log odds (k, n) and log likelihoods (k,) of the mixture, from k starts of the LEDs' typical peak and size."""
+    width = np.full(len(peak), PEAK_SPREAD)
+    long, other_long = _log_density(forms.long, LONG_SPREAD), _log_density(forms.long, OTHER_LONG_SPREAD)
     for _ in range(ROUNDS):
-        brightness, off = forms.peak - peak, forms.size - size
-        lopsided = forms.lopsided / np.exp(size)
-        of_peak = _log_density(brightness, width), _log_density(brightness + DIMMER, OTHER_PEAK_SPREAD)
+        brightness, off = forms.peak - peak[:, None], forms.size - size[:, None]
+        lopsided = forms.lopsided / np.exp(size)[:, None]
+        of_peak = _log_density(brightness, width[:, None]), _log_density(brightness + DIMMER, OTHER_PEAK_SPREAD)
         of_form = (
-            _log_density(off, SIZE_SPREAD)
-            + _log_density(forms.long, LONG_SPREAD)
-            + _log_density(lopsided, LOPSIDED_SPREAD),
-            _log_density(off - LARGER, OTHER_SIZE_SPREAD)
-            + _log_density(forms.long, OTHER_LONG_SPREAD)
-            + _log_density(lopsided, OTHER_LOPSIDED_SPREAD),
+            _log_density(off, SIZE_SPREAD) + long + _log_density(lopsided, LOPSIDED_SPREAD),
+            _log_density(off - LARGER, OTHER_SIZE_SPREAD) + other_long + _log_density(lopsided, OTHER_LOPSIDED_SPREAD),
         )
         other_form = np.logaddexp(np.log(1 - GLINTS) + of_form[1], np.log(GLINTS) + of_form[0])
         led = np.log(PRIOR) + of_peak[0] + of_form[0]
         other = np.log(1 - PRIOR) + of_peak[1] + other_form
         odds = np.clip(led - other, -CERTAIN, CERTAIN)
         p = 1 / (1 + np.exp(-odds))
-        likelihood = float(np.logaddexp(led, other).sum())
+        likelihood = np.logaddexp(led, other).sum(axis=1)
         peak, size = _mean(forms.peak, p, *TYPICAL_PEAK, width), _mean(forms.size, p, *TYPICAL_SIZE, SIZE_SPREAD)
-        width = _spread(forms.peak - peak, p)
-    prior = _log_density(np.array([peak - TYPICAL_PEAK[0]]), TYPICAL_PEAK[1])
-    prior += _log_density(np.array([size - TYPICAL_SIZE[0]]), TYPICAL_SIZE[1])
-    return np.asarray(odds), likelihood + float(prior[0])
+        width = _spread(forms.peak - peak[:, None], p)
+    prior = _log_density(peak - TYPICAL_PEAK[0], TYPICAL_PEAK[1])
+    prior += _log_density(size - TYPICAL_SIZE[0], TYPICAL_SIZE[1])
+    return np.asarray(odds), likelihood + prior
 
 
 def led_probability(forms: Forms) -> Array:
@@ -172,23 +171,24 @@ def _starts(forms: Forms) -> list[tuple[float, float]]:
     return [(float(forms.peak[order[n]]), float(forms.size[order[n]])) for n in some]
 
 
-def _log_density(off: Array, spread: float) -> Array:
-    """Logarithms of normal densities (n,); 0 where a value is unknown (NaN)."""
+def _log_density(off: Array, spread: float | Array) -> Array:
+    """Logarithms of normal densities, of the shape of `off`; 0 where a value is unknown (NaN)."""
     density = -np.log(spread) - np.minimum((off / spread) ** 2 / 2, 2 * CERTAIN)
-    return np.asarray(np.nan_to_num(density, nan=0.0))
+    return np.where(np.isnan(density), 0.0, density)
 
 
-def _mean(values: Array, weights: Array, prior: float, prior_sigma: float, sigma: float) -> float:
-    """Mean of weighted values (n,) of which each has a standard deviation, with a prior; NaN does not count."""
+def _mean(values: Array, weights: Array, prior: float, prior_sigma: float, sigma: float | Array) -> Array:
+    """Means (k,) of values (n,) of standard deviations `sigma`, by weights (k, n), with a prior; NaN does not count."""
     known = np.isfinite(values)
-    total = weights[known].sum() / sigma**2
-    return float((weights[known] @ values[known] / sigma**2 + prior / prior_sigma**2) / (total + prior_sigma**-2))
+    weights, precision = weights[:, known], 1 / np.square(sigma)
+    total = weights.sum(axis=1) * precision
+    return np.asarray((weights @ values[known] * precision + prior / prior_sigma**2) / (total + prior_sigma**-2))
 
 
-def _spread(off: Array, weights: Array) -> float:
-    """Standard deviation of peaks from `off` the mean (n,), at most `PEAK_SPREAD`, which counts as some lights."""
-    squares = SPREAD_LIGHTS * PEAK_SPREAD**2 + float(weights @ off**2)
-    return min(float(np.sqrt(squares / (SPREAD_LIGHTS + weights.sum()))), PEAK_SPREAD)
+def _spread(off: Array, weights: Array) -> Array:
+    """Standard deviations (k,) of peaks from `off` the mean (k, n), at most `PEAK_SPREAD`, which counts as lights."""
+    squares = SPREAD_LIGHTS * PEAK_SPREAD**2 + (weights * off**2).sum(axis=1)
+    return np.asarray(np.minimum(np.sqrt(squares / (SPREAD_LIGHTS + weights.sum(axis=1))), PEAK_SPREAD))
 
 
 def _moments(mask: NDArray[np.bool_]) -> tuple[Array, ...]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from coloc_graph.frontend.images.detection import Blobs, Candidate, Detector, Pixels
-from coloc_graph.frontend.images.light_kinds import Forms, track_probability
+from coloc_graph.frontend.images.light_kinds import forms_of_records, track_probability
 from coloc_graph.frontend.tracks.blink_filter import BlinkFilter
 from coloc_graph.frontend.tracks.kalman import PointFilters, Symmetric
 from coloc_graph.run.messages import Flag, Image
@@ -206,7 +206,7 @@ class MarkerTracker:
         self._ended: list[_Live] = []
         self._parked: list[_Live] = []
         self._taken: list[tuple[Array, Array, float, bool]] = []
-        self._forms: list[Forms] = []  # of the taken detections, image by image
+        self._recorded: list[tuple[Array, Array, NDArray[np.uint8]]] = []  # peaks, areas and flags, image by image
         self._searched = -math.inf  # when the full frame was searched last
         # as `_advance` took them
         self._images: list[tuple[float, list[Place], list[Symmetric], Sequence[Candidate | int]]] = []
@@ -228,7 +228,7 @@ class MarkerTracker:
         whole = blobs[(blobs.flags & UNRELIABLE) == 0]
         numbers = range(len(self._taken), len(self._taken) + len(whole))
         saturated = (whole.flags & Flag.SATURATED) != 0
-        self._forms.append(whole.recorded_forms())
+        self._recorded.append((whole.peak, whole.area, whole.flags))
         self._taken += zip(whole.uv, whole.covariance, whole.peak.tolist(), saturated.tolist(), strict=True)
         places: list[Place] = [(u, v) for u, v in whole.uv.tolist()]
         covariances: list[Symmetric] = [(xx, xy, yy) for (xx, xy), (_, yy) in whole.covariance.tolist()]
@@ -295,9 +295,10 @@ class MarkerTracker:
         if not lives:
             return []
         looks = [_some(live.samples) for live in lives]
-        every = Forms(*(np.concatenate(one) for one in zip(*self._forms, strict=True)))
         rows = np.array([one for some in looks for one in some])
-        led = track_probability(Forms(*(one[rows] for one in every)), [len(some) for some in looks])
+        peak, area, flags = (np.concatenate(one)[rows] for one in zip(*self._recorded, strict=True))
+        forms = forms_of_records(peak, area, (flags & Flag.BLURRED) != 0)
+        led = track_probability(forms, [len(some) for some in looks])
         tracks = []
         for live, probability in zip(lives, led, strict=True):
             uv, covariance, peak, saturated = zip(*(self._taken[one] for one in live.samples), strict=True)  # type: ignore[index]
