@@ -37,7 +37,7 @@ COLLINEAR_SIGMAS = 5.0  # standard deviations from a line within which points co
 MIN_OFF_LINE = 0.15  # share of the points that must lie off the line
 STRAIGHT = 0.03  # ratio of the spreads across and along below which a track is straight, whatever the noise
 MIN_POINTS = 6  # two equations a point for eight unknowns, and some to check
-MOST = 0.9  # share of the points that agree on a homography where hardly any is wrong
+MIN_AGREEING_SHARE = 0.9  # share of the points that agree on a homography where hardly any is wrong
 MAGSAC_SIGMAS = 10.0  # standard deviations up to which MAGSAC++ marginalises the noise
 CORRELATION_SIGMAS = 3.5  # standard deviations, 1 / sqrt(n), above which n residuals count as correlated
 
@@ -109,7 +109,7 @@ def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection", spr
     inliers = _inliers(squared_residuals(H, pairs), np.ones(len(pairs), bool))
     by_all = None
     agree = int(inliers.sum())
-    if MIN_POINTS <= agree < MOST * len(pairs) and _on_a_line(_spread(pairs.x_i[inliers], sigma), agree):
+    if MIN_POINTS <= agree < MIN_AGREEING_SHARE * len(pairs) and _on_a_line(_spread(pairs.x_i[inliers], sigma), agree):
         # it ended at the straight track of one marker, which many homographies fit: all points tell if another is wrong
         by_all = _by_opencv(pairs, sigma, 0)
     if by_all is not None:
@@ -125,7 +125,7 @@ def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection", spr
         before, inliers = inliers, _inliers(squared, inliers)
         if (before == inliers).all():
             break
-    if len(agreeing) < MOST * len(pairs):
+    if len(agreeing) < MIN_AGREEING_SHARE * len(pairs):
         _require_spread(agreeing, sigma)
     chi2, dof = float(squared[before].sum()), 2 * int(before.sum()) - 8
     information = information / variance_factor(chi2, dof, spread)
