@@ -58,6 +58,10 @@ DIRECTED = {
 def test_promises_hold_when(what):
     outcome = run_mission(Scenario(5, 2, tuple(DIRECTED[what])))
     assert outcome.state == "done" and not outcome.violations, (outcome.violations, outcome.log)
+    # what happens is what was drawn, and poses are those of the robots
+    assert any("No space left on device" in line for line in outcome.log) == ("disk" in what)
+    nees, freedom = outcome.nees
+    assert freedom == 6 and nees < 30  # chi2 exceeds this by chance in 4 of 100,000
 
 
 #: Missions in which `make search` found a fault: a full disk while all were told to hold, and amid an estimate.
