@@ -34,6 +34,7 @@ class MemoryRun:
         self.warnings: tuple[str, ...] = ()
         self.stances = tuple(world.stances)
         self.topics: dict[str, int] = {}
+        self.repeated: dict[str, int] = {}
         self.planes: dict[int, Planes] = {}
         self._detections: dict[str, list[Detections]] = {name: [] for name in world.team.names}
         for k in range(len(world.stances)):
