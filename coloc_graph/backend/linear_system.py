@@ -219,7 +219,10 @@ class LinearSystem:
             left.push_back(key)
         columns = self.keys.variables(np.array(kept, int))
         information = rest.augmentedHessian(left)[:-1, :-1] if kept else np.empty((0, 0))
-        return Summary(rest, tuple(kept), columns, information)
+        one = gtsam.GaussianFactorGraph()
+        if kept:  # as one factor: those on kept keys alone would become more each time
+            one.push_back(gtsam.HessianFactor(rest))
+        return Summary(one, tuple(kept), columns, information)
 
     def add_summary(self, summary: "Summary", moved: Array) -> None:
         """Add the marginal of eliminated factors, whose variables (k,) have `moved` since these were linearised."""

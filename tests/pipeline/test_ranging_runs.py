@@ -291,6 +291,7 @@ def test_a_linear_system_is_solved_and_summed_up_as_by_the_book(somewhere):
     early[1] |= gone[factors.seen[measured]] & factors.of_robot[measured]
     system = factors.system(state, [rows[0].of(np.flatnonzero(early[0])), rows[1].of(np.flatnonzero(early[1])), gauge])
     before = system.summed_up(np.flatnonzero(gone & inside))
+    assert before.factors.size() == 1  # however often it is summed up
     system = factors.system(
         state, [rows[0].of(np.flatnonzero(~early[0])), rows[1].of(np.flatnonzero(~early[1]))], priors=False
     )
