@@ -7,7 +7,7 @@ from coloc_graph.cli.place import add_force, require_run_place
 #: Standard deviations of mounts [deg, m], of the markers' span [m] and of the floor [deg] in the demo.
 IMPERFECTIONS = {"mount_sigma_deg": 1.0, "height_sigma": 5e-3, "span_sigma": 1e-4, "floor_sigma_deg": 0.1}
 
-PACE = 20.0  # duration of a planned mission online [s/m]
+PACE = 17.0  # duration of a planned mission online [s/m]
 
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:

@@ -27,7 +27,7 @@ from coloc_graph.simulation.simulated_team import FIELD
 from coloc_graph.team import Team
 
 FPS = 10.0  # images a second of a simulated camera
-PACE = 20.0  # seconds of a mission to the end of a way for each metre, as of `coloc demo`
+PACE = 17.0  # seconds of a mission to the end of a way for each metre, as of `coloc demo`
 LIMIT = 1500.0  # simulated time after which a mission must have ended [s]
 SPAN = 10.0  # time of a stance in which faults are drawn [s]
 MEMORY = "/dev/shm"  # a folder in memory, where there is one

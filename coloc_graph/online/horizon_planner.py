@@ -32,7 +32,7 @@ FIRST_NOISE = 0.1  # noise of a marker centre until a stance has shown it [px]
 PASSING = 0.6  # robots that drive at the same time keep this distance between their ways [m]
 RETRIES = 2  # attempts at a stance before another target is chosen
 SWEEP = (0.35, -0.35, 0.7, -0.7)  # turns with which one that leapt and did not see the mover looks for it [rad]
-OVERHEAD = 4.0  # time of a stance online beside its drive and leap: decision, mover's way, looks, estimate [s]
+OVERHEAD = 5.0  # time of a stance online beside its drive and leap: decision, mover's way, looks, estimate [s]
 MAX_DELAY = 10.0  # a stance that takes this much longer than expected was halted, which costs the rest no time [s]
 MAX_SHARE = 1.5  # a stance counts for at most this share of the information that was expected of it
 

@@ -26,13 +26,14 @@ class Node:
 
 
 def different(nodes: Sequence[Node], beam: int) -> list[Node]:
-    """Choose the `beam` best nodes whose robots stand in different poses, with the gait's own."""
+    """Choose the `beam` best nodes whose robots stand in different poses, and the best one of the gait."""
     chosen: list[Node] = []
     for node in nodes:
         x, y, yaw = node.choices[-1][1]
         others = [other.choices[-1][1] for other in chosen]
-        if node.by_gait or all(math.hypot(x - a, y - b) + 0.5 * abs(yaw - c) > DIFFERENT for a, b, c in others):
+        apart = all(math.hypot(x - a, y - b) + 0.5 * abs(yaw - c) > DIFFERENT for a, b, c in others)
+        if (len(chosen) < beam and apart) or (node.by_gait and not any(one.by_gait for one in chosen)):
             chosen.append(node)
-        if len(chosen) == beam and any(one.by_gait for one in chosen):
+        if len(chosen) >= beam and any(one.by_gait for one in chosen):
             break
     return chosen

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.geometry.se2 import Planar
+from coloc_graph.geometry.se2 import Planar, wrap
 from coloc_graph.planning.beam import Node, different
 from coloc_graph.planning.belief import Belief, updated
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.drive import effective_seconds
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.gaits import MIN_STANCE_DURATION
-from coloc_graph.planning.leaps import Leaps, possible_leaps
+from coloc_graph.planning.leaps import BEND, Leaps, possible_leaps
 from coloc_graph.planning.mission import Mission, best_stance
 from coloc_graph.planning.mover_path import evenly_seen
 from coloc_graph.planning.plan import Plan, PlannedStance
@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 DEPTH = 2  # stances that are looked ahead
 BEAM = 4  # plans that are followed from one stance to the next
 MANY_BEAM = 3  # the same of more than two observers
+CORNER_BEAM = 30  # the same before a corner
+CORNER = 3.0  # a corner is near from this distance along the course on [m]
 SHARES = (0.6, 1.0, 1.7)  # durations of a stance that are compared, relative to the pace of the mission
 FINALISTS = 3  # first leaps whose stances are planned to be compared, with the gait's own
 PREFERRED = 1.03  # the gait's own leap is left for one that promises a variance this much smaller
@@ -218,6 +220,7 @@ class Horizon:
             If no observer can leap anywhere from where it shares a view with the others.
         """
         standing = {name: belief.poses[name] for name in self.observers}
+        many = self._beam(standing)
         beam = [Node(belief, standing, seconds, 0.0)]
         best = beam
         for depth in range(self.depth):
@@ -231,7 +234,7 @@ class Horizon:
             if not grown:
                 break
             grown.sort(key=lambda node: node.score)
-            best = beam = different(grown, BEAM if len(self.observers) == 2 else MANY_BEAM)
+            best = beam = different(grown, many)
             if self.objective != "goal" or self.arrived(best[0].standing):
                 break
         if not best[0].choices:
@@ -247,6 +250,14 @@ class Horizon:
         if not node.by_gait:
             reason += "; this leap promises less than the gait's own"
         return Decision(stance, promise, node.choices, math.sqrt(variance), reason)
+
+    def _beam(self, standing: Mapping[str, Planar]) -> int:
+        """Number of plans that are followed from one stance to the next: more before a corner, where most end."""
+        ways = [self.course.way_of(pose) for pose in standing.values()]
+        headings = [self.course.at(way)[2] for way in np.arange(min(ways), max(ways) + CORNER, 0.5)]
+        if np.abs(wrap(np.diff(headings))).max(initial=0.0) > BEND:
+            return CORNER_BEAM
+        return BEAM if len(self.observers) == 2 else MANY_BEAM
 
     def require_progress(self, before: Sequence[Mapping[str, Planar]]) -> None:
         """Require that of the stances before, each with where the observers stood, one of the last brought them on.

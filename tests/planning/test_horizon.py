@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coloc_graph.errors import InputError
-from coloc_graph.planning.beam import Node
+from coloc_graph.planning.beam import Node, different
 from coloc_graph.planning.belief import Belief
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap, read_floor_map
@@ -93,6 +93,13 @@ def test_another_leap_is_chosen_only_if_its_planned_drive_promises_less_than_the
     monkeypatch.setattr("coloc_graph.planning.horizon.PREFERRED", 1e-9)
     assert planner._finalist(belief, seconds, guessed)[1] is guessed[0]
     assert math.sqrt(variance) == pytest.approx(planner.next(belief, seconds).expected, rel=0.1)
+
+
+def test_few_plans_are_followed_however_late_the_gait_s_own_comes():
+    nodes = [Node(None, {}, 0.0, n, (("A", (0.3 * n, 0.0, 0.0), 4.0),), by_gait=n >= 9) for n in range(20)]
+    assert [node.score for node in different(nodes, 4)] == [0, 1, 2, 3, 9]
+    assert [node.score for node in different(nodes[8:], 4)] == [8, 9, 10, 11]
+    assert [node.score for node in different(nodes[:6], 4)] == [0, 1, 2, 3]
 
 
 def test_it_promises_far_more_than_the_paper_s_formation_with_as_many_images(straight):
