@@ -23,7 +23,8 @@ from scipy.optimize import linear_sum_assignment
 
 from coloc_graph.frontend.images.detection import Blobs, Detector
 from coloc_graph.frontend.tracks.blink_codes import BlinkCodes
-from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
+from coloc_graph.frontend.tracks.track import Track, TrackerOptions
+from coloc_graph.frontend.tracks.tracking import MarkerTracker
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.simulation.blinking import blinking, with_codes
 from coloc_graph.simulation.crowd import Faults, Seen, crowd

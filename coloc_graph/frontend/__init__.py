@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     )
     from coloc_graph.frontend.stance_sightings import sight_movers, sight_standing, unsighted_movers
     from coloc_graph.frontend.stance_tracks import StanceTracks
-    from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
+    from coloc_graph.frontend.tracks.track import Track, TrackerOptions
+    from coloc_graph.frontend.tracks.tracking import MarkerTracker
 
 __all__ = [
     "Blobs",
@@ -106,6 +107,7 @@ __getattr__, __dir__ = lazy_names(
         "stance": "FrontendOptions PairMeasurement Scale little_in_common measure_pair measured_pairs",
         "stance_sightings": "sight_movers sight_standing unsighted_movers",
         "stance_tracks": "StanceTracks",
-        "tracks.tracking": "MarkerTracker Track TrackerOptions",
+        "tracks.track": "Track TrackerOptions",
+        "tracks.tracking": "MarkerTracker",
     },
 )

@@ -14,7 +14,7 @@ from coloc_graph.frontend.pairing.correspondence import Correspondences
 from coloc_graph.frontend.pairing.offset_search import REACH, TimedPath, search_offset
 from coloc_graph.frontend.tracks.interpolation import MAX_GAP
 from coloc_graph.frontend.tracks.paired_tracks import PairedTracks
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.frontend.wheel_offset import refine_wheel_offset
 from coloc_graph.run import OdometrySample, Recorded, Stance
 from coloc_graph.team import Camera, Team

@@ -11,7 +11,8 @@ from coloc_graph.frontend.homography.plane import on_plane, plane_from_mount
 from coloc_graph.frontend.images.apriltags import find_tags
 from coloc_graph.frontend.images.detection import Detector, Pixels, detector_for
 from coloc_graph.frontend.sighting import Marked, at_rest, sight
-from coloc_graph.frontend.tracks.tracking import UNRELIABLE, Track
+from coloc_graph.frontend.tracks.track import Track
+from coloc_graph.frontend.tracks.tracking import UNRELIABLE
 from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.measurements import Sighting
 from coloc_graph.run import Image, Recorded, Stance

@@ -15,7 +15,7 @@ from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.clock_offset import ClockOffset
 from coloc_graph.frontend.pairing.correspondence import pair_by_time
 from coloc_graph.frontend.tracks.marker_pairs import longest_pair, named_pair, tracks_of
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.geometry.lie import across, floor_pose, so3_exp
 from coloc_graph.geometry.se2 import wrap
 from coloc_graph.measurements import Plane, Sighting

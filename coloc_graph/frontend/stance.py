@@ -47,7 +47,7 @@ from coloc_graph.frontend.stance_tracks import StanceTracks, stance_markers, sta
 from coloc_graph.frontend.tracks.interpolation import MAX_GAP
 from coloc_graph.frontend.tracks.marker_pairs import longest_pair, named_pair, span_samples
 from coloc_graph.frontend.tracks.paired_tracks import PairedTracks
-from coloc_graph.frontend.tracks.tracking import Track, TrackerOptions
+from coloc_graph.frontend.tracks.track import Track, TrackerOptions
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan, Plane, RelativePose
 from coloc_graph.run import Recorded, Stance
 from coloc_graph.team import Camera, Markers, Team

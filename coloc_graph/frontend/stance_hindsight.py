@@ -10,7 +10,7 @@ from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.pairing.rigid_alignment import align_paths
 from coloc_graph.frontend.stance_tracks import StanceTracks, stance_plane
 from coloc_graph.frontend.tracks.rigid_path import RigidPath, rigid_path
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 
 MIN_SAMPLES = 25  # mean length of causal tracks below which they broke often
 MIN_SEEN = 0.5  # share of the images with both lights below which the mover was out of view

@@ -12,7 +12,7 @@ from coloc_graph.frontend.pairing.clock_offset import ClockOffset
 from coloc_graph.frontend.sighting import at_rest, sight
 from coloc_graph.frontend.stance import PairMeasurement
 from coloc_graph.frontend.stance_tracks import stance_plane
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.measurements import Sighting
 from coloc_graph.run import Recorded, Stance
 

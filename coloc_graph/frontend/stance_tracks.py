@@ -19,7 +19,8 @@ from coloc_graph.frontend.pairing.correspondence import STILL
 from coloc_graph.frontend.tracks.blink_codes import BlinkCodes
 from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers, merge_named
 from coloc_graph.frontend.tracks.rigid_path import RigidPath
-from coloc_graph.frontend.tracks.tracking import MarkerTracker, Track, TrackerOptions
+from coloc_graph.frontend.tracks.track import Track, TrackerOptions
+from coloc_graph.frontend.tracks.tracking import MarkerTracker
 from coloc_graph.measurements import Plane
 from coloc_graph.run import Detections, Flag, Recorded, Stance
 from coloc_graph.team import Markers, Tracking

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag, cho_solve, cholesky
 from coloc_graph.frontend.homography.refinement import projection
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.clock_offset import ClockOffset
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.geometry.lie import sl3_exp, sl3_normalise
 from coloc_graph.team import Camera
 

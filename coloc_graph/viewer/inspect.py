@@ -14,7 +14,7 @@ from coloc_graph.frontend.homography.fit import INLIER_GATE
 from coloc_graph.frontend.homography.plane import on_plane
 from coloc_graph.frontend.learnt_noise import measure_alone
 from coloc_graph.frontend.stance_tracks import stance_plane
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.geometry.lie import floor_pose, so3_log
 from coloc_graph.run import Run
 from coloc_graph.team import Camera, Team

@@ -10,7 +10,7 @@ from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend import StanceTracks, sight_landmarks
 from coloc_graph.frontend.images.apriltags import find_tags, measure_tag
 from coloc_graph.frontend.landmarks import LandmarkWatch, SeenLandmarks, UnusedSighting, describe_unused, still
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.inspection import inspect, landmarks_seen

@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from coloc_graph.frontend.odometry import WheelTrack
 from coloc_graph.frontend.pairing.offset_search import TimedPath, search_offset
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.frontend.wheel_offset import refine_wheel_offset
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.simulation import reference_team

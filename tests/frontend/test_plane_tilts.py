@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from coloc_graph.frontend import plane_from_mount
 from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.simulation.rig import reference_team
 from coloc_graph.team.shared_view import View

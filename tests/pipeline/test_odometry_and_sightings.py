@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from coloc_graph.frontend import FrontendOptions, WheelTrack, measure_pair, sight, sight_movers
 from coloc_graph.frontend.homography.plane import plane_from_mount
 from coloc_graph.frontend.pairing.clock_offset import ClockOffset
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.pipeline.batch import solve
 from coloc_graph.run import OdometrySample, Stance, open_run, read_truth

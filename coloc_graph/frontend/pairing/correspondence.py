@@ -15,7 +15,7 @@ from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.refinement import PointPairs
 from coloc_graph.frontend.pairing.association import HIDDEN, HIDDEN_ALONE, MIN_POSTERIOR, MIN_SHARE_ALONE, associate
 from coloc_graph.frontend.tracks.interpolation import MAX_GAP
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from coloc_graph.frontend.homography.plane import on_plane
 from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.pairing.correspondence import pair_by_time
 from coloc_graph.frontend.tracks.marker_pairs import MIN_SHARED_SAMPLES
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.geometry.lie import se3, se3_inverse
 from coloc_graph.measurements import Plane, RelativePose
 from coloc_graph.team import Floor, Robot

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from coloc_graph.frontend.pairing.correspondence import Correspondences, pair_each_by_time
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 
 MIN_PARTNERS = 3  # pairs of each of many observers that are measured: with those that share most samples
 

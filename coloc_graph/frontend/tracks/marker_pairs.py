@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.frontend.homography.plane import on_plane
 from coloc_graph.frontend.pairing.correspondence import STILL, pair_by_time
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.measurements import Plane
 from coloc_graph.team import Camera
 

@@ -10,7 +10,7 @@ from scipy import sparse
 from coloc_graph.frontend.homography.refinement import PointPairs
 from coloc_graph.frontend.pairing.correspondence import Correspondences, normalised
 from coloc_graph.frontend.tracks.interpolation import Interpolated, Samples
-from coloc_graph.frontend.tracks.tracking import Track
+from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.team import Camera
 
 Array = NDArray[np.float64]

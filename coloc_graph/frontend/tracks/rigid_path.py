@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.frontend.homography.plane import on_plane
-from coloc_graph.frontend.tracks.tracking import UNRELIABLE, Track
+from coloc_graph.frontend.tracks.track import Track
+from coloc_graph.frontend.tracks.tracking import UNRELIABLE
 from coloc_graph.geometry.lie import across
 from coloc_graph.measurements import Plane
 from coloc_graph.run import Detections, Flag

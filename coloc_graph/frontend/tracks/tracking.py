@@ -10,9 +10,7 @@ start, after a loss, and periodically for markers that came into view.
 
 import math
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +20,16 @@ from coloc_graph.frontend.images.detection import Blobs, Candidate, Detector, Pi
 from coloc_graph.frontend.images.light_kinds import forms_of_records, track_probability
 from coloc_graph.frontend.tracks.blink_filter import BlinkFilter
 from coloc_graph.frontend.tracks.kalman import PointFilters, Symmetric
+from coloc_graph.frontend.tracks.track import (
+    LiveTrack,
+    NearDetection,
+    Track,
+    TrackerOptions,
+    agreeing_pieces,
+    missed_between,
+    sample_key,
+    spread_samples,
+)
 from coloc_graph.run.messages import Flag, Image
 
 Array = NDArray[np.float64]
@@ -40,133 +48,11 @@ MAX_GROWTH = math.log(100.0)  # of the logarithm of the acceleration
 FASTER = 2.0  # a new light's velocity is up to this times those of the lights that are tracked
 REACH_SIGMAS = 3.0  # standard deviations of a light's position that the patch holds
 ROUGH_EXTENT = 2.0  # px by which an extent of approximate centres may be too small
-LOOKED_AT = 12  # samples of a track by whose looks it is called an LED or not
 MIN_PIECE = 4  # samples of a piece on which both directions of time agree
 ROUGH_SIGMA = 0.5  # px, of a candidate's approximate centre
 ROUGH: Symmetric = (ROUGH_SIGMA**2, 0.0, ROUGH_SIGMA**2)
 
 Place = tuple[float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """One marker through time in one camera.
-
-    Attributes
-    ----------
-    robot
-        Robot that carries the camera.
-    marker
-        Name of the marker, such as "C/0", or "" if it is unknown.
-    times
-        Times of the samples by the camera's clock, (n,) [s].
-    uv, covariance
-        Positions, (n, 2) [px], and their covariances, (n, 2, 2) [px^2].
-    peak
-        Peak brightness, (n,) [grey levels].
-    body
-        Number shared by the tracks of one robot in this camera, -1 if it is unknown.
-    mover
-        Name of that robot, if its colour or its blink code tells it, or "".
-    missed
-        Times of images in which the marker was expected and not detected, (k,) [s].
-    saturated
-        True for samples whose core is at the sensor's limit, (n,); None if it is unknown.
-    led
-        Probability that it is an LED, and no reflection or lamp, by its looks; NaN if it is unknown.
-    """
-
-    robot: str
-    marker: str
-    times: Array
-    uv: Array
-    covariance: Array
-    peak: Array
-    body: int = -1
-    mover: str = ""
-    missed: Array = field(default_factory=lambda: np.zeros(0))
-    saturated: NDArray[np.bool_] | None = None
-    led: float = math.nan
-
-    def __len__(self) -> int:
-        return len(self.times)
-
-    @property
-    def loads(self) -> Array:
-        """Parts of the white floors, of other and of saturated spots, in each sample (n, 2): `team.CentreNoise`."""
-        saturated = np.zeros(len(self), bool) if self.saturated is None else self.saturated
-        return np.stack([~saturated, saturated], axis=1).astype(float)
-
-    @property
-    def extent(self) -> float:
-        """Diagonal of the track's bounding box [px], near 0 for a light at rest."""
-        return float(np.linalg.norm(np.ptp(self.uv, axis=0))) if len(self) else 0.0
-
-
-@dataclass(frozen=True)
-class TrackerOptions:
-    """Parameters of `MarkerTracker`.
-
-    Those in pixels are of images 320 px wide, and grow with the width. `acceleration` and `speed` are where the tracker
-    begins: it takes what the lights do for more, and the patch is as large as the time between images asks for.
-    """
-
-    patch: int = 40  # px, side of the search patch, at least
-    patience: int = 3  # frames; a track ends that is not seen for longer, and for `patience_s`
-    reacquire_every: float = 0.25  # s between searches of the full frame for markers that came into view
-    markers: int = 2  # expected number of markers; with fewer live tracks the full frame is searched
-    still_after: int = 50  # frames, and `still_s`, after which a light at rest is parked
-    still_s: float = 4.5  # s
-    patience_s: float = 0.3  # s
-    detected: float = 0.95  # probability of detection of a marker in an image
-    clutter: float = 5e-5  # 1/px^2, density of false detections in an image
-    acceleration: float = 3e3  # px^2/s^3, spectral density of the markers' acceleration
-    jerk: float = 60.0  # px/s, standard deviation of occasional sudden changes of velocity
-    speed: float = 200.0  # px/s, standard deviation of a new track's velocity
-    off: float = 0.0  # s, for which blinking markers go off each time
-    off_rate: float = 0.0  # 1/s, at which a blinking marker that is on goes off
-
-
-@dataclass(slots=True)
-class _Live:
-    """Live track: approximate centres, and the candidates or taken blobs that its samples are measured from.
-
-    `score` is the log likelihood ratio of a light against false detections.
-    """
-
-    times: list[float] = field(default_factory=list)
-    uv: list[tuple[float, float]] = field(default_factory=list)
-    samples: list[Candidate | int] = field(default_factory=list)
-    missed: list[float] = field(default_factory=list)
-    misses: int = 0
-    score: float = 0.0
-    confirmed: bool = False
-
-    @property
-    def extent(self) -> float:
-        """Diagonal of the bounding box of the approximate centres [px]."""
-        u, v = zip(*self.uv, strict=True)
-        return math.hypot(max(u) - min(u), max(v) - min(v))
-
-    def take(self, time: float, place: tuple[float, float], sample: Candidate | int) -> None:
-        self.times.append(time)
-        self.uv.append(place)
-        self.samples.append(sample)
-        self.misses = 0
-
-
-class _Near(NamedTuple):
-    """Detection near a track's prediction: squared distance, whether it jerked, and log likelihoods."""
-
-    squared: float
-    jerked: bool
-    gain: float
-    missed: float
-
-    @property
-    def worth(self) -> float:
-        """Log likelihood ratio to a missed marker and a false detection."""
-        return self.gain - self.missed
 
 
 class MarkerTracker:
@@ -202,9 +88,9 @@ class MarkerTracker:
         self._growth = 0.0  # logarithm of the factor of the acceleration that was seen
         self._moved([], [])
         self._blink = BlinkFilter(self._options.off, self._options.off_rate)
-        self._live: list[_Live] = []  # in the order of the filters
-        self._ended: list[_Live] = []
-        self._parked: list[_Live] = []
+        self._live: list[LiveTrack] = []  # in the order of the filters
+        self._ended: list[LiveTrack] = []
+        self._parked: list[LiveTrack] = []
         self._taken: list[tuple[Array, Array, float, bool]] = []
         self._recorded: list[tuple[Array, Array, NDArray[np.uint8]]] = []  # peaks, areas and flags, image by image
         self._searched = -math.inf  # when the full frame was searched last
@@ -251,21 +137,21 @@ class MarkerTracker:
         for time, places, covariances, samples in reversed(self._images):
             back._filters.predict(-time)
             back._advance(-time, places, covariances, samples, births=True)
-        number = {_key(sample): n for n, live in enumerate(back._confirmed()) for sample in live.samples}
-        pieces = [piece for live in self._confirmed() for piece in _agreeing(live, number)]
+        number = {sample_key(sample): n for n, live in enumerate(back._confirmed()) for sample in live.samples}
+        pieces = [piece for live in self._confirmed() for piece in agreeing_pieces(live, number)]
         return self._measured([piece for piece in pieces if len(piece.times) >= MIN_PIECE])
 
-    def _confirmed(self) -> list[_Live]:
+    def _confirmed(self) -> list[LiveTrack]:
         lives = [live for live in self._ended + self._parked + self._live if live.confirmed and live.times]
         return sorted(lives, key=lambda live: live.times[0])
 
-    def _measured(self, lives: Sequence[_Live]) -> list[Track]:
+    def _measured(self, lives: Sequence[LiveTrack]) -> list[Track]:
         candidates = [one for live in lives for one in live.samples if isinstance(one, Candidate)]
         if not candidates:
             return self._of_taken(lives)
         blobs, real = self._detector.measure(candidates)
         real &= (blobs.flags & UNRELIABLE) == 0
-        looks = [_some(live.samples) for live in lives]
+        looks = [spread_samples(live.samples) for live in lives]
         led = track_probability(
             self._detector.forms([one for some in looks for one in some if isinstance(one, Candidate)]),
             [len(some) for some in looks],
@@ -283,18 +169,18 @@ class MarkerTracker:
                     blobs.uv[own][good],
                     blobs.covariance[own][good],
                     blobs.peak[own][good],
-                    missed=_between(live),
+                    missed=missed_between(live),
                     saturated=(blobs.flags[own][good] & Flag.SATURATED) != 0,
                     led=probability,
                 )
             )
         return [track for track in tracks if len(track)]
 
-    def _of_taken(self, lives: Sequence[_Live]) -> list[Track]:
+    def _of_taken(self, lives: Sequence[LiveTrack]) -> list[Track]:
         """Tracks of detections that were taken from elsewhere."""
         if not lives:
             return []
-        looks = [_some(live.samples) for live in lives]
+        looks = [spread_samples(live.samples) for live in lives]
         rows = np.array([one for some in looks for one in some])
         peak, area, flags = (np.concatenate(one)[rows] for one in zip(*self._recorded, strict=True))
         forms = forms_of_records(peak, area, (flags & Flag.BLURRED) != 0)
@@ -304,7 +190,7 @@ class MarkerTracker:
             uv, covariance, peak, saturated = zip(*(self._taken[one] for one in live.samples), strict=True)  # type: ignore[index]
             fields = np.array(live.times), np.array(uv), np.array(covariance), np.array(peak)
             track = Track(
-                self.robot, "", *fields, missed=_between(live), saturated=np.array(saturated), led=probability
+                self.robot, "", *fields, missed=missed_between(live), saturated=np.array(saturated), led=probability
             )
             tracks.append(track)
         return tracks
@@ -369,7 +255,7 @@ class MarkerTracker:
             new = [column for column in range(len(places)) if column not in taken]
             for column in new:
                 self._filters.add(*places[column], covariances[column])
-                self._live.append(_Live())
+                self._live.append(LiveTrack())
                 self._live[-1].take(time, places[column], samples[column])
             if new:
                 self._blink.add(len(new))
@@ -391,7 +277,7 @@ class MarkerTracker:
                 track.misses += 1
                 track.score += one
             return [], set()
-        near: dict[tuple[int, int], _Near] = {}
+        near: dict[tuple[int, int], NearDetection] = {}
         jerk, false = filters.jerk, math.log(options.clutter / self._scale**2)
         for row, (point, one) in enumerate(zip(filters.points, seen, strict=True)):
             for column, ((u, v), covariance) in enumerate(zip(places, covariances, strict=True)):
@@ -400,7 +286,7 @@ class MarkerTracker:
                     squared, density, jerked = compared
                     off = min(squared, jerked + JERK_PENALTY)
                     gain = math.log(one) - false + density + 0.5 * (squared - off)
-                    near[row, column] = _Near(squared, off < squared, gain, missed[row])
+                    near[row, column] = NearDetection(squared, off < squared, gain, missed[row])
         assigned, doubtful = self._most_likely(near, len(places))
         squares, speeds = [], []
         for row, column in assigned:
@@ -422,7 +308,9 @@ class MarkerTracker:
         self._moved(squares, speeds)
         return assigned, doubtful
 
-    def _most_likely(self, near: dict[tuple[int, int], "_Near"], count: int) -> tuple[list[tuple[int, int]], set[int]]:
+    def _most_likely(
+        self, near: dict[tuple[int, int], "NearDetection"], count: int
+    ) -> tuple[list[tuple[int, int]], set[int]]:
         """Return the most likely assignment of `count` detections to tracks they are `near`, and what is doubtful."""
         if len(near) <= 1 or len({row for row, _ in near}) == len(near) == len({column for _, column in near}):
             return [pair for pair, one in near.items() if one.worth > AMBIGUOUS], set()
@@ -467,7 +355,7 @@ class MarkerTracker:
         """End a track and begin another with its filter, perhaps of another light."""
         if self._live[row].confirmed:
             self._ended.append(self._live[row])
-        self._live[row] = _Live()
+        self._live[row] = LiveTrack()
 
     def _apart(
         self, worth: Array, tracks: NDArray[np.int64], found: NDArray[np.int64], near: NDArray[np.bool_]
@@ -511,7 +399,7 @@ class MarkerTracker:
         point, (width, height) = self._filters.points[row], self._size
         return not (RIM - 0.5 < point.u < width - RIM - 0.5 and RIM - 0.5 < point.v < height - RIM - 0.5)
 
-    def _still(self, track: _Live) -> bool:
+    def _still(self, track: LiveTrack) -> bool:
         """Return whether a track has not moved for long."""
         options = self._options
         if len(track.uv) < options.still_after or track.times[-1] - track.times[0] < options.still_s:
@@ -529,34 +417,3 @@ class MarkerTracker:
 def _close(one: Place, other: Place, limit: float) -> bool:
     """Return whether two places differ by less than a limit along either axis [px]."""
     return abs(one[0] - other[0]) < limit and abs(one[1] - other[1]) < limit
-
-
-def _some(samples: Sequence[Candidate | int]) -> list[Candidate | int]:
-    """Up to `LOOKED_AT` samples, evenly spread."""
-    step = max(len(samples) // LOOKED_AT, 1)
-    return list(samples[::step][:LOOKED_AT])
-
-
-def _between(live: _Live) -> Array:
-    """Times of images in which a track was missed between its first and its last sample, (k,) [s]."""
-    missed = np.array(live.missed)
-    return missed[(missed > live.times[0]) & (missed < live.times[-1])]
-
-
-def _key(sample: Candidate | int) -> int:
-    """Identity of a sample among all of its tracker."""
-    return sample if isinstance(sample, int) else id(sample)
-
-
-def _agreeing(live: _Live, number: Mapping[int, int]) -> list[_Live]:
-    """The pieces of a track whose samples have one `number` each; samples without one are left out."""
-    pieces: list[_Live] = []
-    last = -1
-    for time, place, sample in zip(live.times, live.uv, live.samples, strict=True):
-        now = number.get(_key(sample), -1)
-        if now >= 0 and now != last:
-            pieces.append(_Live(confirmed=True, missed=live.missed))
-        if now >= 0:
-            pieces[-1].take(time, place, sample)
-        last = now if now >= 0 else last
-    return pieces
