@@ -19,7 +19,8 @@ def module_markdown(path: str) -> str:
         value = getattr(module, name)
         if inspect.isclass(value):
             kind = "autoexception" if issubclass(value, BaseException) else "autoclass"
-            bases = "\n   :show-inheritance:" if kind == "autoexception" else ""
+            ours = any(base.__module__.startswith("coloc_graph.") for base in value.__mro__[1:])
+            bases = "\n   :show-inheritance:" if kind == "autoexception" else "\n   :inherited-members:" * ours
             blocks.append(f".. {kind}:: {path}.{name}\n   :members:{bases}")
         elif inspect.isfunction(value):
             blocks.append(f".. autofunction:: {path}.{name}")

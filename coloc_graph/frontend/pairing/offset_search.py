@@ -30,8 +30,8 @@ BASIN = 0.2  # half width of the neighbourhood of the best offset [s]
 INDEPENDENT = 0.25  # share of the points that count: neighbours err alike
 ROUNDS = 3  # rounds of robust weights
 OUTLIER = 3.0  # residuals beyond this, in robust sigmas, count no more
-MOST = 0.8  # share of points that the noise is that of; the rest may be outliers
-MOST_CHI2 = -2 * math.log(1 - MOST)  # chi2 of two degrees of freedom that so many have
+INLIER_SHARE = 0.8  # share of points whose residuals state the noise; the rest may be outliers
+INLIER_CHI2 = -2 * math.log(1 - INLIER_SHARE)  # quantile of chi2 of two degrees of freedom at that share
 MIN_SIGMA = 2e-3  # an offset is known no better [s]
 
 
@@ -141,7 +141,7 @@ def _log_variance(x: Array, y: Array) -> Array:
             off = np.nan_to_num(y - p[..., :2] / p[..., 2:], nan=1e3, posinf=1e3, neginf=-1e3)
         squared = np.minimum((off**2).sum(axis=-1), 1e6)
         # of most points, not of half: a homography fits half of a path at nearly any offset
-        scale = np.nanquantile(np.where(seen, squared, np.nan), MOST, axis=1) / MOST_CHI2 + 1e-12
+        scale = np.nanquantile(np.where(seen, squared, np.nan), INLIER_SHARE, axis=1) / INLIER_CHI2 + 1e-12
         depth = np.abs(p[..., 2]) / np.maximum(np.median(np.abs(p[..., 2]), axis=1, keepdims=True), 1e-12)
         robust = 1 / (1 + squared / (OUTLIER**2 * scale[:, None]))
         weights = seen * robust**2 / np.maximum(depth**2, 1e-2)
