@@ -214,6 +214,38 @@ def wrong(seeds: int) -> None:
     )
 
 
+def crowds(sizes: list[tuple[int, int]]) -> None:
+    """Ten per cent of the homographies of large teams replaced by wrong ones."""
+    for robots, stances in sizes:
+        team = measured_team(robots, stances, np.random.default_rng(0), floor=FLOOR, wrong=0.1)
+        estimate, seconds = clocked(lambda team=team: smooth(graph_of(team)))
+        rejected, bad = {id(one.measurement) for one in estimate.rejected}, set(map(id, team.wrong))
+        print(
+            f"{robots} robots, {stances} stances, {len(team.measurements)} measurements: {seconds:.1f} s, "
+            f"{len(rejected & bad)} of {len(bad)} wrong ones found, {len(rejected - bad)} right ones rejected"
+        )
+
+
+def forgetting(lengths: list[int]) -> None:
+    """The time of an update of an estimator that forgets what is older than its lag, and its memory."""
+    team = paper_team(max(lengths))
+    of_stance = defaultdict(list)
+    for measured in team.measurements:
+        of_stance[max(stance for _, stance in measured.ends)].append(measured)
+    estimator, seconds = Estimator(team.robots[0], team.robots, FLOOR, forgets=True), []
+    for stance in team.stances:
+        started = time.thread_time()
+        estimator.add(stance, of_stance.pop(stance.index, ()))
+        seconds.append(time.thread_time() - started)
+        if stance.index + 1 in lengths:
+            median = 1000 * statistics.median(seconds[-WINDOW:])
+            pages = int(Path("/proc/self/statm").read_text().split()[1])  # of Linux
+            megabytes = pages * resource.getpagesize() / 1e6
+            print(
+                f"forgetting, update at stance {stance.index + 1}: {median:.2f} ms, the process has {megabytes:.0f} MB"
+            )
+
+
 def _square(estimate, team) -> float:
     off = [estimate.pose(*node).translation() - T[:3, 3] for node, T in team.T_world_body.items()]
     return float(np.mean(np.sum(np.square(off), axis=1)))
@@ -247,7 +279,9 @@ def main() -> None:
     batch(1000 if args.quick else 10_000, 3)
     incremental([100, 1000] if args.quick else [100, 1000, 10_000], FLOOR)
     incremental([100, 1000] if args.quick else [100, 1000, 10_000], None)
+    forgetting([100, 1000] if args.quick else [100, 1000, 10_000])
     wrong(5 if args.quick else 40)
+    crowds([(10, 30), (20, 30)] if args.quick else [(10, 30), (20, 30), (30, 30), (50, 30), (10, 100), (50, 100)])
     if args.data:
         files(args.data)
     if not args.quick:
