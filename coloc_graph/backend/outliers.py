@@ -14,7 +14,7 @@ import numpy as np
 from coloc_graph.backend.blame import SEARCHED, SIGMAS_ALONE, WarmStart, moved, scale_of
 from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, innovation
 from coloc_graph.backend.estimate import Bump, Rejection, rejection_of
-from coloc_graph.backend.factors import Method
+from coloc_graph.backend.factors import Method, poses_in
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.landmarks import OnMap
 from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
@@ -173,7 +173,7 @@ def _search(method: Method, graph: PoseGraph, suspected: Mapping[int, Link], sta
             suspected[id(fit.links[index])] = fit.links[index]
             at_rejection[id(fit.links[index])] = tested[index]
         if large:
-            start = fit.values
+            start = _upright(fit)
     return Found(graph, {key: off if off.dof else at_rejection[key] for key, off in offs.items()}, fit)
 
 
@@ -181,6 +181,15 @@ def _fitted(method: Method, graph: PoseGraph, out: Mapping[int, Link], start: gt
     """Fit a graph without some links, between whose ends there are joint covariances."""
     fit = fit_graph(method, graph.without(out.values()), start)
     return replace(fit, without=tuple(out.values()))
+
+
+def _upright(fit: Fit) -> gtsam.Values:
+    """Return the values of a fit with all robots on the floor: outliers turn poses upside down, where they stay."""
+    values, static = gtsam.Values(fit.values), set(fit.graph.pose_keys.static().values())
+    for key in poses_in(values):
+        if key not in static:
+            values.update(key, fit.factors_of.start(values.atPose3(key)))
+    return values
 
 
 def _apart(fit: Fit, worst_first: list[int]) -> list[int]:
