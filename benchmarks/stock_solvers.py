@@ -36,7 +36,7 @@ graph, values, names = solve.load()
 found, iterations = solve.solve(graph, solve.perturbed(values, names, 0.05))
 keys = [key for key, (kind, _) in names.items() if "pose" in kind]
 keys = keys[:: -(-len(keys) // 1000)]
-covariances = solve.covariances(graph, found, keys)
+covariances = solve.covariances(graph, found, names, keys)
 assert "coloc_graph" not in sys.modules and iterations > 0
 at = found.atPose3 if names[keys[0]][0] == "pose" else found.atPose2
 np.savez(sys.argv[2], keys=np.array(keys, np.uint64), T=[at(key).matrix() for key in keys],

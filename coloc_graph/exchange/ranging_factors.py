@@ -26,8 +26,10 @@ Array = NDArray[np.float64]
 
 WHEELS_KEY = "w"  # kind of the keys of wheels
 SENSOR_KEY = "s"  # and of sensors
+DIRECTION_KEY = "d"  # and of directions of bodies
 WHEELS_KIND = "wheel errors: scale, turn scale, delay [s]"
 SENSOR_KIND = "range sensor errors: offset [m], scale, bearing [rad], x, y [m], depth, offset of robots [m]"
+DIRECTION_KIND = "direction [rad]"  # of a body, from the way in which its wheels drive; gtsam_script.txt has it, too
 
 
 def ranging_gtsam_files(estimate: Estimate, team: Team) -> dict[str, str]:
@@ -111,7 +113,20 @@ class _Portable:
             first = int(np.flatnonzero(placed)[0])
             self._add(factors.gauge(state, first, state.poses[first]))
         names = {key: name for key, name in zip(self._keys, self._names, strict=True) if self._values.exists(key)}
-        return self._graph, self._values, names
+        return self._graph, self._values, names | self._add_directions(placed)
+
+    def _add_directions(self, placed: NDArray[np.bool_]) -> dict[int, tuple[str, str]]:
+        """Add the directions of bodies, which are in no measurement and in the sigmas of all headings."""
+        names: dict[int, tuple[str, str]] = {}
+        for robot in sorted(set(self._factors.robot[placed].tolist())):
+            sigma = np.deg2rad(self._factors.models.wheels[robot].wheels.direction_sigma_deg)
+            if sigma > 0:
+                key = gtsam.mrsymbol(ord(DIRECTION_KEY), robot + 1, 0)
+                noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+                self._values.insert(key, np.zeros(1))
+                self._graph.add(gtsam.PriorFactorVector(key, np.zeros(1), noise))
+                names[key] = DIRECTION_KIND, self._factors.keyframes.robots[robot]
+        return names
 
     def _add_shared(self, rows: list[Rows]) -> None:
         """Add the errors and landmarks that factors are on, with their priors."""

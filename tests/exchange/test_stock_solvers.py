@@ -60,7 +60,7 @@ def test_a_bare_script_gets_our_poses_and_covariances(estimate, tmp_path):
     assert set(names) == set(values.keys())
     found, iterations = script.solve(factors, script.perturbed(values, names, 0.05))
     assert iterations > 0
-    covariances = script.covariances(factors, found)
+    covariances = script.covariances(factors, found, names)
     graph = estimate.graph
     for robot, trajectory in estimate.trajectories.items():
         for stance, T, C in zip(trajectory.stances, trajectory.T_world_body, trajectory.covariances, strict=True):

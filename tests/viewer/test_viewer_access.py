@@ -269,11 +269,18 @@ def test_a_camera_follows_a_robot_although_its_browser_answers_late():
         assert waited(lambda: len(viewer.server.get_clients()) == 1)
         camera = next(iter(viewer.server.get_clients().values())).camera
         set_value(viewer.panel.follow, "A")
-        for row, late in ((0, 0), (2, 0), (1, 5)):
+        aside = np.array([-1.0, -2.0, 3.0])
+
+        def looks_at(place):
+            return np.allclose(camera.look_at, place) and np.allclose(camera.position, np.add(place, aside))
+
+        # of some time ago; each a message of its own, so that its coming is seen
+        for row, late in ((0, (0.1, 0, 0)), (2, (0.2, 0, 0)), (1, (5, 0, 0))):
             assert viewer.wait_idle()
-            send(browser, CAMERA | {"position": [late - 1, -2, 3], "look_at": [late, 0, 0]})  # of some time ago
-            assert waited(lambda late=late: np.allclose(camera.look_at, (late, 0, 0)))
+            send(
+                browser,
+                CAMERA | {"position": [x + y for x, y in zip(late, aside.tolist(), strict=True)], "look_at": [*late]},
+            )
+            assert waited(lambda late=late: looks_at(late))
             viewer.go(row)
-            here = np.array([3.0 * row, 0.0, 0.0])
-            assert waited(lambda here=here: np.allclose(camera.look_at, here))
-            assert np.allclose(camera.position - here, (-1, -2, 3))
+            assert waited(lambda row=row: looks_at((3.0 * row, 0.0, 0.0)))
