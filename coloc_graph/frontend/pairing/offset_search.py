@@ -141,7 +141,7 @@ def _log_variance(x: Array, y: Array) -> Array:
             off = np.nan_to_num(y - p[..., :2] / p[..., 2:], nan=1e3, posinf=1e3, neginf=-1e3)
         squared = np.minimum((off**2).sum(axis=-1), 1e6)
         # of most points, not of half: a homography fits half of a path at nearly any offset
-        scale = np.nanquantile(np.where(seen, squared, np.nan), INLIER_SHARE, axis=1) / INLIER_CHI2 + 1e-12
+        scale = _quantiles(np.where(seen, squared, np.inf), counts, INLIER_SHARE) / INLIER_CHI2 + 1e-12
         depth = np.abs(p[..., 2]) / np.maximum(np.median(np.abs(p[..., 2]), axis=1, keepdims=True), 1e-12)
         robust = 1 / (1 + squared / (OUTLIER**2 * scale[:, None]))
         weights = seen * robust**2 / np.maximum(depth**2, 1e-2)
@@ -150,3 +150,11 @@ def _log_variance(x: Array, y: Array) -> Array:
     # offsets with fewer points have less to explain: compared by the mean
     found[enough] = np.log(variance + 1e-12)
     return found
+
+
+def _quantiles(values: Array, counts: NDArray[np.int64], share: float) -> Array:
+    """Quantile (m,) of the finite values, `counts` (m,) of them, in each row (m, n); the others are infinite."""
+    ordered, rows, at = np.sort(values, axis=1), np.arange(len(values)), share * (counts - 1)
+    below = np.floor(at).astype(np.int64)
+    low, high = ordered[rows, below], ordered[rows, np.minimum(below + 1, counts - 1)]
+    return np.asarray(low + (at - below) * (high - low))
