@@ -39,17 +39,14 @@ DEAREST = (
     "test_missions.py",
     "test_experiments.py",
     "test_notebooks.py",
-    "test_viewer_browser.py",
     "test_many_runs.py",
     "test_teams.py",
     "test_cli.py",
-    "test_viewer.py",
     "test_ranging_runs.py",
     "test_estimator.py",
     "test_ranges.py",
     "test_outputs.py",
     "test_joint.py",
-    "test_site.py",
     "test_docs.py",
     "test_horizon.py",
     "test_many_robots.py",
@@ -60,6 +57,10 @@ DEAREST = (
     "test_landmark_sightings.py",
     "test_import_tracks.py",
     "test_coordinator_process.py",
+    # with a browser, which takes a higher priority than its parent's where it may: after the tests in real time
+    "test_viewer_browser.py",
+    "test_viewer.py",
+    "test_site.py",
 )
 ALLOCATIONS = 50_000  # objects more than freed, after which the garbage collector looks at the youngest
 

@@ -448,9 +448,13 @@ def test_the_program_serves_takes_commands_and_ends_with_the_truth(tmp_path):
         assert program.about["epoch_ns"] == 5_000_000_000
         address, ports = program.about["socket"], program.about["ports"]
         with open_camera(f"world:{address}", team_of()["B"].camera, "B") as camera, Create(ports["C"], 2) as wheels:
-            wheels.drive(0.2, 0.0, 0.5)
             camera.read(5.0)
-            assert until(lambda: max(program.ask("speeds")["speeds"]["C"]) > 0.15)
+
+            def drives():
+                keep_driving(wheels, 0.2, 0.0)
+                return max(program.ask("speeds")["speeds"]["C"]) > 0.15
+
+            assert until(drives)
             wheels.stop()
             assert program.ask("freeze B") == {"ok": True}
             time.sleep(STALE + 0.1)
