@@ -115,9 +115,8 @@ def test_a_killed_coordinator_s_record_misses_half_a_second_at_most(mission):
     cut_off = open_run(mission.folder / "mission" / "run.1.mcap")
     assert len(cut_off.stances) == 1
     last = max(one.time for robot in "AB" for one in cut_off.detections(robot))
-    assert (
-        mission.killed_at - last < 0.5 + 0.5
-    )  # and the image before that, which a loaded machine takes longer to send
+    # and the image before that, which a loaded machine takes longer to send
+    assert mission.killed_at - last < 0.5 + 0.5
     goes_on = open_run(mission.folder / "mission" / "run.mcap")
     for robot in "ABC":
         before = [one.time for one in cut_off.odometry(robot)]
@@ -133,11 +132,11 @@ def test_the_record_solved_offline_is_what_was_known_online(mission):
         poses = online[one.stance.index]
         assert poses.keys() == one.estimate.poses.keys()
         for robot, pose in one.estimate.poses.items():
-            # once a stance was taken out, ISAM2 has linearised it elsewhere: far below what is not known
-            share = 0.02 if one.stance.index < PUSHED else 0.5
+            # a sample of wheels may come after its stance has entered, and once a stance was taken out, ISAM2 has
+            # linearised it elsewhere: below what is not known; `coloc replay` compares bits
             off = gtsam.Pose3(np.array(poses[robot])).localCoordinates(pose)[[2, 3, 4]]
             sigmas = np.sqrt(np.diag(one.estimate.covariances[robot])[[2, 3, 4]])
-            assert (np.abs(off) < share * sigmas + 1e-5).all()
+            assert (np.abs(off) < 0.5 * sigmas + 1e-5).all()
 
 
 def test_it_is_as_accurate_as_the_same_record_in_batch(mission):
