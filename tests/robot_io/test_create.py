@@ -353,7 +353,7 @@ def test_the_end_of_its_process_stops_the_wheels(robot, how):
         words = child.stdout.readline().split()
         assert words and words[0] == "moving", child.stderr.read()
         since = float(words[1])  # the monotonic clock is one for all processes
-        assert robot.speeds == pytest.approx((0.2, 0.2))
+        assert robot.trace()[:, 4:].max() == pytest.approx(0.2)  # it may brake by now
         if code < 0 or how in ("SIGINT", "own handler"):
             since = time.monotonic()
             child.send_signal(getattr(signal, how, signal.SIGTERM))
