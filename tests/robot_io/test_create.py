@@ -386,7 +386,7 @@ def driving_process(robot, **more):
 @pytest.mark.parametrize("group", [False, True])
 def test_a_kill_stops_the_wheels(robot, group):
     with driving_process(robot, start_new_session=True) as child:
-        assert robot.speeds == pytest.approx((0.2, 0.2))
+        assert until(lambda: robot.speeds == pytest.approx((0.2, 0.2)))
         os.killpg(child.pid, signal.SIGKILL) if group else child.kill()
         stopped_after(robot, time.monotonic())
         assert until(lambda: robot.mode == Mode.PASSIVE)
