@@ -140,6 +140,15 @@ def test_every_public_name_is_in_the_reference_and_described(reference):
         assert name.startswith("_") or names.home_of(name)
 
 
+def test_a_constant_is_described_by_its_comment(reference):
+    """Whatever is imported besides, a module that is compiled too."""
+    for name in ("frontend.compiled", "robot_io.deadlines"):
+        import_module(f"coloc_graph.{name}")
+    lines = [(float.__doc__ or "").strip().splitlines()[0]]
+    reference("api_pages").describe_constant("coloc_graph.robot_io.deadlines.PERMISSION_LEASE", 0.18, lines)
+    assert lines[0].startswith("a robot gives up its drive") and "``0.18``" in lines[2]
+
+
 def test_modules_that_pages_name_are_public_or_files_that_exist(reference):
     """Every `import` of an example or page comes from a module of the reference, or is named in a page as internal."""
     public = set(reference("public_names").MODULES) | {"coloc_graph"}

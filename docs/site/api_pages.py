@@ -55,7 +55,7 @@ def describe_constant(name: str, value: object, lines: list[str]) -> None:
     if lines and (type(value).__doc__ or "").strip().startswith(lines[0].strip()):
         word = name.rpartition(".")[2]
         files = (getattr(module, "__file__", None) for key, module in sorted(sys.modules.items()) if _ours(key))
-        texts = (Path(file).read_text(encoding="utf-8") for file in files if file)
+        texts = (Path(file).read_text(encoding="utf-8") for file in files if file and file.endswith(".py"))
         found = (re.search(rf"^{word}\b[^\n]*?  # (.+)$", text, re.MULTILINE) for text in texts)
         comment = next((match[1] for match in found if match), "")
         shown = f"Value: ``{value!r}``" if len(repr(value)) < MAX_SHOWN else ""
