@@ -1,6 +1,7 @@
 """`coloc calibrate` on rendered images: the whole road, and bad input in one sentence."""
 
 import json
+import re
 import stat
 import tomllib
 
@@ -105,12 +106,21 @@ def test_from_images_to_a_team_with_a_camera_and_a_mount(call, images, team, tmp
     code, text, err = call("mount", images / "floor", *BOARD, "--thickness", 0.0, "--team", team, "--robot", "A",
                            "--calibration", out, "--json")  # fmt: skip
     assert code == 0, err
+    told = err
     mount = read_team(team)["A"].mount
     for name, sigma in (("height", mount.height_sigma), ("tilt_deg", mount.tilt_sigma_deg),
                         ("roll_deg", mount.roll_sigma_deg)):  # fmt: skip
         assert 0 < abs(getattr(mount, name) - getattr(MOUNT, name)) < 4 * sigma, name
     assert mount.height_sigma < 0.005 and mount.tilt_sigma_deg < 0.5 and mount.yaw_deg == 2.5
     assert json.loads(text)["mount"]["height"] == mount.height and json.loads(text)["dof"] == 6
+
+    # without the camera's covariance a mount seems surer; that the camera is taken as exact is said if it has no bias
+    exact = tmp_path / "exact.toml"
+    for bias, said in ((camera.bias_px, False), (0.0, True)):
+        exact.write_text(re.sub("bias_px = .*", f"bias_px = {bias}", team.read_text()))
+        code, _, err = call("mount", images / "floor", *BOARD, "--team", exact, "--robot", "A", "--json")
+        assert code == 0 and ("the camera is taken as exact; give --calibration" in err) == said
+    assert "taken as exact" not in told and read_team(exact)["A"].mount.height_sigma < 0.9 * mount.height_sigma
 
     kept = team.read_text()
     for comment in ("# our robots", "# the one with the red lid", "# measured with a ruler", "fps = 60.0"):

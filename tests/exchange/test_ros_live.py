@@ -13,6 +13,7 @@ from coloc_graph.cli import main
 from coloc_graph.errors import InputError
 from coloc_graph.exchange import ros_live
 from coloc_graph.exchange.ros_live import RosPublisher
+from coloc_graph.exchange.ros_messages import BODY_SIZE, TEXT_ABOVE, TEXT_HEIGHT
 from coloc_graph.exchange.ros_poses import ros_covariance
 from coloc_graph.geometry.lie import se3, se3_exp
 from coloc_graph.simulation.simulated_team import field_team
@@ -76,6 +77,9 @@ def test_a_second_process_receives_and_decodes_all(heard, rng):
     assert [one["header"]["stamp"]["sec"] for one in path] == [1764444444, 1764444445]
     markers = {one["ns"]: one for one in found["rt/markers"]["markers"]}
     assert set(markers) == {"robots", "names", "ellipses"} and markers["names"]["text"] == "B"
+    above = {ns: one["pose"]["position"]["z"] - T[2, 3] for ns, one in markers.items()}
+    assert above == pytest.approx({"robots": BODY_SIZE[2] / 2, "names": TEXT_ABOVE, "ellipses": 0.0})
+    assert TEXT_ABOVE > BODY_SIZE[2] and markers["names"]["scale"]["z"] == TEXT_HEIGHT  # all that a text's scale has
     x, y = np.linalg.eigvalsh(ros_covariance(C[None], T[None, :3, :3])[0][:2, :2])
     scale = markers["ellipses"]["scale"]
     assert sorted((scale["x"], scale["y"])) == pytest.approx([2 * np.sqrt(5.991 * x), 2 * np.sqrt(5.991 * y)])
