@@ -79,7 +79,7 @@ def test_a_second_process_receives_and_decodes_all(heard, rng):
     assert set(markers) == {"robots", "names", "ellipses"} and markers["names"]["text"] == "B"
     above = {ns: one["pose"]["position"]["z"] - T[2, 3] for ns, one in markers.items()}
     assert above == pytest.approx({"robots": BODY_SIZE[2] / 2, "names": TEXT_ABOVE, "ellipses": 0.0})
-    assert TEXT_ABOVE > BODY_SIZE[2] and markers["names"]["scale"]["z"] == TEXT_HEIGHT  # all that a text's scale has
+    assert BODY_SIZE[2] < TEXT_ABOVE and markers["names"]["scale"]["z"] == TEXT_HEIGHT  # all that a text's scale has
     x, y = np.linalg.eigvalsh(ros_covariance(C[None], T[None, :3, :3])[0][:2, :2])
     scale = markers["ellipses"]["scale"]
     assert sorted((scale["x"], scale["y"])) == pytest.approx([2 * np.sqrt(5.991 * x), 2 * np.sqrt(5.991 * y)])
