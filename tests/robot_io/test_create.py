@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import serial
 from scipy.stats import chi2
+from separate_emulator import EmulatorProcess
 from wheel_nees import nees
 
 from coloc_graph.errors import InputError, RobotError
 from coloc_graph.robot_io.create import protocol as oi
 from coloc_graph.robot_io.create.driver import Create
-from coloc_graph.robot_io.create.emulator import CreateEmulator
 from coloc_graph.robot_io.create.physics import Physics, Wall
 from coloc_graph.robot_io.create.protocol import Mode, decode_values
 from coloc_graph.robot_io.deadlines import STAND_WITHIN, reaction_time
@@ -59,9 +59,15 @@ def stopped_after(robot, since, within=STOPPED):
     return took
 
 
+@pytest.fixture(scope="module")
+def emulators():
+    with EmulatorProcess() as process:
+        yield process
+
+
 @pytest.fixture
-def robot():
-    with CreateEmulator(2) as emulator:
+def robot(emulators):
+    with emulators.robot(2) as emulator:
         yield emulator
 
 
@@ -72,9 +78,9 @@ def create(robot):
 
 
 @pytest.mark.parametrize("model", [1, 2])
-def test_the_model_is_found_out_by_baud_and_checksum(model, monkeypatch):
+def test_the_model_is_found_out_by_baud_and_checksum(emulators, model, monkeypatch):
     monkeypatch.setattr("coloc_graph.robot_io.create.line.ANSWER_TIMEOUT", 0.4)
-    with CreateEmulator(model) as robot, Create(robot.port) as create:
+    with emulators.robot(model) as robot, Create(robot.port) as create:
         assert create.model == model
         assert create._line.decoder.header_counts is (model == 2)
         assert create.state.mode == Mode.SAFE and robot.mode == Mode.SAFE
@@ -109,9 +115,9 @@ def test_sensors(create, robot):
     assert state.hazards()["cliff"] == "a cliff at the front left"
 
 
-def test_a_wall_presses_the_bumper_and_stops_who_asks_for_it():
+def test_a_wall_presses_the_bumper_and_stops_who_asks_for_it(emulators):
     walls = [Wall(0.25, -1.0, 0.5, 1.0)]
-    with CreateEmulator(2, Physics(walls=walls)) as robot, Create(robot.port, 2, stop_on=["bump"]) as create:
+    with emulators.robot(2, Physics(walls=walls)) as robot, Create(robot.port, 2, stop_on=["bump"]) as create:
         with pytest.raises(RobotError, match="it met a bump on the left and right: put it right and call recover"):
             keep(create, 0.3, 0.0, 2.0)
         assert robot.pose[0] < 0.25 - 0.165
@@ -125,8 +131,8 @@ def test_a_wall_presses_the_bumper_and_stops_who_asks_for_it():
 
 
 @pytest.mark.parametrize(("model", "speed"), [(2, 0.2), (2, 0.4), (1, 0.2)])
-def test_a_lease_that_expires_stops_the_wheels(model, speed):
-    with CreateEmulator(model) as robot, Create(robot.port, model) as create:
+def test_a_lease_that_expires_stops_the_wheels(emulators, model, speed):
+    with emulators.robot(model) as robot, Create(robot.port, model) as create:
         set_off(create, robot, speed)
         since = time.monotonic()
         create.drive(speed, 0.0)
@@ -280,7 +286,7 @@ def test_a_stop_has_the_last_word_over_a_drive_that_is_under_way(create, robot):
         create.emergency_stop(f"test {n}")
         thread.join(timeout=20.0)
         assert not thread.is_alive()
-        assert until(lambda: robot._body.wanted == (0.0, 0.0), 0.1)
+        assert until(lambda: robot.wanted == (0.0, 0.0), 0.1)
         create.recover()
 
 
@@ -474,9 +480,9 @@ def test_deadlines_are_shorter_the_faster_it_drives(create, robot, speed):
     assert create._deadline <= time.monotonic() + reaction_time(0.23)
 
 
-def test_signal_handlers_are_as_before_after_the_last_is_closed(robot):
+def test_signal_handlers_are_as_before_after_the_last_is_closed(emulators, robot):
     before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)]
-    with CreateEmulator(2) as other, Create(robot.port, 2), Create(other.port, 2):
+    with emulators.robot(2) as other, Create(robot.port, 2), Create(other.port, 2):
         assert signal.getsignal(signal.SIGTERM) is not before[0]
     assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)] == before
 
@@ -587,8 +593,8 @@ def test_arguments_that_make_no_driver():
 
 
 @pytest.mark.parametrize("model", [2, 1])
-def test_a_corner_is_told_within_its_sigmas(model):
-    with CreateEmulator(model, Physics(seed=5)) as robot, Create(robot.port, model, robot="A", max_turn=4.0) as create:
+def test_a_corner_is_told_within_its_sigmas(emulators, model):
+    with emulators.robot(model, Physics(seed=5)) as robot, Create(robot.port, model, robot="A", max_turn=4.0) as create:
         start = robot.pose
         for _ in range(2):
             keep(create, 0.5, 0.0, 0.45)
@@ -609,8 +615,8 @@ def test_a_corner_is_told_within_its_sigmas(model):
         assert np.hypot(*off[1:]) < 0.1
 
 
-def test_encoders_that_wrap_in_either_direction_leave_no_jump():
-    with CreateEmulator(2, encoders=(65500, 30)) as robot, Create(robot.port, 2) as create:
+def test_encoders_that_wrap_in_either_direction_leave_no_jump(emulators):
+    with emulators.robot(2, encoders=(65500, 30)) as robot, Create(robot.port, 2) as create:
         keep(create, 0.0, -2.0, 0.6)  # to the right: the left wheel up beyond 65535, the right one down below 0
         create.stop()
         assert until(lambda: create.odometry.time > time.time() - 0.02 and robot.still_since is not None)

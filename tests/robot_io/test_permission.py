@@ -6,10 +6,10 @@ import time
 import cv2
 import numpy as np
 import pytest
+from separate_emulator import EmulatorProcess
 
 from coloc_graph.errors import RobotError
 from coloc_graph.online.robot import RobotProgram
-from coloc_graph.robot_io.create.emulator import CreateEmulator
 from coloc_graph.robot_io.deadlines import STAND_WITHIN, reaction_time
 from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
 from coloc_graph.robot_io.link.messages import Drive
@@ -43,7 +43,8 @@ def test_a_motion_depends_on_the_permission_and_a_second_program_ends(tmp_path):
     permitted.set()
     ignore = {f"on_{kind}": lambda *_: None for kind in ("sample", "wheels", "status", "presence")}
     with (
-        CreateEmulator(2) as wheels,
+        EmulatorProcess() as emulators,
+        emulators.robot(2) as wheels,
         CoordinatorLink(TEAM, listen=address, on_event=lambda *one: events.append(one), **ignore) as link,
         program(tmp_path, address, wheels.port) as robot,
     ):

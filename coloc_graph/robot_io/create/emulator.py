@@ -129,6 +129,12 @@ class CreateEmulator:
             return self._body.speeds[0], self._body.speeds[1]
 
     @property
+    def wanted(self) -> tuple[float, float]:
+        """Commanded speeds of the left and the right wheel [m/s]."""
+        with self._lock:
+            return self._body.wanted
+
+    @property
     def still_since(self) -> float | None:
         """Time since which both wheels have stood [s, emulator's clock]; None while one turns."""
         with self._lock:
