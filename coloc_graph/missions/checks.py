@@ -56,11 +56,12 @@ class Checks:
 
     def look(self) -> None:
         """Check what moves now."""
-        now = 1e-9 * self._scheduler.now
+        now, led = 1e-9 * self._scheduler.now, self._runs(COORDINATOR)
         moving = {name for name in self._team.names if self._field.fastest(name) > 0}
         for name in self._team.names:
             since = self._lost_since[name]
-            if self._alive(name) or name in self._field.unplugged:  # nobody stops a Create without its line
+            alive = led and self._runs(name) and not self._network.conditions[name].cut
+            if alive or name in self._field.unplugged:  # nobody stops a Create without its line
                 self._lost_since[name] = None
             elif since is None:
                 self._lost_since[name] = now
@@ -78,14 +79,10 @@ class Checks:
             record = coordinator._registry.record
             self._recorded.append((now, sum(map(len, record._detections.values()))))
 
-    def _alive(self, name: str) -> bool:
-        """Return whether nothing is lost of all that a robot's motion depends on."""
-        processes = self.programs.processes
-        both = [processes.get(name), processes.get(COORDINATOR)]
-        if any(one is None or not one.alive or one.stopped for one in both):
-            return False
-        mains = [self.programs.mains[name], self.programs.mains[COORDINATOR]]
-        return not any(main.hung for main in mains) and not self._network.conditions[name].cut
+    def _runs(self, name: str) -> bool:
+        """Return whether a program, of a robot or of the coordinator, runs."""
+        process = self.programs.processes.get(name)
+        return process is not None and process.alive and not process.stopped and not self.programs.mains[name].hung
 
     def watch_coordinator(self, coordinator: Coordinator) -> None:
         """Follow the messages that a new coordinator takes in."""

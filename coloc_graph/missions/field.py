@@ -25,7 +25,7 @@ from coloc_graph.team.shared_view import View
 
 DELIVERY = 0.008  # time from the middle of an exposure to its frame [s]
 REACH = 4.0  # markers further away are too faint [m]
-STEP = 0.005  # time step of the physics [s]
+STEP = 0.01  # time step of the physics [s]
 FRAMES_AT_ONCE = 2  # further frames of which only the newest is read, to save time
 
 
@@ -79,14 +79,15 @@ class Field:
             body, left = robot.body, now - robot.body.time
             v, w = sum(body.speeds) / 2, (body.speeds[1] - body.speeds[0]) / body.base
             yaw = body.yaw + w * left
-            poses[name] = body.x + v * left * np.cos(yaw), body.y + v * left * np.sin(yaw), yaw
+            poses[name] = body.x + v * left * math.cos(yaw), body.y + v * left * math.sin(yaw), yaw
         return poses
 
     def fastest(self, name: str) -> float:
         """Return the speed of a robot's faster wheel [m/s]."""
         robot = self.robots[name]
         robot.advance(1e-9 * self.scheduler.now)
-        return max(map(abs, robot.body.speeds))
+        left, right = robot.body.speeds
+        return max(abs(left), abs(right))
 
     def open_line(self, name: str, process: Process) -> "Callable[[str, int | None], SimulatedLine]":
         """Return what opens the line to a robot's wheels in a process."""

@@ -115,6 +115,7 @@ class SimulatedSession:
         self.connection = 0  # number of the present connection: what is under way on an earlier one is lost
         self.tokens: list[str] = []
         self._subscribers: list[tuple[re.Pattern[str], Take, bool]] = []
+        self._takers: dict[str, list[tuple[Take, Queue]]] = {}  # by key, of those that were looked up
         self._watchers: list[tuple[re.Pattern[str], Callable[[str, bool], None]]] = []
         self._questions: dict[str, Callable[[Question], None]] = {}
         self._kept: dict[str, deque[tuple[int, bytes]]] = {}
@@ -127,7 +128,13 @@ class SimulatedSession:
 
     def publisher(self, key: str) -> Put:
         """Return a publisher."""
-        return lambda data: self._send_to_peers(lambda peer: peer.take(key, data))
+
+        def put(data: bytes) -> None:
+            for peer in self._peers():
+                if peer.takers(key):
+                    self._link(peer).send(partial(peer.take, key, data))
+
+        return put
 
     def kept_publisher(self, key: str) -> Put:
         """Return a publisher whose messages are kept."""
@@ -143,6 +150,7 @@ class SimulatedSession:
     def subscribe(self, key: str, take: Take, *, at_once: bool = False) -> None:
         """Take messages."""
         self._subscribers.append((_pattern(key), take, at_once))
+        self._takers.clear()
 
     def on_question(self, key: str, take: Callable[[Question], None]) -> None:
         """Take commands."""
@@ -260,9 +268,19 @@ class SimulatedSession:
 
     def take(self, key: str, data: bytes) -> None:
         """Take a message in."""
-        for pattern, take, at_once in self._subscribers:
-            if pattern.fullmatch(key):
-                (self._urgent if at_once else self._inbox).put(partial(take, key, data))
+        for take, queue in self.takers(key):
+            queue.put(partial(take, key, data))
+
+    def takers(self, key: str) -> list[tuple[Take, Queue]]:
+        """Return the subscribers to a key, and the queues of their threads: a publisher sends to nobody else."""
+        found = self._takers.get(key)
+        if found is None:
+            found = self._takers[key] = [
+                (take, self._urgent if at_once else self._inbox)
+                for pattern, take, at_once in self._subscribers
+                if pattern.fullmatch(key)
+            ]
+        return found
 
     def take_question(self, key: str, payload: bytes, reply: Callable[[bytes | None], None]) -> None:
         """Take a command in."""
@@ -288,10 +306,6 @@ class SimulatedSession:
     def _link(self, peer: "SimulatedSession") -> "_Link":
         return _Link(self.network, self if self.robot is not None else peer)
 
-    def _send_to_peers(self, arrive: "Callable[[SimulatedSession], None]") -> None:
-        for peer in self._peers():
-            self._link(peer).send(partial(arrive, peer))
-
     def _receive(self, queue: Queue) -> None:
         while True:
             queue.get()()
@@ -310,13 +324,14 @@ class _Link:
 
     def send(self, arrive: Callable[[], None], *, certain: bool = False, later: float = 0.0) -> None:
         """Let something arrive at the other end; `certain` unless the connection is lost."""
-        conditions, random = self._network.conditions[self._session.robot or ""], self._network.scheduler.random
-        if not certain and conditions.loss and random.random() < conditions.loss:
+        conditions, scheduler = self._network.conditions[self._session.robot or ""], self._network.scheduler
+        random = scheduler.random.random
+        if not certain and conditions.loss and random() < conditions.loss:
             return
-        times = 1 if certain or random.random() >= conditions.duplication else 2
-        for _ in range(times):
-            delay = later + conditions.delay + random.expovariate(1 / conditions.jitter)
-            self._network.scheduler.call_in(delay, lambda: self._arrive(arrive))
+        again = not certain and conditions.duplication and random() < conditions.duplication
+        for _ in range(2 if again else 1):
+            delay = later + conditions.delay + scheduler.exponential(conditions.jitter)
+            scheduler.call_in(delay, partial(self._arrive, arrive))
 
     def _arrive(self, arrive: Callable[[], None]) -> None:
         if not self.holds:

@@ -6,6 +6,7 @@ one seed draws how late each task wakes and where it is interrupted, so that one
 
 import contextlib
 import heapq
+import math
 import os
 import random
 from collections.abc import Callable
@@ -47,7 +48,7 @@ class Host:
 
     def clock(self, now: int) -> int:
         """Return the monotonic clock at a simulated time [ns]."""
-        return now + self.ahead + round(self.drift * now)
+        return now + self.ahead + int(self.drift * now)
 
 
 class OpenFile:
@@ -124,6 +125,7 @@ class Scheduler:
         self._due: list[tuple[int, int, Any, int]] = []
         self._number = 0
         self._readings = 0
+        self._calm = 0  # locks that are taken until others run first
         self._closed = False
 
     def close(self) -> None:
@@ -154,7 +156,7 @@ class Scheduler:
 
     def call_in(self, seconds: float, call: Callable[[], None]) -> None:
         """Call something after a time [s]."""
-        self.call_at(self.now + round(1e9 * seconds), call)
+        self._push(self.now + int(1e9 * seconds) if seconds > 0 else self.now, call, 0)
 
     def wait(self, seconds: float | None = None) -> None:
         """Let the present task wait for `seconds` [s], None for ever, unless it is woken before."""
@@ -164,9 +166,13 @@ class Scheduler:
         assert task is not None and getcurrent() is task.greenlet, "only a task can wait"
         task.turn += 1
         if seconds is not None:
-            late = self.random.expovariate(1 / LATENESS)
-            self._push(self.now + round(1e9 * (max(seconds, 0.0) + late)), task, task.turn)
+            late = self.exponential(LATENESS)
+            self._push(self.now + int(1e9 * (late + seconds if seconds > 0 else late)), task, task.turn)
         self.hub.switch()
+
+    def exponential(self, mean: float) -> float:
+        """Draw from an exponential distribution."""
+        return -math.log(1.0 - self.random.random()) * mean
 
     def wake(self, task: Task) -> None:
         """Let a waiting task run now."""
@@ -175,7 +181,9 @@ class Scheduler:
 
     def interrupt(self) -> None:
         """Let others run first, now and then."""
-        if self.random.random() < INTERRUPTED and self.current is not None:
+        self._calm -= 1
+        if self._calm < 0 and self.current is not None:
+            self._calm = int(self.exponential(1 / INTERRUPTED))
             self.wait(self.random.random() * 1e-3)
 
     def clock(self) -> int:
@@ -183,7 +191,8 @@ class Scheduler:
         self._readings += 1
         if self._readings > MAX_READINGS:
             raise Stuck(f"{self.current and self.current.name} reads the clock for ever at {self.now} ns")
-        return self.host.clock(self.now)
+        assert self.current is not None
+        return self.current.process.host.clock(self.now)
 
     @property
     def host(self) -> Host:
@@ -193,12 +202,12 @@ class Scheduler:
 
     def run(self, ended: Callable[[], bool], until: float) -> bool:
         """Run until something has ended, or until a simulated time [s]; return whether it has ended."""
-        limit = round(1e9 * until)
+        limit, due = round(1e9 * until), self._due
         while not ended():
-            if not self._due or self._due[0][0] > limit:
+            if not due or due[0][0] > limit:
                 self.now = limit
                 return False
-            time, _, task, turn = heapq.heappop(self._due)
+            time, _, task, turn = heapq.heappop(due)
             if time > self.now:
                 self.now, self._readings = time, 0
             if not isinstance(task, Task):

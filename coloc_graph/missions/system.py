@@ -92,12 +92,20 @@ class _Waiters:
         if task in self._tasks:
             self._tasks.remove(task)
 
-    def wake(self, count: int | None = None) -> None:
-        for _ in range(len(self._tasks) if count is None else min(count, len(self._tasks))):
+    def wake(self) -> None:
+        """Wake the task that has waited longest."""
+        if self._tasks:
+            self.scheduler.wake(self._tasks.popleft())
+
+    def wake_all(self) -> None:
+        """Wake all tasks."""
+        while self._tasks:
             self.scheduler.wake(self._tasks.popleft())
 
     def until(self, met: Callable[[], bool], timeout: float | None) -> bool:
         """Wait until a condition is met, for `timeout` [s] at most; return whether it is."""
+        if met():
+            return True
         limit = None if timeout is None else self.scheduler.now + round(1e9 * timeout)
         while not met():
             left = None if limit is None else 1e-9 * (limit - self.scheduler.now)
@@ -120,11 +128,11 @@ class Event:
     def set(self) -> None:
         """Set it."""
         self._set = True
-        self._waiters.wake()
+        self._waiters.wake_all()
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait until it is set."""
-        return self._waiters.until(self.is_set, timeout)
+        return self._set or self._waiters.until(self.is_set, timeout)
 
 
 class Lock:
@@ -140,9 +148,10 @@ class Lock:
         task = scheduler.current
         if self._owner is not task:
             scheduler.interrupt()
-            limit = None if timeout < 0 else timeout
-            if not self._waiters.until(lambda: self._owner is None, limit if blocking else 0.0):
-                return False
+            if self._owner is not None:
+                limit = None if timeout < 0 else timeout
+                if not self._waiters.until(lambda: self._owner is None, limit if blocking else 0.0):
+                    return False
             self._owner = task
         self._count += 1
         return True
@@ -153,7 +162,7 @@ class Lock:
         self._count -= 1
         if not self._count:
             self._owner = None
-            self._waiters.wake(1)
+            self._waiters.wake()
 
     def __enter__(self) -> Self:
         self.acquire()
@@ -191,7 +200,7 @@ class Condition(Lock):
 
     def notify_all(self) -> None:
         """Wake all that wait."""
-        self._notified.wake()
+        self._notified.wake_all()
 
 
 class Queue:
@@ -206,7 +215,7 @@ class Queue:
         if self._size and not self._full.until(lambda: len(self._items) < self._size, timeout):
             raise queue.Full
         self._items.append(item)
-        self._waiters.wake(1)
+        self._waiters.wake()
 
     def put_nowait(self, item: Any) -> None:
         """Add an item, or raise `queue.Full`."""
@@ -214,9 +223,9 @@ class Queue:
 
     def get(self, timeout: float | None = None) -> Any:
         """Take the first item, or raise `queue.Empty`."""
-        if not self._waiters.until(lambda: bool(self._items), timeout):
+        if not (self._items or self._waiters.until(lambda: bool(self._items), timeout)):
             raise queue.Empty
-        self._full.wake(1)
+        self._full.wake()
         return self._items.popleft()
 
 

@@ -13,6 +13,8 @@ from coloc_graph.robot_io.create.state import CLIFFS, DROPS
 
 #: Values of packets that do not change.
 CONSTANT: dict[int, int] = {Packet.VOLTAGE: 15_400, Packet.CHARGE: 2_100, Packet.CAPACITY: 2_696}
+#: Packets that count, so that each frame has others.
+COUNTS = (Packet.LEFT_TICKS, Packet.RIGHT_TICKS, Packet.DISTANCE, Packet.ANGLE)
 
 
 class Firmware:
@@ -48,6 +50,8 @@ class Firmware:
         self._pending = b""
         self.listed: tuple[int, ...] = ()
         self.streaming, self.next_frame = False, 0.0
+        self._state: tuple[object, ...] = ()
+        self._values: dict[int, int | None] = {}
 
     def advance(self, now: float) -> None:
         """Advance the physics, and react as the robot does by itself."""
@@ -62,7 +66,15 @@ class Firmware:
             return None
         late = now - self.next_frame
         self.next_frame += oi.STREAM_PERIOD * (1 + late // oi.STREAM_PERIOD)
-        return {packet: self._value(packet) for packet in self.listed}
+        body = self.body
+        state = (
+            self.listed, self.mode, body.wanted, body.bump_left, body.bump_right, self.docked,
+            frozenset(self.cliffs), frozenset(self.drops),
+        )  # fmt: skip
+        if state != self._state:  # most frames differ in counts alone
+            self._state = state
+            self._values = {packet: None if packet in COUNTS else self._value(packet) for packet in self.listed}
+        return {i: self._value(i) if value is None else value for i, value in self._values.items()}
 
     def take(self, data: bytes, now: float) -> bytes:
         """Obey the commands in these bytes, of which the last may be cut; return the answer."""

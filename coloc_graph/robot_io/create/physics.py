@@ -63,7 +63,7 @@ class Body:
     Attributes
     ----------
     trace
-        The last minutes, one row a step: time [s], x, y [m], yaw [rad], left and right speed [m/s].
+        The last minutes, one row a step while a wheel turns: time [s], x, y [m], yaw [rad], left and right speed [m/s].
     """
 
     model: int
@@ -89,8 +89,12 @@ class Body:
 
     def advance(self, to: float) -> None:
         """Advance to the time `to` [s] in whole steps."""
-        while self.time + self.physics.step <= to:
-            self._step(self.physics.step)
+        step = self.physics.step
+        while self.time + step <= to:
+            if any(self.speeds) or any(self.wanted):
+                self._step(step)
+            else:
+                self._stand(max(int((to - self.time) / step), 1) * step)
 
     def poses_at(self, times: ArrayLike) -> Array:
         """True poses (n, 3) at times (n,) [s] of the last minutes: x, y [m], yaw [rad, unwrapped]."""
@@ -108,11 +112,6 @@ class Body:
 
     def _step(self, dt: float) -> None:
         self.time += dt
-        if not any(self.speeds) and not any(self.wanted):
-            if self.still_since is None:
-                self.still_since = self.time - dt
-            self._record()
-            return
         self.still_since = None
         reach = self.physics.acceleration * dt
         ground = [0.0, 0.0]
@@ -127,6 +126,15 @@ class Body:
         middle = self.yaw + turned / 2
         self.yaw = (self.yaw + turned + pi) % (2 * pi) - pi
         self._move(self.x + forward * cos(middle), self.y + forward * sin(middle))
+        self._record()
+
+    def _stand(self, seconds: float) -> None:
+        """Stand for some steps: the trace has the first and the last instant."""
+        if self.still_since is None:
+            self.still_since = self.time
+        elif len(self.trace) > 1 and self.trace[-2][1:] == self.trace[-1][1:]:
+            self.trace.pop()
+        self.time += seconds
         self._record()
 
     def _normal(self) -> float:
