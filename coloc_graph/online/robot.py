@@ -120,6 +120,7 @@ class RobotProgram:
             )
         self._detect = opened.detector(watched, self.robot.camera)
         with contextlib.ExitStack() as undo:
+            undo.callback(self._encoder_log.close)
             self._camera: CameraSource = undo.enter_context(opened.camera(spec, self.robot.camera, name, clock))
             self._wheels: Create | None = None
             if port is not None:

@@ -199,7 +199,8 @@ class RunWriter:
                     f"{self.path}: time runs backwards in {topic}, from {schemas.to_seconds(last)} s "
                     f"to {time} s; write each topic in the order of time"
                 )
-            self._on_disk(lambda: self._start(ns))
+            if not self._started:
+                self._on_disk(lambda: self._start(ns))
             self._on_disk(lambda: self._message(topic, schema, data, ns))
             self._last[topic] = ns
 

@@ -204,10 +204,12 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         k1, k2, _, _, k3, k4, k5, k6 = (*self.distortion, *([0.0] * (8 - len(self.distortion))))
         r2 = x * x + y * y
         with np.errstate(invalid="ignore"):
-            above, below = (1 + r2 * (a + r2 * (b + r2 * c)) for a, b, c in ((k1, k2, k3), (k4, k5, k6)))
-            above_grows, below_grows = (
-                2 * r2 * (a + r2 * (2 * b + r2 * 3 * c)) for a, b, c in ((k1, k2, k3), (k4, k5, k6))
-            )
+            above = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            above_grows = 2 * r2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+            if not (k4 or k5 or k6):
+                return np.asarray(above + above_grows > 0)
+            below = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+            below_grows = 2 * r2 * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
             # the sign of d(r above / below)/dr
             return np.asarray((above + above_grows) * below - above * below_grows > 0)
 

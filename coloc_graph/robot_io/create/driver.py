@@ -27,7 +27,7 @@ MAX_LEASE = 0.5  # s, bound of the lease that may be asked for
 STALE = 0.3  # s without a frame after which a moving robot has a fault and a standing one does not set off
 FRESH = 0.1  # s that a command waits for a frame before that, since this process may not have run
 HUNG = 1.0  # s without an answer of the watchdog after which there is a fault
-WATCH_PERIOD = 0.01  # s between two checks of what must end
+WATCH_PERIOD = 0.02  # s between two checks of what must end; a motion's deadline is kept to the moment
 REPEAT_PERIOD = 0.05  # s until a stop command that the robot has not taken is sent again
 DELTA_PERIOD = 0.5  # s between two requests for distance and angle from a Create 1
 
@@ -372,9 +372,11 @@ class Create:
 
     def _watch(self, line: Line) -> None:
         """Deadline thread: end each motion in time, and repeat a stop that the robot has not taken."""
-        while not self._ended.wait(WATCH_PERIOD):
+        wait = WATCH_PERIOD
+        while not self._ended.wait(wait):
             line.beat()
             now, deadline = machine.monotonic(), self._deadline
+            wait = WATCH_PERIOD if deadline is None else min(max(deadline - now, 0.0), WATCH_PERIOD)
             if deadline is not None and now >= deadline:
                 self._halt(None)
             elif deadline is not None and self._feed.age > STALE:

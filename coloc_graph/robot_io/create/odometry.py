@@ -97,26 +97,28 @@ class Odometer:
         self.pose = np.zeros(3)
         self._way = np.zeros(3)
         self._covariance = np.zeros((3, 3))
+        self._moved = False
         self._opened: float | None = None
         self._last = self._open_until = 0.0
 
     def add(self, time: float, way: tuple[float, float, float], covariance: Array) -> list[OdometrySample]:
         """Add an increment that ends at `time` [UTC s]; return the samples that it completes."""
         moved = any(way)
+        uncertain = moved or bool(covariance.any())
         if self._opened is None:
             self._opened = time - 1e-3
             self._last = time
             return [self._close(time)]
         samples = []
         late = time - self._last > self.late
-        sets_off = moved and not self._way.any() and time > self._open_until
+        sets_off = moved and not self._moved and time > self._open_until
         if (late or sets_off) and self._last > self._opened:
             samples.append(self._close(self._last))
         if late:
             self._open_until = time + self.period
-        x, y, yaw = compose((float(self.pose[0]), float(self.pose[1]), float(self.pose[2])), way)
-        self.pose = np.array([x, y, wrap(yaw)])
-        if moved or covariance.any():
+        if uncertain:
+            x, y, yaw = compose((float(self.pose[0]), float(self.pose[1]), float(self.pose[2])), way)
+            self.pose = np.array([x, y, wrap(yaw)])
             # an error of the heading rotates the increments that follow
             c, s = cos(self._way[2]), sin(self._way[2])
             R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -124,8 +126,9 @@ class Odometer:
             F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
             self._covariance = F @ self._covariance @ F.T + R @ covariance @ R.T
             self._way += (dx, dy, way[2])
+            self._moved = bool(self._way.any())
         self._last = time
-        after = max(self._opened + (self.period if self._way.any() else self.REST), self._open_until)
+        after = max(self._opened + (self.period if self._moved else self.REST), self._open_until)
         if time >= after - 1e-6:
             samples.append(self._close(time))
         return samples
@@ -134,7 +137,7 @@ class Odometer:
         floor = np.diag(np.square([FLOOR_METRES, FLOOR_METRES, FLOOR_RADIANS]))
         covariance = (self._covariance + self._covariance.T) / 2 + floor
         sample = OdometrySample(self.robot, time, self.pose.copy(), covariance)
-        self._way, self._covariance, self._opened = np.zeros(3), np.zeros((3, 3)), time
+        self._way, self._covariance, self._opened, self._moved = np.zeros(3), np.zeros((3, 3)), time, False
         return sample
 
 

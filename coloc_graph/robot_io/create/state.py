@@ -1,7 +1,9 @@
 """Sensor data of a Create in words and SI units; `CreateState`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import cache
+
+import msgspec
 
 from coloc_graph.robot_io.create.protocol import BumpDrop, Mode, Packet
 
@@ -27,8 +29,7 @@ STREAMED: dict[int, tuple[Packet, ...]] = {1: _COMMON, 2: (*_COMMON, Packet.LEFT
 HAZARDS = ("bump", "cliff", "wheel_drop", "charger")
 
 
-@dataclass(frozen=True)
-class CreateState:
+class CreateState(msgspec.Struct, frozen=True):
     """Sensor data of one frame.
 
     Attributes
@@ -79,14 +80,15 @@ class CreateState:
 
 def read_state(values: Mapping[int, int], time: float) -> CreateState:
     """Read the state from the packets of a frame at `time` [UTC s]. Raises `ValueError` for an unknown mode."""
-    bits, chargers = values[Packet.BUMPS_DROPS], values[Packet.CHARGERS]
+    chargers = values[Packet.CHARGERS]
+    bumps, drops = _pressed(values[Packet.BUMPS_DROPS])
     ticks = (values[Packet.LEFT_TICKS], values[Packet.RIGHT_TICKS]) if Packet.LEFT_TICKS in values else None
     return CreateState(
         time,
         Mode(values[Packet.MODE]),
-        frozenset(where for bit, where in _BUMPS.items() if bits & bit),
-        frozenset(where for packet, where in CLIFFS.items() if values[packet]),
-        frozenset(where for bit, where in DROPS.items() if bits & bit),
+        bumps,
+        frozenset([where for packet, where in CLIFFS.items() if values[packet]]),
+        drops,
         "home base" if chargers & 2 else "internal" if chargers & 1 else None,
         values[Packet.CHARGING_STATE] in (1, 2, 3),
         values[Packet.VOLTAGE] * 1e-3,
@@ -95,3 +97,10 @@ def read_state(values: Mapping[int, int], time: float) -> CreateState:
         (values[Packet.REQUESTED_LEFT] * 1e-3, values[Packet.REQUESTED_RIGHT] * 1e-3),
         ticks,
     )
+
+
+@cache
+def _pressed(bits: int) -> tuple[frozenset[str], frozenset[str]]:
+    """Positions of bumps and of dropped wheels from packet 7."""
+    bumps, drops = (frozenset(where for bit, where in known.items() if bits & bit) for known in (_BUMPS, DROPS))
+    return bumps, drops

@@ -1,13 +1,15 @@
 """Offset of a robot's clock from the coordinator's: four timestamps, guaranteed bounds, drift; `ClockFilter`."""
 
 import math
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coloc_graph.errors import RobotError
 from coloc_graph.machine import machine
+
+Array = NDArray[np.float64]
 
 MAX_EXCHANGES = 64  # exchanges that are kept
 MIN_EXCHANGES = 8  # exchanges that are needed to be synchronised
@@ -35,15 +37,6 @@ class ClockEstimate:
     offset: float
     drift: float
     sigma: float
-
-
-@dataclass(frozen=True)
-class _Exchange:
-    """Bounds `least` and `most` of the offset [ns] at the time `at` [ns, coordinator]."""
-
-    at: int
-    least: int
-    most: int
 
 
 @dataclass(frozen=True)
@@ -76,7 +69,8 @@ class ClockFilter:
     """
 
     def __init__(self) -> None:
-        self._kept: deque[_Exchange] = deque(maxlen=MAX_EXCHANGES)
+        # exchanges that are kept: their time [ns, coordinator], and bounds of the offset then [ns]
+        self._kept = np.zeros((3, 0), np.int64)
         self._fit: _Fit | None = None
         self._jumps = 0
         self._lock = machine.new_lock()
@@ -85,18 +79,19 @@ class ClockFilter:
         """Add an exchange [ns]. Raises `ValueError` if it is impossible."""
         if t4 < t1 or t3 < t2 or (t4 - t1) < (t3 - t2):
             raise ValueError("an answer was received before its question was sent")
-        one = _Exchange((t1 + t4) // 2, least=t3 - t4, most=t2 - t1)
+        at, least, most = (t1 + t4) // 2, t3 - t4, t2 - t1
         with self._lock:
-            if self._kept and one.at < self._kept[-1].at:
-                return  # overtaken by a later one
             if self._fit is not None:
-                known = self._fit.estimate(one.at)
+                if at < self._fit.at:
+                    return  # overtaken by a later one
+                known = self._fit.estimate(at)
                 slack = JUMP + 6 * known.sigma
-                if not one.least - slack <= known.offset <= one.most + slack:
-                    self._kept.clear()
+                if not least - slack <= known.offset <= most + slack:
+                    self._kept = self._kept[:, :0]
                     self._jumps += 1
-            self._kept.append(one)
-            self._fit = _fitted(list(self._kept))
+            newest = np.array([[at], [least], [most]], np.int64)
+            self._kept = np.concatenate([self._kept[:, 1 - MAX_EXCHANGES :], newest], axis=1)
+            self._fit = _fitted(self._kept)
 
     @property
     def jumps(self) -> int:
@@ -116,7 +111,7 @@ class ClockFilter:
     def synchronised(self, at: int, limit: float = 1e-3) -> bool:
         """Return whether the offset is known to `limit` [s, one sigma] at a time of the coordinator's clock [ns]."""
         with self._lock:
-            fit, enough = self._fit, len(self._kept) >= MIN_EXCHANGES
+            fit, enough = self._fit, self._kept.shape[1] >= MIN_EXCHANGES
         return fit is not None and enough and at - fit.at < VALIDITY and fit.estimate(at).sigma <= 1e9 * limit
 
     def to_coordinator(self, stamp: int) -> int:
@@ -135,30 +130,35 @@ class ClockFilter:
         return self._fit
 
 
-def _fitted(kept: list[_Exchange]) -> _Fit:
-    last, base = kept[-1].at, kept[-1].least
-    age = np.array([last - one.at for one in kept], float)
-    least = np.array([one.least - base for one in kept], float)
-    most = np.array([one.most - base for one in kept], float)
+def _fitted(kept: NDArray[np.int64]) -> _Fit:
+    """Fit offset and drift to exchanges (3, n): their times and bounds of the offset [ns]."""
+    last, base, count = int(kept[0, -1]), int(kept[1, -1]), kept.shape[1]
+    age = (last - kept[0]).astype(float)
+    least, most = (kept[1:] - base).astype(float)
     drift, drift_sigma = _drift(age, (least + most) / 2, most - least)
     # the bounds of each, as they are at the last one, for two sigmas of the drift
-    least = np.sort(least + (drift - 2 * drift_sigma) * age)[::-1]
-    most = np.sort(most + (drift + 2 * drift_sigma) * age)
-    width = float(most[0] - least[0])
+    low, high = (least + (drift - 2 * drift_sigma) * age).tolist(), (most + (drift + 2 * drift_sigma) * age).tolist()
+    low.sort(reverse=True)
+    high.sort()
+    width = high[0] - low[0]
     # how sharp a bound is: the five next to it are about twice as far from it as it is from the truth
-    sixth = min(5, len(kept) - 1)
-    blunt = math.hypot(least[0] - least[sixth], most[sixth] - most[0]) / 4
+    sixth = min(5, count - 1)
+    blunt = math.hypot(low[0] - low[sixth], high[sixth] - high[0]) / 4
     sigma = math.hypot(FLOOR, ASYMMETRY * width, blunt)
-    if len(kept) < MIN_EXCHANGES or width < 0:
+    if count < MIN_EXCHANGES or width < 0:
         sigma = max(sigma, abs(width) / 2)
-    return _Fit(last, base, float(least[0] + most[0]) / 2, drift, sigma, drift_sigma)
+    return _Fit(last, base, (low[0] + high[0]) / 2, drift, sigma, drift_sigma)
 
 
-def _drift(age: np.ndarray, middle: np.ndarray, trip: np.ndarray) -> tuple[float, float]:
+def _drift(age: Array, middle: Array, trip: Array) -> tuple[float, float]:
     """Slope [s/s] and its sigma of a line through all exchanges, weighted by their possible errors [ns]."""
-    sigma = FLOOR + (trip - trip.min()) / 2  # what a trip was longer by, it may have been one way
-    A = np.column_stack([np.ones_like(age), -age]) / sigma[:, None]
-    near = middle[np.argmin(trip)]
-    information = A.T @ A + np.diag([0.0, 1 / QUARTZ_DRIFT**2])
-    covariance = np.linalg.inv(information)
-    return float((covariance @ (A.T @ ((middle - near) / sigma)))[1]), float(math.sqrt(covariance[1, 1]))
+    shortest = int(trip.argmin())
+    sigma = FLOOR + (trip - trip[shortest]) / 2  # what a trip was longer by, it may have been one way
+    weight = sigma**-2
+    total = float(weight.sum())
+    mean = float(weight @ age) / total
+    off = age - mean
+    weighted = weight * off
+    # slope of the offset over -age, about the weighted mean, with a prior of 0
+    information = float(weighted @ off) + QUARTZ_DRIFT**-2
+    return -float(weighted @ (middle - middle[shortest])) / information, information**-0.5

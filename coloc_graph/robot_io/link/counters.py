@@ -59,8 +59,10 @@ class LinkCounter:
         """Count messages under a field of `Counts`, and log `why`, if given."""
         with self._lock:
             self._counts[what] += times
+            if not why:
+                return
             number, now = self._counts[what], machine.monotonic()
-            if not why or now - self._logged.get(what, -LOG_PERIOD) < LOG_PERIOD:
+            if now - self._logged.get(what, -LOG_PERIOD) < LOG_PERIOD:
                 return
             self._logged[what] = now
         log.warning("%s (%s: %d until now)", why, what, number)

@@ -24,6 +24,8 @@ MAX_COUNT = 2**53  # bound of numbers that count
 MAX_COORDINATE = 1e6  # m, rad, bound of a coordinate's magnitude
 MAX_DRIVE_SPEED = 0.5  # m/s
 
+SESSION = re.compile(f"[A-Za-z0-9_-]{{1,{MAX_NAME_LENGTH}}}")
+
 M = TypeVar("M", bound=msgspec.Struct)
 
 
@@ -372,7 +374,7 @@ class Refusal(_Message, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 def is_session(name: str) -> bool:
     """Return whether a name can be that of a session: it is a part of zenoh keys."""
-    return re.fullmatch(f"[A-Za-z0-9_-]{{1,{MAX_NAME_LENGTH}}}", name) is not None
+    return SESSION.fullmatch(name) is not None
 
 
 def encode(message: msgspec.Struct) -> bytes:
@@ -405,20 +407,24 @@ def _symmetric(upper: tuple[float, ...]) -> "np.ndarray[Any, np.dtype[np.float64
 
 
 def _short(*texts: str) -> None:
-    if any(len(text) > MAX_TEXT_LENGTH for text in texts):
-        raise ValueError(f"a text has more than {MAX_TEXT_LENGTH} characters")
+    for text in texts:
+        if len(text) > MAX_TEXT_LENGTH:
+            raise ValueError(f"a text has more than {MAX_TEXT_LENGTH} characters")
 
 
 def _named(*names: str) -> None:
-    if any(len(name) > MAX_NAME_LENGTH for name in names):
-        raise ValueError(f"a name has more than {MAX_NAME_LENGTH} characters")
+    for name in names:
+        if len(name) > MAX_NAME_LENGTH:
+            raise ValueError(f"a name has more than {MAX_NAME_LENGTH} characters")
 
 
 def _counted(*numbers: int) -> None:
-    if any(not 0 <= number < MAX_COUNT for number in numbers):
-        raise ValueError("a count is negative or too large")
+    for number in numbers:
+        if not 0 <= number < MAX_COUNT:
+            raise ValueError("a count is negative or too large")
 
 
 def _stamped(*stamps: int) -> None:
-    if any(abs(stamp) >= MAX_STAMP for stamp in stamps):
-        raise ValueError("a time stamp is out of range")
+    for stamp in stamps:
+        if abs(stamp) >= MAX_STAMP:
+            raise ValueError("a time stamp is out of range")
