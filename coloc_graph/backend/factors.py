@@ -277,5 +277,5 @@ def _noise(link: PoseLink) -> gtsam.noiseModel.Gaussian:
         return gtsam.noiseModel.Gaussian.Covariance(C)
     # heading, x and y alone are measured; the rows of roll, pitch and height are zero
     R = np.zeros((6, 6))
-    R[2:5, 2:5] = np.linalg.cholesky(np.linalg.inv(C)).T
+    R[2:5, 2:5] = gtsam.noiseModel.Gaussian.Covariance(C, False).R()
     return gtsam.noiseModel.Gaussian.SqrtInformation(R, False)  # not diagonal, which would have infinite sigmas

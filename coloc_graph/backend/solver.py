@@ -23,6 +23,7 @@ MAX_GAUSS_NEWTON = 20  # iterations of Gauss-Newton, most of which converge in f
 MAX_RISES = 2  # steps of Gauss-Newton that may raise the error, as the first ones of a bent chain do
 MAX_RISE = 1e5  # error, relative to the initial one, above which it has diverged; 2e4 in a chain of 10,000 stances
 MAX_ITERATIONS = 500  # of Levenberg-Marquardt; no search that needs more converges
+CHOLESKY_TOLERANCE = 1e-7  # relative change of the error by a step of Cholesky, after which steps are QR's
 COST_TOLERANCE = 1e-9  # half chi2 below which there is nothing to optimise
 
 # ISAM2 linearises a pose anew when its estimate has changed by more than these. Errors of linearisation come from
@@ -126,7 +127,8 @@ def optimise(
         The optimiser failed. GTSAM's returns the initial values silently then, so the result is checked: the error is
         finite, did not rise, and fell wherever a step lowers it.
     """
-    before = factors.error(initial)
+    with held(initial):
+        before = factors.error(initial)
     if before < COST_TOLERANCE:
         return initial, 0  # nothing to optimise; LM would only try out its dampings
     if not np.isfinite(before):
@@ -166,7 +168,8 @@ def _gauss_newton(
 ) -> tuple[gtsam.Values, int] | None:
     """Return values and iterations of Gauss-Newton; None where it fails.
 
-    Cholesky until the search has converged, and QR from there, or where Cholesky finds the system too ill conditioned.
+    Cholesky until the search has nearly converged, and QR from there, or where Cholesky finds the system too ill
+    conditioned.
     GTSAM's own optimiser hands a copy of all values to every factor in Python: ten times slower at 1,000 stances.
     """
     limits = lm_parameters()
@@ -186,10 +189,10 @@ def _gauss_newton(
         rises += after > error * (1 + 1e-9) + COST_TOLERANCE
         if not np.isfinite(after) or rises > MAX_RISES or after > MAX_RISE * before:
             return None
-        converged = abs(error - after) <= max(limits.getAbsoluteErrorTol(), limits.getRelativeErrorTol() * error)
-        if converged and step is _qr_step:
+        gained = abs(error - after)
+        if step is _qr_step and gained <= max(limits.getAbsoluteErrorTol(), limits.getRelativeErrorTol() * error):
             return (moved if after < error else values), iteration
-        if converged:
+        if gained <= CHOLESKY_TOLERANCE * error:
             step = _qr_step
         values, error = moved, after
     return None

@@ -122,7 +122,9 @@ def test_in_a_large_graph_a_few_wrong_homographies_are_found_from_where_the_fit_
     right = smooth(graph.without(team.wrong), reject=False)
     for robot, trajectory in right.trajectories.items():
         np.testing.assert_allclose(estimate.trajectories[robot].positions, trajectory.positions, atol=1e-5)
-        np.testing.assert_allclose(estimate.trajectories[robot].covariances, trajectory.covariances, rtol=1e-3, atol=1e-14)
+        np.testing.assert_allclose(
+            estimate.trajectories[robot].covariances, trajectory.covariances, rtol=1e-3, atol=1e-14
+        )
 
 
 def test_of_many_residuals_a_little_too_much_is_no_suspicion(monkeypatch):
