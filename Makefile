@@ -18,6 +18,8 @@ ARGS ?=
 DATA ?=
 GRAPHS ?=
 MRCLAM ?=
+# modules are compiled once, not by each of the hundred processes that tests start
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-long lint types unit unit-and-types ordinary realtime docs notebooks bench fuzz search clean
 

@@ -14,7 +14,7 @@ SMALLEST = {
     "association": ["--scenes", "1", "--lockstep", "1"],
     "hallway": ["--seeds", "1", "--stances", "3", "--points", "30"],
     "leapfrog_ekf": ["--seeds", "1", "--stances", "3", "--points", "40"],
-    "nees_interval": ["--draws", "20", "--seeds", "1"],
+    "nees_interval": ["--draws", "5", "--seeds", "1"],
     "ranges": ["--seeds", "1", "--stances", "3", "--points", "40"],
     "relative_pose": ["--runs", "2", "--cells", "1"],
     "team": ["--seeds", "1", "--robots", "3", "--stances", "2"],

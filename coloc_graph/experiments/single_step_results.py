@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import spearmanr
 
 from coloc_graph.experiments.paper import BIN_CM, FIG4_MEAN_CM, fig4_within_1cm
 from coloc_graph.experiments.pool import Progress
@@ -142,6 +141,8 @@ class Fig5:
         if len(self.cells) < 3:
             return float("nan")
         overlaps = [cell.overlap_px for cell in self.cells]
+        from scipy.stats import spearmanr  # half a second, which every process of an experiment would take
+
         return float(spearmanr(overlaps, [cell.mean_cm(estimates_of(cell, method)) for cell in self.cells]).statistic)
 
     def numbers(self) -> dict[str, Any]:

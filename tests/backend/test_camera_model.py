@@ -178,7 +178,7 @@ def test_a_span_has_unit_covariance_and_no_bias(rng):
     true = replace(true, covariance=6 * true.covariance)
     root = np.linalg.cholesky(true.covariance)
     off, without, by_noisy_weights = [], [], []
-    for _ in range(1500):
+    for _ in range(800):
         noisy = true.x_i + (root @ rng.normal(size=(*true.x_i.shape, 1)))[..., 0]
         span = MarkerSpan("C", noisy, true.covariance, true.by_h, true.shared)
         (model,) = near([span], n, 0.0, [MARKERS.span])

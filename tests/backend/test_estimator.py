@@ -234,7 +234,7 @@ def test_a_withdrawn_stance_is_as_if_it_had_never_come_and_can_come_again():
 
 
 def test_wrong_homographies_are_refused_before_they_enter_and_leave_no_trace():
-    made = team_of(6, 12, seed=1, wrong=0.1)
+    made = team_of(6, 9, seed=1, wrong=0.1)
     estimator = fed(made)
     assert {id(r.measurement) for r in estimator.rejected} == set(map(id, made.wrong)) and len(made.wrong) >= 5
     right = smooth(graph_of_team(made, [m for m in made.measurements if m not in made.wrong]))

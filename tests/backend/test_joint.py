@@ -119,7 +119,7 @@ def test_an_estimator_goes_on_from_its_checkpoint_with_mounts_as_they_were(solve
         np.testing.assert_allclose(b.trajectories[robot].positions, trajectory.positions, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("signs", [(1, 1, -1), (-1, 1, 1), (1, -1, -1)])
+@pytest.mark.parametrize("signs", [(1, 1, -1), (-1, 1, 1)])
 def test_from_mounts_three_degrees_and_two_centimetres_wrong_it_comes_to_the_same(signs, solved):
     graph, true = solved.estimate.graph, solved.estimate.calibration
 
@@ -206,7 +206,7 @@ def test_scale_by_the_span_leaves_heights_open(wrong_mounts, copied, tmp_path):
         for r in run.team.robots
     )
     team = msgspec.structs.replace(run.team, robots=robots)
-    path = copied(wrong_mounts, tmp_path / "high.mcap", stances=run.stances[:8], team=team)
+    path = copied(wrong_mounts, tmp_path / "high.mcap", stances=run.stances[:6], team=team)
     options = SolveOptions().resolved()
     solution = solve(open_run(path), replace(options, frontend=replace(options.frontend, scale="span")))
     assert all(abs(row.length_error_percent) < 0.5 for row in accuracy_of(solution.estimate, wrong_mounts).robots)
@@ -377,7 +377,9 @@ def fed(graph):
 
 def test_the_yaw_of_a_mount_is_found_by_odometry_and_else_named_as_not_observable(tmp_path):
     imperfections = Imperfections(mount_sigma_deg=0.5, mount_yaw_sigma_deg=1.0, height_sigma=0.003)
-    simulate("hallway", tmp_path / "run.mcap", depth="tracks", seed=1, stances=14, imperfections=imperfections)
+    simulate(
+        "hallway", tmp_path / "run.mcap", depth="tracks", seed=1, stances=10, points=200, imperfections=imperfections
+    )
     run = open_run(tmp_path / "run.mcap")
     true = read_true_team(run.path)
     solution = solve(run)
@@ -389,7 +391,9 @@ def test_the_yaw_of_a_mount_is_found_by_odometry_and_else_named_as_not_observabl
         assert solution.estimate.calibration.of_team(run.team)[robot].mount.yaw_deg == row.found
     assert not solution.estimate.calibration.unobservable and not any("observable" in one for one in solution.warnings)
 
-    simulate("hallway", tmp_path / "short.mcap", depth="tracks", seed=1, stances=3, imperfections=imperfections)
+    simulate(
+        "hallway", tmp_path / "short.mcap", depth="tracks", seed=1, stances=3, points=60, imperfections=imperfections
+    )
     without = solve(open_run(tmp_path / "short.mcap"), SolveOptions(odometry=False))
     assert {row.robot for row in without.estimate.calibration.unobservable} >= {"A", "B"}
     assert any("A: camera yaw not observable" in one for one in without.warnings)

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from teams import FLOOR, ate, fed, graph_of_team, planar_nees, team_of
+from teams import FLOOR, ate, graph_of_team, planar_nees, team_of
 
 from coloc_graph.backend import PoseGraph, chain, diagnose, smooth
 from coloc_graph.backend.calibration import size_of
@@ -29,7 +29,7 @@ from coloc_graph.team import Slip
 @pytest.fixture(scope="module")
 def six():
     """A team of six with wrong relative poses, and its estimate."""
-    team = team_of(6, 12, seed=1, wrong=0.1)
+    team = team_of(6, 9, seed=1, wrong=0.1)
     return team, smooth(graph_of_team(team))
 
 
@@ -67,13 +67,13 @@ def test_nees_over_200_seeds_is_inside_its_interval(robots):
 
 def test_wrong_homographies_in_a_loopy_team_are_all_found_and_no_right_one_is_refused(six):
     team, estimate = six
-    assert len(team.wrong) >= 8
+    assert len(team.wrong) >= 6
     assert {id(r.measurement) for r in estimate.rejected} == set(map(id, team.wrong))
     assert all("outlier" in r.reason and "sigmas" in r.reason for r in estimate.rejected)
     # what remains is a fit as good as any
     low, high = chi2.ppf([1e-4, 1 - 1e-4], estimate.dof)
     assert low < estimate.chi2 < high
-    assert ate(estimate, team) < 1.3 * ate(smooth(graph_of_team(team_of(6, 12, seed=1))), team)
+    assert ate(estimate, team) < 1.3 * ate(smooth(graph_of_team(team_of(6, 9, seed=1))), team)
 
 
 def test_without_refusing_wrong_homographies_spoil_it(six):
@@ -84,9 +84,9 @@ def test_without_refusing_wrong_homographies_spoil_it(six):
 
 def test_even_a_third_of_the_homographies_may_be_wrong():
     """Refusing the worst one after the other does not do: together they look right."""
-    team = team_of(5, 10, seed=5, wrong=0.3)
+    team = team_of(5, 7, seed=5, wrong=0.3)
     estimate = smooth(graph_of_team(team))
-    assert len(team.wrong) > 12
+    assert len(team.wrong) > 8
     assert {id(r.measurement) for r in estimate.rejected} == set(map(id, team.wrong))
 
 
@@ -122,9 +122,7 @@ def test_in_a_large_graph_a_few_wrong_homographies_are_found_from_where_the_fit_
     right = smooth(graph.without(team.wrong), reject=False)
     for robot, trajectory in right.trajectories.items():
         np.testing.assert_allclose(estimate.trajectories[robot].positions, trajectory.positions, atol=1e-5)
-        np.testing.assert_allclose(
-            estimate.trajectories[robot].covariances, trajectory.covariances, rtol=1e-3, atol=1e-14
-        )
+        np.testing.assert_allclose(estimate.trajectories[robot].covariances, trajectory.covariances, rtol=1e-3)
 
 
 def test_of_many_residuals_a_little_too_much_is_no_suspicion(monkeypatch):
@@ -234,23 +232,6 @@ def test_a_slip_is_a_constraint_of_its_own_and_widens_the_covariance():
     assert 0 < np.linalg.norm(off) < 0.05
     last = team.stances[-1].index
     assert loose.covariance("B", last)[3, 3] > exact.covariance("B", last)[3, 3]
-
-
-def test_a_tilt_on_the_floor_tells_nothing_of_the_heading():
-    T = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.002, -0.003, 1.2), np.array([3.0, 4.0, 0.0]))
-    values = gtsam.Values()
-    values.insert(1, T)
-    about_the_vertical = np.concatenate(
-        [T.rotation().matrix()[2], T.rotation().unrotate(np.cross([0, 0, 1], T.translation()))]
-    )
-    for factor in Factors(FLOOR).of_pose(1):
-        J, _ = factor.linearize(values).jacobian()
-        np.testing.assert_allclose(J @ about_the_vertical, 0, atol=1e-9)
-    # else the sigma of a heading that only the odometry checks depends on the tilts of the estimate
-    team = team_of(3, 300, rotating=False, sightings=False)
-    last = ("B", 299)
-    ratio = fed(team).covariance(*last)[2, 2] / smooth(graph_of_team(team)).covariance(*last)[2, 2]
-    assert ratio == pytest.approx(1, abs=0.03)
 
 
 def test_joint_covariances_hold_the_single_ones_and_say_how_poses_move_together():

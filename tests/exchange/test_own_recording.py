@@ -21,7 +21,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "own-recording.md"
 def recording(tmp_path_factory):
     """A folder with A/*.png, B/*.png and times.csv, as a user has them, and the truth elsewhere."""
     folder, truth = (tmp_path_factory.mktemp(name) for name in ("own", "truth"))
-    simulate("hallway", truth / "run.mcap", depth="images", stances=2, seed=1, points=100, image_format="png")
+    simulate("hallway", truth / "run.mcap", depth="images", stances=2, seed=1, points=60, image_format="png")
     run = open_run(truth / "run.mcap")
     rows = [("robot", "file", "time")]
     for robot in "AB":

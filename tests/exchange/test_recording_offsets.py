@@ -15,7 +15,7 @@ from coloc_graph.team.shared_view import View
 
 TEAM = reference_team()
 POSES = {"A": (0.0, 0.4, -0.3), "B": (0.0, -0.4, 0.3)}
-SECONDS = 12.0
+SECONDS = 9.0
 
 
 def recorded(robot, poses, late, fps=10.0):

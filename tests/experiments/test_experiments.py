@@ -70,8 +70,8 @@ def steps(table_1):
 
 @pytest.fixture(scope="module")
 def hall():
-    """Table II of two seeds, six stances."""
-    return table2(runs=2, stances=6)
+    """Table II of two seeds, four stances."""
+    return table2(runs=2, stances=4)
 
 
 def test_table_1_is_the_papers_as_printed(steps):
@@ -147,10 +147,10 @@ def test_images_go_the_same_road():
 
 
 def test_more_processes_give_the_same_cells(single):
-    cells = measure_cells([(cell.baseline, cell.theta_deg) for cell in single.cells[:2]], runs=5, processes=2)
+    cells = measure_cells([(cell.baseline, cell.theta_deg) for cell in single.cells[:2]], runs=2, processes=2)
     for cell, alone in zip(cells, single.cells, strict=False):  # the first runs of those
-        assert np.array_equal(cell.ours.lengths, alone.ours.lengths[:5])
-        assert np.array_equal(cell.eq2.lengths, alone.eq2.lengths[:5])
+        assert np.array_equal(cell.ours.lengths, alone.ours.lengths[:2])
+        assert np.array_equal(cell.eq2.lengths, alone.eq2.lengths[:2])
     assert not np.array_equal(cells[0].eq2.lengths, cells[1].eq2.lengths)
 
 
@@ -186,8 +186,8 @@ def test_table_2_goes_down_the_hallway(hall):
     for outing in hall.outings:
         assert set(outing.courses) == {"A", "B"}
         for course in outing.courses.values():
-            assert course.true.shape == course.eq2.shape == course.ours.shape == (6, 2)
-            assert 0.6 < course.length(course.true) < 1.3
+            assert course.true.shape == course.eq2.shape == course.ours.shape == (4, 2)
+            assert 0.3 < course.length(course.true) < 0.9
             assert course.error_cm(course.ours) < 1.5
         assert np.linalg.norm(np.diff(outing.standing("true"), axis=0), axis=1) == pytest.approx(0.743, abs=0.06)
     assert hall.rms("ours")["end_error_cm"] < hall.rms("eq2")["end_error_cm"] / 2

@@ -38,20 +38,43 @@ def test_a_notebook_comes_back_from_jupyter_as_it_was(path):
     ]
 
 
+@pytest.fixture(scope="module")
+def run_in_jupyter(tmp_path_factory):
+    """Runs a notebook and returns its outputs; those of `make test` share a kernel, but no names."""
+    import jupytext
+    import nbclient
+    import nbformat
+
+    outputs, folder = {}, tmp_path_factory.mktemp("notebooks")
+
+    def run(paths):
+        notebooks = [jupytext.read(path) for path in paths]
+        together = notebooks[0].copy()
+        together.cells = []
+        for notebook in notebooks:
+            together.cells += [nbformat.v4.new_code_cell("%reset -f"), *notebook.cells]
+        nbclient.NotebookClient(together, timeout=60, resources={"metadata": {"path": folder}}).execute()
+        for path, notebook in zip(paths, notebooks, strict=True):
+            code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+            outputs[path] = [output for cell in code for output in cell.outputs]
+        assert not list(folder.iterdir()), "a notebook leaves files behind"
+
+    def outputs_of(path):
+        if path not in outputs:
+            run([path] if path.stem in LONG else [one for one in NOTEBOOKS if one.stem not in LONG])
+        return outputs[path]
+
+    return outputs_of
+
+
 @pytest.mark.parametrize(
     "path",
     [pytest.param(path, id=path.stem, marks=[pytest.mark.long] * (path.stem in LONG)) for path in NOTEBOOKS],
 )
-def test_a_notebook_runs_and_shows_its_figure(path, tmp_path):
-    import jupytext
-    import nbclient
-
-    notebook = jupytext.read(path)
-    nbclient.NotebookClient(notebook, timeout=60, resources={"metadata": {"path": tmp_path}}).execute()
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+def test_a_notebook_runs_and_shows_its_figure(path, run_in_jupyter):
+    outputs = run_in_jupyter(path)
     assert not [output for output in outputs if output.output_type == "error"]
     printed = "".join(output.text for output in outputs if output.output_type == "stream")
-    assert not list(tmp_path.iterdir()), "a notebook leaves files behind"
     if path.stem in TUTORIALS:
         assert TUTORIALS[path.stem] in printed
         return

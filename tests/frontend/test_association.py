@@ -16,8 +16,7 @@ def found(both, **options):
     return associate(Candidates(both[0][0], both[1][0], FACTS.camera, FACTS.camera, **options))
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("n", "seed"), [(1, 0), (1, 1), (2, 0), (3, 1), (4, 0), (5, 1)])
 def test_however_many_robots_move_each_marker_is_found_again(n, seed):
     both = seen_by_both(movers(n, seed), seed)
     one = found(both)
@@ -27,7 +26,7 @@ def test_however_many_robots_move_each_marker_is_found_again(n, seed):
 
 
 @pytest.mark.parametrize("hidden", [None, 0, 1])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_robots_in_lock_step_are_ambiguous_and_not_guessed(seed, hidden):
     both = seen_by_both(lockstep(seed), seed, hidden)
     one = found(both)

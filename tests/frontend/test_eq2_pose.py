@@ -84,7 +84,7 @@ def test_the_covariance_is_that_of_the_errors():
 
 
 def test_the_covariance_carries_the_tolerances_of_both_mounts():
-    rng, runs = np.random.default_rng(2), 300
+    rng, runs = np.random.default_rng(2), 200
     nominal = [mounted(m, height_sigma=2e-3, tilt_sigma_deg=0.3, roll_sigma_deg=0.2) for m in MOUNTS[1]]
     information = information_of(Scene(*nominal))
     plane = plane_from_mount(nominal[0], MARKERS)
@@ -110,7 +110,7 @@ def test_the_covariance_carries_the_tolerances_of_both_mounts():
 
 
 def test_the_covariance_carries_a_floor_that_is_not_level_and_markers_of_another_height():
-    rng, runs = np.random.default_rng(3), 300
+    rng, runs = np.random.default_rng(3), 200
     scene = Scene()
     floor = Floor(tilt_sigma_deg=0.2, height_sigma=2e-3)
     plane = plane_from_mount(MOUNT, Markers(height=0.15, positions=((0, 0),), height_sigma=1e-3), floor)

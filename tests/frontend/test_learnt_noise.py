@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -100,10 +101,21 @@ def restated(path, out, factor):
     return open_run(out)
 
 
+@pytest.fixture(scope="module")
+def solved(hallway, tmp_path_factory):
+    """Solutions, by the factor between stated and true sigma, of the run without odometry."""
+
+    @cache
+    def solution(factor):
+        path = tmp_path_factory.mktemp("restated") / "run.mcap"
+        return solve(restated(hallway, path, factor), SolveOptions(odometry=False))
+
+    return solution
+
+
 @pytest.mark.parametrize("factor", [0.1, 1.0, 3.0])
-def test_noise_is_found_whatever_is_stated(hallway, tmp_path, factor):
-    run = restated(hallway, tmp_path / "run.mcap", factor)
-    solution = solve(run, SolveOptions(odometry=False))
+def test_noise_is_found_whatever_is_stated(solved, factor):
+    solution = solved(factor)
     noise = solution.noise
     for robot in ("A", "B"):
         sigma, within = noise.sigma(robot)
@@ -123,9 +135,9 @@ def test_noise_that_changes_the_typical_centre_by_less_than_a_hundredth_is_the_s
         assert other.differs_from(learnt) == differs
 
 
-def test_a_short_run_keeps_what_is_stated_and_is_wide(hallway, tmp_path):
+def test_a_short_run_keeps_what_is_stated_and_is_wide(hallway, solved):
     run = open_run(hallway)
-    nothing, one = NoiseBelief.of(run.team), solve(run, SolveOptions(odometry=False)).noise
+    nothing, one = NoiseBelief.of(run.team), solved(1.0).noise
     stated = nothing.noise("A")
     assert stated.floor_px == pytest.approx(CentreNoise().floor_px)
     # of a floor that is known within a factor of three the variance is expected eleven times its median
@@ -143,9 +155,8 @@ def test_a_pair_measured_alone_has_the_noise_that_a_run_of_it_has(hallway, tmp_p
     assert alone.homography.shared is not None
 
 
-def test_learnt_noise_is_in_the_team_that_a_result_writes_and_the_next_run_starts_from_it(hallway, tmp_path):
-    run = restated(hallway, tmp_path / "run.mcap", 0.1)
-    first = solve(run, SolveOptions(odometry=False))
+def test_learnt_noise_is_in_the_team_that_a_result_writes_and_the_next_run_starts_from_it(solved, tmp_path):
+    first = solved(0.1)
     write_result(first, tmp_path / "out")
     learnt = read_team(tmp_path / "out" / "team.toml")
     noise = learnt["A"].camera.centre_noise
@@ -163,9 +174,9 @@ def test_learnt_noise_is_in_the_team_that_a_result_writes_and_the_next_run_start
     assert "Noise of marker centres" in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_stance_by_stance_learns_about_the_same_as_all_at_once(hallway, tmp_path):
-    run = restated(hallway, tmp_path / "run.mcap", 0.1)
-    batch, online = (solve(run, SolveOptions(odometry=False, incremental=one)).noise for one in (False, True))
+def test_stance_by_stance_learns_about_the_same_as_all_at_once(solved):
+    batch = solved(0.1).noise
+    online = solve(solved(0.1).run, SolveOptions(odometry=False, incremental=True)).noise
     for robot in ("A", "B"):
         assert online.sigma(robot)[0] == pytest.approx(batch.sigma(robot)[0], rel=0.1)
 
@@ -181,9 +192,9 @@ def test_a_stance_that_is_withdrawn_takes_what_it_taught_with_it(hallway):
     assert solver.noise is beliefs[0]
 
 
-def test_a_shared_error_with_which_a_pair_would_tell_nothing_is_not_taken(hallway, monkeypatch):
-    before = solve(open_run(hallway))
+def test_a_shared_error_with_which_a_pair_would_tell_nothing_is_not_taken(solved, monkeypatch):
+    before = solved(1.0)
     monkeypatch.setattr("coloc_graph.pipeline.batch.shared_noise_of", lambda *_: SharedNoise(1e4, 1.5))
-    after = solve(open_run(hallway))
+    after = solve(before.run, SolveOptions(odometry=False))
     assert after.count.used == before.count.used
     np.testing.assert_allclose(after.estimate.chi2, before.estimate.chi2, rtol=0.1)

@@ -338,7 +338,7 @@ def test_a_record_gives_back_what_its_run_holds(tmp_path):
 def test_a_record_that_was_cut_off_goes_on_and_the_old_one_is_kept(tmp_path):
     team, path = reference_team(), tmp_path / "run.mcap"
     with Record(path, team) as record:
-        for n in range(2000):
+        for n in range(900):
             record.take(detections("A", 1e9 + n / 30, 8))
         record.complete(Stance(0, 1e9, 1e9 + 2, ("A", "B"), ("C",)))
     path.write_bytes(path.read_bytes()[:-3000])
@@ -348,7 +348,7 @@ def test_a_record_that_was_cut_off_goes_on_and_the_old_one_is_kept(tmp_path):
     kept, run = open_run(tmp_path / "run.1.mcap"), open_run(path)
     assert kept.warnings and not run.warnings
     before = [one.time for one in kept.detections("A")]
-    assert [one.time for one in run.detections("A")] == [*before, 1e9 + 100] and len(before) > 1000
+    assert [one.time for one in run.detections("A")] == [*before, 1e9 + 100] and len(before) > 400
     assert run.stances == kept.stances
     with pytest.raises(RunError, match="another team"):
         continued(path, reference_team((0.1, 0.0, 0.0, 0.0)))

@@ -28,9 +28,9 @@ UNEVEN = Imperfections(mount_sigma_deg=0.5, height_sigma=0.003, floor_sigma_deg=
 
 @pytest.fixture(scope="module")
 def ten(tmp_path_factory):
-    """Ten robots, four stances."""
+    """Ten robots, three stances."""
     path = tmp_path_factory.mktemp("team") / "run.mcap"
-    simulate("team", path, stances=4, seed=1, imperfections=UNEVEN)
+    simulate("team", path, stances=3, seed=1, imperfections=UNEVEN)
     return open_run(path)
 
 

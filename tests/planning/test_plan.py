@@ -108,10 +108,10 @@ def test_a_robot_that_stands_in_the_way_costs_points():
 
 
 def test_simulate_takes_a_gait_and_a_plan(tmp_path, capsys):
-    write_plan(straight_plan(2, duration=3.0), tmp_path / "plan.csv")
-    run = tmp_path / "run.mcap"
+    run, plan = tmp_path / "run.mcap", str(tmp_path / "plan.csv")
+    write_plan(straight_plan(2, duration=3.0), plan)
     assert main(["simulate", "hallway", "-l", "1.2", "--stances", "2", "--points", "40", "--out", str(run)]) == 0
-    assert main(["simulate", "hallway", "--plan", str(tmp_path / "plan.csv"), "--out", str(tmp_path / "p.mcap")]) == 0
+    assert main(["simulate", "hallway", "--plan", plan, "--out", str(tmp_path / "p.mcap")]) == 0
     for name, *more in (
         ("six-step",),
         ("landmarks", "--length", "10", "--laps", "1"),
@@ -133,7 +133,7 @@ def test_simulate_takes_a_gait_and_a_plan(tmp_path, capsys):
         assert main(arguments) == 0
     for name in ("six-step", "single-step", "landmarks", "team"):
         out = str(tmp_path / f"{name} planned.mcap")
-        assert main(["simulate", name, "--plan", str(tmp_path / "plan.csv"), "--out", out]) == 0
+        assert main(["simulate", name, "--plan", plan, "--out", out]) == 0
     assert open_run(out).team.names == ("A", "B", "C")
     assert [landmark.name for landmark in open_run(tmp_path / "landmarks planned.mcap").team.landmarks]
     capsys.readouterr()

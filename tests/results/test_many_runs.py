@@ -1,14 +1,16 @@
 """A folder of runs: each solved by itself, resumed, and whatever one of them does to its process."""
 
+import io
 import json
 import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
 
 import pytest
-from killed_runs import kills_its_process_once
+from killed_runs import kills_its_process
 
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
@@ -50,35 +52,55 @@ def solved(folder, out, executors, options=None):
     return {one.run.stem: one for one in outcomes}
 
 
-def test_a_folder_is_solved_and_a_bad_run_ends_none_of_the_others_and_what_is_there_stays(folder, tmp_path):
-    out, one = tmp_path / "out", partial(ThreadPoolExecutor, 1)
-    first = solved(folder, out, partial(workers, 2))
-    assert first["a"].summary["stances"] and not first["a"].failed and not first["b"].failed
-    assert "bad.mcap" in first["bad"].failed and not (out / "bad").exists()
+@pytest.fixture(scope="module")
+def command(runs, tmp_path_factory):
+    """The folder solved by the command, on two processes: its exit code, folder of results and stdout."""
+    out, printed = tmp_path_factory.mktemp("solved") / "out", io.StringIO()
+    with redirect_stdout(printed), redirect_stderr(io.StringIO()):
+        code = main(["solve", str(runs), "--out", str(out), "--processes", "2", "--json"])
+    return code, out, printed.getvalue()
+
+
+@pytest.fixture
+def out(command, tmp_path):
+    """A copy of the results, to be spoiled."""
+    return Path(shutil.copytree(command[1], tmp_path / "out"))
+
+
+def test_a_bad_run_ends_none_of_the_others(command):
+    code, out, printed = command
+    assert code == 1 and [row["state"] for row in json.loads(printed)] == ["solved", "failed", "solved"]
+    a, bad, _ = json.loads(printed)
+    assert a["summary"]["stances"] and "bad.mcap" in bad["why"] and not (out / "bad").exists()
     assert (out / "deep" / "b" / "summary.json").is_file()
+
+
+def test_results_that_are_there_stay_unless_options_or_runs_are_others(command, folder, out):
+    one = partial(ThreadPoolExecutor, 1)
     again = solved(folder, out, one)
     assert {name: one.resumed for name, one in again.items()} == {"a": True, "bad": False, "b": True}
-    assert again["a"].summary == first["a"].summary
+    assert again["a"].summary == json.loads(command[2])[0]["summary"]
     # other options, another run, or a later one are solved anew
+    (folder / "bad.mcap").unlink()
+    shutil.rmtree(folder / "deep")
     assert not solved(folder, out, one, SolveOptions(odometry=False))["a"].resumed
-    shutil.copy(folder / "deep" / "b.mcap", folder / "a.mcap")
-    later = solved(folder, out, one, SolveOptions(odometry=False))
-    assert not later["a"].resumed and later["b"].resumed
+    assert solved(folder, out, one, SolveOptions(odometry=False))["a"].resumed
+    shutil.copy(folder / "a.mcap", folder / "later.mcap")
+    shutil.move(folder / "later.mcap", folder / "a.mcap")
+    assert not solved(folder, out, one, SolveOptions(odometry=False))["a"].resumed
 
 
 def test_a_run_that_kills_its_process_is_tried_again_and_then_given_up(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(many_runs, "solve_one", kills_its_process_once)
+    monkeypatch.setattr(many_runs, "solve_one", kills_its_process)
     monkeypatch.setenv("PYTHONPATH", f"{SUPPORT}:{os.environ.get('PYTHONPATH', '')}")
-    (folder / "bad.mcap").unlink()
-    once = solved(folder, tmp_path / "once", partial(workers, 1))
-    assert not once["a"].failed and not once["b"].failed
-    shutil.rmtree(folder / "deep")
-    always = solved(folder, tmp_path / "always", partial(workers, 1))
-    assert "the process that solved it ended" in always["a"].failed
+    shutil.move(folder / "deep" / "b.mcap", folder / "always.mcap")
+    found = solved(folder, tmp_path / "out", partial(workers, 1))
+    assert not found["a"].failed and "the process that solved it ended" in found["always"].failed
+    assert (tmp_path / "out" / "killed").exists()
 
 
 def test_a_cluster_goes_on_when_a_worker_is_killed(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(many_runs, "solve_one", kills_its_process_once)
+    monkeypatch.setattr(many_runs, "solve_one", kills_its_process)
     monkeypatch.setenv("PYTHONPATH", f"{SUPPORT}:{os.environ.get('PYTHONPATH', '')}")
     from distributed import LocalCluster
 
@@ -88,15 +110,14 @@ def test_a_cluster_goes_on_when_a_worker_is_killed(folder, tmp_path, monkeypatch
     assert (tmp_path / "out" / "killed").exists()
 
 
-def test_the_command_prints_a_table_and_says_which_failed(folder, tmp_path, capsys):
-    out = tmp_path / "out"
+def test_the_command_prints_a_table_and_says_which_failed(folder, out, capsys):
+    shutil.copytree(out / "a", out / "bad")  # the result of another run, which stays where --force is not given
     assert main(["solve", str(folder), "--out", str(out), "--processes", "1"]) == 1
     printed = capsys.readouterr()
-    assert "3 runs: 2 solved, 0 solved before, 1 failed" in printed.out
-    assert printed.err.count(str(folder / "bad.mcap")) == 1
-    assert main(["solve", str(folder), "--out", str(out), "--processes", "1", "--json"]) == 1
-    states = [row["state"] for row in json.loads(capsys.readouterr().out)]
-    assert states == ["resumed", "failed", "resumed"]
+    assert "3 runs: 0 solved, 2 solved before, 1 failed" in printed.out
+    rows = {line.split()[0]: line.split()[1:] for line in printed.out.splitlines()}
+    assert rows["a.mcap"][0] == "1" and rows["bad.mcap"] == ["failed"]
+    assert str(out / "bad") in printed.err and f"{folder / 'a.mcap'}: solved before" in printed.err
 
 
 @pytest.mark.parametrize(
@@ -120,11 +141,9 @@ def test_no_result_lies_in_another(folder, tmp_path, capsys):
     assert "its result would lie in that of" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_a_run_that_has_become_bad_leaves_its_earlier_result_and_says_so(folder, tmp_path):
-    out, one = tmp_path / "out", partial(ThreadPoolExecutor, 1)
-    solved(folder, out, one)
+def test_a_run_that_has_become_bad_leaves_its_earlier_result_and_says_so(folder, out):
     (folder / "a.mcap").write_bytes((folder / "bad.mcap").read_bytes())
-    again = solved(folder, out, one)["a"]
+    again = solved(folder, out, partial(ThreadPoolExecutor, 1))["a"]
     assert "still holds an earlier result" in again.failed and (out / "a" / "summary.json").is_file()
 
 

@@ -64,7 +64,7 @@ def right(found, both):
     return all(both[0][1][a] == both[1][1][b] for a, b in found.chosen)
 
 
-def lockstep_run(path, team, image, frames=70, step=0.1):
+def lockstep_run(path, team, image, frames=50, step=0.1):
     """A run of A and B that watch C and D, who drive the same way side by side; where A and B stand; and where they see
     the four lights, (frames, 4, 2) [px]. `image` makes one of these in frame k.
     """

@@ -9,11 +9,12 @@ from coloc_graph.results import many_runs
 solve_one = many_runs.solve_one
 
 
-def kills_its_process_once(run, out, options):
-    """As `solve_one`, but for the run that kills the process it is in: the first time, or always."""
+def kills_its_process(run, out, options):
+    """As `solve_one`, but for runs that kill the process they are in: `a` the first time, `always` always."""
     flag = Path(out).parent / "killed"
-    if run.stem == "a" and (out.parent.name == "always" or not flag.exists()):
-        flag.parent.mkdir(parents=True, exist_ok=True)
-        flag.touch()
+    if run.stem == "always" or (run.stem == "a" and not flag.exists()):
+        if run.stem == "a":
+            flag.parent.mkdir(parents=True, exist_ok=True)
+            flag.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return solve_one(run, out, options)

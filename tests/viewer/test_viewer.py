@@ -1,11 +1,13 @@
 """The viewer without a browser: scenes, pictures of them, picking, bad input, the server."""
 
+import io
 import os
 import re
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -504,15 +506,30 @@ def started(arguments, **more):
     )
 
 
-@pytest.mark.parametrize("command", ["view", "solve"])
-def test_ctrl_c_ends_it_without_a_word(command, result, short, tmp_path):
-    of = {"view": [result], "solve": [short, "--out", tmp_path / "out", "--incremental", "--view"]}[command]
-    arguments = [COLOC, command, *of, "--no-browser", "--port", "0"]
-    process = started(arguments, stdout=subprocess.PIPE)
+def test_ctrl_c_ends_the_view_of_a_result(result, monkeypatch):
+    class Interrupting(io.StringIO):
+        def write(self, text):
+            if "Ctrl-C ends it" in text:
+                threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+            return super().write(text)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "stderr", said := Interrupting())
+            assert main(["view", str(result), "--no-browser", "--port", "0"]) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert re.fullmatch(r"the viewer is at http://127\.0\.0\.1:\d+/[\w-]{22} \(Ctrl-C ends it\)\n", said.getvalue())
+
+
+def test_ctrl_c_ends_the_view_of_a_run_that_was_solved_without_a_word(short, tmp_path):
+    arguments = [COLOC, "solve", short, "--out", tmp_path / "out", "--incremental", "--view", "--no-browser"]
+    process = started([*arguments, "--port", "0"], stdout=subprocess.PIPE)
     try:
         said = next(line for line in process.stderr if "viewer" in line)
         assert re.match(r"the viewer is at http://127\.0\.0\.1:\d+/[\w-]{22} \(Ctrl-C ends it\)", said)
-        solved = command == "view" or any("3 of 3 measurements used" in line for line in process.stdout)
+        solved = any("3 of 3 measurements used" in line for line in process.stdout)
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=30)
