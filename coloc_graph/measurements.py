@@ -5,7 +5,8 @@ translation [m], in the body frame of the right-hand side: T_true = T_measured e
 covariance (3, 3) of the tangent's heading, x and y.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -381,6 +382,11 @@ class Steps:
     twists: Array
     covariances: Array
 
+    def part(self, first: int, until: int) -> "Steps":
+        """Return the steps between some keyframes: from `first` to the one before `until`."""
+        some = slice(first, max(until - 1, first))
+        return Steps(self.delays, self.twists[:, some], self.covariances[some])
+
 
 @dataclass(frozen=True, eq=False)
 class RangeBearings:
@@ -412,6 +418,10 @@ class RangeBearings:
     def __len__(self) -> int:
         return len(self.time)
 
+    def of(self, rows: NDArray[np.bool_] | slice) -> "RangeBearings":
+        """Return some of the measurements."""
+        return RangeBearings(*(getattr(self, one.name)[rows] for one in fields(self)))
+
 
 @dataclass(frozen=True, eq=False)
 class RangeBearing:
@@ -440,7 +450,7 @@ class RangeBearing:
 
 @dataclass(frozen=True, eq=False)
 class Keyframes:
-    """Keyframes of a team with their odometry and measurements.
+    """Keyframes of a team with their odometry and measurements: those of a whole run, or a part of them.
 
     Parameters
     ----------
@@ -454,6 +464,8 @@ class Keyframes:
         Ranges and bearings.
     warnings : tuple of str
         Sentences on recorded data that was left out.
+    begins : tuple of int
+        Number of each robot's first keyframe; () if these are all from 0 on.
     """
 
     robots: tuple[str, ...]
@@ -462,7 +474,56 @@ class Keyframes:
     steps: tuple[Steps, ...]
     measured: RangeBearings
     warnings: tuple[str, ...] = ()
+    begins: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "begins", self.begins or (0,) * len(self.robots))
 
     def __repr__(self) -> str:
         counts = f"{sum(map(len, self.times))} keyframes, {len(self.measured)} measurements"
         return f"Keyframes({len(self.robots)} robots, {len(self.landmarks)} landmarks, {counts})"
+
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Number of the keyframe that comes after each robot's last one."""
+        return tuple(begin + len(times) for begin, times in zip(self.begins, self.times, strict=True))
+
+    def between(self, after: float, until: float) -> "Keyframes":
+        """Return what came from one time to before another [UTC s], as `IncrementalKeyframes` takes it.
+
+        Each robot's last keyframe before it comes first, for the step to the next one.
+        """
+        found = [np.searchsorted(times, (after, until)).tolist() for times in self.times]
+        first = [max(one - 1, 0) for one, _ in found]
+        begin, end = np.searchsorted(self.measured.time, (after, until)).tolist()
+        return self._part(first, [last for _, last in found], slice(begin, end))
+
+    def since(self, begins: Sequence[int]) -> "Keyframes":
+        """Return the keyframes from these numbers on, with the measurements between them and of landmarks."""
+        m, first = self.measured, np.array(begins)
+        of_landmark, target = m.target >= len(first), np.minimum(m.target, len(first) - 1)
+        there = (m.keyframe >= first[m.robot]) & (of_landmark | (m.target_keyframe >= first[target]))
+        return self._part((first - self.begins).tolist(), [len(times) for times in self.times], there)
+
+    def followed_by(self, *later: "Keyframes") -> "Keyframes":
+        """Return these keyframes and those after them, which begin with each robot's last one before, if it has any."""
+        parts, times, steps, begins = (self, *later), [], [], []
+        for robot in range(len(self.robots)):
+            first, *more = [one for one in parts if len(one.times[robot])] or [self]
+            begins.append(first.begins[robot])
+            times.append(np.concatenate([first.times[robot], *(one.times[robot][1:] for one in more)]))
+            of = [one.steps[robot] for one in (first, *more)]
+            twists, C = np.concatenate([one.twists for one in of], axis=1), [one.covariances for one in of]
+            steps.append(Steps(of[0].delays, twists, np.concatenate(C)))
+        columns = (np.concatenate([getattr(one.measured, of.name) for one in parts]) for of in fields(RangeBearings))
+        said = tuple(one for part in parts for one in part.warnings)
+        measured = RangeBearings(*columns)
+        return Keyframes(self.robots, self.landmarks, tuple(times), tuple(steps), measured, said, tuple(begins))
+
+    def _part(self, first: list[int], last: list[int], rows: NDArray[np.bool_] | slice) -> "Keyframes":
+        """Return keyframes from `first` to before `last` of each robot, counted from those here, and measurements."""
+        spans = list(zip(first, last, strict=True))
+        times = tuple(one[a:b] for one, (a, b) in zip(self.times, spans, strict=True))
+        steps = tuple(one.part(a, b) for one, (a, b) in zip(self.steps, spans, strict=True))
+        begins = tuple(a + begin for a, begin in zip(first, self.begins, strict=True))
+        return Keyframes(self.robots, self.landmarks, times, steps, self.measured.of(rows), begins=begins)

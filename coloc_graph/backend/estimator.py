@@ -314,7 +314,7 @@ class Estimator(EstimatorState):
 
         Measurements are named by identity.
         """
-        require_all(self._past, "remove anything")
+        require_all(self._kept, "remove anything")
         measurements = tuple(one for one in self._log if id(one) not in gone)
         rejected = {key: one for key, one in self._rejected.items() if key not in gone}
         self._changed = True
@@ -330,7 +330,7 @@ class Estimator(EstimatorState):
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint atomically, from which `resume` continues."""
-        require_all(self._past, "write a checkpoint")
+        require_all(self._kept, "write a checkpoint")
         team = self.reference, self.robots, self.floor, self.slips, self.robot_models, self.landmarks, self.lag
         came = self._base, tuple(self._journal), tuple(self._waiting.values())
         checkpoint.write(checkpoint.Checkpoint(*team, *came), Path(path))

@@ -75,6 +75,11 @@ class EstimatorState:
         self._live = Isam2Graph.again(factors_of, past.factors, past.values, past.tied)
 
     @property
+    def _kept(self) -> str | None:
+        """The first stance that was kept, where others were forgotten."""
+        return None if self._past is None else f"stance {min(self._past.stances)}"
+
+    @property
     def method(self) -> Method:
         """`joint` if mounts are calibrated, `smooth` if they are taken as stated."""
         return "joint" if self.robot_models else "smooth"
@@ -107,7 +112,7 @@ class EstimatorState:
     @property
     def graph(self) -> PoseGraph:
         """Graph of all inputs; `EstimationError` while there is no stance, or where some were forgotten."""
-        require_all(self._past, "return the graph of all inputs")
+        require_all(self._kept, "return the graph of all inputs")
         return PoseGraph(
             self.reference, self.robots, self.stances, self.measurements, self.floor, self.slips, self.robot_models,
             self.landmarks, self._on_map,

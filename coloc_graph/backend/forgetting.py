@@ -49,10 +49,10 @@ class Past:
     disconnected: Sequence[Link]
 
 
-def require_all(past: Past | None, what: str) -> None:
-    """Raise `EstimationError` where an estimator has forgotten what it needs for `what`."""
-    if past is not None:
+def require_all(kept: str | None, what: str) -> None:
+    """Raise `EstimationError` where an estimator has forgotten all but what it `kept`, and needs it for `what`."""
+    if kept is not None:
         raise EstimationError(
-            f"the estimator cannot {what}, since it has forgotten all before stance {min(past.stances)}: solve the "
-            "recorded run, or make the estimator without `forgets`"
+            f"the estimator cannot {what}, since it has forgotten all before {kept}: solve the recorded run, or make "
+            "the estimator without `forgets`"
         )

@@ -13,7 +13,7 @@ from coloc_graph.backend.calibration import ANCHOR_TILT_SIGMA, PLANE, TILTS, is_
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, agreement, innovation, keys_of
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
-from coloc_graph.backend.fixed_lag import marginal_factors
+from coloc_graph.backend.fixed_lag import marginal_factor
 from coloc_graph.backend.graph import Link, PoseGraph
 from coloc_graph.backend.insertion import InsertionPlan, Tie
 from coloc_graph.backend.optimize import fit_graph
@@ -254,7 +254,8 @@ class Isam2Graph:
             (past if (gone | planes).intersection(factor.keys()) else left).add(factor)
         oldest_first = [key for key in keys_of(past.at(n) for n in range(past.size())) if key in gone]
         with _batch(self._batched.values()):
-            for summary in marginal_factors(past, values, (*oldest_first, *sorted(planes))):
+            summary = marginal_factor(past.linearize(values), values, (*oldest_first, *sorted(planes)))
+            if summary is not None:
                 left.add(summary)
             for key in gone | planes:
                 values.erase(key)

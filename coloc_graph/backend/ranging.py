@@ -13,6 +13,13 @@ from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Keyframes, Node, RangeBearing
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+def pose_key(keyframes: Keyframes, robots: Index, numbers: Index) -> Index:
+    """Return GTSAM's keys (n,) of keyframes' poses, by robot and number: the same however many keyframes there are."""
+    keys: Index = numbers * len(keyframes.robots) + robots
+    return keys
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -36,8 +43,8 @@ class RangingProblem:
     direction_sigmas : (robots,) float
         Standard deviation [rad] of each body's heading about that in which its wheels drive.
     solved : callable or None
-        Gives the marginal covariances of all poses, in the order of robots and keyframes; None of an incremental
-        estimate, which has marginalised most.
+        Gives the marginal covariances of all poses, by `pose_key`; None of an incremental estimate, which has
+        marginalised most.
     """
 
     keyframes: Keyframes
@@ -98,10 +105,9 @@ class RangingProblem:
         """Return the joint covariance (6 n, 6 n) of different nodes at (n, 4, 4), in their bodies' tangents."""
         if self._marginals is None:
             raise EstimationError("ranging runs have no joint covariances incrementally: solve it in batch")
-        first = dict(zip(self.robots, np.cumsum([0, *map(len, self.keyframes.times)]).tolist(), strict=False))
-        joint = self._marginals.joint([first[robot] + number for robot, number in nodes])
-        whole = joint_in_space(T_world_body, joint)
         owner = np.array([self.robots.index(robot) for robot, _ in nodes])
+        keys = pose_key(self.keyframes, owner, np.array([number for _, number in nodes]))
+        whole = joint_in_space(T_world_body, self._marginals.joint(keys.tolist()))
         whole[2::6, 2::6] += (owner[:, None] == owner) * self.direction_sigmas[owner] ** 2
         return whole
 

@@ -2,8 +2,9 @@
 
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from typing import TypeVar
+from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import gtsam
 import numpy as np
@@ -14,12 +15,14 @@ from coloc_graph.errors import EstimationError
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
+State = TypeVar("State")
 
 # GTSAM walks its trees by recursion: with 8 MiB of stack a chain of 50,000 poses ends the process
 DEEP_RECURSION_POSES = 3000  # poses above which the solver runs in a thread with a larger stack
 STACK_SIZE = 1 << 30  # bytes of that stack; only the part in use takes memory
 
 MAX_GAUSS_NEWTON = 20  # iterations of Gauss-Newton, most of which converge in five to eight
+MAX_HALVINGS = 6  # of a step that does not lower the cost, where steps are halved
 MAX_RISES = 1  # steps of Gauss-Newton that may raise the error, as the first one of a bent chain does
 MAX_RISE = 100.0  # error, relative to the initial one, above which it has diverged
 MAX_ITERATIONS = 500  # of Levenberg-Marquardt; no search that needs more converges
@@ -115,6 +118,124 @@ def isam_parameters(*, calibrates: bool = False) -> gtsam.ISAM2Params:
     return parameters
 
 
+class Problem(Protocol[State]):
+    """Least squares problem: half chi2 of a state, its linear factors, and the state after a step."""
+
+    def cost(self, state: State, /) -> float:
+        """Return half chi2 of a state."""
+
+    def linear(self, state: State, /) -> gtsam.GaussianFactorGraph:
+        """Return the factors, linearised at a state."""
+
+    def moved(self, state: State, step: gtsam.VectorValues, /) -> State:
+        """Return the state after a step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum(Generic[State]):
+    """Optimum of a problem: its state, its last linear factors with the order of elimination, and iterations."""
+
+    state: State
+    linear: gtsam.GaussianFactorGraph
+    ordering: gtsam.Ordering
+    iterations: int
+
+
+def eliminated(
+    linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, *, by_qr: bool = False
+) -> tuple[gtsam.GaussianBayesTree, bool]:
+    """Return the Bayes tree of linear factors, and whether it is by QR: if asked for, or if Cholesky fails.
+
+    Raises
+    ------
+    EstimationError
+        The factors leave a variable open.
+    """
+    if not by_qr:
+        with suppress(RuntimeError):  # GTSAM's indeterminate system
+            return linear.eliminateMultifrontal(ordering), False
+    try:
+        return linear.eliminateMultifrontal(ordering, gtsam.EliminateQR), True
+    except RuntimeError as failure:
+        raise EstimationError(
+            "what was measured does not determine where everything is: let the robots see more landmarks, or each "
+            "other more often"
+        ) from failure
+
+
+def gauss_newton(
+    problem: Problem[State], start: State, tolerance: Callable[[float], float], *, rises: int = 0, precise: bool = False
+) -> Optimum[State]:
+    """Return the optimum of a problem near a state by Gauss-Newton.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    start
+        Initial state.
+    tolerance
+        Half chi2, given the present one, by which an iteration must lower it; the search ends where one does not.
+    rises
+        Steps that may raise the cost. With 0, one that does is halved until it does not.
+    precise
+        Take the last step by QR.
+
+    Raises
+    ------
+    EstimationError
+        The search does not end, or the factors leave a variable open.
+    """
+    state, cost, ordering, by_qr, halves = start, problem.cost(start), None, False, not rises
+    first = cost
+    for iteration in range(1, MAX_GAUSS_NEWTON + 1):
+        linear, allowed = problem.linear(state), cost + tolerance(cost) + COST_TOLERANCE * (1 + cost)
+        ordering = ordering or gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+        tree, by_qr = eliminated(linear, ordering, by_qr=by_qr)
+        step, halvings = tree.optimize(), 0
+        tried = problem.moved(state, step)
+        while (after := problem.cost(tried)) > allowed and halves and halvings < MAX_HALVINGS:
+            halvings += 1
+            tried = problem.moved(state, step.scale(0.5**halvings))
+        rises -= after > allowed
+        if rises < 0 or not np.isfinite(after) or after > MAX_RISE * first:
+            raise EstimationError(f"the optimisation does not converge (half chi2 {cost:.6g} after {iteration} steps)")
+        converged = abs(cost - after) <= tolerance(cost) and not halvings
+        if converged and (by_qr or not precise):
+            return Optimum(tried if after < cost else state, linear, ordering, iteration)
+        by_qr |= converged
+        state, cost = tried, after
+    raise EstimationError(f"the optimisation did not end in {MAX_GAUSS_NEWTON} steps (half chi2 {cost:.6g})")
+
+
+class Nonlinear:
+    """Problem of GTSAM's nonlinear factors, which are evaluated within the context `held`, given the values.
+
+    GTSAM's own optimiser hands a copy of all values to every factor in Python: ten times slower at 1,000 stances.
+    """
+
+    def __init__(
+        self,
+        factors: gtsam.NonlinearFactorGraph,
+        held: Callable[[gtsam.Values], AbstractContextManager[object]] = nullcontext,
+    ) -> None:
+        self._factors, self._held = factors, held
+
+    def cost(self, values: gtsam.Values) -> float:
+        """Return half chi2 at some values."""
+        with self._held(values):
+            return float(self._factors.error(values))
+
+    def linear(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+        """Return the factors, linearised at some values."""
+        with self._held(values):
+            return self._factors.linearize(values)
+
+    def moved(self, values: gtsam.Values, step: gtsam.VectorValues) -> gtsam.Values:
+        """Return the values after a step in their tangents."""
+        return values.retract(step)
+
+
 def optimise(
     factors: gtsam.NonlinearFactorGraph,
     initial: gtsam.Values,
@@ -139,9 +260,17 @@ def optimise(
         return initial, 0  # nothing to optimise; LM would only try out its dampings
     if not np.isfinite(before):
         raise EstimationError("the graph's error is not finite at the initial values: a measurement is not finite")
-    found = _gauss_newton(factors, initial, before, held)
-    if found is not None:
-        return found
+    limits = lm_parameters(initial.size())
+    absolute, relative = limits.getAbsoluteErrorTol(), limits.getRelativeErrorTol()
+    with suppress(EstimationError):
+        found = gauss_newton(
+            Nonlinear(factors, held),
+            initial,
+            lambda cost: max(absolute, relative * cost),
+            rises=MAX_RISES,
+            precise=True,
+        )
+        return found.state, found.iterations
     if roughly_first:
         parameters = lm_parameters(initial.size())
         parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
@@ -160,73 +289,17 @@ def optimise(
     if (
         optimiser.iterations() == 0
         and before > 1e-6
-        and factors.error(_one_step(factors, initial)) < before * (1 - 1e-6)
+        and factors.error(_one_step(Nonlinear(factors, held), initial)) < before * (1 - 1e-6)
     ):
         raise EstimationError(f"the optimiser gave up at the initial values (error {before:.6g})")
     return values, int(optimiser.iterations())
 
 
-def _gauss_newton(
-    factors: gtsam.NonlinearFactorGraph,
-    initial: gtsam.Values,
-    before: float,
-    held: Callable[[gtsam.Values], AbstractContextManager[object]],
-) -> tuple[gtsam.Values, int] | None:
-    """Return values and iterations of Gauss-Newton; None where it fails.
-
-    Cholesky until the search has converged, and QR from there, or where Cholesky finds the system too ill conditioned.
-    GTSAM's own optimiser hands a copy of all values to every factor in Python: ten times slower at 1,000 stances.
-    """
-    limits = lm_parameters(initial.size())
-    values, error, rises, step = initial, before, 0, _cholesky_step
-    for iteration in range(1, MAX_GAUSS_NEWTON + 1):
-        try:
-            with held(values):
-                linear = factors.linearize(values)
-            moved = step(linear, values)
-        except RuntimeError:  # GTSAM's indeterminate system
-            if step is _qr_step:
-                return None
-            step = _qr_step
-            continue
-        with held(moved):
-            after = factors.error(moved)
-        rises += after > error * (1 + 1e-9) + COST_TOLERANCE
-        if not np.isfinite(after) or rises > MAX_RISES or after > MAX_RISE * before:
-            return None
-        converged = abs(error - after) <= max(limits.getAbsoluteErrorTol(), limits.getRelativeErrorTol() * error)
-        if converged and step is _qr_step:
-            return (moved if after < error else values), iteration
-        if converged:
-            step = _qr_step
-        values, error = moved, after
-    return None
-
-
-def _cholesky_step(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.Values:
-    """Return values after one step by Cholesky; raises `RuntimeError` where the system is too ill conditioned."""
-    return values.retract(linear.optimize(gtsam.Ordering.ColamdGaussianFactorGraph(linear)))
-
-
-def _qr_step(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.Values:
-    """Return values after one step by QR; raises `RuntimeError` where the system is indeterminate."""
-    factors = gtsam.NonlinearFactorGraph()
-    for n in range(linear.size()):
-        factors.add(gtsam.LinearContainerFactor(linear.at(n), values))
-    parameters = gtsam.GaussNewtonParams()
-    parameters.setLinearSolverType("MULTIFRONTAL_QR")
-    optimiser = gtsam.GaussNewtonOptimizer(factors, values, parameters)
-    optimiser.iterate()
-    return optimiser.values()
-
-
-def _one_step(factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+def _one_step(problem: Nonlinear, values: gtsam.Values) -> gtsam.Values:
     """Take one Gauss-Newton step with QR."""
-    parameters = gtsam.ISAM2Params()
-    parameters.setFactorization("QR")
-    isam = gtsam.ISAM2(parameters)
-    isam.update(factors, values)
-    return isam.calculateEstimate()
+    linear = problem.linear(values)
+    tree, _ = eliminated(linear, gtsam.Ordering.ColamdGaussianFactorGraph(linear), by_qr=True)
+    return problem.moved(values, tree.optimize())
 
 
 def joint_covariance(isam: gtsam.ISAM2, keys: Sequence[int]) -> Array:

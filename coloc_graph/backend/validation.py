@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import MeasurementError
-from coloc_graph.measurements import Measurement, PoseMeasurement, Range, RelativePose
+from coloc_graph.measurements import Keyframes, Measurement, PoseMeasurement, Range, RelativePose
 from coloc_graph.team import Floor
 
 Array = NDArray[np.float64]
@@ -31,6 +31,39 @@ def require_valid(measurements: Sequence[Measurement], floor: Floor | None) -> N
     poses = [one for one in measurements if not isinstance(one, Range)]
     if poses:
         _require_poses(poses, floor)
+
+
+def require_following(before: Keyframes, new: Keyframes) -> None:
+    """Raise `MeasurementError` where keyframes do not follow those before, or hold what is no measurement."""
+    if (new.robots, new.landmarks) != (before.robots, before.landmarks):
+        raise MeasurementError(
+            f"keyframes of {', '.join((*new.robots, *new.landmarks))} are not of the team's robots and landmarks: "
+            f"name {', '.join((*before.robots, *before.landmarks))}, in this order"
+        )
+    for name, times, begin, end, had in zip(new.robots, new.times, new.begins, before.ends, before.times, strict=True):
+        if len(times) and begin != end - (len(had) > 0):
+            raise MeasurementError(
+                f"keyframes of {name} begin with number {begin}: begin with its last one, {max(end - 1, 0)}"
+            )
+        every = times if not len(had) else np.concatenate([had[-1:], times[1:]])
+        if not np.isfinite(every).all() or (np.diff(every) <= 0).any():
+            raise MeasurementError(f"times of the keyframes of {name} do not increase")
+    m, robots = new.measured, len(new.robots)
+    begins, ends = np.array(before.begins), np.maximum(before.ends, new.ends)
+    last = np.minimum(m.target, robots - 1)
+    there = (begins[m.robot] <= m.keyframe) & (m.keyframe < ends[m.robot])
+    there &= (m.target >= robots) | ((begins[last] <= m.target_keyframe) & (m.target_keyframe < ends[last]))
+    valid = np.isfinite(m.range) & (m.range > 0) & np.isfinite(m.bearing) & (m.share > 0).all(axis=1)
+    for well, why in (
+        (there, "is of a keyframe that has not come, or has left the window"),
+        (valid, "is no number of metres above 0 with a bearing and shares above 0"),
+    ):
+        if not well.all():
+            row = int(np.argmin(well))
+            names = (*new.robots, *new.landmarks)
+            raise MeasurementError(
+                f"range of {names[m.target[row]]} by {names[m.robot[row]]} at {m.time[row]:.3f} s {why}"
+            )
 
 
 def _require_ranges(measured: Range) -> None:

@@ -11,6 +11,7 @@ from coloc_graph.backend.planar import (
     LAG,
     NONE_LOCATED,
     UNLOCATED,
+    UPDATE_PERIOD,
     IncrementalKeyframes,
     Latest,
     optimise_keyframes,
@@ -334,16 +335,18 @@ def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_up
     updates: list[float] = []
     online: Mapping[str, Trajectory] = {}
     if options.incremental:
-        incremental = IncrementalKeyframes(run.team, keyframes, lag=LAG if options.lag is None else options.lag)
-        begin, end = (incremental.times[n] for n in (0, -1))
-        for until in incremental.times:
+        incremental = IncrementalKeyframes(run.team, lag=LAG if options.lag is None else options.lag)
+        begin, end = keyframes.measured.time[[0, -1]].tolist()
+        count = int((end - begin) / UPDATE_PERIOD) + 1
+        for number in range(count):
+            new = keyframes.between(begin + number * UPDATE_PERIOD, begin + (number + 1) * UPDATE_PERIOD)
             before = time.perf_counter()
-            latest = incremental.add(until)
+            latest = incremental.add(new)
             updates.append(time.perf_counter() - before)
             if on_update is not None:
                 on_update(latest)
             if progress is not None:
-                progress(round(until - begin), round(end - begin) or 1)
+                progress(number + 1, count)
         estimate, online = incremental.estimate(), incremental.online
     else:
         estimate = optimise_keyframes(run.team, keyframes)

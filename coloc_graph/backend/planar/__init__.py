@@ -5,12 +5,13 @@
 
 from coloc_graph.backend.planar.batch import optimise_keyframes
 from coloc_graph.backend.planar.filter import NONE_LOCATED, UNLOCATED, Filtered, filter_forward, unlocated
-from coloc_graph.backend.planar.incremental import LAG, IncrementalKeyframes, Latest
+from coloc_graph.backend.planar.incremental import LAG, UPDATE_PERIOD, IncrementalKeyframes, Latest
 
 __all__ = [
     "LAG",
     "NONE_LOCATED",
     "UNLOCATED",
+    "UPDATE_PERIOD",
     "Filtered",
     "IncrementalKeyframes",
     "Latest",

@@ -1,20 +1,22 @@
 """Maximum-likelihood poses, landmarks and sensor errors of a whole ranging run."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.floor_poses import in_body
-from coloc_graph.backend.linear_system import Optimum, Rows, gauss_newton
+from coloc_graph.backend.linear_system import Rows
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.factors import KeyframeFactors, State, robust
 from coloc_graph.backend.planar.filter import INITIAL_PERIOD, NONE_LOCATED, Filtered, Models, filter_forward
 from coloc_graph.backend.planar.summary import OUTLIER, Found, measured_off, ranging_estimate
 from coloc_graph.backend.sensor_calibration import SensorErrors
+from coloc_graph.backend.solver import Optimum, gauss_newton
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Keyframes
 from coloc_graph.team import Team
@@ -22,6 +24,10 @@ from coloc_graph.team import Team
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+CHECK = (
+    "the measurements contradict each other, and it is not known which are wrong; check each robot's clock and "
+    "odometry, who is called who, and the positions of the landmarks"
+)
 COST_TOLERANCE_PER_POSE = 1e-4  # half chi2; its expected value is about 3
 MIN_REDUNDANCY = 0.3  # share of squared residuals that the fit leaves, for an estimate of noise
 NOISE_RANGE = (0.2, 5.0)  # estimated noise relative to that stated
@@ -50,22 +56,21 @@ def optimise_keyframes(team: Team, keyframes: Keyframes, *, calibrate_noise: boo
     if not filtered.placed_at:
         raise EstimationError(NONE_LOCATED)
     factors = KeyframeFactors(keyframes, models)
-    fit = _fitted(factors, _start(filtered, factors))
+    seen = np.flatnonzero(np.isfinite(filtered.landmarks[:, 0])).tolist()
+    fit = _fitted(factors, _start(filtered, factors), seen)
     iterations, absorbed = fit.optimum.iterations, None
     if calibrate_noise:
         noise, absorbed = _noise(factors, fit)
         factors = KeyframeFactors(keyframes, models, noise)
-        fit = _fitted(factors, fit.state)
+        fit = _fitted(factors, fit.state, seen)
         iterations += fit.optimum.iterations
-    taken = np.zeros(len(keyframes.measured), bool)
-    taken[fit.problem.measured] = True
     marginals = partial(fit.problem.marginals, fit.state)
-    return ranging_estimate(factors, _found(factors, filtered, fit), taken, iterations, absorbed, marginals)
+    return ranging_estimate(factors, _found(factors, filtered, fit), iterations, absorbed, marginals)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Problem:
-    """Factors of the robots that have a pose: `steps` from some poses, and `measured` ones by index.
+    """Factors of the robots that have a pose: `steps` from some poses, `measured` ones by index, and `landmarks`.
 
     `gauge` is the pose that defines the world, with its value, if no landmark does.
     """
@@ -74,21 +79,40 @@ class _Problem:
     poses: Index
     steps: Index
     measured: Index
+    landmarks: Collection[int]
     gauge: tuple[int, Array] | None
+    _names: Sequence[int] = field(default=(), init=False)  # GTSAM's keys of the variables
+    _last: tuple[State, list[Rows], float] | None = field(default=None, init=False)  # evaluated last
 
-    def rows(self, state: State) -> tuple[list[Rows], float]:
+    def cost(self, state: State) -> float:
+        """Return half chi2 of all factors with their robust loss."""
+        return self._rows(state)[1]
+
+    def linear(self, state: State) -> gtsam.GaussianFactorGraph:
+        """Return all factors, linearised."""
+        graph = self.factors.system(state, self._rows(state)[0]).graph
+        self._names = graph.keyVector()
+        return graph
+
+    def moved(self, state: State, step: gtsam.VectorValues) -> State:
+        """Return the state after a step from where it was linearised last."""
+        return self.factors.moved(state, step, self._names)
+
+    def _rows(self, state: State) -> tuple[list[Rows], float]:
         """Linearise all factors without the priors, and return them with the whole cost (half chi2)."""
-        steps = self.factors.steps(state, self.steps)
-        measured, cost = robust(self.factors.measured(state, self.measured))
-        cost += 0.5 * float((steps.residuals**2).sum()) + self.factors.cost_before(state)
-        rows = [steps, measured]
-        if self.gauge is not None:
-            rows.append(self.factors.gauge(state, *self.gauge))
-        return rows, cost
+        if self._last is None or self._last[0] is not state:
+            steps = self.factors.steps(state, self.steps)
+            measured, cost = robust(self.factors.measured(state, self.measured))
+            cost += 0.5 * float((steps.residuals**2).sum()) + self.factors.cost_before(state)
+            rows = [steps, measured]
+            if self.gauge is not None:
+                rows.append(self.factors.gauge(state, *self.gauge))
+            self._last = state, rows, cost
+        return self._last[1:]
 
     def marginals(self, state: State) -> Marginals:
         """Return the marginal covariances of all variables at the optimum."""
-        return Marginals(self.factors.system(state, self.rows(state)[0]).graph, self.factors.keys.size)
+        return Marginals(self.linear(state), self.factors.keys.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +128,7 @@ class _Fit:
 
     @cached_property
     def marginals(self) -> Marginals:
-        return Marginals(self.optimum.system.graph, self.problem.factors.keys.size, self.optimum.ordering)
+        return Marginals(self.optimum.linear, self.problem.factors.keys.size, self.optimum.ordering)
 
 
 def _start(filtered: Filtered, factors: KeyframeFactors) -> State:
@@ -118,26 +142,27 @@ def _start(filtered: Filtered, factors: KeyframeFactors) -> State:
     return State(poses, np.where(factors.free, shared, factors.start()))
 
 
-def _posed(factors: KeyframeFactors, state: State) -> _Problem:
-    placed = np.isfinite(state.poses[:, 0])
+def _posed(factors: KeyframeFactors, state: State, landmarks: Collection[int]) -> _Problem:
+    placed, gauge = np.isfinite(state.poses[:, 0]), None
     poses = np.flatnonzero(placed)
-    last = factors.first[1:][np.diff(factors.first) > 0] - 1
-    ends = placed[factors.observer] & (placed[factors.seen] | ~factors.of_robot)
-    gauge = None
     if not factors.models.map_known:
         gauge = int(poses[0]), state.poses[poses[0]].copy()
-    return _Problem(factors, poses, np.setdiff1d(poses, last), np.flatnonzero(ends), gauge)
+    measured = factors.measured_between(placed, landmarks)
+    return _Problem(factors, poses, factors.steps_between(placed), measured, landmarks, gauge)
 
 
-def _fitted(factors: KeyframeFactors, state: State) -> _Fit:
-    """Find the optimum near a state; Levenberg-Marquardt is no better here."""
-    problem = _posed(factors, state)
+def _fitted(factors: KeyframeFactors, state: State, landmarks: Collection[int]) -> _Fit:
+    """Find the optimum near a state, of some landmarks and those that are exact; Levenberg-Marquardt is no better."""
+    problem = _posed(factors, state, landmarks)
     tolerance = COST_TOLERANCE_PER_POSE * len(factors)
-    return _Fit(problem, gauss_newton(state, problem.rows, factors.system, factors.moved, tolerance))
+    try:
+        return _Fit(problem, gauss_newton(problem, state, lambda _: tolerance))
+    except EstimationError as failure:
+        raise EstimationError(f"{failure}: {CHECK}") from failure
 
 
 def found_landmarks(
-    factors: KeyframeFactors, shared: Array, C: Array, there: Sequence[int]
+    factors: KeyframeFactors, shared: Array, C: Array, there: Collection[int]
 ) -> dict[int, tuple[Array, Array]]:
     """Return positions and covariances of the landmarks `there`, and of exact ones."""
     return {
@@ -150,14 +175,14 @@ def found_landmarks(
 def _found(factors: KeyframeFactors, filtered: Filtered, fit: _Fit) -> Found:
     state, poses = fit.state, fit.problem.poses
     covariances = np.full((len(factors), 3, 3), np.nan)
-    covariances[poses] = in_body(state.poses[poses], np.array([fit.marginals.covariance(n) for n in poses.tolist()]))
+    names = factors.keys.names[poses].tolist()
+    covariances[poses] = in_body(state.poses[poses], np.array(list(map(fit.marginals.covariance, names))))
     C = factors.shared_covariance(fit.marginals)
     errors = [
         factors.errors_in(robot, state.shared, C) if robot in filtered.placed_at else SensorErrors(None, None)
         for robot in range(len(factors.keyframes.robots))
     ]
-    seen = np.flatnonzero(np.isfinite(filtered.landmarks[:, 0])).tolist()
-    return Found(state, covariances, found_landmarks(factors, state.shared, C, seen), errors)
+    return Found(state, covariances, found_landmarks(factors, state.shared, C, fit.problem.landmarks), errors)
 
 
 def _noise(factors: KeyframeFactors, fit: _Fit) -> tuple[Array, float]:
@@ -186,5 +211,5 @@ def _taken(fit: _Fit) -> Array:
     taken = np.zeros((len(fit.problem.measured), 2))
     for index, parts in factors.keys.blocks(rows):
         keys, jacobians = zip(*parts, strict=True)
-        taken[index] = fit.marginals.variances(keys, jacobians)
+        taken[index] = fit.marginals.variances([factors.keys.names[one] for one in keys], jacobians)
     return taken

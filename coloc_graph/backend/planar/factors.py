@@ -4,16 +4,18 @@ Variables are numbered: x, y and heading of all poses, robot after robot, then t
 of sensors, positions of landmarks. Poses change along the world's axes.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.linear_system import Keys, LinearSystem, Rows
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.filter import Models
+from coloc_graph.backend.ranging import pose_key
 from coloc_graph.backend.sensor_calibration import SensorErrors
 from coloc_graph.backend.sensor_model import RANGING, WHEELS
 from coloc_graph.geometry.se2 import wrap
@@ -22,6 +24,7 @@ from coloc_graph.measurements import Keyframes
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+SHARED = 1 << 40  # GTSAM's key of the first variable that is not a pose
 EXACT_SIGMA = 1e-3  # m: tolerance of a landmark's position below which it is not estimated
 UNKNOWN_SIGMA = 1e4  # m: prior of a landmark without a stated position, about the origin
 GAUGE_SIGMA = 1e-4  # m, rad: prior that fixes the world frame where no landmark does
@@ -51,10 +54,10 @@ class KeyframeFactors:
         self.first: Index = np.cumsum([0, *map(len, keyframes.times)])
         self.times = np.concatenate(keyframes.times)
         self.robot: Index = np.repeat(np.arange(robots), np.diff(self.first))
-        m = keyframes.measured
+        m, zero = keyframes.measured, self.first[:-1] - np.array(keyframes.begins)
         self.of_robot = m.target < robots
-        self.observer: Index = self.first[m.robot] + m.keyframe
-        self.seen: Index = np.where(self.of_robot, self.first[np.minimum(m.target, robots)] + m.target_keyframe, -1)
+        self.observer: Index = zero[m.robot] + m.keyframe
+        self.seen: Index = np.where(self.of_robot, zero[np.minimum(m.target, robots - 1)] + m.target_keyframe, -1)
         known = np.isfinite(models.map[:, 0])
         self._exact: NDArray[np.bool_] = known & (models.map_sigmas < EXACT_SIGMA)
         self._ranging, self._marks = WHEELS * robots, (WHEELS + RANGING) * robots
@@ -95,6 +98,20 @@ class KeyframeFactors:
     def is_exact(self, landmark: int) -> bool:
         """Return whether a landmark's position is exact, and not estimated."""
         return bool(self._exact[landmark])
+
+    def steps_between(self, inside: NDArray[np.bool_]) -> Index:
+        """Return the poses inside, of (n,), from which there are steps to others inside."""
+        found: Index = np.flatnonzero(inside[:-1] & inside[1:] & (self.robot[:-1] == self.robot[1:]))
+        return found
+
+    def measured_between(self, inside: NDArray[np.bool_], landmarks: Collection[int]) -> Index:
+        """Return the measurements between poses inside, of (n,), and of some landmarks and those that are exact."""
+        placed = np.append(self._exact, False)
+        placed[list(landmarks)] = True
+        ends = np.append(inside, False)
+        there = np.where(self.of_robot, ends[self.seen], placed[self._landmark])
+        found: Index = np.flatnonzero(inside[self.observer] & there)
+        return found
 
     def steps(self, state: State, poses: Index) -> Rows:
         """Linearise the odometry from some poses (n,), ascending, each to its robot's next."""
@@ -159,10 +176,24 @@ class KeyframeFactors:
 
     @cached_property
     def keys(self) -> Keys:
-        """Keys of all variables: poses by their number, then wheels and sensors by robot, then landmarks."""
+        """Keys of all variables: poses by their number, then wheels and sensors by robot, then landmarks.
+
+        GTSAM's keys number the poses by keyframe and robot, and are the same whatever is in the window.
+        """
         robots, landmarks = len(self.keyframes.robots), len(self.keyframes.landmarks)
         sizes = np.repeat([3, WHEELS, RANGING, 2], [len(self), robots, robots, landmarks])
-        return Keys(sizes, np.concatenate([np.ones(3 * len(self), bool), self.free]))
+        number = np.arange(len(self)) - self.first[self.robot] + np.array(self.keyframes.begins)[self.robot]
+        names = np.concatenate(
+            [pose_key(self.keyframes, self.robot, number), SHARED + np.arange(2 * robots + landmarks)]
+        )
+        return Keys(names, sizes, np.concatenate([np.ones(3 * len(self), bool), self.free]))
+
+    def values(self, state: State, names: Iterable[int]) -> gtsam.Values:
+        """Return the values of some variables, by GTSAM's keys."""
+        wanted, every, values = list(names), np.concatenate([state.poses.ravel(), state.shared]), gtsam.Values()
+        for name, key in zip(wanted, self.keys.numbers(wanted).tolist(), strict=True):
+            values.insert(name, every[self.keys.span(key)])
+        return values
 
     def system(self, state: State, rows: Iterable[Rows], *, priors: bool = True) -> LinearSystem:
         """Return the linear system of some factors, with the priors of the shared variables."""
@@ -176,17 +207,18 @@ class KeyframeFactors:
                 system.add_prior(key, self.sigmas[own], (state.shared - self._known_before)[own])
         return system
 
-    def moved(self, state: State, step: Array) -> State:
-        """Return the state after a step of all variables."""
-        poses = 3 * len(self)
+    def moved(self, state: State, found: gtsam.VectorValues, names: Sequence[int]) -> State:
+        """Return the state after a step in some variables, by GTSAM's keys in ascending order."""
+        poses, step = 3 * len(self), self.keys.step(found, names)
         return State(state.poses + step[:poses].reshape(-1, 3), state.shared + step[poses:])
 
     def shared_covariance(self, marginals: Marginals) -> Array:
         """Return the covariance (m, m) of the shared variables; 0 of exact ones."""
-        there = [key for key in range(len(self), len(self.keys.sizes)) if marginals.has(key)]
+        shared = len(self.keys.sizes) - len(self)
+        there = [name for name in range(SHARED, SHARED + shared) if marginals.has(name)]
         C = np.zeros((len(self.free),) * 2)
         if there:
-            at = self.keys.variables(np.array(there)) - 3 * len(self)
+            at = self.keys.variables(self.keys.numbers(there)) - 3 * len(self)
             C[np.ix_(at, at)] = marginals.joint(there)
         return C * self.free * self.free[:, None]
 

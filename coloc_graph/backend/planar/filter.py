@@ -7,6 +7,7 @@ robotics", 1990.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -107,6 +108,15 @@ def filter_forward(team: Team, keyframes: Keyframes, *, period: float = 0.0) -> 
     return Filter(team, keyframes, period).run()
 
 
+def aligned(values: Sequence[Array], before: Keyframes, now: Keyframes) -> list[Array]:
+    """Return values (n, ...) by robot of the keyframes `now`, from those of the keyframes `before`; NaN of new ones."""
+    found = []
+    for one, old, begin, times in zip(values, before.begins, now.begins, now.times, strict=True):
+        there = one[begin - old :]
+        found.append(np.concatenate([there, np.full((len(times) - len(there), *one.shape[1:]), np.nan)]))
+    return found
+
+
 def unlocated(team: Team, keyframes: Keyframes) -> dict[str, str]:
     """Return the reason by robot that no measurements locate; it ends as soon as all are located."""
     one = Filter(team, keyframes, INITIAL_PERIOD)
@@ -178,13 +188,29 @@ class Filter:
         range_, bearing, time = float(m.range[index]), float(m.bearing[index]), float(m.time[index])
         if time - self._used_at.get((robot, target), -math.inf) < self._period:
             return
-        self._go(robot, int(m.keyframe[index]))
+        begins = self.keyframes.begins
+        self._go(robot, int(m.keyframe[index]) - begins[robot])
         if target < self._robots:
-            self._go(target, int(m.target_keyframe[index]))
+            self._go(target, int(m.target_keyframe[index]) - begins[target])
         if self._ready(robot, target, range_, bearing):
             self.out.used[index] = self._update(robot, target, range_, bearing, m.share[index].tolist())
             if self.out.used[index]:
                 self._used_at[robot, target] = time
+
+    def follow(self, keyframes: Keyframes, models: "Models") -> None:
+        """Go on with keyframes of which more have come, and older ones have left."""
+        out = self.out
+        left = np.subtract(keyframes.begins, self.keyframes.begins).tolist()
+        for robot, gone in enumerate(left):
+            self._go(robot, gone)
+            self._at[robot] -= gone
+        out.poses = aligned(out.poses, self.keyframes, keyframes)
+        out.covariances = aligned(out.covariances, self.keyframes, keyframes)
+        out.placed_at = {robot: max(at - left[robot], 0) for robot, at in out.placed_at.items()}
+        out.used = np.zeros(len(keyframes.measured), bool)
+        self.keyframes, self.models = keyframes, models
+        for robot in out.placed_at:
+            self._note(robot)
 
     @property
     def is_complete(self) -> bool:
@@ -236,7 +262,8 @@ class Filter:
 
     def _note(self, robot: int) -> None:
         k, at = self._at[robot], slice(3 * robot, 3 * robot + 3)
-        self.out.poses[robot][k], self.out.covariances[robot][k] = self.mean[at], self.P[at, at]
+        if k < len(self.out.poses[robot]):  # a robot that defines the world may have no keyframe yet
+            self.out.poses[robot][k], self.out.covariances[robot][k] = self.mean[at], self.P[at, at]
 
     def _go(self, robot: int, k: int) -> None:
         """Predict a robot's pose by odometry up to a keyframe."""

@@ -4,24 +4,29 @@ A filter gives initial values of robots and landmarks. The estimate of a keyfram
 it leaves the window, corrected by later measurements.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.estimate import Estimate
+from coloc_graph.backend.fixed_lag import marginal_factor
 from coloc_graph.backend.floor_poses import in_body, trajectory
-from coloc_graph.backend.linear_system import LinearSystem, Summary
+from coloc_graph.backend.forgetting import require_all
+from coloc_graph.backend.linear_system import LinearSystem
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.batch import found_landmarks
 from coloc_graph.backend.planar.factors import KeyframeFactors, State, robust
-from coloc_graph.backend.planar.filter import INITIAL_PERIOD, Filter
+from coloc_graph.backend.planar.filter import INITIAL_PERIOD, Filter, Models, aligned
 from coloc_graph.backend.planar.summary import Found, ranging_estimate
 from coloc_graph.backend.sensor_calibration import SensorErrors
+from coloc_graph.backend.solver import eliminated
+from coloc_graph.backend.validation import require_following
 from coloc_graph.geometry.se2 import compose
 from coloc_graph.geometry.trajectory import Trajectory
-from coloc_graph.measurements import Keyframes
+from coloc_graph.measurements import Keyframes, RangeBearings, Steps
 from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
@@ -42,232 +47,246 @@ class Latest:
 
 
 @dataclass(frozen=True, eq=False)
-class _Solved:
-    """Window after its last step: its poses, their linear system, and its Bayes tree."""
+class _Log:
+    """Estimates of poses, as they were noted: robots and keyframes, poses (n, 3) and covariances (n, 3, 3)."""
 
-    poses: Index
-    system: LinearSystem
-    ordering: gtsam.Ordering
-    tree: gtsam.GaussianBayesTree
+    entries: list[tuple[Index, Index, Array, Array]] = field(default_factory=list)
 
-    def covariances(self, poses: Index) -> Array:
-        """Return covariances (n, 3, 3) of some poses, along the world's axes."""
-        return np.array([self.tree.marginalCovariance(pose) for pose in poses.tolist()]).reshape(-1, 3, 3)
+    def arrays(self, keyframes: Keyframes) -> tuple[Array, Array]:
+        """Return the last ones of all keyframes; NaN where there is none."""
+        first = np.cumsum([0, *map(len, keyframes.times)])
+        poses, C = np.full((first[-1], 3), np.nan), np.full((first[-1], 3, 3), np.nan)
+        for robots, numbers, some, some_C in self.entries:
+            poses[first[robots] + numbers], C[first[robots] + numbers] = some, some_C
+        return poses, C
 
 
 class IncrementalKeyframes:
-    """Fixed-lag smoother of a ranging run, in the order of time.
+    """Fixed-lag smoother of a ranging run, to which keyframes are added as they come.
 
     Parameters
     ----------
     team : Team
         The team.
-    keyframes : Keyframes
-        Keyframes, odometry and measurements.
     lag : float
         Time for which poses are corrected [s].
     calibrating : float
         Time at the beginning in which all poses are [s].
+    forgets : bool
+        Forget what has left the window, so that memory stays bounded in a mission of any length; then there is no
+        `estimate` of the whole.
     """
 
     def __init__(
-        self, team: Team, keyframes: Keyframes, *, lag: float = LAG, calibrating: float = CALIBRATION_TIME
+        self, team: Team, *, lag: float = LAG, calibrating: float = CALIBRATION_TIME, forgets: bool = False
     ) -> None:
-        self.keyframes, self._lag, self._calibrating = keyframes, lag, calibrating
-        self._filter = Filter(team, keyframes, INITIAL_PERIOD)
-        self._factors = factors = KeyframeFactors(keyframes, self._filter.models)
-        self._state = State(np.full((len(factors), 3), np.nan), factors.start())
-        self._entered = [0] * len(keyframes.robots)  # number of keyframes of each that were added
-        self._inside = np.zeros(len(factors), bool)
+        self._team, self._lag, self._calibrating, self._forgets = team, lag, calibrating, forgets
+        self._keyframes = _nothing(team)  # those of the window
+        models = Models(team, self._keyframes)
+        self._filter = Filter(team, self._keyframes, INITIAL_PERIOD)
+        self._factors = KeyframeFactors(self._keyframes, models)
+        self._state = State(np.empty((0, 3)), self._factors.start())
+        self._begun = np.inf  # time of the first keyframe [UTC s]
         self._left = -np.inf  # time before which all poses were marginalised [UTC s]
-        self._before: tuple[Summary, Array] | None = None  # their marginal, and its linearisation point
-        self._gauge: tuple[int, Array] | None = None
+        self._past: gtsam.LinearContainerFactor | None = None  # what these say of the others
+        self._gauge: tuple[int, int, Array] | None = None  # robot, keyframe and pose that define the world
         self._landmarks: set[int] = set()
-        self._next = 0
-        self._taken = np.zeros(len(keyframes.measured), bool)
-        self._solved: _Solved | None = None
-        self._smoothed, self._online = (np.full((len(factors), 3), np.nan) for _ in range(2))
-        self._smoothed_C, self._online_C = (np.full((len(factors), 3, 3), np.nan) for _ in range(2))
+        self._latest: dict[int, tuple[Array, Array]] = {}
+        # of all keyframes, unless it forgets
+        self._came: list[Keyframes] = []
+        self._smoothed, self._online = _Log(), _Log()
 
-    def add(self, time: float) -> Latest:
-        """Add all measurements before a time [UTC s], and return the newest poses."""
-        m = self.keyframes.measured
-        while self._next < len(m) and m.time[self._next] < time:
-            if not self._filter.is_complete:
-                self._filter.take(self._next)
-            self._next += 1
-        before = list(self._entered)
-        self._enter_robots(time)
+    def add(self, new: Keyframes) -> Latest:
+        """Add keyframes with all that was measured at them, and return the newest poses.
+
+        Parameters
+        ----------
+        new : Keyframes
+            What has come since the last call, as by `Keyframes.between`: each robot's keyframes from its last one on.
+
+        Raises
+        ------
+        MeasurementError
+            They do not follow those added before, or a measurement is of a keyframe that has left the window.
+        """
+        require_following(self._keyframes, new)
+        if not self._forgets:
+            self._came.append(new)
+        ends, rows = self._keyframes.ends, len(self._keyframes.measured)
+        self._follow(self._keyframes.followed_by(new))
+        if not self._filter.is_complete:
+            for row in range(rows, len(self._keyframes.measured)):
+                self._filter.take(row)
+        time = max((float(times[-1]) for times in self._keyframes.times if len(times)), default=-np.inf)
+        self._begun = min([self._begun, *(float(times[0]) for times in new.times if len(times))])
+        self._enter_robots()
         self._enter_landmarks()
-        if self._inside.any():
-            self._solved = self._step()
-            self._note_latest(before)
-            self._leave(time)
-        latest = {}
-        for robot, (name, count) in enumerate(zip(self.keyframes.robots, self._entered, strict=True)):
-            if count:
-                last = int(self._factors.first[robot]) + count - 1
-                latest[name] = self._online[last], self._online_C[last]
-        return Latest(time, latest)
+        if np.isfinite(self._state.poses[:, 0]).any():
+            _, _, tree = self._step()
+            self._note_latest(ends, tree)
+            self._leave(time, tree)
+        return Latest(time, {self._team.names[robot]: one for robot, one in self._latest.items()})
 
-    def _enter_robots(self, time: float) -> None:
-        """Add new keyframes of the robots that have poses: the first ones by the filter, then by odometry."""
+    def _follow(self, keyframes: Keyframes) -> None:
+        """Go on with the keyframes of another window: more have come, or older ones have left."""
+        before, poses = self._keyframes, np.split(self._state.poses, self._factors.first[1:-1])
+        models = Models(self._team, keyframes)
+        self._filter.follow(keyframes, models)
+        self._keyframes, self._factors = keyframes, KeyframeFactors(keyframes, models)
+        self._state = State(np.concatenate(aligned(poses, before, keyframes)), self._state.shared)
+
+    def _enter_robots(self) -> None:
+        """Give poses to new keyframes of the robots that have any: the first ones by the filter, then by odometry."""
         factors, poses = self._factors, self._state.poses
-        for robot, times in enumerate(self.keyframes.times):
-            if robot not in self._filter.out.placed_at:
+        for robot, times in enumerate(self._keyframes.times):
+            if robot not in self._filter.out.placed_at or not len(times):
                 continue
-            first, until = int(factors.first[robot]), int(np.searchsorted(times, time))
-            entered = self._entered[robot]
-            if not entered and until:
-                whole = self._filter.out.whole(self.keyframes, factors.models)[robot][:until]
-                entered = max(int(np.isfinite(whole[:, 0]).sum()), 1)
-                poses[first : first + entered] = whole[:entered]
+            own = poses[factors.first[robot] : factors.first[robot + 1]]
+            entered = int(np.isfinite(own[:, 0]).sum())
+            if not entered:
+                whole = self._filter.out.whole(self._keyframes, factors.models)[robot]
+                entered = int(np.isfinite(whole[:, 0]).sum())
+                own[:entered] = whole[:entered]
                 if not factors.models.map_known and self._gauge is None:
-                    self._gauge = first, poses[first].copy()
-            if until > entered:
-                deltas, _ = factors.models.wheels[robot].steps(
-                    slice(entered - 1, until - 1), factors.wheels(self._state.shared)[robot]
-                )
-                for k, (x, y, yaw) in enumerate(deltas.tolist(), start=first + entered):
-                    a, b, c = poses[k - 1].tolist()
-                    poses[k] = compose((a, b, c), (x, y, yaw))
-            new = np.arange(first + self._entered[robot], first + max(until, entered))
-            self._inside[new] = factors.times[new] >= self._left
-            self._entered[robot] = max(until, entered)
+                    self._gauge = robot, self._keyframes.begins[robot], own[0].copy()
+            deltas, _ = factors.models.wheels[robot].steps(
+                slice(entered - 1, len(times) - 1), factors.wheels(self._state.shared)[robot]
+            )
+            for k, (x, y, yaw) in enumerate(deltas.tolist(), start=entered):
+                a, b, c = own[k - 1].tolist()
+                own[k] = compose((a, b, c), (x, y, yaw))
 
     def _enter_landmarks(self) -> None:
         """Add landmarks that the filter knows since the last time."""
-        for number in range(len(self.keyframes.landmarks)):
+        for number in range(len(self._keyframes.landmarks)):
             position = self._filter.landmark(number)
             if position is not None and number not in self._landmarks and not self._factors.is_exact(number):
                 self._factors.landmarks(self._state.shared)[number] = position
                 self._landmarks.add(number)
 
-    def _steps(self, inside: NDArray[np.bool_]) -> Index:
-        """Return the poses from which there are steps to others inside."""
-        factors = self._factors
-        ends: Index = np.flatnonzero(inside[:-1] & inside[1:])
-        steps: Index = ends[factors.robot[ends] == factors.robot[ends + 1]]
-        return steps
-
-    def _measured(self, inside: NDArray[np.bool_]) -> Index:
-        """Return the processed measurements between poses inside, or of known landmarks."""
-        factors, m = self._factors, self.keyframes.measured
-        earliest = factors.times[inside].min() - 1.0
-        index = np.arange(np.searchsorted(m.time, earliest), self._next)
-        landmark = m.target[index] - len(self.keyframes.robots)
-        placed = np.array(
-            [n in self._landmarks or factors.is_exact(n) for n in range(len(self.keyframes.landmarks))], bool
-        )
-        there = inside[factors.seen[index]]
-        if len(placed):
-            there = np.where(landmark < 0, there, placed[np.maximum(landmark, 0)])
-        found: Index = index[inside[factors.observer[index]] & there]
-        return found
-
     def _system(self, steps: Index, measured: Index) -> LinearSystem:
-        """Linearise some factors in the window, with the marginal of those before it."""
+        """Linearise some factors in the window, with what those before it say."""
         factors, state = self._factors, self._state
         rows = [factors.steps(state, steps), robust(factors.measured(state, measured))[0]]
-        if self._before is None and self._gauge is not None:
-            rows.append(factors.gauge(state, *self._gauge))
-        system = factors.system(state, rows, priors=self._before is None)
-        if self._before is not None:
-            before, at = self._before
-            system.add_summary(before, self._vector()[before.columns] - at)
+        if self._past is None and self._gauge is not None:
+            robot, number, at = self._gauge
+            rows.append(factors.gauge(state, int(factors.first[robot]) + number - self._keyframes.begins[robot], at))
+        system = factors.system(state, rows, priors=self._past is None)
+        if self._past is not None:
+            system.graph.push_back(self._past.linearize(factors.values(state, self._past.keys())))
         return system
 
-    def _vector(self) -> Array:
-        """Return all variables by their numbers."""
-        return np.concatenate([self._state.poses.ravel(), self._state.shared])
+    def _step(self) -> tuple[LinearSystem, gtsam.Ordering, gtsam.GaussianBayesTree]:
+        """Take one Gauss-Newton step in the window, which was at its optimum before; return what it solved."""
+        factors, inside = self._factors, np.isfinite(self._state.poses[:, 0])
+        system = self._system(factors.steps_between(inside), factors.measured_between(inside, self._landmarks))
+        ordering = system.ordering(factors.keys.names[self._newest()].tolist())
+        tree, _ = eliminated(system.graph, ordering)
+        self._state = factors.moved(self._state, tree.optimize(), system.graph.keyVector())
+        return system, ordering, tree
 
-    def _step(self) -> _Solved:
-        """Take one Gauss-Newton step in the window, which was at its optimum before."""
-        measured = self._measured(self._inside)
-        self._taken[measured] = True
-        system = self._system(self._steps(self._inside), measured)
-        ordering = system.ordering(self._newest())
-        tree = system.eliminated(ordering)
-        moved = self._factors.moved(self._state, system.step(tree, ordering))
-        self._state.poses[:], self._state.shared[:] = moved.poses, moved.shared
-        return _Solved(np.flatnonzero(self._inside), system, ordering, tree)
-
-    def _leave(self, time: float) -> None:
-        """Keep the estimates of poses older than the lag, and marginalise them."""
-        solved, factors, times = self._solved, self._factors, self._factors.times
-        if solved is None or time < times.min() + self._calibrating or time - self._lag < self._left + LEAVING_PERIOD:
+    def _leave(self, time: float, tree: gtsam.GaussianBayesTree) -> None:
+        """Keep the estimates of poses older than the lag, and marginalise them; each robot's newest one stays."""
+        factors = self._factors
+        if time < self._begun + self._calibrating or time - self._lag < self._left + LEAVING_PERIOD:
             return
         self._left = time - self._lag
-        gone = self._inside & (times < self._left)
-        if not gone.any():
-            return
-        self._keep(np.flatnonzero(gone))
-        steps, measured = self._steps(self._inside), self._measured(self._inside)
-        seen = gone[factors.seen[measured]] & factors.of_robot[measured]
-        system = self._system(steps[gone[steps] | gone[steps + 1]], measured[gone[factors.observer[measured]] | seen])
-        before = system.summed_up(np.flatnonzero(gone))
-        self._before = before, self._vector()[before.columns]
-        self._inside &= ~gone
+        old = factors.times < self._left
+        old[self._lasts()] = False
+        inside = np.isfinite(self._state.poses[:, 0])
+        gone = old & inside
+        if gone.any():
+            if not self._forgets:
+                self._note(self._smoothed, np.flatnonzero(gone), tree.marginalCovariance)
+            steps, measured = factors.steps_between(inside), factors.measured_between(inside, self._landmarks)
+            seen = gone[factors.seen[measured]] & factors.of_robot[measured]
+            system = self._system(
+                steps[gone[steps] | gone[steps + 1]], measured[gone[factors.observer[measured]] | seen]
+            )
+            # in the order of the whole graph: one robot after the other would tie all poses of the others
+            whole, names = system.ordering(), set(factors.keys.names[np.flatnonzero(gone)].tolist())
+            values = factors.values(self._state, system.graph.keyVector())
+            first = [name for name in map(whole.at, range(whole.size())) if name in names]
+            self._past = marginal_factor(system.graph, values, first)
+        counts = [int(one.sum()) for one in np.split(old, factors.first[1:-1])]
+        self._follow(self._keyframes.since(np.add(self._keyframes.begins, counts).tolist()))
 
-    def _keep(self, poses: Index) -> None:
-        """Keep the smoothed estimates of poses."""
-        assert self._solved is not None
-        self._smoothed[poses] = self._state.poses[poses]
-        self._smoothed_C[poses] = in_body(self._state.poses[poses], self._solved.covariances(poses))
+    def _note(self, log: _Log, poses: Index, covariance: Callable[[int], Array]) -> None:
+        """Note the estimates of poses, with their covariances (3, 3) by GTSAM's key."""
+        factors, at = self._factors, self._state.poses[poses]
+        robots = factors.robot[poses]
+        C = np.array(list(map(covariance, factors.keys.names[poses].tolist()))).reshape(-1, 3, 3)
+        numbers = poses - factors.first[robots] + np.array(self._keyframes.begins)[robots]
+        log.entries.append((robots, numbers, at, in_body(at, C)))
 
-    def _note_latest(self, before: list[int]) -> None:
-        """Keep the estimate of each robot's newest keyframe at its time."""
-        solved = self._solved
-        assert solved is not None
-        had = self._factors.first[:-1] + before
-        poses = np.array([one for one in self._newest() if one >= had[self._factors.robot[one]]], int)
-        self._online[poses] = self._state.poses[poses]
-        self._online_C[poses] = in_body(self._state.poses[poses], solved.covariances(poses))
+    def _note_latest(self, ends: Sequence[int], tree: gtsam.GaussianBayesTree) -> None:
+        """Keep the estimate of each robot's newest keyframe at its time, of those that have a new one."""
+        new = []
+        for pose in self._newest():
+            robot = int(self._factors.robot[pose])
+            if robot not in self._latest or self._keyframes.ends[robot] > ends[robot]:
+                new.append(pose)
+        self._note(self._online, np.array(new, int), tree.marginalCovariance)
+        robots, _, poses, C = self._online.entries[-1]
+        self._latest |= zip(robots.tolist(), zip(poses, C, strict=True), strict=True)
+        if self._forgets:
+            self._online.entries.clear()
+
+    def _lasts(self) -> list[int]:
+        """Return the newest keyframe of each robot that has one."""
+        return [int(end) - 1 for end, n in zip(self._factors.first[1:], self._keyframes.times, strict=True) if len(n)]
 
     def _newest(self) -> list[int]:
-        """Return the newest pose in the window of each robot that has one."""
-        newest = [int(first) + count - 1 for first, count in zip(self._factors.first[:-1], self._entered, strict=True)]
-        return [one for one, count in zip(newest, self._entered, strict=True) if count and self._inside[one]]
+        """Return the newest pose of each robot that has one."""
+        return [one for one in self._lasts() if np.isfinite(self._state.poses[one, 0])]
 
     def estimate(self) -> Estimate:
-        """Return the smoothed estimate of all keyframes that were added."""
-        factors, state = self._factors, self._state
-        C = np.zeros((len(factors.free),) * 2)
-        if self._solved is not None:
-            self._solved = self._step()
-            solved = self._solved
-            marginals = Marginals(solved.system.graph, factors.keys.size, solved.ordering)
-            self._smoothed[solved.poses] = state.poses[solved.poses]
-            inside = np.array([marginals.covariance(pose) for pose in solved.poses.tolist()])
-            self._smoothed_C[solved.poses] = in_body(state.poses[solved.poses], inside)
-            C = factors.shared_covariance(marginals)
-        errors = [
-            factors.errors_in(robot, state.shared, C) if count else SensorErrors(None, None)
-            for robot, count in enumerate(self._entered)
-        ]
-        landmarks = found_landmarks(factors, state.shared, C, sorted(self._landmarks))
-        found = Found(State(self._smoothed, state.shared), self._smoothed_C, landmarks, errors)
-        return ranging_estimate(factors, found, self._taken, 0)
+        """Return the smoothed estimate of all keyframes that were added.
 
-    @property
-    def times(self) -> tuple[float, ...]:
-        """Times of the updates that add everything, one each `UPDATE_PERIOD` [UTC s]."""
-        begin, end = self._factors.times.min(), self._factors.times.max()
-        return tuple((begin + UPDATE_PERIOD * np.arange(1, np.ceil((end - begin) / UPDATE_PERIOD) + 2)).tolist())
+        Raises
+        ------
+        EstimationError
+            It forgets what has left the window, and something has.
+        """
+        forgotten = self._forgets and np.isfinite(self._left)
+        require_all("the keyframes in its window" if forgotten else None, "estimate the whole run")
+        C = np.zeros((len(self._factors.free),) * 2)
+        if self._latest:
+            system, ordering, _ = self._step()
+            marginals = Marginals(system.graph, self._factors.keys.size, ordering)
+            C = self._factors.shared_covariance(marginals)
+            inside = np.flatnonzero(np.isfinite(self._state.poses[:, 0]))
+            self._note(self._smoothed, inside, marginals.covariance)
+        shared = self._state.shared
+        whole = self._keyframes if self._forgets else _nothing(self._team).followed_by(*self._came)
+        factors = KeyframeFactors(whole, Models(self._team, whole))
+        poses, covariances = self._smoothed.arrays(whole)
+        errors = [
+            factors.errors_in(robot, shared, C) if robot in self._latest else SensorErrors(None, None)
+            for robot in range(len(whole.robots))
+        ]
+        landmarks = found_landmarks(factors, shared, C, sorted(self._landmarks))
+        return ranging_estimate(factors, Found(State(poses, shared), covariances, landmarks, errors), 0)
 
     @property
     def online(self) -> dict[str, Trajectory]:
-        """Poses as they were estimated at their times, by robot."""
-        found, factors = {}, self._factors
-        for robot, name in enumerate(self.keyframes.robots):
-            own = slice(factors.first[robot], factors.first[robot + 1])
-            there = np.isfinite(self._online[own, 0])
+        """Poses as they were estimated at their times, by robot; none if it forgets."""
+        found, models = {}, self._factors.models
+        whole = _nothing(self._team).followed_by(*self._came)
+        ends = np.cumsum([*map(len, whole.times)])[:-1]
+        poses_of, C_of = (np.split(one, ends) for one in self._online.arrays(whole))
+        for robot, (poses, C) in enumerate(zip(poses_of, C_of, strict=True)):
+            there = np.isfinite(poses[:, 0])
             if there.any():
-                found[name] = trajectory(
-                    name,
-                    self.keyframes.times[robot][there],
-                    self._online[own][there],
-                    self._online_C[own][there],
-                    factors.models.wheels[robot].wheels.direction_sigma_deg,
-                )
+                name, unsure = whole.robots[robot], models.wheels[robot].wheels.direction_sigma_deg
+                found[name] = trajectory(name, whole.times[robot][there], poses[there], C[there], unsure)
         return found
+
+
+def _nothing(team: Team) -> Keyframes:
+    """Return the keyframes of a team of which none has come."""
+    landmarks, n = tuple(one.name for one in team.landmarks), len(team.names)
+    steps = Steps(np.zeros(1), np.zeros((1, 0, 3)), np.zeros((0, 3, 3)))
+    nothing, nobody = np.zeros(0), np.zeros(0, int)
+    measured = RangeBearings(nothing, *(nobody,) * 4, nothing, nothing, np.zeros((0, 2)))
+    return Keyframes(team.names, landmarks, (nothing,) * n, (steps,) * n, measured)

@@ -46,19 +46,19 @@ def measured_off(factors: KeyframeFactors, state: State) -> Array:
 def ranging_estimate(
     factors: KeyframeFactors,
     found: Found,
-    taken: NDArray[np.bool_],
     iterations: int,
     absorbed: float | None = None,
     marginals: Callable[[], Marginals] | None = None,
 ) -> Estimate:
-    """Return the estimate of an optimiser's result by the measurements `taken`.
+    """Return the estimate of an optimiser's result.
 
     `absorbed` are the degrees of freedom of a batch fit beyond the shares; without it there is no chi2. `marginals`
     gives those of all variables, by number.
     """
     keyframes, models = factors.keyframes, factors.models
-    off = np.where(taken[:, None], measured_off(factors, found.state), np.nan)
-    valid = np.isfinite(off[:, 0])
+    valid = np.zeros(len(keyframes.measured), bool)
+    valid[factors.measured_between(np.isfinite(found.state.poses[:, 0]), found.landmarks)] = True
+    off = np.where(valid[:, None], measured_off(factors, found.state), np.nan)
     outliers = valid & (np.abs(np.where(valid[:, None], off, 0.0)).max(axis=1, initial=0.0) > OUTLIER)
     good = valid & ~outliers
     share = keyframes.measured.share[good]
