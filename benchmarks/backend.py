@@ -45,14 +45,15 @@ class Bare:
     def __init__(self, floor: Floor | None) -> None:
         self.floor = floor
         self.tilt = 1e-6 if floor is None else np.deg2rad(floor.tilt_sigma_deg)
-        self.level = gtsam.noiseModel.Isotropic.Sigma(2, self.tilt)
+        self.level = gtsam.noiseModel.Gaussian.SqrtInformation(np.diag([1 / self.tilt, 1 / self.tilt, 0.0]), False)
         self.on_floor = gtsam.noiseModel.Diagonal.Precisions(np.array([0, 0, (self.tilt * 0.25) ** -2]))
-        self.up = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
+        self.up = np.array([0.0, 0.0, 1.0])
 
     def pose(self, factors, key):
         """The priors of a pose."""
         if self.floor is not None:
-            factors.add(gtsam.AttitudeFactorPose3(key, self.up, self.level))
+            # AttitudeFactorPose3 would make sigmas of headings too small: `Factors.of_pose`
+            factors.add(gtsam.MagPoseFactorPose3(key, self.up, 1.0, self.up, np.zeros(3), self.level))
             factors.add(gtsam.PoseTranslationPrior3D(key, np.zeros(3), self.on_floor))
 
     def gauge(self, factors, key):
@@ -92,7 +93,7 @@ def bare_batch(team, keyed, reference, covariances):
         bare.between(factors, i, j, measured)
     for key, pose in poses.items():
         values.insert(key, pose)
-    result = gtsam.LevenbergMarquardtOptimizer(factors, values, lm_parameters(values.size())).optimize()
+    result = gtsam.LevenbergMarquardtOptimizer(factors, values, lm_parameters()).optimize()
     if covariances:
         isam = gtsam.ISAM2(isam_parameters())
         isam.update(factors, result)

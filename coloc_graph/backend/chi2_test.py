@@ -3,7 +3,8 @@
 Source: W. Baarda, "A Testing Procedure for Use in Geodetic Networks", 1968.
 """
 
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -54,10 +55,31 @@ def agreement(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, jo
     distributed, and is the decrease of the sum of squares when they are left out.
     """
     A, b = _whitened(factors, values)
-    checked, directions = np.linalg.eigh(np.eye(len(b)) - A @ joint @ A.T)
+    return _tested(A[None], b[None], joint[None])[0]
+
+
+def agreements(
+    factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, joint: Callable[[Sequence[int]], Array]
+) -> list[Agreement]:
+    """Test each of some factors that are in a fit, as `agreement`; `joint` gives the joint covariance of keys."""
+    alike: dict[tuple[int, ...], list[tuple[int, Array, Array, Array]]] = defaultdict(list)
+    for n, factor in enumerate(factors):
+        A, b = _weighing(*factor.linearize(values).jacobian())
+        alike[A.shape].append((n, A, b, joint(list(factor.keys()))))
+    found = dict[int, Agreement]()
+    for some in alike.values():
+        numbers, *stacks = zip(*some, strict=True)
+        found.update(zip(numbers, _tested(*map(np.array, stacks)), strict=True))
+    return [found[n] for n in range(len(factors))]
+
+
+def _tested(A: Array, b: Array, joint: Array) -> list[Agreement]:
+    """Tests of n whitened residuals (n, m) in a fit, with Jacobians (n, m, k) and joint covariances (n, k, k)."""
+    checked, directions = np.linalg.eigh(np.eye(b.shape[1]) - A @ joint @ A.mT)
     kept = checked > MIN_REDUNDANCY
-    along = directions.T @ b
-    return Agreement(float((along[kept] ** 2 / checked[kept]).sum()), int(kept.sum()))
+    along = (directions.mT @ b[..., None])[..., 0]
+    squares = np.where(kept, along**2 / np.where(kept, checked, 1.0), 0.0)
+    return [Agreement(*one) for one in zip(squares.sum(axis=1).tolist(), kept.sum(axis=1).tolist(), strict=True)]
 
 
 def innovation(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, joint: Array) -> Agreement:
@@ -79,6 +101,10 @@ def _whitened(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values) ->
     ordering = gtsam.Ordering()
     for key in keys_of(factors):
         ordering.push_back(key)
-    A, b = linear.jacobian(ordering)
+    return _weighing(*linear.jacobian(ordering))
+
+
+def _weighing(A: Array, b: Array) -> tuple[Array, Array]:
+    """Return the rows of a Jacobian and a residual that are not zero."""
     weighing = np.abs(A).max(axis=1) > 0
-    return A[weighing], np.asarray(b)[weighing]
+    return A[weighing], b[weighing]

@@ -27,7 +27,7 @@ POINT_YAW_SIGMA = 1.0  # rad: sigma of the meaningless heading of a landmark tha
 GAUGE_SIGMA = 1e-6  # rad, m: sigma of the prior that fixes the world frame, far below any measurement's
 MIN_FLOOR_SIGMA = 1e-5  # rad, m: sigma of a floor that is stated as exactly flat
 BODY_LENGTH = 0.05  # m: height by which an uneven floor raises a body, per rad of tilt
-_UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
+_UP = np.array([0.0, 0.0, 1.0])
 _ORIGIN = np.zeros(3)
 
 
@@ -83,11 +83,10 @@ class Factors:
         tilt, height = GAUGE_SIGMA, GAUGE_SIGMA
         if floor is not None:
             tilt = max(float(np.deg2rad(floor.tilt_sigma_deg)), MIN_FLOOR_SIGMA)
-            # a smaller sigma slows the search down: 100 iterations instead of 15 at 1,000 stances
             height = max(floor.height_sigma, tilt * BODY_LENGTH, MIN_FLOOR_SIGMA)
         self.gauge_sigmas = np.array([tilt, tilt, GAUGE_SIGMA, GAUGE_SIGMA, GAUGE_SIGMA, height])
-        self._level = gtsam.noiseModel.Isotropic.Sigma(2, tilt)
         # not Diagonal.Precisions: a sigma that is infinite cannot be read back from a serialised graph
+        self._level = gtsam.noiseModel.Gaussian.SqrtInformation(np.diag([1 / tilt, 1 / tilt, 0.0]), False)
         self._on_floor = gtsam.noiseModel.Gaussian.SqrtInformation(np.diag([0.0, 0.0, 1 / height]), False)
 
     def dof(self, values: gtsam.Values, links: Iterable[tuple[Link, gtsam.NonlinearFactor]], points: int = 0) -> int:
@@ -123,11 +122,16 @@ class Factors:
         return gtsam.PriorFactorPose3(key, gtsam.Pose3(), noise)
 
     def of_pose(self, key: int) -> tuple[gtsam.NonlinearFactor, ...]:
-        """Return the priors of any other pose: it stands on the floor, where there is one."""
+        """Return the priors of any other pose: it stands on the floor, where there is one.
+
+        The residual of a tilt is in the body frame (GTSAM's magnetometer serves for it). That of GTSAM's
+        `AttitudeFactorPose3` is in the world frame and turns with the body: to Gauss-Newton a tilt then seems to tell
+        the heading.
+        """
         if self.floor is None:
             return ()
         return (
-            gtsam.AttitudeFactorPose3(key, _UP, self._level),
+            gtsam.MagPoseFactorPose3(key, _UP, 1.0, _UP, _ORIGIN, self._level),
             gtsam.PoseTranslationPrior3D(key, _ORIGIN, self._on_floor),
         )
 
@@ -273,5 +277,5 @@ def _noise(link: PoseLink) -> gtsam.noiseModel.Gaussian:
         return gtsam.noiseModel.Gaussian.Covariance(C)
     # heading, x and y alone are measured; the rows of roll, pitch and height are zero
     R = np.zeros((6, 6))
-    R[2:5, 2:5] = np.linalg.cholesky(np.linalg.inv(C)).T
+    R[2:5, 2:5] = gtsam.noiseModel.Gaussian.Covariance(C, False).R()
     return gtsam.noiseModel.Gaussian.SqrtInformation(R, False)  # not diagonal, which would have infinite sigmas

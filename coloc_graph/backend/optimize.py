@@ -11,7 +11,7 @@ from scipy.special import chdtrc
 from coloc_graph.backend.batched_factors import BatchedFactors
 from coloc_graph.backend.calibration import size_of
 from coloc_graph.backend.chain import compose, spanning_tree
-from coloc_graph.backend.chi2_test import Agreement, agreement
+from coloc_graph.backend.chi2_test import UNCHECKED, Agreement, agreements
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
 from coloc_graph.backend.graph import Link, PoseGraph, point_of, pose_of
 from coloc_graph.backend.marginals import Marginals
@@ -85,18 +85,16 @@ class Fit:
             return self._agreements(kinds)
 
     def _agreements(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
-        found = {}
+        found: dict[int, Agreement] = {}
         for index, link in enumerate(self.links):
-            if not isinstance(link, kinds):
-                continue
-            factor = self.factor(index)
-            if len(self.links) > ALL_TESTED:
-                alone = Agreement(2 * factor.error(self.values), self.factors_of.rows(link, factor))
-                if alone.p_value() > LOOKED_INTO:
-                    found[index] = alone
-                    continue
-            found[index] = agreement([factor], self.values, self.marginals.joint(list(factor.keys())))
-        return found
+            if isinstance(link, kinds):
+                found[index] = UNCHECKED  # as yet
+                if len(self.links) > ALL_TESTED:
+                    factor = self.factor(index)
+                    found[index] = Agreement(2 * factor.error(self.values), self.factors_of.rows(link, factor))
+        among = [index for index, one in found.items() if not one.dof or one.p_value() <= LOOKED_INTO]
+        tested = agreements([self.factor(index) for index in among], self.values, self.marginals.joint)
+        return found | dict(zip(among, tested, strict=True))
 
 
 def fit_graph(

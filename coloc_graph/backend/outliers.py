@@ -107,7 +107,7 @@ def gnc_outliers(graph: PoseGraph, fit: Fit | None = None) -> dict[int, Link]:
         for index, link in enumerate(fit.links)
         if isinstance(link, RelativePose) or (isinstance(link, Sighting) and link.seen in landmarks)
     ]
-    parameters = gtsam.GncLMParams(robust_parameters(fit.values.size()))
+    parameters = gtsam.GncLMParams(robust_parameters())
     parameters.setKnownInliers(sorted(set(range(fit.factors.size())) - {first + index for index in suspects}))
     optimiser = gtsam.GncLMOptimizer(fit.factors, fit.values, parameters)
     optimiser.setInlierCostThresholdsAtProbability(1 - 1e-4)

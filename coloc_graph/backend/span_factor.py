@@ -62,9 +62,14 @@ def _at_instants(x_i: Array, n: Array) -> tuple[Array, Array, Array, Array]:
     return lengths[:, 0], by_n[:, 0], X[:, 0], u[:, 0]
 
 
-def _widened(shared: Array, columns: int) -> Array:
-    """Roots (k, 2, 2, q) of covariances with columns of zeros after theirs."""
-    return np.pad(shared, [(0, 0)] * (shared.ndim - 1) + [(0, columns - shared.shape[-1])])
+def _widened(shared: Sequence[Array]) -> Array:
+    """Roots (k, 2, 2, q) of covariances, one after the other, with columns of zeros after theirs."""
+    out = np.zeros((sum(map(len, shared)), *shared[0].shape[1:-1], max(one.shape[-1] for one in shared)))
+    begin = 0
+    for one in shared:
+        out[begin : begin + len(one), ..., : one.shape[-1]] = one
+        begin += len(one)
+    return out
 
 
 def _by_rays(X: Array, u: Array, n: Array) -> Array:
@@ -127,11 +132,10 @@ class SpanModel:
         R = np.array([np.eye(3) if span.R_camera_view is None else span.R_camera_view for span in spans])
         n = (n[:, None] @ R)[:, 0]
         N = n / np.linalg.norm(n, axis=1)[:, None]
-        most = max(span.shared.shape[-1] for span in spans)
         x_i, covariance, by_h = (
             np.concatenate([getattr(one, name) for one in spans]) for name in ("x_i", "covariance", "by_h")
         )
-        shared = np.concatenate([_widened(span.shared, most) for span in spans])
+        shared = _widened([span.shared for span in spans])
         of = np.repeat(np.arange(len(spans)), [len(span.x_i) for span in spans])
         sine = ((x_i * N[of, None, :2]).sum(-1) + N[of, None, 2]) / np.sqrt(1 + (x_i**2).sum(-1))
         which = (sine > np.maximum(MIN_SINE, CLEARANCE_SIGMAS * normal_sigma)[of, None]).all(axis=1)

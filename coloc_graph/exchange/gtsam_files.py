@@ -2,6 +2,8 @@
 
 Of `chain` and `smooth` the factors are those that were solved. Of `joint` the homographies and sighted markers, which
 GTSAM has no factors for, are linearised at the optimum: `LinearContainerFactor` on poses, mounts, markers and clocks.
+The prior of a body's tilt is `AttitudeFactorPose3`, since GTSAM does not serialise ours: the same optimum, but a
+smaller sigma of the heading where that is 0.05 rad and more (`Factors.of_pose`).
 """
 
 import csv
@@ -11,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import gtsam
+import numpy as np
 
 from coloc_graph.backend import Estimate
 from coloc_graph.backend.calibration import CLOCKS, MARKERS, MOUNT, PLANE, RANGING
@@ -21,6 +24,7 @@ from coloc_graph.exchange.relative_edges import used_links
 
 SCRIPT = Path(__file__).with_name("gtsam_script.txt")  # text, since it runs where coloc-graph is not
 EPOCH = (1980, 1, 1, 0, 0, 0)  # time of all members of the archive, so that its bytes are reproducible
+UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 CALIBRATIONS = {
     MOUNT: "mount errors: height [m], tilt, roll [rad]",
     MARKERS: "marker errors: span (relative), height [m]",
@@ -64,13 +68,17 @@ def portable_factors(estimate: Estimate) -> gtsam.NonlinearFactorGraph:
             factors.add(Factors(None).of_link(link, *map(key, link.ends)))
         return factors
     used = estimate.graph.without(one.measurement for one in estimate.rejected)
-    made, _, batched = Factors(used.floor, estimate.calibration.variables).of_graph(used, poses_in(values))
+    factors_of = Factors(used.floor, estimate.calibration.variables)
+    made, _, batched = factors_of.of_graph(used, poses_in(values))
+    level = gtsam.noiseModel.Isotropic.Sigma(2, factors_of.gauge_sigmas[0])
     factors = gtsam.NonlinearFactorGraph()
     with batched:
         for n in range(made.size()):
             factor = made.at(n)
             if isinstance(factor, gtsam.CustomFactor):
                 factor = gtsam.LinearContainerFactor(factor.linearize(values), values)
+            elif isinstance(factor, gtsam.MagPoseFactorPose3):
+                factor = gtsam.AttitudeFactorPose3(factor.keys()[0], UP, level)
             factors.add(factor)
     return factors
 
