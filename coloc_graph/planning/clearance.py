@@ -1,6 +1,7 @@
 """Distances that a plan keeps, or does not, between robots and to walls; `conflicts`."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def conflicts(plan: Plan, free: Free | None = None) -> list[tuple[int, str]]:
         for name in stance.leapers:
             if name in before:
                 others = [place for other, place in places.items() if other != name]
-                if not _reaches(before[name], places[name], others, free):
+                if not reaches(before[name], places[name], others, free):
                     found.append((k, f"{name} cannot leap there: robots or walls are in its way"))
         if not clear_way(stance.waypoints, list(places.values()), free, to_robot=TO_ROBOT - TOLERANCE):
             found.append((k, f"the drive of {stance.mover} comes too near to a robot or a wall"))
@@ -48,9 +49,10 @@ def conflicts(plan: Plan, free: Free | None = None) -> list[tuple[int, str]]:
     return found
 
 
-def _reaches(
-    start: tuple[float, float], goal: tuple[float, float], others: list[tuple[float, float]], free: Free | None
+def reaches(
+    start: tuple[float, float], goal: tuple[float, float], others: Sequence[tuple[float, float]], free: Free | None
 ) -> bool:
+    """Return whether a robot comes from start to goal, straight or round what is in its way."""
     if clear_way([start, goal], others, free, to_robot=TO_ROBOT - TOLERANCE):
         return True
     return bool(reachable(start, [goal], others, free)[0])

@@ -22,6 +22,7 @@ from coloc_graph.planning.mission import Mission, best_stance
 from coloc_graph.planning.mover_path import evenly_seen
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor, Promise
+from coloc_graph.planning.refinement import Refinement
 from coloc_graph.planning.rollout import Rollout
 
 Array = NDArray[np.float64]
@@ -130,7 +131,18 @@ class Horizon:
             self._rollouts[frozenset(pair)] = one
 
     def mission(self, belief: Belief) -> Mission:
-        """Plan the whole mission of a team from where it stands, as if all went as planned.
+        """Plan the whole mission of a team from where it stands: stance by stance, then all of them refined.
+
+        Raises
+        ------
+        InputError
+            If the team cannot come to the goal.
+        """
+        draft = self.draft(belief)
+        return self.refined(draft) if self.objective == "goal" else draft
+
+    def draft(self, belief: Belief) -> Mission:
+        """Plan a mission stance by stance, each as `next` does, as if all went as planned.
 
         Raises
         ------
@@ -164,13 +176,22 @@ class Horizon:
                 raise InputError(f"the goal is not reached in {MAX_STANCES} stances: give a nearer one, or more goals")
             decision = self.next(belief, left)
 
+    def refined(self, mission: Mission) -> Mission:
+        """Return a mission with stops, waypoints and durations moved to a lower variance at its end."""
+        start, one = mission.start, Refinement(self.predictor, self.observers, self.mover, self.arrived, self.timed)
+        seconds = min(mission.duration if self.timed else mission.capture_time, self.seconds)
+        stances, _ = one.refined(start, mission.plan.stances, seconds)
+        plan = Plan(tuple(stances))
+        promises = tuple(self.predictor.of_plan(start, plan))
+        return Mission(plan, promises, one.leap_times(start.poses, stances), start, tuple(one.reasons(start, stances)))
+
     def starts(self) -> dict[str, Planar]:
-        """Return poses from which the observers can begin at the origin: two in the gait, the others behind them."""
+        """Return poses from which the observers can begin, their middle at the origin: two and two abreast."""
+        rows = [k // 2 * max(ROW, self.gait.leap) for k in range(len(self.observers))]
         poses = {}
-        for k, name in enumerate(self.observers):
-            x, y, yaw = self.gait.stop(k % 2)
-            row = k // 2 * max(ROW, self.gait.leap)
-            poses[name] = x - self.gait.leap / 2 - row, y, yaw - self.predictor.camera_yaw(name)
+        for k, (name, row) in enumerate(zip(self.observers, rows, strict=True)):
+            _, y, yaw = self.gait.stop(k % 2)
+            poses[name] = float(np.mean(rows)) - row, y, yaw - self.predictor.camera_yaw(name)
         return poses
 
     def remaining(self, standing: Mapping[str, Planar]) -> float:

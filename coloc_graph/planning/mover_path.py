@@ -77,11 +77,20 @@ def places_in_common_view(model: StanceModel, standing: Array, margins: Array, f
     xy = xy[away > CLEARANCE]
     if free is not None:
         xy = xy[free(xy, CLEARANCE / 2)]
+    return np.asarray(xy[commonly_seen(model, standing, xy, margins)])
+
+
+def commonly_seen(model: StanceModel, standing: Array, places: Array, margins: Array) -> NDArray[np.bool_]:
+    """Return at which places (n, 2) two cameras see all markers of the mover at any heading."""
+    seen = model.in_view(standing, _rim(model, places).reshape(-1, 3), margins).reshape(len(standing), len(places), 4)
+    return np.asarray(seen.all(axis=2).sum(axis=0) >= 2)
+
+
+def _rim(model: StanceModel, places: Array) -> Array:
+    """Four points (n, 4, 3) of the circle on which markers of a mover at places (n, 2) are [m]."""
     reach = float(np.hypot(*model.p_markers[:, :2].T).max())
     rim = reach * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    points = np.concatenate([xy[:, None] + rim, np.full((len(xy), 4, 1), model.p_markers[0, 2])], axis=-1)
-    seen = model.in_view(standing, points.reshape(-1, 3), margins).reshape(len(standing), len(xy), 4)
-    return np.asarray(xy[seen.all(axis=2).sum(axis=0) >= 2])
+    return np.concatenate([places[:, None] + rim, np.full((len(places), 4, 1), model.p_markers[0, 2])], axis=-1)
 
 
 def _grid(model: StanceModel, standing: Array) -> Array:
@@ -253,9 +262,7 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
     xy, r = _grid(model, standing[0]), standing.shape[1]
     if free is not None:
         xy = xy[free(xy, CLEARANCE / 2)]
-    reach = float(np.hypot(*model.p_markers[:, :2].T).max())
-    rim = reach * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    points = np.concatenate([xy[:, None] + rim, np.full((len(xy), 4, 1), model.p_markers[0, 2])], axis=-1)
+    points = _rim(model, xy)
     # all but the last observer are the same in all: what none of them sees need not be asked of the last
     alone = (
         model.in_view(standing[:1], points.reshape(1, -1, 3), 0.0)[0, :-1].reshape(r - 1, -1, 4).all(axis=2).any(axis=0)

@@ -120,12 +120,24 @@ class Predictor:
 
     def information(self, stance: PlannedStance) -> tuple[Array, float]:
         """Return the information (d, d) of a stance on its variables, and the expected number of correspondences."""
-        drive = drive_through(there_and_back(stance.waypoints, stance.duration, self.speed), self.speed)
-        instants = np.linspace(0.0, stance.duration, INSTANTS, endpoint=False) + stance.duration / INSTANTS / 2
-        images = stance.duration * self.fps / INSTANTS
-        standing = np.array(list(stance.standing.values()))
-        velocity = (drive.at(instants + MOMENT) - drive.at(instants)) / MOMENT
-        return self.model(tuple(stance.standing), stance.mover).total(standing, drive.at(instants), images, velocity)
+        information, points = self.informations([stance])
+        return information[0], float(points[0])
+
+    def informations(self, stances: Sequence[PlannedStance], instants: int = INSTANTS) -> tuple[Array, Array]:
+        """Return the information (n, d, d) of stances of the same robots, and the correspondences (n,) expected.
+
+        `instants` is the number of instants of each drive at which its pixels are linearised.
+        """
+        standing = np.array([list(stance.standing.values()) for stance in stances])
+        at, velocity = [], []
+        for stance in stances:
+            drive = drive_through(there_and_back(stance.waypoints, stance.duration, self.speed), self.speed)
+            times = (np.arange(instants) + 0.5) * stance.duration / instants
+            at.append(drive.at(times))
+            velocity.append((drive.at(times + MOMENT) - at[-1]) / MOMENT)
+        images = np.array([stance.duration for stance in stances]) * self.fps / instants
+        model = self.model(tuple(stances[0].standing), stances[0].mover)
+        return model.total(standing, np.array(at), images, np.array(velocity))
 
     def of_plan(self, before: Belief, plan: Plan) -> list[Promise]:
         """Predict all stances of a plan in turn."""

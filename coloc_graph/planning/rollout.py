@@ -1,7 +1,7 @@
 """The rest of a mission by a periodic gait: the covariance at its end, as a function of that now; `Rollout`."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from coloc_graph.planning.drive import effective_seconds
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.gaits import GaitSearch
 from coloc_graph.planning.prediction import Predictor
+from coloc_graph.planning.steps import Steps
 
 Array = NDArray[np.float64]
 
@@ -21,28 +22,43 @@ RATIO = 1.3  # between durations of a stance for which the rest is computed
 SECONDS = tuple(0.5 * RATIO**n for n in range(20))  # these durations [s]
 
 
-@dataclass(frozen=True, eq=False)
-class _Steps:
-    """Covariance after some stances: P -> C + A P (I + B P)^-1 A^T, (..., d, d) each."""
+def end_weights(observers: int) -> Array:
+    """Return the weights (12 n + 2,) of the variances of observers and markers in the variance at a mission's end."""
+    one = np.zeros(OBSERVER)
+    one[2:5] = HEADING_ARM**2, 1.0, 1.0
+    return np.concatenate([*[one / observers] * observers, [0.0, 0.0]])
 
-    A: Array
-    B: Array
-    C: Array
 
-    def then(self, later: "_Steps") -> "_Steps":
-        """Return these stances followed by later ones.
+def what_costs(P: Array, variance: Callable[[Array], Array]) -> str:
+    """Return which of what is not known after a stance costs most at the end of a mission, in one line.
 
-        Notes
-        -----
-        Sarkka and Garcia-Fernandez, "Temporal parallelization of Bayesian smoothers", 2021.
-        """
-        back = np.linalg.inv(np.eye(self.A.shape[-1]) + self.C @ later.B)
-        through = later.A @ back
-        return _Steps(
-            through @ self.A,
-            self.B + self.A.mT @ later.B @ back @ self.A,
-            later.C + through @ self.C @ later.A.mT,
-        )
+    Each kind of variable is taken to be known exactly, and the rest of the mission is computed again.
+
+    Parameters
+    ----------
+    P
+        Covariance (12 n + 2, 12 n + 2) of observers and markers.
+    variance
+        Variances (b,) at the end of the mission of covariances (b, d, d) [m^2].
+    """
+    each = OBSERVER * np.arange(len(P) // OBSERVER)[:, None]
+    kinds = {
+        "headings": np.ravel(each + 2),
+        "positions": np.ravel(each + np.arange(3, 5)),
+        "mounts": np.ravel(each + np.arange(POSE, OBSERVER)),
+        "markers": np.array([len(P) - 2, len(P) - 1]),
+    }
+    exact = [P - P[:, of] @ np.linalg.pinv(P[np.ix_(of, of)], hermitian=True) @ P[of] for of in kinds.values()]
+    now, *without = variance(np.array([P, *exact, 0 * P])).tolist()
+    inherited = max(now - without[-1], 1e-30)
+    shares = {what: (now - value) / inherited for what, value in zip(kinds, without, strict=False)}
+    later = without[-1] / now
+    first, second = sorted(shares, key=lambda what: -shares[what])[:2]
+    return (
+        f"{1e3 * math.sqrt(now):.1f} mm expected at the goal, {100 * later:.0f} % of the variance by later "
+        f"stances; of the rest, exact {first} would take off {100 * shares[first]:.0f} %, "
+        f"{second} {100 * shares[second]:.0f} %"
+    )
 
 
 class Rollout:
@@ -89,7 +105,7 @@ class Rollout:
         most = max(math.ceil(course.length / self.gait.leap), 1) + 2
         size = 2 * OBSERVER + 2
         eye = np.broadcast_to(np.eye(size), (len(SECONDS), size, size))
-        nothing = _Steps(eye, 0 * eye, 0 * eye)
+        nothing = Steps(eye, 0 * eye, 0 * eye)
         one = [self._stance(best.information, best.leaps, anchor) for anchor in (0, 1)]
         # of n stances, the first of which robot `anchor` stands still in
         many = [[nothing], [nothing]]
@@ -101,9 +117,7 @@ class Rollout:
             np.array([[getattr(steps, name) for steps in of] for of in many]) for name in ("A", "B", "C")
         )
 
-    def _stance(
-        self, information: Array, leaps: tuple[tuple[Array, Array], tuple[Array, Array]], anchor: int
-    ) -> _Steps:
+    def _stance(self, information: Array, leaps: tuple[tuple[Array, Array], tuple[Array, Array]], anchor: int) -> Steps:
         """The leap of the other observer to beside the anchor, and the stance, at each of `SECONDS`."""
         size, leaper = 2 * OBSERVER + 2, 1 - anchor
         # the leap k of a gait is to its pose k + 1; information is in the order anchor, leaper, markers
@@ -116,8 +130,8 @@ class Rollout:
         own[np.ix_(order, order)] = information[anchor]
         B = effective_seconds(SECONDS, self._speed)[:, None, None] * own
         eye = np.broadcast_to(np.eye(size), B.shape)
-        leap = _Steps(np.broadcast_to(A, B.shape), 0 * B, np.broadcast_to(C, B.shape))
-        return leap.then(_Steps(eye, B, 0 * B))
+        leap = Steps(np.broadcast_to(A, B.shape), 0 * B, np.broadcast_to(C, B.shape))
+        return leap.then(Steps(eye, B, 0 * B))
 
     def rows(self, belief: Belief) -> NDArray[np.int64]:
         """Return the rows of a belief's covariance that the rest depends on."""
@@ -163,40 +177,18 @@ class Rollout:
         return seconds / stances - self._leap_time
 
     def reason(self, belief: Belief, front: str, seconds: float) -> str:
-        """Return which of what is not known after a stance costs most at the end, in one line.
+        """Return which of what is not known after a stance costs most at the end, in one line."""
 
-        Each kind of variable is taken to be known exactly, and the rest of the mission is computed again.
-        """
+        def variance(P: Array) -> Array:
+            many = {name: np.repeat([belief.poses[name]], len(P), axis=0) for name in self.pair}
+            return self.end_variance(P, many, front, np.full(len(P), seconds))
+
         rows = self.rows(belief)
-        P = belief.covariance[np.ix_(rows, rows)]
-        both = np.array([[0], [OBSERVER]])
-        kinds = {
-            "headings": np.ravel(both + 2),
-            "positions": np.ravel(both + np.arange(3, 5)),
-            "mounts": np.ravel(both + np.arange(POSE, OBSERVER)),
-            "markers": np.array([len(P) - 2, len(P) - 1]),
-        }
-        exact = [P - P[:, of] @ np.linalg.pinv(P[np.ix_(of, of)], hermitian=True) @ P[of] for of in kinds.values()]
-        known = [P, *exact, 0 * P]
-        many = {name: np.repeat([belief.poses[name]], len(known), axis=0) for name in self.pair}
-        now, *without = self.end_variance(np.array(known), many, front, np.full(len(known), seconds)).tolist()
-        inherited = max(now - without[-1], 1e-30)
-        shares = {what: (now - value) / inherited for what, value in zip(kinds, without, strict=False)}
-        later = without[-1] / now
-        first, second = sorted(shares, key=lambda what: -shares[what])[:2]
-        return (
-            f"{1e3 * math.sqrt(now):.1f} mm expected at the goal, {100 * later:.0f} % of the variance by later "
-            f"stances; of the rest, exact {first} would take off {100 * shares[first]:.0f} %, "
-            f"{second} {100 * shares[second]:.0f} %"
-        )
+        return what_costs(belief.covariance[np.ix_(rows, rows)], variance)
 
     def _after(self, P: Array, anchor: int, stances: NDArray[np.int64], pace: NDArray[np.int64]) -> Array:
-        A, B, C = (M[anchor, stances, pace] for M in (self._A, self._B, self._C))
-        left = np.linalg.solve(np.eye(P.shape[-1]) + P @ B, P)
-        numbers = np.array([2, 3, 4, OBSERVER + 2, OBSERVER + 3, OBSERVER + 4])
-        weight = np.array([HEADING_ARM**2, 1.0, 1.0] * 2) / 2
-        a, c = A[:, numbers], C[:, numbers, numbers]
-        return np.asarray(((a @ left * a).sum(axis=2) + c) @ weight)
+        steps = Steps(*(M[anchor, stances, pace] for M in (self._A, self._B, self._C)))
+        return steps.variance(P, end_weights(len(self.pair)))
 
     def _in_formation(self, P: Array, poses: dict[str, Array], front: str, ways: Array) -> Array:
         """Move the errors of robots to where the gait would have them stand: it goes on from there."""

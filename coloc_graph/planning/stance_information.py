@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.backend.camera_model import Mounts
 from coloc_graph.errors import InputError
@@ -154,16 +154,16 @@ class StanceModel:
         J, points = self._pixels(standing, drive)
         return Seen(self._by_variables.T @ _without_mover(J) @ self._by_variables, points)
 
-    def total(self, standing: Array, drive: Array, images: float, velocity: Array) -> tuple[Array, float]:
-        """Sum up a stance whose drive (n, 3) stands for `images` images at each instant.
+    def total(self, standing: Array, drive: Array, images: ArrayLike, velocity: Array) -> tuple[Array, Array]:
+        """Sum up stances (...) whose drives (..., n, 3) stand for `images` (...) images at each instant.
 
         Errors that all images share are unknowns: a bias of each marker's centre in each camera, and the offset of the
-        cameras' clocks, by which the mover's `velocity` (n, 3) [m/s, rad/s] shifts what they see.
+        cameras' clocks, by which the mover's `velocity` (..., n, 3) [m/s, rad/s] shifts what they see.
 
         Returns
         -------
         tuple
-            Information (d, d) of the variables, and the number of correspondences.
+            Information (..., d, d) of the variables, and the number (...) of correspondences.
         """
         J, points = self._pixels(standing, drive)
         r, rows = len(self.observers), J.shape[-2]
@@ -178,11 +178,12 @@ class StanceModel:
                 by_clock[..., own[k], k - 1] = late[..., own[k]]
             shared.append(by_clock)
         J = np.concatenate([J[..., :-3], *shared, J[..., -3:]], axis=-1)
-        total = images * _without_mover(J).sum(axis=0)
+        images = np.asarray(images, float)
+        total = images[..., None, None] * _without_mover(J).sum(axis=-3)
         d = self._by_variables.shape[0]
-        nuisance = total[d:, d:] + np.eye(len(total) - d)
-        left = total[:d, :d] - total[:d, d:] @ np.linalg.solve(nuisance, total[d:, :d])
-        return self._by_variables.T @ left @ self._by_variables, images * float(points.sum())
+        nuisance = total[..., d:, d:] + np.eye(total.shape[-1] - d)
+        left = total[..., :d, :d] - total[..., :d, d:] @ np.linalg.solve(nuisance, total[..., d:, :d])
+        return self._by_variables.T @ left @ self._by_variables, images * points.sum(axis=-1)
 
     def _pixels(self, standing: Array, drive: Array) -> tuple[Array, Array]:
         """Whitened Jacobians (..., n, 2 r m, 6 r + 5) of pixels by cameras, markers and the mover's pose.

@@ -10,6 +10,7 @@ import pytest
 from coloc_graph.errors import InputError
 from coloc_graph.planning.beam import Node, different
 from coloc_graph.planning.belief import Belief
+from coloc_graph.planning.clearance import conflicts
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap, read_floor_map
 from coloc_graph.planning.formation import PAPER, Gait
@@ -50,7 +51,7 @@ STRAIGHT = Course(((0.0, 0.0), (3.0, 0.0)))
 @pytest.fixture(scope="module")
 def straight():
     planner = horizon(STRAIGHT)
-    return planner, planner.mission(start(planner.predictor.team))
+    return planner, planner.draft(start(planner.predictor.team))
 
 
 def test_a_mission_arrives_with_its_seconds_spent_and_one_anchor_in_each_stance(straight):
@@ -67,6 +68,17 @@ def test_what_it_expects_at_the_start_it_finds_at_the_end(straight):
     expected = planner.next(first, 60.0 - mission.plan.stances[0].duration).expected
     found = math.hypot(mission.end_sigma, HEADING_ARM * mission.heading_sigma)
     assert found == pytest.approx(expected, rel=0.1)
+
+
+def test_refining_a_mission_promises_less_in_as_much_time_and_touches_nothing(straight):
+    planner, draft = straight
+    mission = planner.refined(draft)
+    assert mission.end_sigma < 0.93 * draft.end_sigma
+    assert mission.heading_sigma < draft.heading_sigma
+    assert mission.capture_time <= draft.capture_time + 1e-9
+    assert planner.arrived(mission.plan.stances[-1].standing)
+    assert not conflicts(mission.plan)
+    assert mission.plan.stances[0].standing == draft.plan.stances[0].standing
 
 
 def test_no_second_that_is_left_is_free_to_spend(straight):
