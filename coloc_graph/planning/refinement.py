@@ -35,7 +35,7 @@ SEEN = 0.9  # share of a drive that lies in the common view
 SAMPLE = 0.1  # distance between places of a drive that are checked [m]
 TRIED = 8  # changes of a stance, the best first, that are checked for being possible
 WORTHWHILE = 1e-4  # relative decrease of the variance below which nothing is changed
-LONGEST = 1.5  # a combined change is at most this many steps long, in each number
+MAX_STEPS = 1.5  # a combined change is at most this many steps long, in each number
 
 
 @dataclass
@@ -145,7 +145,7 @@ class Refinement:
         return out
 
     def _leaps(self, belief: Belief, poses: Mapping[str, Planar], stances: Sequence[PlannedStance]) -> list[Steps]:
-        """What the leaps before each of some stances do, from `poses` on."""
+        """Effects of the leaps before each of some stances, from `poses` on."""
         found, poses = [], dict(poses)
         for stance in stances:
             A, C = self._eye.copy(), self._none.copy()
@@ -229,8 +229,8 @@ class Refinement:
         value, made = self._compared(belief, chain, place, options, worth)
         up, down, now = value[1 : numbers + 1], value[numbers + 1 :], value[0]
         curved, slope = (up + down) / 2 - now, (up - down) / 2
-        lowest = np.where(curved > 0, -slope / np.maximum(2 * curved, 1e-30), -np.sign(slope) * LONGEST)
-        combined = step * np.clip(lowest, -LONGEST, LONGEST)
+        lowest = np.where(curved > 0, -slope / np.maximum(2 * curved, 1e-30), -np.sign(slope) * MAX_STEPS)
+        combined = step * np.clip(lowest, -MAX_STEPS, MAX_STEPS)
         more = [changed(combined), changed(combined / 2)]
         value_more, made_more = self._compared(belief, chain, place, more, worth)
         value, options, made = np.concatenate([value, value_more]), options + more, made + made_more
