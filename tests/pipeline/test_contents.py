@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
 import numpy as np
@@ -127,7 +128,9 @@ def test_options_that_do_not_apply_are_refused(options, which, request, tmp_path
     assert not (tmp_path / "result").exists()
 
 
-def test_each_run_in_a_folder_is_solved_by_what_it_holds(ranging, both, short, empty, tmp_path, capsys):
+def test_each_run_in_a_folder_is_solved_by_what_it_holds(ranging, both, short, empty, tmp_path, capsys, monkeypatch):
+    # processes are started in tests/results/test_many_runs.py
+    monkeypatch.setattr("coloc_graph.results.executors.workers", lambda *_: ThreadPoolExecutor(1))
     folder = tmp_path / "runs"
     folder.mkdir()
     for path in (ranging, both, short, empty):
