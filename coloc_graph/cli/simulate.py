@@ -60,6 +60,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         "--leap", type=float, help="advance a stance, m (default: 0.185; landmarks 0.25; rows of team 0.45)"
     )
     single.add_argument("--plan", metavar="CSV", help="follow a plan that `coloc plan --poses` wrote")
+    single.add_argument("--map", metavar="YAML", help="with --plan: ROS map_server map of walls that hide the mover")
     single.add_argument("--team", metavar="TEAM.toml", help="with --plan: its robots (default: those of the reference)")
 
     team = command.add_argument_group("scenario team")
@@ -83,6 +84,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
 def run(args: argparse.Namespace) -> int:
     """Simulate a scenario and write its run."""
     from coloc_graph.errors import InputError
+    from coloc_graph.planning.floor_map import read_floor_map
     from coloc_graph.planning.plan import read_plan
     from coloc_graph.simulation import Imperfections, simulate
     from coloc_graph.team import read_team
@@ -118,6 +120,7 @@ def run(args: argparse.Namespace) -> int:
             theta_deg=args.theta if args.scenario not in GAITS else None,
             gait=gait_of(args),
             plan=None if args.plan is None else read_plan(args.plan),
+            floor_map=None if args.map is None else read_floor_map(args.map),
             team=None if args.team is None else read_team(args.team),
             robots=args.robots,
             at_once=args.at_once,

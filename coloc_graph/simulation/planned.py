@@ -6,7 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from coloc_graph.errors import InputError
+from coloc_graph.planning.clearance import conflicts
 from coloc_graph.planning.drive import drive_through, there_and_back
+from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.plan import Plan
 from coloc_graph.planning.slip import HEADING_SIGMA, stop_sigma
 from coloc_graph.simulation.floor_plans import FloorPlan
@@ -26,7 +28,7 @@ class PlannedScenario(Scenario):
     """
 
     plan: Plan | None = None
-    floor_plan: FloorPlan | None = None
+    walls: FloorPlan | FloorMap | None = None
     at: tuple[dict[str, int], ...] = ()
 
     @property
@@ -79,8 +81,8 @@ class PlannedScenario(Scenario):
             by_view[n] = sees(view, points)
             others = [other.T_world_camera[:2, 3] for other in views if other is not view]
             by_view[n] &= ~hidden(view.T_world_camera[:3, 3], points, np.array(others))
-            if self.floor_plan is not None:
-                by_view[n] &= ~self.floor_plan.blocked(view.T_world_camera[:2, 3], points)
+            if self.walls is not None:
+                by_view[n] &= ~self.walls.blocked(view.T_world_camera[:2, 3], points)
         # what one camera alone sees is seen with no other
         recorded = by_view.sum(axis=0) >= 2
         by_view &= recorded
@@ -92,15 +94,28 @@ class PlannedScenario(Scenario):
         return Tour(leg, start + instants, recorded, by_view)
 
 
+def require_clear(plan: Plan, floor_map: FloorMap) -> None:
+    """Require that robots that follow a plan keep off the walls of a map, and off each other.
+
+    Raises
+    ------
+    InputError
+        If they do not.
+    """
+    if found := conflicts(plan, floor_map.clear):
+        k, sentence = found[0]
+        raise InputError(f"stance {k} of the plan: {sentence}; plan it with this map")
+
+
 def planned(
     plan: Plan,
     rng: np.random.Generator | None = None,
-    floor_plan: FloorPlan | None = None,
+    walls: FloorPlan | FloorMap | None = None,
     landmarks: tuple[Pose, ...] = (),
 ) -> PlannedScenario:
     """Make the scenario that follows a plan; each stop is off by some centimetres and a degree.
 
-    Walls of a `floor_plan` hide what is behind them; `landmarks` are the poses of landmarks.
+    `walls` hide what is behind them; `landmarks` are the poses of landmarks.
 
     Raises
     ------
@@ -136,7 +151,7 @@ def planned(
         (first, second),
         mover,
         plan=plan,
-        floor_plan=floor_plan,
+        walls=walls,
         landmarks=landmarks,
         at=tuple(at),
     )

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coloc_graph.errors import InputError
+from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.plan import Plan
 from coloc_graph.run import atomic_run
@@ -15,7 +16,7 @@ from coloc_graph.run.messages import Detections, Image, Motion, OdometrySample, 
 from coloc_graph.simulation.blinking import with_codes
 from coloc_graph.simulation.mess import messy_frames
 from coloc_graph.simulation.paths import Array
-from coloc_graph.simulation.planned import planned
+from coloc_graph.simulation.planned import planned, require_clear
 from coloc_graph.simulation.rig import FISHEYE_BIAS_PX, Imperfections, reference_team, wide_team
 from coloc_graph.simulation.scenarios import TeamScenario, scenario
 from coloc_graph.simulation.scenery import Scenery, frames, make_scenery
@@ -69,6 +70,7 @@ def simulate(
     fisheye_deg: float | None = None,
     uwb_landmarks: int = 0,
     team: Team | None = None,
+    floor_map: FloorMap | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> World:
     """Simulate a scenario (`single-step`, `six-step`, `hallway`, `team`, `landmarks`), written as a run to `out`.
@@ -79,9 +81,10 @@ def simulate(
     `at_once`, and whether they `blink` and markers have no names (2000 points then) are team's; `length` [m] in all, in
     how many `laps`, with a landmark every so many metres, and whether the team is told where these are (`known`), are
     landmarks'; `uwb_landmarks` are ranged and not seen. `gait` is the formation; a `plan` is followed instead, at
-    `fps`, by a `team` (default: the reference's robots), with the points that its drives bring. `progress` is called
-    with the stances done and their number. The same arguments give the same bytes. Returns what was true. Raises
-    `InputError`, and leaves no file, where an argument is wrong or the pair has no common view.
+    `fps`, by a `team` (default: the reference's robots), with the points that its drives bring, among the walls of a
+    `floor_map`, behind which nothing is seen. `progress` is called with the stances done and their number. The same
+    arguments give the same bytes. Returns what was true. Raises `InputError`, and leaves no file, where an argument is
+    wrong or the pair has no common view.
     """
     if depth not in get_args(Depth):
         raise InputError(f"`depth` is {depth!r}; use tracks or images")
@@ -100,13 +103,21 @@ def simulate(
         raise InputError("a plan has its own robots, stances, points and gait: leave these out")
     if team is not None and plan is None:
         raise InputError("a team of your own follows a plan: give one, too")
+    if floor_map is not None and plan is None:
+        raise InputError("robots keep off the walls of a map by a plan: give one that was planned with this map")
+    if floor_map is not None and (depth == "images" or scenario_name == "landmarks"):
+        raise InputError(
+            "walls of a map hide markers of robots at depth tracks: leave out images, landmarks, or the map"
+        )
     rng = stream(seed, "formation")
     what = scenario(
         scenario_name, stances=stances, l=l, theta_deg=theta_deg, robots=robots, at_once=at_once,
         length=length, landmark_every=landmark_every, laps=laps, rng=rng, gait=gait,
     )  # fmt: skip
     if plan is not None:
-        what = planned(plan, stream(seed, "formation"), landmarks=what.landmarks)
+        if floor_map is not None:
+            require_clear(plan, floor_map)
+        what = planned(plan, stream(seed, "formation"), floor_map, what.landmarks)
         team = team or _reference_of(plan)
     if points is None:
         points = 250 if depth == "images" or scenario_name == "single-step" else 2000 if blink else 100

@@ -1,11 +1,13 @@
 """Plans as data: gaits, the CSV file, and the simulated team that follows one."""
 
+import cv2
 import numpy as np
 import pytest
 
 from coloc_graph.cli import main
 from coloc_graph.errors import InputError
 from coloc_graph.planning.drive import drive_through, there_and_back
+from coloc_graph.planning.floor_map import read_floor_map
 from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.plan import Plan, PlannedStance, read_plan, write_plan
 from coloc_graph.run import open_run
@@ -105,6 +107,45 @@ def test_a_robot_that_stands_in_the_way_costs_points():
     blocked = Plan((PlannedStance({**stance.standing, "B": (1.1, 0.2, 0.0)}, (), "C", stance.waypoints, 20.0),))
     counts = [build_world(planned(plan), fps=10.0).captures[0][0].recorded.sum() for plan in (free, blocked)]
     assert counts[1] < 0.8 * counts[0]
+
+
+def ros_map(path, pillar):
+    """Write a map_server map, free from -1, -2 to 4, 2 but for a pillar x0, y0, x1, y1 [m]."""
+    cells = np.full((80, 100), 254, np.uint8)
+    x0, y0, x1, y1 = (round(20 * (number + 1 + k % 2)) for k, number in enumerate(pillar))
+    cells[80 - y1 : 80 - y0, x0:x1] = 0
+    cv2.imwrite(str(path.with_suffix(".pgm")), cells)
+    fields = "resolution: 0.05\norigin: [-1.0, -2.0, 0.0]\nnegate: 0\nfree_thresh: 0.2\n"
+    path.write_text(f"image: {path.with_suffix('.pgm').name}\n{fields}")
+    return str(path)
+
+
+def test_a_pillar_of_a_map_hides_the_mover_from_one_behind_it(tmp_path):
+    plan = straight_plan(1, duration=20.0)
+    floor_map = read_floor_map(ros_map(tmp_path / "map.yaml", (0.7, 0.3, 0.8, 0.4)))
+    free, walled = (build_world(planned(plan, walls=one), fps=10.0).captures[0] for one in (None, floor_map))
+    by_robot = {one.robot: (one.recorded.sum(), other.recorded.sum()) for one, other in zip(free, walled, strict=True)}
+    assert by_robot["A"][1] < 0.9 * by_robot["A"][0]
+
+
+def test_simulate_honours_a_map_or_says_why_not(tmp_path, capsys):
+    write_plan(straight_plan(1, duration=3.0), tmp_path / "plan.csv")
+    beside = ros_map(tmp_path / "beside.yaml", (0.7, 0.3, 0.8, 0.4))
+    before = ros_map(tmp_path / "before.yaml", (1.2, 0.0, 1.4, 0.3))
+    follow = ["--plan", str(tmp_path / "plan.csv")]
+    start = ["simulate", "hallway", "--out", str(tmp_path / "run.mcap"), "--force"]
+    assert main([*start, *follow, "--map", beside]) == 0
+    capsys.readouterr()
+    for arguments, sentence in (
+        ([*follow, "--map", before], "stance 0 of the plan: the drive of C comes too near to a robot or a wall; plan"),
+        (["--map", beside], "robots keep off the walls of a map by a plan: give one"),
+        ([*follow, "--map", beside, "--depth", "images"], "walls of a map hide markers of robots at depth tracks"),
+        ([*follow, "--map", str(tmp_path / "plan.csv")], "plan.csv is not a map"),
+    ):
+        assert main([*start, *arguments]) == 2
+        error = capsys.readouterr().err
+        assert sentence in error
+        assert error.count("\n") == 1
 
 
 def test_simulate_takes_a_gait_and_a_plan(tmp_path, capsys):
