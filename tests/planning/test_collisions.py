@@ -76,7 +76,7 @@ def test_through_a_doorway_no_robot_touches_another_or_a_wall_wherever_it_stops(
 
 def test_what_is_planned_through_a_doorway_is_seen_in_a_world_with_those_walls(mission):
     _, mission = mission
-    world = build_world(planned(mission.plan, floor_plan=DOOR), fps=10.0)
+    world = build_world(planned(mission.plan, walls=DOOR), fps=10.0)
     points = [captures[0].recorded.sum() for captures in world.captures]
     assert min(points) > 30
     assert sum(points) == pytest.approx(sum(promise.points for promise in mission.promises), rel=0.2)
