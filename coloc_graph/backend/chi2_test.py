@@ -44,6 +44,11 @@ class Agreement:
         """Distance in standard deviations, if all of it lies in one direction."""
         return float(np.sqrt(self.chi2))
 
+    @property
+    def reason(self) -> str:
+        """Reason of a rejection in words."""
+        return f"an outlier: {self.sigmas:.0f} sigmas from the other measurements"
+
 
 UNCHECKED = Agreement(0.0, 0)  # of a measurement that nothing can contradict
 

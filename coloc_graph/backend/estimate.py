@@ -37,7 +37,7 @@ class Rejection:
     reason : str
         Reason in words.
     sigmas : float
-        Distance from all other measurements in standard deviations; of a ranging run, from the estimate.
+        Distance from all other measurements in standard deviations.
     alternative : tuple of Cause
         Other causes that would explain the measurements as well.
     """
@@ -48,10 +48,10 @@ class Rejection:
     alternative: tuple[Cause, ...] = ()
 
 
-def rejection_of(measurement: Measurement | OnMap, off: Agreement) -> Rejection:
+def rejection_of(measurement: Measurement | RangeBearing | OnMap, off: Agreement) -> Rejection:
     """Return the rejection of an outlier, by its test statistic."""
     cause = NO_LINE_OF_SIGHT if isinstance(measurement, Range) else ""
-    return Rejection(measurement, f"an outlier: {off.sigmas:.0f} sigmas from the other measurements{cause}", off.sigmas)
+    return Rejection(measurement, f"{off.reason}{cause}", off.sigmas)
 
 
 @dataclass(frozen=True, eq=False)

@@ -120,39 +120,23 @@ class Keys:
                     parts.append((keys[index, slot], block))
             yield index, parts
 
-
-class LinearSystem:
-    """Linear least squares over `keys`: `add` factors to its `graph`."""
-
-    def __init__(self, keys: Keys) -> None:
-        self.keys, self.graph = keys, gtsam.GaussianFactorGraph()
-
-    def add(self, rows: Rows) -> None:
-        """Add factors of one kind."""
+    def add(self, graph: gtsam.GaussianFactorGraph, rows: Rows) -> None:
+        """Add factors of one kind to a graph."""
         make: Callable[..., gtsam.JacobianFactor] = gtsam.JacobianFactor
-        push = self.graph.push_back
         noise = gtsam.noiseModel.Unit.Create(rows.jacobians.shape[1])
-        for index, parts in self.keys.blocks(rows):
-            b = -rows.residuals[index]
-            columns = [column for keys, block in parts for column in (self.keys.names[keys].tolist(), block)]
+        for index, parts in self.blocks(rows):
+            columns = [column for keys, block in parts for column in (self.names[keys].tolist(), block)]
             if parts:
-                for one in zip(*columns, b, strict=True):
-                    push(make(*one, noise))
+                for one in zip(*columns, -rows.residuals[index], strict=True):
+                    graph.push_back(make(*one, noise))
 
-    def add_prior(self, key: int, sigmas: Array, off: Array) -> None:
+    def add_prior(self, graph: gtsam.GaussianFactorGraph, key: int, sigmas: Array, off: Array) -> None:
         """Add the prior of a key: standard deviations (size,) of its variables, and their errors `off` (size,)."""
-        free = self.keys.free[self.keys.span(key)]
+        free = self.free[self.span(key)]
         if free.any():
-            weights = np.where(free, 1 / np.where(free, sigmas, 1.0), 1.0)
-            noise = gtsam.noiseModel.Unit.Create(len(free))
-            name = int(self.keys.names[key])
-            self.graph.push_back(gtsam.JacobianFactor(name, np.diag(weights), -weights * free * off, noise))
-
-    def ordering(self, last: Sequence[int] = ()) -> gtsam.Ordering:
-        """Return an order of elimination, for all systems of the same factors; GTSAM's METIS segfaults on some.
-
-        Keys that are `last` are at the root, where covariances cost least.
-        """
-        if not len(last):
-            return gtsam.Ordering.ColamdGaussianFactorGraph(self.graph)
-        return gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(self.graph, list(last))
+            weights, noise = (
+                np.where(free, 1 / np.where(free, sigmas, 1.0), 1.0),
+                gtsam.noiseModel.Unit.Create(len(free)),
+            )
+            name = int(self.names[key])
+            graph.push_back(gtsam.JacobianFactor(name, np.diag(weights), -weights * free * off, noise))

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from coloc_graph.backend.chi2_test import Agreement
 from coloc_graph.backend.floor_poses import joint_in_space
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.errors import EstimationError
@@ -16,10 +17,19 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
+# the test of other kinds rejects good ones: successive errors are correlated (docs/ranging-runs.md)
+OUTLIER = 6.0  # residual of a range or bearing beyond which a measurement is an outlier [sigmas]
+
+
 def pose_key(keyframes: Keyframes, robots: Index, numbers: Index) -> Index:
     """Return GTSAM's keys (n,) of keyframes' poses, by robot and number: the same however many keyframes there are."""
     keys: Index = numbers * len(keyframes.robots) + robots
     return keys
+
+
+def outliers_of(residuals: Array) -> NDArray[np.bool_]:
+    """Return which measurements of residuals (n, 2) are outliers; NaN are none."""
+    return np.asarray(np.abs(residuals).max(axis=-1) > OUTLIER)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -34,8 +44,6 @@ class RangingProblem:
         By robot, the keyframe of each pose of its trajectory.
     residuals : (m, 2) float
         Of ranges and bearings in units of their noise; NaN where a measurement was not used.
-    outliers : (m,) bool
-        Measurements that were rejected: their robust weight is near 0.
     noise : (robots, 2) float
         Factors on the stated standard deviations of ranges and of bearings.
     on_map : bool
@@ -50,7 +58,6 @@ class RangingProblem:
     keyframes: Keyframes
     numbers: Mapping[str, NDArray[np.int64]]
     residuals: Array
-    outliers: NDArray[np.bool_]
     noise: Array
     on_map: bool
     direction_sigmas: Array
@@ -68,6 +75,11 @@ class RangingProblem:
     def names(self) -> tuple[str, ...]:
         """Robots, then landmarks: the names of `robot` and `target` of the measurements, by number."""
         return (*self.keyframes.robots, *self.keyframes.landmarks)
+
+    @cached_property
+    def outliers(self) -> NDArray[np.bool_]:
+        """True where a measurement was rejected (m,): its robust weight is near 0."""
+        return outliers_of(self.residuals)
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -97,9 +109,9 @@ class RangingProblem:
         """RMS residual of a range and bearing in units of its noise; NaN where it was not used."""
         return float(np.sqrt(np.mean(self.residuals[measurement.row] ** 2)))
 
-    def sigmas(self, row: int) -> float:
-        """Larger residual of a range and bearing, in standard deviations."""
-        return float(np.abs(self.residuals[row]).max())
+    def agreement(self, row: int) -> Agreement:
+        """Return how a range and bearing agrees with the estimate."""
+        return Agreement(float((self.residuals[row] ** 2).max()), 1)
 
     def joint(self, nodes: Sequence[Node], T_world_body: Array) -> Array:
         """Return the joint covariance (6 n, 6 n) of different nodes at (n, 4, 4), in their bodies' tangents."""
@@ -124,7 +136,7 @@ class RangingProblem:
     def reason(self, row: int) -> str | None:
         """Return why a measurement is not used; None where it is."""
         if self.outliers[row]:
-            return f"an outlier: {self.sigmas(row):.1f} sigmas from the estimate"
+            return self.agreement(row).reason
         if not np.isfinite(self.residuals[row, 0]):
             return "one of its ends has no pose"
         return None

@@ -40,30 +40,32 @@ def require_following(before: Keyframes, new: Keyframes) -> None:
             f"keyframes of {', '.join((*new.robots, *new.landmarks))} are not of the team's robots and landmarks: "
             f"name {', '.join((*before.robots, *before.landmarks))}, in this order"
         )
-    for name, times, begin, end, had in zip(new.robots, new.times, new.begins, before.ends, before.times, strict=True):
+    for name, times, steps, begin, end, had in zip(
+        new.robots, new.times, new.steps, new.begins, before.ends, before.times, strict=True
+    ):
+        every, why = np.concatenate([had[-1:], times[len(had[-1:]) :]]), None
         if len(times) and begin != end - (len(had) > 0):
-            raise MeasurementError(
-                f"keyframes of {name} begin with number {begin}: begin with its last one, {max(end - 1, 0)}"
-            )
-        every = times if not len(had) else np.concatenate([had[-1:], times[1:]])
-        if not np.isfinite(every).all() or (np.diff(every) <= 0).any():
-            raise MeasurementError(f"times of the keyframes of {name} do not increase")
+            why = f"begin with number {begin}: begin with its last one, {max(end - 1, 0)}"
+        elif not np.isfinite(every).all() or (np.diff(every) <= 0).any():
+            why = "have times that do not increase"
+        elif len(steps.covariances) != max(len(times) - 1, 0) or not np.isfinite(steps.covariances).all():
+            why = "have steps that are not those between them, or are not finite"
+        if why is not None:
+            raise MeasurementError(f"keyframes of {name} {why}")
     m, robots = new.measured, len(new.robots)
     begins, ends = np.array(before.begins), np.maximum(before.ends, new.ends)
     last = np.minimum(m.target, robots - 1)
     there = (begins[m.robot] <= m.keyframe) & (m.keyframe < ends[m.robot])
     there &= (m.target >= robots) | ((begins[last] <= m.target_keyframe) & (m.target_keyframe < ends[last]))
     valid = np.isfinite(m.range) & (m.range > 0) & np.isfinite(m.bearing) & (m.share > 0).all(axis=1)
-    for well, why in (
-        (there, "is of a keyframe that has not come, or has left the window"),
-        (valid, "is no number of metres above 0 with a bearing and shares above 0"),
-    ):
-        if not well.all():
-            row = int(np.argmin(well))
-            names = (*new.robots, *new.landmarks)
-            raise MeasurementError(
-                f"range of {names[m.target[row]]} by {names[m.robot[row]]} at {m.time[row]:.3f} s {why}"
-            )
+    for row in np.flatnonzero(~(there & valid))[:1].tolist():
+        why = "is of a keyframe that has not come, or has left the window"
+        if not valid[row]:
+            why = "has a range or bearing that is not finite, a range of 0 or less, or a share of 0"
+        names = *new.robots, *new.landmarks
+        raise MeasurementError(
+            f"the range of {names[m.target[row]]} by {names[m.robot[row]]} at {m.time[row]:.3f} s {why}"
+        )
 
 
 def _require_ranges(measured: Range) -> None:

@@ -4,7 +4,7 @@
 """
 
 from coloc_graph.backend.planar.batch import optimise_keyframes
-from coloc_graph.backend.planar.filter import NONE_LOCATED, UNLOCATED, Filtered, filter_forward, unlocated
+from coloc_graph.backend.planar.filter import NONE_LOCATED, UNLOCATED, Filter, filter_forward, unlocated
 from coloc_graph.backend.planar.incremental import LAG, UPDATE_PERIOD, IncrementalKeyframes, Latest
 
 __all__ = [
@@ -12,7 +12,7 @@ __all__ = [
     "NONE_LOCATED",
     "UNLOCATED",
     "UPDATE_PERIOD",
-    "Filtered",
+    "Filter",
     "IncrementalKeyframes",
     "Latest",
     "filter_forward",

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.backend.linear_system import Keys, LinearSystem, Rows
+from coloc_graph.backend.linear_system import Keys, Rows
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.filter import Models
 from coloc_graph.backend.ranging import pose_key
@@ -195,17 +195,16 @@ class KeyframeFactors:
             values.insert(name, every[self.keys.span(key)])
         return values
 
-    def system(self, state: State, rows: Iterable[Rows], *, priors: bool = True) -> LinearSystem:
-        """Return the linear system of some factors, with the priors of the shared variables."""
-        system = LinearSystem(self.keys)
+    def linear(self, state: State, rows: Iterable[Rows], *, priors: bool = True) -> gtsam.GaussianFactorGraph:
+        """Return the linear factors of some rows, with the priors of the shared variables."""
+        graph = gtsam.GaussianFactorGraph()
         for one in rows:
-            system.add(one)
-        if priors:
-            for key in range(len(self), len(self.keys.sizes)):
-                at = self.keys.span(key)
-                own = slice(at.start - 3 * len(self), at.stop - 3 * len(self))
-                system.add_prior(key, self.sigmas[own], (state.shared - self._known_before)[own])
-        return system
+            self.keys.add(graph, one)
+        for key in range(len(self), len(self.keys.sizes)) if priors else ():
+            at = self.keys.span(key)
+            own = slice(at.start - 3 * len(self), at.stop - 3 * len(self))
+            self.keys.add_prior(graph, key, self.sigmas[own], (state.shared - self._known_before)[own])
+        return graph
 
     def moved(self, state: State, found: gtsam.VectorValues, names: Sequence[int]) -> State:
         """Return the state after a step in some variables, by GTSAM's keys in ascending order."""

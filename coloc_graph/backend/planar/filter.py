@@ -8,7 +8,6 @@ robotics", 1990.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,46 +37,6 @@ NONE_LOCATED = (
 )
 
 
-@dataclass(eq=False)
-class Filtered:
-    """Result of a filter.
-
-    Parameters
-    ----------
-    poses, covariances : list of (n, 3) and (n, 3, 3) float
-        x, y [m], heading [rad] of each robot's keyframes at their times; NaN before its initial pose.
-    landmarks : (m, 2) float
-        Positions at the end [m]; NaN of landmarks that were never seen.
-    wheels, ranging : (robots, 3) and (robots, 7) float
-        Calibration errors at the end.
-    used : (k,) bool
-        True of used measurements.
-    placed_at : dict of int to int
-        Keyframe of each robot's initial pose, by its number.
-    """
-
-    poses: list[Array]
-    covariances: list[Array]
-    landmarks: Array
-    wheels: Array
-    ranging: Array
-    used: NDArray[np.bool_]
-    placed_at: dict[int, int] = field(default_factory=dict)
-
-    def whole(self, keyframes: Keyframes, models: "Models") -> list[Array]:
-        """Return the poses of all keyframes, those before a robot's initial pose by odometry backwards."""
-        out = []
-        for robot, poses in enumerate(self.poses):
-            poses = poses.copy()
-            first = self.placed_at.get(robot)
-            for k in range((first or 0) - 1, -1, -1):
-                delta, _ = models.wheels[robot].step(k, self.wheels[robot])
-                back = between(delta, (0.0, 0.0, 0.0))
-                poses[k] = compose(_pose(poses[k + 1]), back)
-            out.append(poses)
-        return out
-
-
 class Models:
     """Wheels and sensors of a team, with the tolerances of their errors."""
 
@@ -103,9 +62,14 @@ class Models:
         return bool(np.isfinite(self.map).any())
 
 
-def filter_forward(team: Team, keyframes: Keyframes, *, period: float = 0.0) -> Filtered:
-    """Run the filter over all keyframes and measurements; `period` as of `Filter`."""
-    return Filter(team, keyframes, period).run()
+def filter_forward(team: Team, keyframes: Keyframes, *, period: float = 0.0) -> "Filter":
+    """Run the filter over all keyframes and measurements, in the order of time; `period` as of `Filter`."""
+    one = Filter(team, keyframes, period)
+    for index in range(len(keyframes.measured)):
+        one.take(index)
+    for robot, times in enumerate(keyframes.times):
+        one.go(robot, len(times) - 1)
+    return one
 
 
 def aligned(values: Sequence[Array], before: Keyframes, now: Keyframes) -> list[Array]:
@@ -121,16 +85,19 @@ def unlocated(team: Team, keyframes: Keyframes) -> dict[str, str]:
     """Return the reason by robot that no measurements locate; it ends as soon as all are located."""
     one = Filter(team, keyframes, INITIAL_PERIOD)
     for index in range(len(keyframes.measured)):
-        if len(one.out.placed_at) == len(keyframes.robots):
+        if len(one.placed_at) == len(keyframes.robots):
             break
         one.take(index)
-    return dict.fromkeys((name for n, name in enumerate(keyframes.robots) if n not in one.out.placed_at), UNLOCATED)
+    return dict.fromkeys((name for n, name in enumerate(keyframes.robots) if n not in one.placed_at), UNLOCATED)
 
 
 class Filter:
     """EKF whose state is the robots, their calibration errors and the landmarks.
 
     A target is used by a robot once a `period` [s] when both have poses: initial values need no more.
+
+    `poses` (n, 3) and `covariances` (n, 3, 3) of each robot's keyframes are those at their times, NaN before its
+    initial pose, at the keyframe `placed_at`; `used` (k,) are the measurements that were used.
     """
 
     def __init__(self, team: Team, keyframes: Keyframes, period: float = 0.0) -> None:
@@ -158,28 +125,40 @@ class Filter:
         reference = keyframes.robots.index(team.reference)
         if not self.models.map_known:
             self._placed[reference] = True
-        self.out = Filtered(
-            poses=[np.full((len(t), 3), np.nan) for t in keyframes.times],
-            covariances=[np.full((len(t), 3, 3), np.nan) for t in keyframes.times],
-            landmarks=np.full((landmarks, 2), np.nan),
-            wheels=np.zeros((robots, WHEELS)),
-            ranging=np.zeros((robots, RANGING)),
-            used=np.zeros(len(keyframes.measured), bool),
-        )
+        self.poses = [np.full((len(t), 3), np.nan) for t in keyframes.times]
+        self.covariances = [np.full((len(t), 3, 3), np.nan) for t in keyframes.times]
+        self.used = np.zeros(len(keyframes.measured), bool)
+        self.placed_at: dict[int, int] = {}
         if not self.models.map_known:
-            self.out.placed_at[reference] = 0
+            self.placed_at[reference] = 0
             self._note(reference)
 
-    def run(self) -> Filtered:
-        """Process all measurements in the order of time, then the steps to the last keyframes."""
-        for index in range(len(self.keyframes.measured)):
-            self.take(index)
-        for robot, times in enumerate(self.keyframes.times):
-            self._go(robot, len(times) - 1)
-        self.out.landmarks[self._known] = self.mean[self._marks :].reshape(-1, 2)[self._known]
-        self.out.wheels = self.mean[self._wheels : self._ranging].reshape(-1, WHEELS).copy()
-        self.out.ranging = self.mean[self._ranging : self._marks].reshape(-1, RANGING).copy()
-        return self.out
+    @property
+    def landmarks(self) -> Array:
+        """Positions (m, 2) of the landmarks [m]; NaN of those that were never seen."""
+        return np.where(self._known[:, None], self.mean[self._marks :].reshape(-1, 2), np.nan)
+
+    @property
+    def wheels(self) -> Array:
+        """Errors (robots, 3) of the wheels."""
+        return self.mean[self._wheels : self._ranging].reshape(-1, WHEELS)
+
+    @property
+    def ranging(self) -> Array:
+        """Errors (robots, 7) of the sensors."""
+        return self.mean[self._ranging : self._marks].reshape(-1, RANGING)
+
+    def whole(self) -> list[Array]:
+        """Return the poses of all keyframes, those before a robot's initial pose by odometry backwards."""
+        out = []
+        for robot, poses in enumerate(self.poses):
+            poses = poses.copy()
+            for k in range(self.placed_at.get(robot, 0) - 1, -1, -1):
+                delta, _ = self.models.wheels[robot].step(k, self.wheels[robot])
+                back = between(delta, (0.0, 0.0, 0.0))
+                poses[k] = compose(_pose(poses[k + 1]), back)
+            out.append(poses)
+        return out
 
     def take(self, index: int) -> None:
         """Process the next measurement."""
@@ -189,27 +168,26 @@ class Filter:
         if time - self._used_at.get((robot, target), -math.inf) < self._period:
             return
         begins = self.keyframes.begins
-        self._go(robot, int(m.keyframe[index]) - begins[robot])
+        self.go(robot, int(m.keyframe[index]) - begins[robot])
         if target < self._robots:
-            self._go(target, int(m.target_keyframe[index]) - begins[target])
+            self.go(target, int(m.target_keyframe[index]) - begins[target])
         if self._ready(robot, target, range_, bearing):
-            self.out.used[index] = self._update(robot, target, range_, bearing, m.share[index].tolist())
-            if self.out.used[index]:
+            self.used[index] = self._update(robot, target, range_, bearing, m.share[index].tolist())
+            if self.used[index]:
                 self._used_at[robot, target] = time
 
     def follow(self, keyframes: Keyframes, models: "Models") -> None:
         """Go on with keyframes of which more have come, and older ones have left."""
-        out = self.out
         left = np.subtract(keyframes.begins, self.keyframes.begins).tolist()
         for robot, gone in enumerate(left):
-            self._go(robot, gone)
+            self.go(robot, gone)
             self._at[robot] -= gone
-        out.poses = aligned(out.poses, self.keyframes, keyframes)
-        out.covariances = aligned(out.covariances, self.keyframes, keyframes)
-        out.placed_at = {robot: max(at - left[robot], 0) for robot, at in out.placed_at.items()}
-        out.used = np.zeros(len(keyframes.measured), bool)
+        self.poses = aligned(self.poses, self.keyframes, keyframes)
+        self.covariances = aligned(self.covariances, self.keyframes, keyframes)
+        self.placed_at = {robot: max(at - left[robot], 0) for robot, at in self.placed_at.items()}
+        self.used = np.zeros(len(keyframes.measured), bool)
         self.keyframes, self.models = keyframes, models
-        for robot in out.placed_at:
+        for robot in self.placed_at:
             self._note(robot)
 
     @property
@@ -254,7 +232,7 @@ class Filter:
         self.mean[at] = compose(frame, self._own[robot])
         self.P[at, at] = np.diag(np.square(INITIAL_SIGMAS))
         self._placed[robot] = True
-        self.out.placed_at[robot] = self._at[robot]
+        self.placed_at[robot] = self._at[robot]
         self._note(robot)
 
     def _pose(self, robot: int) -> Pose:
@@ -262,10 +240,10 @@ class Filter:
 
     def _note(self, robot: int) -> None:
         k, at = self._at[robot], slice(3 * robot, 3 * robot + 3)
-        if k < len(self.out.poses[robot]):  # a robot that defines the world may have no keyframe yet
-            self.out.poses[robot][k], self.out.covariances[robot][k] = self.mean[at], self.P[at, at]
+        if k < len(self.poses[robot]):  # a robot that defines the world may have no keyframe yet
+            self.poses[robot][k], self.covariances[robot][k] = self.mean[at], self.P[at, at]
 
-    def _go(self, robot: int, k: int) -> None:
+    def go(self, robot: int, k: int) -> None:
         """Predict a robot's pose by odometry up to a keyframe."""
         model = self.models.wheels[robot]
         of_errors = slice(self._wheels + WHEELS * robot, self._wheels + WHEELS * (robot + 1))

@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.fixed_lag import marginal_factor
-from coloc_graph.backend.floor_poses import in_body, trajectory
+from coloc_graph.backend.floor_poses import in_body
 from coloc_graph.backend.forgetting import require_all
-from coloc_graph.backend.linear_system import LinearSystem
 from coloc_graph.backend.marginals import Marginals
-from coloc_graph.backend.planar.batch import found_landmarks
-from coloc_graph.backend.planar.factors import KeyframeFactors, State, robust
+from coloc_graph.backend.planar.factors import KeyframeFactors, State
 from coloc_graph.backend.planar.filter import INITIAL_PERIOD, Filter, Models, aligned
-from coloc_graph.backend.planar.summary import Found, ranging_estimate
-from coloc_graph.backend.sensor_calibration import SensorErrors
+from coloc_graph.backend.planar.problem import KeyframeProblem
+from coloc_graph.backend.planar.summary import ranging_estimate, trajectories_of
 from coloc_graph.backend.solver import eliminated
 from coloc_graph.backend.validation import require_following
 from coloc_graph.geometry.se2 import compose
@@ -52,12 +50,12 @@ class _Log:
 
     entries: list[tuple[Index, Index, Array, Array]] = field(default_factory=list)
 
-    def arrays(self, keyframes: Keyframes) -> tuple[Array, Array]:
+    def arrays(self, factors: KeyframeFactors) -> tuple[Array, Array]:
         """Return the last ones of all keyframes; NaN where there is none."""
-        first = np.cumsum([0, *map(len, keyframes.times)])
-        poses, C = np.full((first[-1], 3), np.nan), np.full((first[-1], 3, 3), np.nan)
+        poses, C = np.full((len(factors), 3), np.nan), np.full((len(factors), 3, 3), np.nan)
         for robots, numbers, some, some_C in self.entries:
-            poses[first[robots] + numbers], C[first[robots] + numbers] = some, some_C
+            at = factors.first[robots] + numbers
+            poses[at], C[at] = some, some_C
         return poses, C
 
 
@@ -139,12 +137,12 @@ class IncrementalKeyframes:
         """Give poses to new keyframes of the robots that have any: the first ones by the filter, then by odometry."""
         factors, poses = self._factors, self._state.poses
         for robot, times in enumerate(self._keyframes.times):
-            if robot not in self._filter.out.placed_at or not len(times):
+            if robot not in self._filter.placed_at or not len(times):
                 continue
             own = poses[factors.first[robot] : factors.first[robot + 1]]
             entered = int(np.isfinite(own[:, 0]).sum())
             if not entered:
-                whole = self._filter.out.whole(self._keyframes, factors.models)[robot]
+                whole = self._filter.whole()[robot]
                 entered = int(np.isfinite(whole[:, 0]).sum())
                 own[:entered] = whole[:entered]
                 if not factors.models.map_known and self._gauge is None:
@@ -164,26 +162,24 @@ class IncrementalKeyframes:
                 self._factors.landmarks(self._state.shared)[number] = position
                 self._landmarks.add(number)
 
-    def _system(self, steps: Index, measured: Index) -> LinearSystem:
-        """Linearise some factors in the window, with what those before it say."""
-        factors, state = self._factors, self._state
-        rows = [factors.steps(state, steps), robust(factors.measured(state, measured))[0]]
-        if self._past is None and self._gauge is not None:
+    def _problem(self, steps: Index, measured: Index) -> KeyframeProblem:
+        """Return the problem of some factors in the window, with what those before it say."""
+        gauge = None
+        if self._gauge is not None:
             robot, number, at = self._gauge
-            rows.append(factors.gauge(state, int(factors.first[robot]) + number - self._keyframes.begins[robot], at))
-        system = factors.system(state, rows, priors=self._past is None)
-        if self._past is not None:
-            system.graph.push_back(self._past.linearize(factors.values(state, self._past.keys())))
-        return system
+            gauge = int(self._factors.first[robot]) + number - self._keyframes.begins[robot], at
+        return KeyframeProblem(self._factors, steps, measured, gauge, self._past)
 
-    def _step(self) -> tuple[LinearSystem, gtsam.Ordering, gtsam.GaussianBayesTree]:
+    def _step(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Ordering, gtsam.GaussianBayesTree]:
         """Take one Gauss-Newton step in the window, which was at its optimum before; return what it solved."""
         factors, inside = self._factors, np.isfinite(self._state.poses[:, 0])
-        system = self._system(factors.steps_between(inside), factors.measured_between(inside, self._landmarks))
-        ordering = system.ordering(factors.keys.names[self._newest()].tolist())
-        tree, _ = eliminated(system.graph, ordering)
-        self._state = factors.moved(self._state, tree.optimize(), system.graph.keyVector())
-        return system, ordering, tree
+        problem = self._problem(factors.steps_between(inside), factors.measured_between(inside, self._landmarks))
+        linear, newest = problem.linear(self._state), factors.keys.names[self._newest()].tolist()
+        # the newest are at the root, where covariances cost least
+        ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, newest)
+        tree, _ = eliminated(linear, ordering)
+        self._state = problem.moved(self._state, tree.optimize())
+        return linear, ordering, tree
 
     def _leave(self, time: float, tree: gtsam.GaussianBayesTree) -> None:
         """Keep the estimates of poses older than the lag, and marginalise them; each robot's newest one stays."""
@@ -195,19 +191,18 @@ class IncrementalKeyframes:
         old[self._lasts()] = False
         inside = np.isfinite(self._state.poses[:, 0])
         gone = old & inside
-        if gone.any():
+        gone_at = np.flatnonzero(gone)
+        if len(gone_at):
             if not self._forgets:
-                self._note(self._smoothed, np.flatnonzero(gone), tree.marginalCovariance)
+                self._note(self._smoothed, gone_at, tree.marginalCovariance)
             steps, measured = factors.steps_between(inside), factors.measured_between(inside, self._landmarks)
             seen = gone[factors.seen[measured]] & factors.of_robot[measured]
-            system = self._system(
-                steps[gone[steps] | gone[steps + 1]], measured[gone[factors.observer[measured]] | seen]
-            )
+            before = gone[steps] | gone[steps + 1], gone[factors.observer[measured]] | seen
+            linear = self._problem(steps[before[0]], measured[before[1]]).linear(self._state)
             # in the order of the whole graph: one robot after the other would tie all poses of the others
-            whole, names = system.ordering(), set(factors.keys.names[np.flatnonzero(gone)].tolist())
-            values = factors.values(self._state, system.graph.keyVector())
-            first = [name for name in map(whole.at, range(whole.size())) if name in names]
-            self._past = marginal_factor(system.graph, values, first)
+            whole, names = gtsam.Ordering.ColamdGaussianFactorGraph(linear), set(factors.keys.names[gone_at].tolist())
+            values = factors.values(self._state, linear.keyVector())
+            self._past = marginal_factor(linear, values, [k for k in map(whole.at, range(whole.size())) if k in names])
         counts = [int(one.sum()) for one in np.split(old, factors.first[1:-1])]
         self._follow(self._keyframes.since(np.add(self._keyframes.begins, counts).tolist()))
 
@@ -252,35 +247,25 @@ class IncrementalKeyframes:
         require_all("the keyframes in its window" if forgotten else None, "estimate the whole run")
         C = np.zeros((len(self._factors.free),) * 2)
         if self._latest:
-            system, ordering, _ = self._step()
-            marginals = Marginals(system.graph, self._factors.keys.size, ordering)
+            linear, ordering, _ = self._step()
+            marginals = Marginals(linear, self._factors.keys.size, ordering)
             C = self._factors.shared_covariance(marginals)
             inside = np.flatnonzero(np.isfinite(self._state.poses[:, 0]))
             self._note(self._smoothed, inside, marginals.covariance)
-        shared = self._state.shared
-        whole = self._keyframes if self._forgets else _nothing(self._team).followed_by(*self._came)
-        factors = KeyframeFactors(whole, Models(self._team, whole))
-        poses, covariances = self._smoothed.arrays(whole)
-        errors = [
-            factors.errors_in(robot, shared, C) if robot in self._latest else SensorErrors(None, None)
-            for robot in range(len(whole.robots))
-        ]
-        landmarks = found_landmarks(factors, shared, C, sorted(self._landmarks))
-        return ranging_estimate(factors, Found(State(poses, shared), covariances, landmarks, errors), 0)
+        factors = self._whole()
+        poses, covariances = self._smoothed.arrays(factors)
+        return ranging_estimate(factors, State(poses, self._state.shared), covariances, C, self._landmarks, 0)
 
     @property
     def online(self) -> dict[str, Trajectory]:
         """Poses as they were estimated at their times, by robot; none if it forgets."""
-        found, models = {}, self._factors.models
-        whole = _nothing(self._team).followed_by(*self._came)
-        ends = np.cumsum([*map(len, whole.times)])[:-1]
-        poses_of, C_of = (np.split(one, ends) for one in self._online.arrays(whole))
-        for robot, (poses, C) in enumerate(zip(poses_of, C_of, strict=True)):
-            there = np.isfinite(poses[:, 0])
-            if there.any():
-                name, unsure = whole.robots[robot], models.wheels[robot].wheels.direction_sigma_deg
-                found[name] = trajectory(name, whole.times[robot][there], poses[there], C[there], unsure)
-        return found
+        factors = self._whole()
+        return trajectories_of(factors, *self._online.arrays(factors))
+
+    def _whole(self) -> KeyframeFactors:
+        """Return the factors of all keyframes that were kept."""
+        whole = self._keyframes if self._forgets else _nothing(self._team).followed_by(*self._came)
+        return KeyframeFactors(whole, Models(self._team, whole))
 
 
 def _nothing(team: Team) -> Keyframes:
