@@ -60,7 +60,7 @@ def folder(tmp_path_factory):
     board, rng = make_board("7x5", 0.03), np.random.default_rng(4)
     mount = Mount(height=0.40, tilt_deg=25.0)
     for name, poses in (
-        ("board", held_poses(rng, camera, board, 10)),
+        ("board", held_poses(rng, camera, board, 7)),
         ("floor", floor_poses(rng, camera, mount, board, 3, farthest=0.7)),
     ):
         (folder / name).mkdir()

@@ -99,7 +99,7 @@ def bring_in(tmp_path):
 def recorded(tmp_path_factory):
     """A hallway of two stances as rendered images."""
     path = tmp_path_factory.mktemp("recorded") / "recorded.mcap"
-    simulate("hallway", path, depth="images", stances=2, points=60, seed=2, image_format="png")
+    simulate("hallway", path, depth="images", stances=2, points=40, seed=2, image_format="png")
     return path
 
 
