@@ -1,7 +1,7 @@
 import json
 import re
 import runpy
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import gtsam
 import numpy as np
@@ -26,7 +26,9 @@ from coloc_graph.exchange.pyfg import read_pyfg
 from coloc_graph.exchange.range_graph import factors_of, key_of, values_of
 from coloc_graph.exchange.ranging_factors import ranging_gtsam_files
 from coloc_graph.exchange.ranging_graph import ranging_graph
+from coloc_graph.frontend.keyframe_stream import KeyframeStream
 from coloc_graph.frontend.keyframes import keyframes_of
+from coloc_graph.measurements import RangeBearings
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.inspection import Finding, inspect
 from coloc_graph.pipeline.ranges import of_targets
@@ -357,6 +359,25 @@ def test_what_has_left_the_window_is_not_forgotten(run, batch):
         off = estimate.trajectories[robot].positions - batch.estimate.trajectories[robot].positions
         assert len(off) == len(batch.estimate.trajectories[robot])
         assert 1e-4 < np.sqrt((off**2).sum(axis=1).mean()) < 0.03
+
+
+def test_keyframes_that_are_made_as_records_come_are_those_of_the_whole_run(run):
+    whole, stream, parts = keyframes_of(run), KeyframeStream(run.team), []
+    records = [one for name in run.team.names for of in (run.odometry, run.ranges) for one in of(name)]
+    begin = min(one.time for one in records)
+    for second in range(44):
+        stream.add(*(one for one in records if second <= one.time - begin < second + 1))
+        parts.append(stream.take(begin + second - 1.0))  # odometry may be late by its delay
+        assert max(map(len, stream._odometry)) < 400
+    joined = parts[0].followed_by(*parts[1:])
+    assert joined.begins == whole.begins
+    for found, expected in zip(joined.times, whole.times, strict=True):
+        np.testing.assert_array_equal(found, expected)
+    for found, expected in zip(joined.steps, whole.steps, strict=True):
+        np.testing.assert_allclose(found.twists, expected.twists, atol=1e-12)
+        np.testing.assert_allclose(found.covariances, expected.covariances, rtol=1e-6)
+    for one in fields(RangeBearings):
+        np.testing.assert_array_equal(getattr(joined.measured, one.name), getattr(whole.measured, one.name))
 
 
 def test_errors_that_last_count_by_how_long_they_do(run):
