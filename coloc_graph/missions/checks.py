@@ -7,6 +7,7 @@ from collections import deque
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coloc_graph.errors import ColocError
 from coloc_graph.geometry.se2 import Planar, compose, inverse, wrap
@@ -16,6 +17,7 @@ from coloc_graph.missions.network import Network
 from coloc_graph.missions.programs import Programs
 from coloc_graph.missions.scheduler import Scheduler
 from coloc_graph.online.coordinator import Coordinator
+from coloc_graph.online.leap_planner import StancePlan
 from coloc_graph.online.mission_states import MissionState
 from coloc_graph.online.replay import replay
 from coloc_graph.pipeline.incremental import EnteredStance
@@ -23,7 +25,7 @@ from coloc_graph.robot_io.create.physics import RADIUS
 from coloc_graph.robot_io.deadlines import STAND_WITHIN
 from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
 from coloc_graph.robot_io.link.messages import Status
-from coloc_graph.run import open_run
+from coloc_graph.run import Run, open_run
 from coloc_graph.team import Team
 
 LOST_RECORD = 0.5  # newest part of the record that a killed coordinator may lose [s]
@@ -32,6 +34,9 @@ PLANAR = [2, 3, 4]  # heading, x, y in a tangent vector
 WELL_KNOWN = 1e12  # condition of a covariance above which it is none
 REPLAYED = 4  # of this number of missions one is replayed, and all those that were continued
 RESUMED = 1e-9  # difference between an estimate after a resume and an uninterrupted one [m]
+ASTRAY = 0.2  # an observer that stands is at most this far from where the coordinator has it [m]
+TURNED = 0.2  # the same of its heading [rad]
+MORE = 2.5  # the mover may be this number of times as far from there
 
 
 class Checks:
@@ -106,6 +111,32 @@ class Checks:
         for type_ in coordinator.link._calls:
             coordinator.link._calls[type_] = watched
 
+    def take_plan(self, plan: StancePlan) -> None:
+        """Compare where the coordinator has the robots, as it plans, with its estimate and with the truth."""
+        coordinator = self.programs.coordinator
+        assert coordinator is not None
+        registry, one, stances = coordinator._registry, self._newest, coordinator._mission.stances
+        if one is not None and plan.index <= one.stance.index:
+            self._violate(f"stance {plan.index} is planned though stance {one.stance.index} has entered")
+        if one is not None and stances and stances[-1] == one.stance:
+            for name in one.stance.observers:
+                tracker = registry[name].tracker
+                if tracker._displaced <= one.stance.start:
+                    off = _apart(tracker.pose(one.stance.start), _planar(one.estimate.poses[name].matrix()))
+                    if max(off) > RESUMED:
+                        self._violate(f"{name} is {off[0]:.2g} m, {off[1]:.2g} rad from where the last stance has it")
+        if self.pushed or self._origin is None:
+            return
+        poses = self._field.poses()
+        for name, robot in registry.robots.items():
+            since, last = robot.stands_since(), registry.record.last_odometry(name)
+            if since is None or last is None or last.time < registry.utc(since):
+                continue  # the last metres of its way have not come yet
+            off = _apart(robot.tracker.pose(), self._in_world(poses[name]))
+            more = MORE if name == self._mover else 1.0
+            if off[0] > more * ASTRAY or off[1] > more * TURNED:
+                self._violate(f"{name} stands {off[0]:.2f} m, {off[1]:.2f} rad from where the coordinator has it")
+
     def take_stance(self, one: EnteredStance) -> None:
         """Compare the estimate of a stance with the truth, while all robots stand."""
         poses, reference = self._field.poses(), self._team.reference
@@ -118,7 +149,7 @@ class Checks:
                 continue
             covariance = one.estimate.covariances[name][np.ix_(PLANAR, PLANAR)]
             T = one.estimate.poses[name].matrix()
-            x, y, yaw = compose(inverse((T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0]))), self._in_world(poses[name]))
+            x, y, yaw = compose(inverse(_planar(T)), self._in_world(poses[name]))
             error = np.array([wrap(yaw), x, y])
             self.ends += ((math.hypot(x, y), abs(float(wrap(yaw)))),)
             if np.linalg.cond(covariance) < WELL_KNOWN:
@@ -172,12 +203,31 @@ class Checks:
             self._violate(f"the mission is done after the stances {indices}")
         if run.warnings:
             self._violate(f"the record is damaged: {run.warnings[0]}")
+        if self._coordinators > 1:
+            self._compare_records(folder, run)
         if self._coordinators > 1 or self._seed % REPLAYED == 0:
-            self._compare_replay(folder)
+            self._compare_replay(folder, indices)
 
-    def _compare_replay(self, folder: Path) -> None:
+    def _compare_records(self, folder: Path, run: Run) -> None:
+        """Check that the last record goes on from the earlier ones, and has no image twice."""
+        last = {name: _images(run, name) for name in self._team.names}
+        for name, images in last.items():
+            seen = [uv for _, uv in images if uv]  # noise makes each image another one
+            if len(set(seen)) < len(seen):
+                self._violate(f"the record has {len(seen) - len(set(seen))} images of {name} twice")
+        for path in sorted(folder.glob("run.*.mcap")):
+            before = open_run(path)
+            for name, images in last.items():
+                earlier = _images(before, name)
+                if images[: len(earlier)] != earlier:
+                    self._violate(f"the record of a continued mission lacks images of {name} that {path.name} has")
+
+    def _compare_replay(self, folder: Path, indices: list[int]) -> None:
         """Replay the mission, as if it had never been interrupted: it must give the same estimates, bit for bit."""
         stances = list(replay(folder, self.programs.options.solve))
+        replayed = [one.entered.stance.index for one in stances]
+        if replayed != indices:
+            self._violate(f"the record has the stances {indices}, a replay {replayed}")
         for one in stances:
             if one.same is False:
                 self._violate(f"the estimate of stance {one.entered.stance.index} is another one when it is replayed")
@@ -197,3 +247,18 @@ class Checks:
     def _violate(self, text: str) -> None:
         if len(self.violations) < 20:
             self.violations.append(f"{1e-9 * self._scheduler.now:.2f} s: {text}")
+
+
+def _planar(T: NDArray[np.float64]) -> Planar:
+    """Return x [m], y [m] and yaw [rad] of a pose (4, 4)."""
+    return float(T[0, 3]), float(T[1, 3]), math.atan2(T[1, 0], T[0, 0])
+
+
+def _apart(a: Planar, b: Planar) -> tuple[float, float]:
+    """Distance between two poses [m], and angle between their headings [rad]."""
+    return math.dist(a[:2], b[:2]), abs(float(wrap(a[2] - b[2])))
+
+
+def _images(run: Run, robot: str) -> list[tuple[float, bytes]]:
+    """Times and pixels of a robot's detections, one of each image."""
+    return [(one.time, one.uv.tobytes()) for one in run.detections(robot)]

@@ -4,7 +4,11 @@ import random
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from coloc_graph.online.mission_states import MissionState
+
 COORDINATOR = "coordinator"
+AFTERWARDS = (5.0, 30.0)  # time from a push to the kill that follows [s]
+LATE = 0.7  # longest time of a state after which a fault that waits for it begins [s]
 
 #: Kinds of faults by name, and the least and largest amount of each, where it has one.
 KINDS: dict[str, tuple[float, float]] = {
@@ -22,6 +26,16 @@ KINDS: dict[str, tuple[float, float]] = {
     "freeze": (0.0, 0.0),  # a robot's camera delivers nothing
     "push": (0.03, 0.12),  # a robot is displaced by this distance [m]
 }
+#: Kinds that are drawn more often than others: a resume, and stances that are taken again, have most to keep.
+OFTEN = {"kill": 5, "push": 3}
+#: States of the coordinator for one of which a fault waits, by how often; estimating is short.
+STATES = {
+    MissionState.PLANNING: 1,
+    MissionState.PLACING: 1,
+    MissionState.LOOKING: 1,
+    MissionState.CAPTURING: 1,
+    MissionState.ESTIMATING: 3,
+}
 NETWORK = ("cut", "loss", "delay", "duplication")
 #: Faults that only robots have.
 ROBOTS = (*NETWORK, "jump", "unplug", "freeze", "push")
@@ -29,26 +43,40 @@ ROBOTS = (*NETWORK, "jump", "unplug", "freeze", "push")
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of a kind that begins at `time` [s] on a robot or the coordinator, and is over after `duration` [s]."""
+    """A fault of a kind that begins at `time` [s] on a robot or the coordinator, and is over after `duration` [s].
+
+    With a `state` it begins when the coordinator is next in that state, `late` [s] after that is seen.
+    """
 
     time: float
     kind: str
     where: str
     duration: float
     amount: float = 0.0
+    state: str = ""
+    late: float = 0.0
 
     def __str__(self) -> str:
         amount = f" {self.amount:.3g}" if self.amount else ""
-        return f"{self.time:.2f} s: {self.kind}{amount} of {self.where} for {self.duration:.2f} s"
+        when = f", {self.late:.2f} s into {self.state}" if self.state else ""
+        return f"{self.time:.2f} s{when}: {self.kind}{amount} of {self.where} for {self.duration:.2f} s"
 
 
 def draw_faults(seed: int, robots: Sequence[str], count: int, until: float) -> tuple[Fault, ...]:
-    """Draw faults of random kinds, places and times up to `until` [s]."""
+    """Draw faults of random kinds, places and times up to `until` [s].
+
+    Half of them wait for a state. Half of the pushes are followed by a kill of the coordinator, which must not forget
+    what the push did to its estimate.
+    """
     draw = random.Random(seed)
     faults = []
     for _ in range(count):
-        kind = draw.choice(list(KINDS))
-        where = draw.choice([*robots] if kind in ROBOTS else [*robots, COORDINATOR, COORDINATOR])
+        (kind,) = draw.choices(list(KINDS), [OFTEN.get(kind, 1) for kind in KINDS])
+        where = draw.choice([*robots] if kind in ROBOTS else [*robots, *[COORDINATOR] * len(robots)])
         duration = draw.choice((0.1, 0.4, 1.0, 3.0, 8.0)) * draw.uniform(0.5, 1.5)
-        faults.append(Fault(draw.uniform(0.0, until), kind, where, duration, draw.uniform(*KINDS[kind])))
+        time, amount, late = draw.uniform(0.0, until), draw.uniform(*KINDS[kind]), draw.uniform(0.0, LATE)
+        (state,) = draw.choices(list(STATES), list(STATES.values())) if draw.random() < 0.5 else ("",)
+        faults.append(Fault(time, kind, where, duration, amount, state, late if state else 0.0))
+        if kind == "push" and draw.random() < 0.5:
+            faults.append(Fault(time + draw.uniform(*AFTERWARDS), "kill", COORDINATOR, duration))
     return tuple(sorted(faults, key=lambda one: one.time))

@@ -29,6 +29,7 @@ from coloc_graph.team import Team
 FPS = 10.0  # images a second of a simulated camera
 PACE = 17.0  # seconds of a mission to the end of a way for each metre, as of `coloc demo`
 LIMIT = 1500.0  # simulated time after which a mission must have ended [s]
+STATE_PERIOD = 0.02  # time between two looks at the coordinator's state [s]
 SPAN = 10.0  # time of a stance in which faults are drawn [s]
 MEMORY = "/dev/shm"  # a folder in memory, where there is one
 
@@ -149,12 +150,13 @@ def _run(scenario: Scenario, scheduler: Scheduler, folder: Path) -> Outcome:
     starts, _ = in_world(team, mover, options.goals)
     field_, network = Field(scheduler, team, starts, scenario.seed), Network(scheduler, team.names)
     checks = Checks(scheduler, field_, network, team, mover, scenario.seed)
-    programs = Programs(scheduler, network, field_, team, options, folder, checks.watch_coordinator, checks.take_stance)
+    programs = Programs(scheduler, network, field_, team, options, folder, checks)
     checks.programs = programs
     for name in (COORDINATOR, *team.names):
         scheduler.call_in(scheduler.random.uniform(0.0, 0.5), partial(programs.start, name))
     for fault in scenario.faults:
-        scheduler.call_in(fault.time, partial(_begin, fault, scheduler, field_, network, programs, checks))
+        begin = partial(_begin, fault, scheduler, field_, network, programs, checks)
+        scheduler.call_in(fault.time, partial(_await_state, fault, scheduler, programs, begin))
     _repeat(scheduler, 0.1, network.watch_silence)
     _repeat(scheduler, 0.02, checks.look)
     ended = scheduler.run(lambda: programs.state is not None, LIMIT)
@@ -169,6 +171,18 @@ def _run(scenario: Scenario, scheduler: Scheduler, folder: Path) -> Outcome:
     return outcome
 
 
+def _await_state(fault: Fault, scheduler: Scheduler, programs: Programs, begin: Callable[[], None]) -> None:
+    """Let a fault begin once the coordinator is in the state that it waits for."""
+    if programs.state is not None:
+        return
+    if not fault.state:
+        begin()
+    elif programs.leads_in(fault.state):
+        scheduler.call_in(fault.late, begin)
+    else:
+        scheduler.call_in(STATE_PERIOD, partial(_await_state, fault, scheduler, programs, begin))
+
+
 def _begin(
     fault: Fault, scheduler: Scheduler, field_: Field, network: Network, programs: Programs, checks: Checks
 ) -> None:
@@ -180,7 +194,7 @@ def _begin(
     if fault.kind in NETWORK:
         end = _network_fault(fault, network)
     elif fault.kind == "kill":
-        if process is not None:
+        if process is not None and process.alive:
             scheduler.kill(process)
             if where == COORDINATOR:
                 checks.look_at_record(programs.folder / "mission")

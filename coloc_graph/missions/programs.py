@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 from coloc_graph.errors import ColocError
 from coloc_graph.missions.faults import COORDINATOR
@@ -11,6 +12,7 @@ from coloc_graph.missions.scheduler import Host, Process, Scheduler, Task
 from coloc_graph.missions.system import Event
 from coloc_graph.online.coordinator import Coordinator
 from coloc_graph.online.devices import Devices
+from coloc_graph.online.leap_planner import StancePlan
 from coloc_graph.online.mission import MissionOptions
 from coloc_graph.online.mission_states import MissionState
 from coloc_graph.online.robot import RobotProgram
@@ -19,6 +21,19 @@ from coloc_graph.robot_io.create.driver import Create
 from coloc_graph.team import Team
 
 RESTART = 2.0  # time after which a program that ended with an error is started again [s]
+
+
+class Watcher(Protocol):
+    """Follows a mission."""
+
+    def watch_coordinator(self, coordinator: Coordinator) -> None:
+        """Take note of a new coordinator before it runs."""
+
+    def take_plan(self, plan: StancePlan) -> None:
+        """Take note of the plan of a stance."""
+
+    def take_stance(self, one: EnteredStance) -> None:
+        """Take note of a stance that has entered the estimate."""
 
 
 class Programs:
@@ -32,10 +47,8 @@ class Programs:
         The team and its mission.
     folder
         Folder for the mission's files.
-    on_coordinator
-        Called with each new coordinator before it runs.
-    on_stance
-        Called with each stance that has entered the estimate.
+    watcher
+        Told of each coordinator, plan and stance.
 
     Attributes
     ----------
@@ -57,12 +70,11 @@ class Programs:
         team: Team,
         options: MissionOptions,
         folder: Path,
-        on_coordinator: Callable[[Coordinator], None],
-        on_stance: Callable[[EnteredStance], None],
+        watcher: Watcher,
     ) -> None:
         self._scheduler, self._network, self._field = scheduler, network, field
         self._team, self.options, self.folder = team, options, folder
-        self._on_coordinator, self._on_stance = on_coordinator, on_stance
+        self._watcher = watcher
         draw = scheduler.random
         self.hosts = {
             name: Host(name, draw.randrange(10**9, 10**13), draw.gauss(0.0, 20e-6), 1_800_000_000 * 10**9)
@@ -75,6 +87,16 @@ class Programs:
         self.coordinator: Coordinator | None = None
         self.errors: list[str] = []
         self.crashes: list[str] = []
+
+    def leads_in(self, state: str) -> bool:
+        """Return whether a coordinator runs and is in a state."""
+        process = self.processes.get(COORDINATOR)
+        return (
+            self.coordinator is not None
+            and process is not None
+            and process.alive
+            and self.coordinator._mission.states.now == state
+        )
 
     def start(self, name: str) -> None:
         """Start a program, unless it runs."""
@@ -131,10 +153,11 @@ class Programs:
             self.options,
             resume=(folder / "run.mcap").exists(),
             open_session=self._network.open(process, None),
-            on_stance=self._on_stance,
+            on_stance=self._watcher.take_stance,
+            on_plan=self._watcher.take_plan,
         )
         self.coordinator = coordinator
         with coordinator:
-            self._on_coordinator(coordinator)
+            self._watcher.watch_coordinator(coordinator)
             state = coordinator.run(Event(self._scheduler))  # type: ignore[arg-type]
         self.state = state

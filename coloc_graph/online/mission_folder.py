@@ -6,7 +6,7 @@ from types import TracebackType
 from typing import Self
 
 from coloc_graph.errors import InputError
-from coloc_graph.online.record import Record, continued
+from coloc_graph.online.record import Record, begun, continued
 from coloc_graph.run import Run
 from coloc_graph.run.output_lock import OutputLock
 from coloc_graph.team import Team
@@ -52,7 +52,8 @@ class MissionFolder:
         self.path.mkdir(exist_ok=True)
         if self.record_path.exists():
             return continued(self.record_path, team)
-        return Record(self.record_path, team), None
+        self._locks.callback(OutputLock(self.record_path).release)
+        return begun(self.record_path, team), None
 
     def __enter__(self) -> Self:
         return self

@@ -104,6 +104,10 @@ class Record(_InMemory):
         self._writer.write(stance)
         self._writer.flush()
 
+    def hand_over(self) -> None:
+        """Hand all that was taken to the operating system: a killed process does not lose it."""
+        self._writer.flush(to_seconds(machine.time_ns()))
+
     @property
     def counts(self) -> dict[str, tuple[int, int]]:
         """Number of detections and of odometry samples of each robot, of the whole run."""
@@ -147,6 +151,22 @@ def _between(kept: Sequence[T], start: float | None, end: float | None) -> Seque
     return kept[first:last]
 
 
+def begun(path: str | Path, team: Team) -> Record:
+    """Begin a record that is at `path` as soon as it has its team: a coordinator killed before leaves none there."""
+    path = Path(path)
+    new = path.with_suffix(".new.mcap")
+    record = Record(new, team)
+    try:
+        record.hand_over()
+        new.rename(path)
+    except BaseException:
+        record.__exit__(None, None, None)
+        new.unlink(missing_ok=True)
+        raise
+    record.path = path
+    return record
+
+
 def continued(path: str | Path, team: Team) -> tuple[Record, Run]:
     """Begin a record with all that can be read of an earlier one, which may have been cut off, and return both.
 
@@ -174,6 +194,7 @@ def continued(path: str | Path, team: Team) -> tuple[Record, Run]:
                 record.moves(robot, motion.time, motion.moving)
         for stance in before.stances:
             record.complete(stance)
+        record.hand_over()
         try:
             kept.hardlink_to(path)
         except OSError:  # a file system without hard links

@@ -12,6 +12,7 @@ from coloc_graph.online.pose_tracker import PoseTracker
 from coloc_graph.online.record import Record
 from coloc_graph.pipeline.incremental import EnteredStance
 from coloc_graph.robot_io.link.messages import Drive, Event, Sample, Status, Wheels
+from coloc_graph.robot_io.link.session import CACHED
 from coloc_graph.run import Detections, OdometrySample
 from coloc_graph.run.schemas import to_seconds
 
@@ -44,7 +45,9 @@ class RobotState:
     drive, arrived, interrupted
         Last drive command, whether it has been completed, and whether the robot stopped on the way.
     odometry_until, detections_until
-        Odometry and detections up to these times are in the record already [UTC s].
+        Odometry, and images without lights, up to these times are in the record already [UTC s].
+    recorded
+        Pixels of the images that are in the record already: noise makes each another one, whatever the clocks.
     """
 
     name: str
@@ -61,6 +64,7 @@ class RobotState:
     interrupted: bool = False
     odometry_until: float = -math.inf
     detections_until: float = -math.inf
+    recorded: set[bytes] = field(default_factory=set)
 
     def trouble(self, *, drives: bool = False) -> str | None:
         """Describe what keeps the robot from taking part; None if nothing does. Hazards do not stop one that drives."""
@@ -151,18 +155,19 @@ class RobotRegistry:
     def take_sample(self, name: str, sample: Sample) -> Detections | None:
         """Take in the detections of one image; return them as recorded, None if they are recorded already."""
         robot = self.robots[name]
-        time_ = self.utc(robot.to_coordinator(sample.stamp))
-        if time_ <= robot.detections_until:
+        new = sample.detections(name, self.utc(robot.to_coordinator(sample.stamp)))
+        if new.uv.tobytes() in robot.recorded if len(new.uv) else new.time <= robot.detections_until:
             return None
-        seen = self.record.take(sample.detections(name, time_))
+        seen = self.record.take(new)
         assert isinstance(seen, Detections)
         return seen
 
     def restore(self) -> None:
         """Continue from what an earlier coordinator recorded of all robots."""
         for name, robot in self.robots.items():
-            for detections in self.record.detections(name, 0.0, math.inf):
-                robot.detections_until = detections.time + SAME
+            images = list(self.record.detections(name, 0.0, math.inf))[-CACHED:]
+            robot.recorded = {image.uv.tobytes() for image in images}
+            robot.detections_until = images[-1].time + SAME if images else -math.inf
             for sample in self.record.odometry(name):
                 robot.tracker.add(sample)
                 robot.odometry_until = sample.time + SAME

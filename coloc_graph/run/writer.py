@@ -151,11 +151,11 @@ class RunWriter:
             if self._started:
                 self._on_disk(lambda: self._message(*self._of_team(schemas.TRUE_TEAM_TOPIC, team), self._start_ns))
 
-    def flush(self) -> None:
-        """Hand all that was written to the operating system now."""
+    def flush(self, begun: float = 0.0) -> None:
+        """Hand all that was written to the operating system now; `begun` [s] is the team's time if nothing was."""
         with self._lock:
             self._check_open()
-            self._on_disk(lambda: self._start(0))
+            self._on_disk(lambda: self._start(schemas.to_ns(begun)))
             self._on_disk(self._flush)
 
     def close(self) -> None:

@@ -1,16 +1,24 @@
 """Whole missions on simulated time: shipped programs, all that is promised of them checked, faults from a seed."""
 
+import re
 from functools import cache
 
 import pytest
 
+from coloc_graph.missions import mission
 from coloc_graph.missions.faults import COORDINATOR, Fault
 from coloc_graph.missions.mission import Scenario, run_mission, scenario_of
+from coloc_graph.online import coordinator, mission_folder
+from coloc_graph.online.journal import Journal
+from coloc_graph.online.record import Record, continued
+from coloc_graph.online.resume import restore
+from coloc_graph.online.robot_registry import RobotRegistry
+from coloc_graph.run import Detections
 
 #: Outcome of the mission of a seed, run once.
 outcome_of = cache(run_mission)
 #: Seeds of short missions with random faults, and of those of `make test-long`; `make search` runs any number.
-SEEDS = range(1, 6)
+SEEDS = range(1, 5)
 LONG_SEEDS = range(20_000, 20_200)
 
 
@@ -38,14 +46,24 @@ def test_promises_hold_in_hundreds_of_missions():
     assert not any(found), "\n".join(one for one in found if one)
 
 
+#: The coordinator is killed amid its first estimate, and after it, while the mover is on its way.
+KILLED_TWICE = [
+    Fault(5.0, "kill", COORDINATOR, 0.5, state="estimating", late=0.1),
+    Fault(21.0, "kill", COORDINATOR, 0.5, state="placing", late=1.0),
+]
 #: Faults of a mission in whose midst they happen, by what they are about.
 DIRECTED = {
-    "the coordinator is killed twice": [Fault(9.0, "kill", COORDINATOR, 1.0), Fault(22.5, "kill", COORDINATOR, 2.0)],
+    "the coordinator is killed twice": KILLED_TWICE,
     "the mover's program is killed": [Fault(7.6, "kill", "C", 1.5)],
     "all links are cut": [Fault(7.6, "cut", name, 3.0) for name in "ABC"],
     "processes are stopped": [Fault(7.6, "stop", "C", 1.0), Fault(12.0, "stop", COORDINATOR, 3.0)],
     "main loops hang": [Fault(7.6, "hang", COORDINATOR, 1.5), Fault(14.0, "hang", "C", 1.5)],
-    "the coordinator's disk is full": [Fault(8.0, "full", COORDINATOR, 6.0)],
+    "the coordinator's disk is full": [
+        Fault(8.0, "full", COORDINATOR, 6.0),
+        Fault(16.0, "full", COORDINATOR, 2.0, state="estimating", late=0.1),  # and of all that hold
+        Fault(22.0, "cut", "A", 1.0),
+        Fault(22.1, "full", COORDINATOR, 2.0, state="holding"),
+    ],
     "a network loses, repeats and delays": [
         Fault(1.0, kind, name, 20.0, amount)
         for name in "ABC"
@@ -64,11 +82,56 @@ def test_promises_hold_when(what):
     assert freedom == 6 and nees < 30  # chi2 exceeds this by chance in 4 of 100,000
 
 
-#: Missions in which `make search` found a fault: a full disk while all were told to hold, and amid an estimate.
-FOUND = (5040, 5023)
+def without_follow(monkeypatch):
+    def restored(*arguments):
+        with monkeypatch.context() as patch:
+            patch.setattr(RobotRegistry, "follow", lambda *_: None)
+            return restore(*arguments)
+
+    monkeypatch.setattr(coordinator, "restore", restored)
 
 
-@pytest.mark.parametrize("seed", FOUND)
-def test_what_a_search_has_found_stays_mended(seed):
-    outcome = run_mission(scenario_of(seed, 3, faults=6))
-    assert outcome.state == "done" and not outcome.violations, outcome.violations
+def without_images(monkeypatch):
+    take = Record.take
+
+    def copied(*arguments):
+        with monkeypatch.context() as patch:
+            patch.setattr(Record, "take", lambda self, one: one if isinstance(one, Detections) else take(self, one))
+            return continued(*arguments)
+
+    monkeypatch.setattr(mission_folder, "continued", copied)
+
+
+def with_last_attempt(monkeypatch):
+    began = Journal.__init__
+
+    def begin(self, run, attempts):
+        began(self, run, attempts)
+        self.attempts += [one for one in attempts[-1:] if one not in self.attempts]
+
+    monkeypatch.setattr(Journal, "__init__", begin)
+
+
+#: What is broken on purpose at a resume, and the promise that this breaks.
+BREAKS = {
+    "the registry is not restored": (
+        lambda patch: patch.setattr(RobotRegistry, "restore", lambda _: None),
+        "images of A twice|from where the coordinator has it",
+    ),
+    "images of the stance under way are lost": (without_images, "lacks images of A"),
+    "poses do not follow the estimate": (without_follow, "from where the last stance has it"),
+    "an attempt that was not decided enters": (with_last_attempt, r"has the stances \[1\]|planned though"),
+    "the last stance is forgotten": (
+        lambda patch: patch.setattr(coordinator, "restore", lambda *arguments: restore(*arguments)[:-1]),
+        "stance 0 is planned though stance 0 has entered",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BREAKS)
+def test_what_is_broken_on_purpose_is_noticed(what, monkeypatch):
+    break_it, promise = BREAKS[what]
+    break_it(monkeypatch)
+    monkeypatch.setattr(mission, "LIMIT", 33.0)
+    violations = run_mission(Scenario(0, 2, tuple(KILLED_TWICE))).violations
+    assert any(re.search(promise, one) for one in violations), violations

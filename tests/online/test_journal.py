@@ -1,15 +1,17 @@
 """A mission that is continued: which stances enter again, with which data, and where the robots then stand."""
 
 import json
+import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from coloc_graph.online.journal import Attempt, Journal, read_attempts
-from coloc_graph.online.record import Record
+from coloc_graph.online.record import Record, begun, continued
 from coloc_graph.online.resume import restore
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.pipeline.incremental import IncrementalSolver
@@ -68,7 +70,7 @@ def test_a_continued_mission_has_its_robots_where_the_estimate_says(tmp_path, ru
         for name in "AB":  # who stood until the end
             x, y, _ = registry[name].tracker.pose()
             np.testing.assert_allclose((x, y), np.array(last["poses"][name])[:2, 3], atol=1e-3)
-        # a clock compared anew after a restart differs by less than 5 ms: what comes again is taken once
+        # what comes again is taken once: odometry by its time, to 5 ms of a clock compared anew, images by their pixels
         for later, kept in ((0.004, False), (0.006, True)):
             for name in "AB":
                 wheels, seen = list(run.odometry(name))[-1], list(run.detections(name))[-1]
@@ -76,7 +78,24 @@ def test_a_continued_mission_has_its_robots_where_the_estimate_says(tmp_path, ru
                 registry.take_wheels(name, Wheels.of(wheels, session="1", number=0, stamp=at[0]))
                 assert (record.last_odometry(name).time > wheels.time) == kept
                 sample = Sample.of(seen, session="1", number=0, capture=0, stamp=at[1])
-                assert (registry.take_sample(name, sample) is not None) == kept
+                assert registry.take_sample(name, sample) is None
+                moved = msgspec.structs.replace(sample, uv=[(u + 0.1, v) for u, v in sample.uv])
+                assert registry.take_sample(name, moved) is not None
         stop = threading.Event()
         stop.set()
         assert restore(run, MISSION / "mission.jsonl", IncrementalSolver(run.team), registry, stop) == []
+
+
+def test_a_record_can_be_continued_from_its_first_moment(tmp_path, run):
+    def left_behind(name):  # as by a coordinator that is killed now
+        return shutil.copy(tmp_path / "run.mcap", tmp_path / name)
+
+    with begun(tmp_path / "run.mcap", run.team) as record:
+        again, before = continued(left_behind("killed.mcap"), run.team)
+        again.__exit__(None, None, None)
+        assert before.team == run.team and not before.stances
+        for one in run.detections("A"):
+            record.take(one)
+    with continued(tmp_path / "run.mcap", run.team)[0]:
+        copied = [one.time for one in open_run(left_behind("again.mcap")).detections("A")]
+    assert copied == [one.time for one in run.detections("A")]
