@@ -32,6 +32,7 @@ INSTANTS = 24  # instants of a drive at which its pixels are linearised
 SHARE_OF_TIME = 0.15  # relative change of a duration by which its worth is found
 POWERS = (0.5, 0.25)  # of a duration's worth by which the duration is changed
 SEEN = 0.9  # share of a drive that lies in the common view
+APART = 0.5  # robots that stand come no nearer to each other than this, if they are not nearer already [m]
 SAMPLE = 0.1  # distance between places of a drive that are checked [m]
 TRIED = 8  # changes of a stance, the best first, that are checked for being possible
 WORTHWHILE = 1e-4  # relative decrease of the variance below which nothing is changed
@@ -278,8 +279,10 @@ class Refinement:
                     return False
             if stance is not chain.stances[place.k + i]:
                 places = np.array(list(at.values()))
-                apart = np.hypot(*np.moveaxis(places[:, None] - places, -1, 0)) + 10.0 * np.eye(len(places))
-                if apart.min() < CLEARANCE or not (free is None or free(places, TO_WALL).all()):
+                before = np.array([pose[:2] for pose in chain.stances[place.k + i].standing.values()])
+                if (_distances(places) < np.minimum(_distances(before), APART)).any():
+                    return False
+                if not (free is None or free(places, TO_WALL).all()):
                     return False
                 drive = np.array(stance.waypoints)
                 if not (free is None or free(drive, CLEARANCE / 2).all()):
@@ -306,6 +309,11 @@ class Refinement:
         model = self._predictor.model(names, stance.mover)
         seen = commonly_seen(model, standing, np.concatenate(parts), self._predictor.margins(leapt, names))
         return float(seen.mean()) if seen[0] and seen[-1] else 0.0
+
+
+def _distances(places: Array) -> Array:
+    """Distances (n, n) of places (n, 2) from each other [m]."""
+    return np.asarray(np.hypot(*np.moveaxis(places[:, None] - places, -1, 0)))
 
 
 def _leapers(poses: Mapping[str, Planar], stance: PlannedStance) -> list[str]:
