@@ -1,7 +1,8 @@
 """Errors that all samples of a marker share in a stance, learnt from how stances contradict each other.
 
 The residuals of one homography do not show what is the same in all its points: the next stances do. Its size is a
-variance component of the whole graph, by restricted maximum likelihood under a log-normal prior.
+variance component of the whole graph, by restricted maximum likelihood under a log-normal prior with an
+exponential tail: they can be far larger than is usual, and homographies trusted too much bend planes and mounts.
 """
 
 import math
@@ -22,7 +23,10 @@ Array = NDArray[np.float64]
 
 MAX_STANCES = 60  # of a longer run, whose first part tells as much as is needed; the search takes their square
 COARSE = (-4.0, -2.0, 0.0, 2.0, 4.0)  # sizes that are tried, in standard deviations of the prior
-FINE = (-1.0, -0.5, 0.5, 1.0)  # and then about the likeliest of them
+REACH = 12.0  # standard deviations beyond which no size is tried
+RESOLVED = 1.0  # decrease of the log posterior between neighbouring sizes below which the search ends
+MIN_STEP = 0.05  # standard deviations of the prior, smallest step of the search
+TAIL = 2.0  # standard deviations above which the logarithm of the prior falls no faster
 
 
 @dataclass(frozen=True)
@@ -62,16 +66,22 @@ def learn_shared_noise(graph: PoseGraph, values: gtsam.Values, factor: float, me
     prior = math.log(median)
     tried: dict[float, float] = {}
 
-    def posterior(steps: Iterable[float]) -> float:
+    def likeliest(steps: Iterable[float]) -> float:
         """Try some sizes; return the likeliest so far."""
         for step in steps:
             if step not in tried:
                 likelihood = restricted_log_likelihood(_at_size(graph, math.exp(prior + sigma * step)), values)
-                tried[step] = likelihood - 0.5 * step**2
+                inner = min(step, TAIL)
+                tried[step] = likelihood - inner * (step - inner / 2)
         return max(tried, key=tried.__getitem__)
 
-    best = posterior(COARSE)
-    posterior(best + step for step in FINE)
+    best = likeliest(COARSE)
+    while best == max(tried) and best < REACH:
+        best = likeliest([best + 2.0])
+    width = 2.0
+    while width > MIN_STEP and max(tried[best] - tried[one] for one in _beside(best, tried)) > RESOLVED:
+        width /= 2
+        best = likeliest([max(best - width, COARSE[0]), best + width])
     steps = np.array(sorted(tried))
     # between the sizes that were tried it is smooth
     fine = np.linspace(steps[0], steps[-1], 801)
@@ -82,6 +92,12 @@ def learn_shared_noise(graph: PoseGraph, values: gtsam.Values, factor: float, me
     spread = sigma * math.sqrt(float(weights @ (fine - mean) ** 2))
     mean = prior + sigma * mean
     return SharedNoise(math.exp(mean), math.exp(max(spread, 1e-3)))
+
+
+def _beside(best: float, tried: Iterable[float]) -> list[float]:
+    """Return the nearest sizes below and above the best one."""
+    below, above = [one for one in tried if one < best], [one for one in tried if one > best]
+    return [*([max(below)] if below else []), *([min(above)] if above else [])]
 
 
 def _at_size(graph: PoseGraph, size: float) -> PoseGraph:

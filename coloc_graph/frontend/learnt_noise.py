@@ -152,11 +152,19 @@ class NoiseBelief:
 
     def sigma(self, robot: str) -> tuple[float, float]:
         """Return the standard deviation of a typical centre [px] and its factor of uncertainty."""
-        mean, covariance = self._of(robot)
+        mean, _ = self._of(robot)
         stated, saturated = self.typical[self.robots.index(robot)]
         parts = np.exp(mean) * (stated, 1 - saturated, saturated)
+        return math.sqrt(parts.sum()), math.exp(math.sqrt(self._log_variance(robot)) / 2)
+
+    def _log_variance(self, robot: str, saturated: float | None = None) -> float:
+        """Variance of the logarithm of the variance of a typical centre, or of a typical one with a saturated share."""
+        mean, covariance = self._of(robot)
+        stated, usual = self.typical[self.robots.index(robot)]
+        share = usual if saturated is None else saturated
+        parts = np.exp(mean) * (stated, 1 - share, share)
         relative = parts / parts.sum()
-        return math.sqrt(parts.sum()), math.exp(math.sqrt(relative @ covariance @ relative) / 2)
+        return float(relative @ covariance @ relative)
 
     def differs_from(self, other: "NoiseBelief") -> bool:
         """Return whether measurements differ by the two: the typical centre does by more than `SAME_NOISE`."""
@@ -190,8 +198,8 @@ class NoiseBelief:
     def used(self, team: Team) -> Team:
         """Return a team whose cameras have the expected variances, which are larger than the medians if uncertain.
 
-        The variance of a centre is often known better than its components, which cannot be separated: all are widened
-        by the uncertainty of the typical centre.
+        The variance of a centre is often known better than its components, which cannot be separated: the scale is
+        widened by the uncertainty of the typical centre, and each floor by that of a typical centre of its kind.
         """
         noises = {}
         for name in self.robots:
@@ -199,7 +207,7 @@ class NoiseBelief:
             # half the variance of the logarithm of the variance
             widening = covariance.diagonal() / 2
             if self.points[self.robots.index(name)]:
-                widening = np.full(len(mean), 2 * math.log(self.sigma(name)[1]) ** 2)
+                widening = np.array([self._log_variance(name, saturated) for saturated in (None, 0.0, 1.0)]) / 2
             spread = self.spread * math.exp(math.log(self.spread_factor) ** 2)  # root of the expected square
             noises[name] = CentreNoise.of_logs((mean + widening).tolist(), [0.0] * len(COMPONENTS), spread, 1.0)
         expected = self.bias_px * np.exp(np.log(self.bias_factor) ** 2)  # root of the expected square

@@ -50,7 +50,7 @@ from coloc_graph.pipeline.moves import infer_moves, moves_unstated
 from coloc_graph.pipeline.odometry_checks import CheckedRun
 from coloc_graph.pipeline.options import METHODS, SolveOptions
 from coloc_graph.pipeline.ranges import ranges_of_run
-from coloc_graph.pipeline.shared_errors import shared_noise_of
+from coloc_graph.pipeline.shared_errors import learn_shared_errors
 from coloc_graph.pipeline.solution import Solution
 from coloc_graph.run import Run, Stance
 from coloc_graph.run.recorded import Restated
@@ -217,16 +217,13 @@ def _in_batch(
     if options.method != "chain":
         arms, estimate = find_lever_arms(estimate, BATCH[options.method])
     if options.method == "joint":
-        shared = shared_noise_of(estimate, noise)
-        noisier = noise if shared is None else noise.with_bias(shared.size, shared.factor)
-        again = measured if shared is None else measured_again(measured, noisier.used(run.team))
-        # errors so large that a pair tells nothing any more are none of the cameras'
-        if shared is not None and _usable(again) == _usable(measured):
-            noise, measured = noisier, again
-            graph, sources = _graph_of(run, options, measured, noise.used(run.team))
-            graph = with_lever_arms(graph, arms)
+
+        def again(noisier: NoiseBelief, measured: Sequence[PairMeasurement], start: Estimate) -> Estimate:
+            graph, _ = _graph_of(run, options, measured, noisier.used(run.team))
             _require_ties(run, graph, measured)
-            estimate = joint(graph, start=estimate.values)
+            return joint(with_lever_arms(graph, arms), start=start.values)
+
+        estimate, noise, measured = learn_shared_errors(estimate, noise, measured, run.team, again)
     estimate, left_out = _with_ranges(run, options, estimate)
     measured = tuple(replace(one, with_team=None) for one in measured)
     log.info("%s: chi2/dof %.6g/%d, %d rejected", options.method, estimate.chi2, estimate.dof, len(estimate.rejected))

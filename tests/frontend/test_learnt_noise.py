@@ -194,7 +194,7 @@ def test_a_stance_that_is_withdrawn_takes_what_it_taught_with_it(hallway):
 
 def test_a_shared_error_with_which_a_pair_would_tell_nothing_is_not_taken(solved, monkeypatch):
     before = solved(1.0)
-    monkeypatch.setattr("coloc_graph.pipeline.batch.shared_noise_of", lambda *_: SharedNoise(1e4, 1.5))
+    monkeypatch.setattr("coloc_graph.pipeline.shared_errors.shared_noise_of", lambda *_: SharedNoise(1e4, 1.5))
     after = solve(before.run, SolveOptions(odometry=False))
     assert after.count.used == before.count.used
     np.testing.assert_allclose(after.estimate.chi2, before.estimate.chi2, rtol=0.1)
