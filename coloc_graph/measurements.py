@@ -90,6 +90,9 @@ class HomographyMeasurement:
         Reason for which only the paper's chain uses it.
     shared : (8, 8) float or None
         Part of the covariance of h by errors that all samples of a marker share.
+    by_lenses : (2, 8, q) float or None
+        Derivatives of h by the terms that the lens models of cameras i and j leave (`Camera.lens_terms`); of a stated
+        plane.
     """
 
     stance: int
@@ -110,6 +113,7 @@ class HomographyMeasurement:
     share: float = 1.0
     doubt: str | None = None
     shared: Array | None = None
+    by_lenses: Array | None = None
 
     def at_shared(self, size: float) -> "HomographyMeasurement":
         """Return the measurement with shared errors `size` times as large."""

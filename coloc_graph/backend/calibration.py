@@ -1,4 +1,4 @@
-"""Calibration variables of a team: mounts, markers, clocks and planes that are stated with a tolerance."""
+"""Calibration variables of a team: mounts, markers, clocks, planes and lenses that are stated with a tolerance."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -15,6 +15,7 @@ from coloc_graph.backend.sensor_model import RANGING as RANGING_SIZE
 from coloc_graph.backend.sensor_model import Sensors
 from coloc_graph.measurements import RelativePose
 from coloc_graph.team import Landmark, Markers, Mount, Robot, Team
+from coloc_graph.team.camera import LENS_TERMS
 
 Array = NDArray[np.float64]
 
@@ -27,8 +28,10 @@ MOUNT = ord("m")  # height [m], tilt, roll, yaw [rad], x, y [m]
 MARKERS = ord("k")  # span (relative), height [m]
 CLOCKS = ord("o")  # offset of the clocks of a pair [s]
 PLANE = ord("p")  # normal in two directions [rad], distance (relative)
+LENS = ord("l")  # terms that the lens model leaves, in units of their standard deviation
 RANGING = ord("r")  # offset [m], scale, bearing [rad], x, y [m], depth, offset of robots [m]
-SIZES = {MOUNT: 6, MARKERS: 2, CLOCKS: 1, PLANE: 3, RANGING: RANGING_SIZE}  # dimension of each
+# dimension of each
+SIZES = {MOUNT: 6, MARKERS: 2, CLOCKS: 1, PLANE: 3, LENS: LENS_TERMS, RANGING: RANGING_SIZE}
 TILTS = slice(1, 3)  # tilt and roll among the errors of a mount
 YAW = "camera yaw"
 UNOBSERVABLE = 0.8  # part of a stated tolerance that is left of what nothing measures
@@ -100,6 +103,11 @@ class Variables:
     def plane(self, robot: str, stance: int, sigmas: Array) -> int | None:
         """Return the key of a plane that was stated for a stance."""
         return self._key(PLANE, robot, stance, sigmas.tolist())
+
+    def lens(self, robot: str) -> int | None:
+        """Return the key of what the lens model of a robot's camera leaves; None where it is exact."""
+        exact = self.robot_models[robot].camera.lens_px == 0
+        return self._key(LENS, robot, 0, [0.0 if exact else 1.0] * LENS_TERMS)
 
     def ranging(self, robot: str) -> int | None:
         """Return the key of a robot's range sensor; None where it is exact, or the robot has none."""

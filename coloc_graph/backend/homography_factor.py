@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.batched_factors import BatchedFactor, FactorEvaluator, Group
-from coloc_graph.backend.calibration import MOUNT, RANGING, SIZES, Variables, sigmas_of_plane
+from coloc_graph.backend.calibration import LENS, MOUNT, RANGING, SIZES, Variables, sigmas_of_plane
 from coloc_graph.backend.camera_model import MarkersModel
 from coloc_graph.backend.homography_model import HomographyModel, StatedPlaneModel, level_plane
 from coloc_graph.backend.range_model import RangeModel
@@ -45,7 +45,9 @@ def homography_factors(
         if not link.plane.normal_from_mount:
             plane = StatedPlaneModel(measured, link.plane.N / link.plane.d, mount_i, mount_j)
             key = variables.plane(link.robot_i, link.stance, sigmas_of_plane(link))
-            made.append(BatchedFactor(FactorEvaluator(plane, (i, j), (key,), (3,))))
+            both = link.robot_i, link.robot_j
+            lenses = [None if measured.by_lenses is None else variables.lens(robot) for robot in both]
+            made.append(BatchedFactor(FactorEvaluator(plane, (i, j), (key, *lenses), (3, SIZES[LENS], SIZES[LENS]))))
             continue
         clocks, sign = variables.clocks(link.robot_i, link.robot_j, measured.time_offset_sigma)
         model = HomographyModel(measured, own, mount_i, mount_j, _markers_of(link, variables), on_floor, sign)

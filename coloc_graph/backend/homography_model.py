@@ -15,6 +15,7 @@ from coloc_graph.backend.span_factor import SpanModel, Spans
 from coloc_graph.geometry.lie import hat, se3_inverse, sl3_adjoint, sl3_log, sl3_log_derivative, sl3_vee
 from coloc_graph.measurements import HomographyMeasurement
 from coloc_graph.team import Markers, Mount
+from coloc_graph.team.camera import LENS_TERMS
 
 Array = NDArray[np.float64]
 
@@ -168,7 +169,7 @@ class StatedPlaneModel:
     """Residual of a measured homography of a plane that is stated in camera i.
 
     The plane's own variable is the error (3,) of n = N / d, across two directions and along the normal, relative to
-    the stated |n|.
+    the stated |n|. The other two are the terms (LENS_TERMS,) that the lens models of both cameras leave.
     """
 
     measured: HomographyMeasurement
@@ -203,6 +204,9 @@ class _StatedPlanes:
         self._by_error = size[..., None] * sides[:, [1, 2, 0]].mT
         self._root = np.linalg.cholesky(np.array([one.measured.information for one in models])).mT
         self._H_inverse = np.linalg.inv(np.array([one.measured.H_j_i for one in models]))
+        none = np.zeros((2, 8, LENS_TERMS))
+        lenses = [none if one.measured.by_lenses is None else one.measured.by_lenses for one in models]
+        self._by_lens_i, self._by_lens_j = -self._root @ np.moveaxis(np.array(lenses), 1, 0)
 
     def at(
         self, T_world_i: Array, T_world_j: Array, errors: Sequence[Array]
@@ -221,4 +225,6 @@ class _StatedPlanes:
         by_i = by_h @ by_ci @ _adjoint(se3_inverse(self._T_bi_ci))
         by_j = -by_i @ _adjoint(se3_inverse(T_bj_bi))
         by_n = sl3_vee(back @ (t[:, None, :, None] * np.eye(3)[:, None, :])).mT
-        return (self._root @ h[..., None])[..., 0], [by_i, by_j, by_h @ by_n @ self._by_error], near
+        e = self._root @ h[..., None]
+        e += self._by_lens_i @ errors[1][..., None] + self._by_lens_j @ errors[2][..., None]
+        return e[..., 0], [by_i, by_j, by_h @ by_n @ self._by_error, self._by_lens_i, self._by_lens_j], near

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.eq2_pose import relative_pose
-from coloc_graph.frontend.homography.fit import HomographyFit, fit_homography, persisting, shared_error
+from coloc_graph.frontend.homography.fit import HomographyFit, fit_homography, persisting
 from coloc_graph.frontend.homography.fit_checks import require_agreement, require_determined
 from coloc_graph.frontend.homography.marker_span import marker_spans
 from coloc_graph.frontend.homography.ml_pose import most_likely_pose
@@ -24,6 +24,7 @@ from coloc_graph.frontend.homography.plane_view import (
 )
 from coloc_graph.frontend.homography.refinement import Criterion
 from coloc_graph.frontend.homography.scatter import spread_of
+from coloc_graph.frontend.homography.smooth_errors import bias_root, by_lenses, shared_error
 from coloc_graph.frontend.landmarks import SeenLandmarks
 from coloc_graph.frontend.pairing.clock_offset import (
     NOT_OBSERVABLE,
@@ -354,7 +355,8 @@ def _measured(
     own = information_weight(found, (seen.robot_i, seen.robot_j), seen.pairs, seen.tracks, _window(seen.run))
     fit = replace(fit, information=own * fit.information)
     measurement = _measurement(seen.stance, seen.robot_i, seen.robot_j, fit, found, *seen.cameras)
-    measurement = replace(measurement, share=own, doubt=doubt)
+    lenses = None if plane.normal_from_mount else by_lenses(fit, found, *seen.cameras)
+    measurement = replace(measurement, share=own, doubt=doubt, by_lenses=lenses)
     if offset is not None:
         measurement = replace(
             measurement,
@@ -384,7 +386,7 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
         return ()
     robot, movers = seen.team[seen.robot_i], seen.stance.movers
     view = seen.cameras[0]
-    bias = _bias_root(found.uv_i, found.pairs.x_i, view)
+    bias = bias_root(found.uv_i, found.pairs.x_i, view)
     named = any(track.marker for track in seen.tracks_i)
     couples: dict[str, tuple[int, int]] = {}
     for mover in movers:
@@ -423,7 +425,7 @@ def _measurement(
     camera_j: Camera,
 ) -> HomographyMeasurement:
     pairs = found.pairs
-    roots = _bias_root(found.uv_i, pairs.x_i, camera_i), _bias_root(found.uv_j, pairs.x_j, camera_j)
+    roots = bias_root(found.uv_i, pairs.x_i, camera_i), bias_root(found.uv_j, pairs.x_j, camera_j)
     shared = shared_error(fit, pairs, found.markers, roots)
     information = np.linalg.inv(np.linalg.inv(fit.information) + shared)
     return HomographyMeasurement(
@@ -439,19 +441,6 @@ def _measurement(
         overlap_px=overlap(fit.H, camera_i, camera_j),
         shared=shared if shared.any() else None,
     )
-
-
-def _bias_root(uv: Array, x: Array, camera: Camera) -> Array:
-    """Square root (n, 2, 6) of the covariance of a camera's bias at points, or (n, 2, 0) if it has none.
-
-    The bias is an error that is smooth over the image, with a constant part and parts that grow across the points, each
-    with standard deviation `bias_px`. `uv` are pixels, `x` normalised coordinates, (n, 2).
-    """
-    if not camera.bias_px:
-        return np.empty((len(x), 2, 0))
-    across = (uv - uv.mean(axis=0)) / np.maximum(uv.std(axis=0), 1.0)
-    root = camera.bias_px * camera.per_pixel(x)
-    return np.concatenate([root, across[:, :1, None] * root, across[:, 1:, None] * root], axis=2)
 
 
 def _unusable(

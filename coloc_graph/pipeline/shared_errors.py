@@ -21,8 +21,8 @@ Again = Callable[[NoiseBelief, Sequence[PairMeasurement], Estimate], Estimate]
 
 
 def learn_shared_errors(
-    estimate: Estimate, noise: NoiseBelief, measured: Sequence[PairMeasurement], team: Team, again: Again
-) -> tuple[Estimate, NoiseBelief, Sequence[PairMeasurement]]:
+    estimate: Estimate, noise: NoiseBelief, measured: tuple[PairMeasurement, ...], team: Team, again: Again
+) -> tuple[Estimate, NoiseBelief, tuple[PairMeasurement, ...]]:
     """Learn the shared errors from a joint estimate, and estimate again with them.
 
     Homographies that are trusted too much bend planes and mounts to fit them. The errors that such an estimate leaves

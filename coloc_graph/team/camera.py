@@ -5,6 +5,7 @@ from typing import Literal
 
 import msgspec
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.input_file import quoted
@@ -18,6 +19,8 @@ Array = NDArray[np.float64]
 MAX_SIDE = 65_535  # px, side of an image, as of a JPEG
 MAX_RAY = 15.0  # x / z of the outermost ray by which a lens model is checked, 86 deg off the axis
 RAYS = 6001  # number of these rays
+LENS_ORDER = 3  # of the polynomials that a lens model may leave
+LENS_TERMS = (LENS_ORDER + 1) * (LENS_ORDER + 2)  # two for each of these polynomials
 MIN_DEPTH = math.cos(math.radians(89.5))  # z of a unit ray below which a fisheye's (x, y, 1) is not defined
 
 
@@ -45,6 +48,8 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         lens distortion, a bright background. A median; 0 states nothing.
     bias_factor : float
         Factor within which `bias_px` is known (one standard deviation of its logarithm).
+    lens_px : float
+        Standard deviation per axis of each smooth term that the lens model leaves, the same in all images [px].
     centre_noise : CentreNoise or None
         Noise beyond that stated by detections, with tolerances; None for the defaults.
     """
@@ -62,6 +67,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     shot_gain: float = 0.1
     bias_px: float = 0.0
     bias_factor: float = 3.0
+    lens_px: float = 0.03
     centre_noise: CentreNoise | None = None
 
     def __post_init__(self) -> None:
@@ -72,7 +78,7 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         for name in ("width", "height"):
             if getattr(self, name) > MAX_SIDE:
                 raise ValueError(f"`{name}` is {quoted(getattr(self, name))}; give pixels, {MAX_SIDE} at most")
-        require_not_negative(self, ("shot_gain", "bias_px"))
+        require_not_negative(self, ("shot_gain", "bias_px", "lens_px"))
         if not 1 < self.bias_factor <= 100:
             raise ValueError(f"`bias_factor` is {self.bias_factor}; give a number above 1, 100 at most")
         if self.model == "fisheye" and len(self.distortion) not in (0, 4):
@@ -98,6 +104,18 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             return stated
         scale, *added = self.centre_noise.variances
         return np.asarray(scale * stated + (loads @ added)[:, None, None] * np.eye(2))
+
+    def lens_terms(self, uv: Array) -> Array:
+        """Evaluate the terms of what a lens model may leave, at pixels (n, 2): shifts (n, 2, LENS_TERMS) [px].
+
+        Legendre polynomials in the image, up to the third order, each with a standard deviation of `lens_px`.
+        """
+        x, y = (legendre.legvander(one, LENS_ORDER) for one in (2 * uv / (self.width, self.height) - 1).T)
+        root = np.sqrt(2 * np.arange(LENS_ORDER + 1) + 1)  # so that the mean square over the image is 1
+        orders = [(m, n) for m in range(LENS_ORDER + 1) for n in range(LENS_ORDER + 1 - m)]
+        terms = np.stack([(root[m] * x[:, m]) * (root[n] * y[:, n]) for m, n in orders], axis=1)
+        shifts = np.einsum("nq,ab->naqb", terms, np.eye(2)).reshape(len(uv), 2, LENS_TERMS)
+        return np.asarray(self.lens_px * shifts)
 
     @property
     def K(self) -> Array:

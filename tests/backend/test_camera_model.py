@@ -13,6 +13,7 @@ from coloc_graph.backend.span_factor import SpanModel, Spans, spans_on_plane
 from coloc_graph.geometry.lie import floor_pose, se3_exp, se3_inverse, sl3_log, sl3_normalise
 from coloc_graph.measurements import HomographyMeasurement, MarkerSpan
 from coloc_graph.team import Markers, Mount
+from coloc_graph.team.camera import LENS_TERMS
 
 MOUNT_I = Mount(height=0.4, tilt_deg=20.0, roll_deg=1.0, yaw_deg=5.0, x=0.05, y=-0.02)
 MOUNT_J = Mount(height=0.38, tilt_deg=17.0, roll_deg=-2.0, yaw_deg=-3.0, x=0.02, y=0.01)
@@ -218,19 +219,23 @@ def test_spans_taken_together_are_those_taken_alone(rng):
 
 
 def test_jacobians_of_a_stated_plane(rng):
-    measured = homography(rng)
+    measured = replace(homography(rng), by_lenses=1e-3 * rng.normal(size=(2, 8, LENS_TERMS)))
     T = T_WORLD_I @ MOUNT_I.T_body_camera
     n = T[:3, :3].T @ np.array([0.0, 0.0, -1.0]) / (T[2, 3] - 0.15)
     model = StatedPlaneModel(measured, n, MOUNT_I, MOUNT_J)
-    assert np.abs(at(model, T_WORLD_I, T_WORLD_J, np.zeros(3))[0]).max() < 1e-6
+    none = np.zeros(LENS_TERMS)
+    assert np.abs(at(model, T_WORLD_I, T_WORLD_J, np.zeros(3), none, none)[0]).max() < 1e-6
     T_j = T_WORLD_J @ se3_exp(0.01 * rng.normal(size=6))
-    errors = 0.01 * rng.normal(size=3)
+    errors = np.concatenate([0.01 * rng.normal(size=3), rng.normal(size=2 * LENS_TERMS)])
+
+    def parts(all_errors):
+        return np.split(all_errors, [3, 3 + LENS_TERMS])
 
     def moved(step):
-        return at(model, T_WORLD_I @ se3_exp(step[:6]), T_j @ se3_exp(step[6:12]), errors + step[12:])[0]
+        return at(model, T_WORLD_I @ se3_exp(step[:6]), T_j @ se3_exp(step[6:12]), *parts(errors + step[12:]))[0]
 
-    expected = by_differences(moved, np.zeros(15))
-    got = at(model, T_WORLD_I, T_j, errors)[1]
+    expected = by_differences(moved, np.zeros(15 + 2 * LENS_TERMS))
+    got = at(model, T_WORLD_I, T_j, *parts(errors))[1]
     np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-7 * np.abs(expected).max())
 
 

@@ -16,6 +16,7 @@ from coloc_graph.pipeline import batch as pipeline
 from coloc_graph.pipeline.inspection import inspect
 from coloc_graph.run import Motion, Stance, open_run
 from coloc_graph.team import Camera, Floor, Markers, Mount, Robot, Team, write_team
+from coloc_graph.team.camera import LENS_TERMS
 
 CAMERA = Camera(width=640, height=480, fx=500.0, fy=510.0, cx=320.0, cy=240.0, distortion=(-0.1, 0.02, 1e-3, -1e-3))
 MOUNT = Mount(height=0.5, tilt_deg=25.0)
@@ -120,9 +121,12 @@ def test_stated_planes_give_the_pose_of_cameras_off_the_floor_exactly(files):
     np.testing.assert_allclose(solution.estimate.pose("B", 0).matrix(), T_WORLD_B, atol=1e-6)
 
 
-def test_planes_that_are_stated_with_sigmas_are_found_along_with_the_pose(files):
-    """Eight boards before two cameras that never moved; each is stated 2 deg and 3 % off, and said to be."""
-    rng = np.random.default_rng(1)
+def boards(rng, normal_off_deg, d_off, normal_sigma_deg, d_sigma, noise_px=0.0, lenses=None):
+    """Rows of tracks and planes of eight boards before two cameras that never moved.
+
+    Stated planes are `..._off` from the true ones (one sigma; of d relative to d) and say `..._sigma`. `lenses` are
+    coefficients of `Camera.lens_terms` by robot.
+    """
     T_world_c = MOUNT.T_body_camera
     tracks, planes = [], "stance,robot,nx,ny,nz,d,normal_sigma_deg,d_sigma\n"
     for k in range(8):
@@ -132,11 +136,23 @@ def test_planes_that_are_stated_with_sigmas_are_found_along_with_the_pose(files)
         points = flat @ T_world_plane[:3, :3].T + T_world_plane[:3, 3]
         N = T_world_c[:3, :3].T @ T_world_plane[:3, 2]
         d = N @ (T_world_c[:3, :3].T @ (T_world_plane[:3, 3] - T_world_c[:3, 3]))
-        off = so3_exp(np.deg2rad(2.0) * rng.normal(size=3)) @ (N * np.sign(d))
-        stated = (*off, abs(d) * (1 + 0.03 * rng.normal()), 2.0, 0.03 * abs(d))
+        off = so3_exp(np.deg2rad(normal_off_deg) * rng.normal(size=3)) @ (N * np.sign(d))
+        stated = (*off, abs(d) * (1 + d_off * rng.normal()), normal_sigma_deg, d_sigma * abs(d))
         planes += f"{k},A," + ",".join(f"{value:.12f}" for value in stated) + "\n"
         for robot, T in (("A", T_world_c), ("B", T_WORLD_B @ T_world_c)):
-            tracks += rows(k, robot, seen(T, points), T0 + 10 * k)
+            uv = seen(T, points)
+            uv += noise_px * rng.normal(size=uv.shape)
+            if lenses is not None:
+                uv += CAMERA.lens_terms(uv) @ lenses[robot]
+            tracks += rows(k, robot, uv, T0 + 10 * k)
+    return tracks, planes
+
+
+def test_planes_that_are_stated_with_sigmas_are_found_along_with_the_pose(files):
+    """Eight boards before two cameras that never moved; each is stated 2 deg and 3 % off, and said to be."""
+    tracks, planes = boards(
+        np.random.default_rng(1), normal_off_deg=2.0, d_off=0.03, normal_sigma_deg=2.0, d_sigma=0.03
+    )
     files.bring_in(HEADER + "".join(tracks), planes=planes, moves=MOVES, of=team(markers_on=()))
     run = open_run(files.out)
     normal_sigma, d_sigma = run.planes[3].sigmas["A"]
@@ -147,8 +163,25 @@ def test_planes_that_are_stated_with_sigmas_are_found_along_with_the_pose(files)
     shift, turn = np.linalg.norm(T[:3, 3]), np.linalg.norm(so3_log(T[:3, :3]))
     # the tilts come out of the homographies by themselves, the scale from eight distances
     length = np.linalg.norm(T_WORLD_B[:3, 3])
-    assert turn < 1e-3 and shift < 3 * 0.03 / np.sqrt(8) * length and len(estimate.calibration.values) == 8
+    assert turn < 1e-3 and shift < 3 * 0.03 / np.sqrt(8) * length
+    assert len(estimate.calibration.values) == 8 + 2  # planes, and what both lens models leave
     assert estimate.chi2 / estimate.dof < 2
+
+
+def test_what_lenses_leave_in_all_stances_does_not_spoil_a_pose_by_loosely_stated_planes(files):
+    nees = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        lenses = {robot: rng.normal(size=LENS_TERMS) for robot in "AB"}
+        stated = boards(rng, 0.1, 0.001, normal_sigma_deg=0.4, d_sigma=0.004, noise_px=0.05, lenses=lenses)
+        files.bring_in(
+            HEADER + "".join(stated[0]), planes=stated[1], moves=MOVES, of=team(markers_on=(), noise_px=0.05)
+        )
+        estimate = pipeline.solve(open_run(files.out)).estimate
+        T = se3_inverse(estimate.pose("B", 0).matrix()) @ T_WORLD_B
+        xi = np.concatenate([so3_log(T[:3, :3]), T[:3, 3]])
+        nees.append(xi @ np.linalg.solve(estimate.covariance("B", 0), xi) / 6)
+    assert 0.1 < np.mean(nees) < 2.0  # above 3 with lenses as exact
 
 
 def test_what_is_read_back_is_what_was_given(files):

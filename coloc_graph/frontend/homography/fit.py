@@ -23,7 +23,6 @@ from coloc_graph.frontend.homography.refinement import (
     linearise,
     refine,
     squared_residuals,
-    whitened_rows,
 )
 from coloc_graph.frontend.homography.scatter import variance_factor
 from coloc_graph.geometry.lie import sl3_normalise
@@ -172,38 +171,6 @@ def persisting(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64],
             break
         total += 2 * rho
     return replace(fit, information=fit.information / total, persistence=total)
-
-
-def shared_error(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64], roots: tuple[Array, Array]) -> Array:
-    """Covariance (8, 8) of the homography due to errors that all points of a group share in each image.
-
-    Averaging over points does not reduce such errors: a lens calibrated to 0.02 px, a bias by a marker's background.
-
-    Parameters
-    ----------
-    fit, pairs
-        Fit, and the points that it was made of.
-    groups
-        Track of each point, (n,).
-    roots
-        Square roots (n, 2, q) of the shared error's covariance in image i and in image j, normalised coordinates.
-    """
-    added = np.zeros((8, 8))
-    if not any(root.shape[2] for root in roots):
-        return added
-    among, groups = pairs[fit.inliers], groups[fit.inliers]
-    at = linearise(fit.H, among.x_i, among)
-    rows = whitened_rows(at, among.x_i)
-    weighted = np.linalg.inv(rows @ rows.mT) @ rows
-    in_i, in_j = (root[fit.inliers] for root in roots)
-    for group in np.unique(groups):
-        own = groups == group
-        for moved in (-(at.by_z[own] @ in_i[own]), in_j[own]):
-            whitened = np.concatenate([at.g0[own, None] * moved[:, 0], np.zeros_like(moved[:, 1])])
-            whitened[len(moved) :] = at.g1[own, None] * (moved[:, 1] - at.k[own, None] * whitened[: len(moved)])
-            by_error = weighted[:, np.tile(own, 2)] @ whitened
-            added += by_error @ by_error.T
-    return added
 
 
 def _inliers(squared: Array, among: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -48,6 +48,7 @@ def measured_between_cameras(
         information=back.T @ measured.information @ back,
         shared=None if measured.shared is None else Ad @ measured.shared @ Ad.T,
         by_time_offset=None if measured.by_time_offset is None else Ad @ measured.by_time_offset,
+        by_lenses=None if measured.by_lenses is None else Ad @ measured.by_lenses,
     )
 
 
