@@ -160,14 +160,24 @@ def test_images_of_another_size_and_stances_that_are_none_are_refused(team, tmp_
     recorded(tmp_path / "B", 2, [10 * k for k in range(30)])
     given, out = [f"A={tmp_path / 'A'}", f"B={tmp_path / 'B'}"], tmp_path / "run.mcap"
     csv = tmp_path / "stances.csv"
-    csv.write_text(f"stance,start,end,observers,movers,anchors\n0,{START},{START + 2},A B,C,\n")
-    assert [one.movers for one in import_images(team, given, out, fps=10, stances=csv).stances] == [("C",)]
+    first = f"0,{START},{START + 1},A B,C,\n"
+    csv.write_text(f"stance,start,end,observers,movers,anchors\n{first}1,{START + 1},{START + 2},A B,C,\n")
+    assert [one.movers for one in import_images(team, given, out, fps=10, stances=csv).stances] == [("C",)] * 2
     csv.write_text(f"stance,start,end,observers,movers,anchors\n0,{START},{START + 2},A X,C,\n")
     with pytest.raises(InputError, match="line 2: `observers`: robot `X` is not in the team"):
         import_images(team, given, out, fps=10, stances=csv)
     csv.write_text(f"stance,start,end,observers,movers,anchors\n0,{START + 50},{START + 60},A B,C,\n")
     with pytest.raises(InputError, match="observer A has no image from"):
         import_images(team, given, out, fps=10, stances=csv)
+    for rows, words in (
+        (f"0,{START},{START},A B,C,\n", "line 2: it ends before it starts"),
+        (f"{first}1,{START + 0.5},{START + 2},A B,C,\n", "line 3: .* starts before the last one ends"),
+        (f"{first}2,{START + 1},{START + 2},A B,C,\n", "line 3: stance 2 comes where 1 is due"),
+        (f"0,{START},{START + 1},A B,B,\n", "line 2: `B` both observes and moves"),
+    ):
+        csv.write_text(f"stance,start,end,observers,movers,anchors\n{rows}")
+        with pytest.raises(InputError, match=words):
+            import_images(team, given, out, fps=10, stances=csv)
     cv2.imwrite(str(tmp_path / "A" / "frame7.png"), np.zeros((10, 10), np.uint8))
     csv.write_text(f"stance,start,end,observers,movers,anchors\n0,{START},{START + 2},A B,C,\n")
     with pytest.raises(InputError, match=r"frame7\.png has 10 x 10 pixels, and the camera of A is 320 x 240"):

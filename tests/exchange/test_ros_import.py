@@ -583,6 +583,10 @@ def test_what_is_no_unit_quaternion_is_no_pose_and_one_that_nearly_is_becomes_a_
     ("sent", "words"),
     [
         ([], "has no /tf and no /tf_static, which `truth_tf` of C needs"),
+        (
+            [tf("/tf", T0, "world", "C/base", floor_pose(np.nan, 0.0, 0.0))],
+            "/tf received at .* has no finite translation and unit quaternion of `C/base`",
+        ),
         ([tf("/tf", T0, "map", "C/base", np.eye(4))], "tf has no frame `world`.*it has: C/base, map"),
         ([tf("/tf_static", T0, "world", "C/base", np.eye(4))], "`C/base` in `world`.*never moves"),
         ([tf("/tf", T0, "world", "x", np.eye(4)), tf("/tf", T0, "y", "C/base", np.eye(4))], "is not known"),

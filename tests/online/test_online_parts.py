@@ -222,6 +222,14 @@ def test_an_observer_that_was_pushed_is_told_by_where_it_has_the_mover():
     assert truly.displaced(thought) == {}
 
 
+def test_odometry_is_kept_for_ten_minutes_and_no_longer():
+    tracker = PoseTracker((0.0, 0.0, 0.0))
+    for n in range(2000):
+        tracker.add(odometry("A", float(n), 0.01 * n, 0.0, 0.0))
+    assert 600 <= len(tracker._times) <= 1.2 * 600 + 2
+    assert tracker.pose(1999.0 - 600.0)[0] == pytest.approx(0.01 * (1999 - 600))
+
+
 def test_a_robot_that_was_carried_is_no_anchor_in_the_record_either():
     joined, seen, resumed = JoinedOdometry(), PoseTracker((0.0, 0.0, 0.0)), PoseTracker((0.0, 0.0, 0.0))
     for n in range(3):

@@ -334,6 +334,7 @@ def stance_row(ns=5, **changes):
 
 
 MOTION = ("coloc_graph.Motion", "json")
+PLANES_ROW = ("/planes", "coloc_graph.Planes", "json", 5, b'{"stance": 0, "planes": {}}')
 
 
 @pytest.mark.parametrize(
@@ -343,6 +344,7 @@ MOTION = ("coloc_graph.Motion", "json")
         ([TEAM_ROW, TEAM_ROW], "2 messages of /team"),
         ([TEAM_ROW, stance_row(observers=["A", "Z"])], "stance 0 names robot `Z`"),
         ([TEAM_ROW, stance_row(), stance_row(ns=6)], "stance 0 is recorded twice"),
+        ([TEAM_ROW, PLANES_ROW, PLANES_ROW], "planes of stance 0 are recorded twice"),
         ([TEAM_ROW, stance_row(), stance_row(ns=4, index=1)], "backwards in /stance at 4e-09 s"),
         ([TEAM_ROW, stance_row(end_ns=None)], r"/stance at 5e-09 s is wrong: .*`end_ns`"),
         ([TEAM_ROW, stance_row(colour=1)], r"unknown field `colour`"),
