@@ -18,7 +18,8 @@ from coloc_graph.exchange.g2o import read_g2o
 from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.frontend import WheelTrack
 from coloc_graph.frontend.ranged_landmarks import locate
-from coloc_graph.frontend.stance_ranges import OUTLIER_SIGMAS
+from coloc_graph.frontend.stance_ranges import OUTLIER_SIGMAS, Standing, ranges_of_stances
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Range
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.contents import unused_in, unused_ranges
@@ -422,6 +423,22 @@ def test_errors_of_places_by_odometry_have_their_stated_covariance(rng):
     predicted = root @ root.T
     scale = np.sqrt(np.outer(predicted.diagonal(), predicted.diagonal()))
     np.testing.assert_allclose(np.cov(np.array(drawn).T) / scale, predicted / scale, atol=0.13)
+
+
+@pytest.mark.parametrize("driver", ["A", "B"])
+def test_a_range_is_as_uncertain_as_the_odometry_of_whichever_end_drives(mixed, driver):
+    team = open_run(mixed).team
+    places = {"A": floor_pose(0.0, 0.0, 0.0), "B": floor_pose(3.0, 0.0, 0.0)}
+    standing = {name: [Standing(0, 0.0, 2.0 if name == driver else 20.0, T)] for name, T in places.items()}
+    times = np.arange(61) * 0.1
+    way = np.column_stack([np.maximum(times - 2.0, 0.0) * 0.1, np.zeros(61), np.zeros(61)])
+    samples = [OdometrySample(driver, t, p, 1e-2 * np.eye(3)) for t, p in zip(times.tolist(), way, strict=True)]
+    apart = 3.0 - way[:, 0] * (1 if driver == "A" else -1)
+    recorded = {"A": [Ranges("A", t, ("B",), np.array([r])) for t, r in zip(times.tolist(), apart, strict=True)]}
+    found = ranges_of_stances(team, standing, {driver: WheelTrack(driver, samples)}, recorded)
+    (made,) = found.ranges
+    sigmas = np.sqrt(made.covariance.diagonal())
+    assert len(sigmas) > 2 and sigmas.min() < 0.05 and np.median(sigmas) > 0.1
 
 
 def test_sensors_that_measure_no_bearing_need_no_noise_of_it():
