@@ -68,16 +68,17 @@ class KeyframeFactors:
         self.free[self._marks :] = ~np.repeat(self._exact, 2)
         self._known_before = np.zeros(len(self.free))
         self._known_before[self._marks :] = np.where(known[:, None], models.map, 0.0).ravel()
-        # e^T C^-1 e with C = L L^T
-        self._whiten = np.concatenate(
-            [np.linalg.inv(np.linalg.cholesky(each.covariances)).reshape(-1, 3, 3) for each in models.wheels]
-        )
         self._step_first: Index = np.cumsum([0, *map(len, models.wheels)])
         self._sigmas_measured = models.sensors.sigmas(m.robot, m.range)
         self._landmark: Index = np.maximum(m.target - robots, 0) if landmarks else np.zeros(len(m), int)
 
     def __len__(self) -> int:
         return len(self.times)
+
+    @cached_property
+    def _whiten(self) -> Array:
+        """Inverses of the roots L of the covariances L L^T of all steps."""
+        return np.linalg.inv(np.linalg.cholesky(np.concatenate([each.covariances for each in self.models.wheels])))
 
     def start(self) -> Array:
         """Return the prior means of the shared variables; landmarks of unknown positions at the origin."""

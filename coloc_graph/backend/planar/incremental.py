@@ -120,16 +120,17 @@ class IncrementalKeyframes:
         self._enter_robots()
         self._enter_landmarks()
         if np.isfinite(self._state.poses[:, 0]).any():
-            _, _, tree = self._step()
+            linear, ordering, tree = self._step()
             self._note_latest(ends, tree)
-            self._leave(time, tree)
+            self._leave(time, linear, ordering)
         return Latest(time, {self._team.names[robot]: one for robot, one in self._latest.items()})
 
     def _follow(self, keyframes: Keyframes) -> None:
         """Go on with the keyframes of another window: more have come, or older ones have left."""
         before, poses = self._keyframes, np.split(self._state.poses, self._factors.first[1:-1])
         models = Models(self._team, keyframes)
-        self._filter.follow(keyframes, models)
+        if not self._filter.is_complete or len(self._latest) < len(self._team.names):
+            self._filter.follow(keyframes, models)  # it has more to give
         self._keyframes, self._factors = keyframes, KeyframeFactors(keyframes, models)
         self._state = State(np.concatenate(aligned(poses, before, keyframes)), self._state.shared)
 
@@ -181,7 +182,7 @@ class IncrementalKeyframes:
         self._state = problem.moved(self._state, tree.optimize())
         return linear, ordering, tree
 
-    def _leave(self, time: float, tree: gtsam.GaussianBayesTree) -> None:
+    def _leave(self, time: float, solved: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> None:
         """Keep the estimates of poses older than the lag, and marginalise them; each robot's newest one stays."""
         factors = self._factors
         if time < self._begun + self._calibrating or time - self._lag < self._left + LEAVING_PERIOD:
@@ -194,7 +195,7 @@ class IncrementalKeyframes:
         gone_at = np.flatnonzero(gone)
         if len(gone_at):
             if not self._forgets:
-                self._note(self._smoothed, gone_at, tree.marginalCovariance)
+                self._note(self._smoothed, gone_at, Marginals(solved, factors.keys.size, ordering).covariance)
             steps, measured = factors.steps_between(inside), factors.measured_between(inside, self._landmarks)
             seen = gone[factors.seen[measured]] & factors.of_robot[measured]
             before = gone[steps] | gone[steps + 1], gone[factors.observer[measured]] | seen
