@@ -6,6 +6,10 @@ The EKF is that of `coloc_graph.backend.planar` (robots, landmarks, what is off 
 and the same without calibration, as filters on these data usually are. What is thought at the time is compared at the
 same instants: where the incremental estimate has just taken in what was measured. Seconds are of one processor, from
 the run on disk to the estimate (of the EKF without reading).
+
+NEES of the batch is by robot, of positions and of headings, with 95 % intervals by a bootstrap of blocks of 60 s. The
+true heading of R1 steps by 5 deg and more from one frame of the motion capture to the next: NEES of headings is also
+given without the blocks in which the truth does so.
 """
 
 import argparse
@@ -17,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from coloc_graph.backend.floor_poses import trajectory
 from coloc_graph.backend.landmarks import StaticPose
@@ -24,9 +29,16 @@ from coloc_graph.backend.planar import filter_forward
 from coloc_graph.evaluation import align, evaluate
 from coloc_graph.exchange.mrclam import import_mrclam
 from coloc_graph.frontend.keyframes import keyframes_of
+from coloc_graph.geometry.lie import se3_inverse
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.run import Run, open_run, read_truth
+
+BLOCK = 60.0  # s
+DRAWS = 4000
+MIN_STEP = float(np.deg2rad(5.0))  # rad, of a true heading within a frame or two
+MAX_GAP, AROUND = 0.2, 0.3  # s, between the frames of a step, and on both sides of it
+MIN_FRAMES = 6  # on each side of a step
 
 
 def uncalibrated(run: Run) -> Run:
@@ -76,6 +88,52 @@ def report(label: str, trajectories: Mapping[str, Trajectory], run: Run, on_map:
     return errors
 
 
+def truth_steps(path: Path) -> NDArray[np.float64]:
+    """Times [s] at which a heading of the motion capture steps: by more than `MIN_STEP` against its rates around."""
+    t, yaw = np.loadtxt(path, usecols=(0, 3)).T
+    yaw, found = np.unwrap(yaw), []
+    for i in np.flatnonzero((np.abs(np.diff(yaw)) > MIN_STEP / 2) & (np.diff(t) < MAX_GAP)):
+        before, after = (t > t[i] - AROUND) & (t <= t[i]), (t > t[i]) & (t < t[i + 1] + AROUND)
+        if min(before.sum(), after.sum()) < MIN_FRAMES:
+            continue
+        lines = [np.polyfit(t[part] - at, yaw[part], 1) for part, at in ((before, t[i]), (after, t[i + 1]))]
+        expected = (lines[0][0] + lines[1][0]) / 2 * (t[i + 1] - t[i])
+        if abs(lines[1][1] - lines[0][1] - expected) > MIN_STEP:
+            found.append(t[i])
+    return np.array(found)
+
+
+def report_nees(trajectories: Mapping[str, Trajectory], run: Run, data: Path) -> None:
+    """Print NEES of positions and of headings by robot."""
+    true = align(trajectories, read_truth(run.path), run.team.reference, on_floor=True, alignment="none")
+    rng = np.random.default_rng(0)
+    for name, found in trajectories.items():
+        there = np.isfinite(true[name]).all(axis=(1, 2))
+        T, C, times = se3_inverse(found.T_world_body[there]) @ true[name][there], found.covariances, found.times[there]
+        assert C is not None
+        C, p = C[there], T[:, :2, 3]
+        place = np.einsum("ni,nij,nj->n", p, np.linalg.inv(C[:, 3:5, 3:5]), p) / 2
+        heading = np.arctan2(T[:, 1, 0], T[:, 0, 0]) ** 2 / C[:, 2, 2]
+        block = ((times - times[0]) // BLOCK).astype(int)
+        steps = truth_steps(data / f"Robot{name.removeprefix('R')}_Groundtruth.dat")
+        sound = ~np.isin(block, (steps - times[0]) // BLOCK)
+        of_places, of_headings = (_by_blocks(one, block, rng) for one in (place, heading))
+        of_sound = _by_blocks(heading[sound], block[sound], rng)
+        print(
+            f"{name}: NEES of positions {of_places}, of headings {of_headings}; "
+            f"{len(steps)} steps of the true heading, without their blocks {of_sound}"
+        )
+
+
+def _by_blocks(values: NDArray[np.float64], block: NDArray[np.int64], rng: np.random.Generator) -> str:
+    """Mean of values with its 95 % interval by a bootstrap of blocks."""
+    numbers = np.unique(block)
+    sums, counts = (np.array([part[block == n].sum() for n in numbers]) for part in (values, np.ones(len(values))))
+    drawn = rng.integers(0, len(numbers), (DRAWS, len(numbers)))
+    low, high = np.quantile(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1), (0.025, 0.975))
+    return f"{values.mean():.2f} ({low:.2f}-{high:.2f})"
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -97,6 +155,8 @@ def main() -> None:
                 batch = solve(run, SolveOptions(between_robots=between_robots))
                 seconds = time.process_time() - started
                 of_batch = report("batch", batch.estimate.trajectories, run, map_known, seconds)
+                if map_known and between_robots:
+                    report_nees(batch.estimate.trajectories, run, Path(args.data))
                 started = time.process_time()
                 one = solve(run, SolveOptions(incremental=True, between_robots=between_robots))
                 of_incremental = time.process_time() - started
