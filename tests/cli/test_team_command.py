@@ -1,5 +1,7 @@
 """coloc team new and check: a team that can be solved, also with a robot that only moves and has no camera."""
 
+import re
+
 import pytest
 
 from coloc_graph.cli import main
@@ -31,6 +33,38 @@ def test_a_principal_point_far_from_the_middle_is_said(tmp_path, capsys):
         said = capsys.readouterr()
         assert "the principal point of A is far from the middle" in said.out + said.err
         assert "principal point of B" not in said.out + said.err
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"height = 0.4": 6.0}, "the camera of A is 6 m high: metres?"),
+        ({"height = 0.4": 4.9}, None),
+        ({"fx": 90.0}, None),
+        ({"fx": 80.0}, "the camera of A sees 152 deg across: is fx (80 px) of this size?"),
+        ({"fx": 2500.0}, "the camera of A sees 15 deg across"),
+        ({"fx": 2400.0}, None),
+        ({"tilt_deg": -30.0}, "the camera of A does not see the floor at a tilt of -30 deg"),
+        ({"height_sigma": 0.0, "tilt_sigma_deg": 0.0, "roll_sigma_deg": 0.0}, "the mount of A has no tolerances"),
+        ({"height_sigma": 0.0, "tilt_sigma_deg": 0.0}, None),
+        ({"positions": "[[0.0, 0.1]]"}, "A carries one marker, which does not tell its heading: give it two"),
+        ({"positions": "[[0.0, 2.0], [0.0, -2.0]]"}, "the markers of A are 4 m apart: metres?"),
+    ],
+)
+def test_what_is_implausible_in_a_team_is_said(tmp_path, capsys, changes, words):
+    path = tmp_path / "team.toml"
+    assert main(["team", "new", "A", "B", "C", "--out", str(path)]) == 0
+    head, robots = path.read_text().split("[[robots]]", 1)
+    for field, value in changes.items():
+        name = field.split(" = ")[0]  # the first height that is 0.4 is the camera's
+        robots = re.sub(rf"^{field}\b.*$", f"{name} = {value}", robots, count=1, flags=re.MULTILINE)
+    if "positions" in changes:
+        robots = re.sub(r"^span_sigma = .*$", "", robots, count=1, flags=re.MULTILINE)
+    path.write_text(head + "[[robots]]" + robots)
+    capsys.readouterr()
+    main(["team", "check", str(path)])
+    said = capsys.readouterr()
+    assert (words in said.out + said.err) if words else "no problem found" in said.out, said
 
 
 @pytest.mark.parametrize(
