@@ -118,7 +118,9 @@ class Checks:
         registry, one, stances = coordinator._registry, self._newest, coordinator._mission.stances
         if one is not None and plan.index <= one.stance.index:
             self._violate(f"stance {plan.index} is planned though stance {one.stance.index} has entered")
-        if one is not None and stances and stances[-1] == one.stance:
+        if one is not None and stances and stances[-1].index == one.stance.index:
+            if stances[-1] != one.stance:
+                self._violate(f"stance {one.stance.index} is not the one that has entered")
             for name in one.stance.observers:
                 tracker = registry[name].tracker
                 if tracker._displaced <= one.stance.start:
@@ -206,7 +208,8 @@ class Checks:
         if self._coordinators > 1:
             self._compare_records(folder, run)
         if self._coordinators > 1 or self._seed % REPLAYED == 0:
-            self._compare_replay(folder, indices)
+            entered = {row["stance"] for row in rows if row["what"] == "entered"}
+            self._compare_replay(folder, indices, entered)
 
     def _compare_records(self, folder: Path, run: Run) -> None:
         """Check that the last record goes on from the earlier ones, and has no image twice."""
@@ -222,15 +225,16 @@ class Checks:
                 if images[: len(earlier)] != earlier:
                     self._violate(f"the record of a continued mission lacks images of {name} that {path.name} has")
 
-    def _compare_replay(self, folder: Path, indices: list[int]) -> None:
+    def _compare_replay(self, folder: Path, indices: list[int], entered: set[int]) -> None:
         """Replay the mission, as if it had never been interrupted: it must give the same estimates, bit for bit."""
         stances = list(replay(folder, self.programs.options.solve))
         replayed = [one.entered.stance.index for one in stances]
         if replayed != indices:
             self._violate(f"the record has the stances {indices}, a replay {replayed}")
         for one in stances:
-            if one.same is False:
-                self._violate(f"the estimate of stance {one.entered.stance.index} is another one when it is replayed")
+            index = one.entered.stance.index
+            if one.same is False or (one.same is None and index in entered):
+                self._violate(f"the estimate of stance {index} is another one when it is replayed")
         newest = stances[-1].entered if stances else None
         if self._newest is not None and newest is not None and newest.stance == self._newest.stance:
             for name, pose in self._newest.estimate.poses.items():
