@@ -110,6 +110,9 @@ def test_images_of_folders_have_their_times_by_the_end_of_their_paths(tmp_path):
     csv.write_text("robot,file,time\nA,frame1.png,1\nA,0/A/frame2.png,2\nA,1/A/frame2.png,3\n")
     with pytest.raises(InputError, match=r"`frame1.png` is the end of both .*0/A/frame1.png and .*1/A/frame1.png"):
         open_sources(TEAM, [f"A={tmp_path}/*/A/*.png"], times=csv)
+    csv.write_text("robot,file,time\nA,0/A/frame1.png,1\nA,0/A/frame1.png,2\n")
+    with pytest.raises(InputError, match=r"`0/A/frame1.png` of A is there twice; state its time once"):
+        open_sources(TEAM, [f"A={tmp_path}/*/A/*.png"], times=csv)
     csv.write_text("robot,file,time\nA,0/A/frame1.png,1\n")
     with pytest.raises(InputError, match=r"has no time of .*0/A/frame2.png of robot A"):
         open_sources(TEAM, [f"A={tmp_path}/*/A/*.png"], times=csv)

@@ -72,6 +72,14 @@ def test_without_samples_before_the_end_there_is_no_way():
     assert WheelTrack("A", []).between(0, 1, 0.0, 1e9) is None
 
 
+def test_where_a_robot_is_is_unknown_only_in_a_gap_in_which_it_drove():
+    places = {0.0: 0.0, 1.0: 0.3, 5.0: 0.305, 9.0: 0.6, 9.5: 0.9}  # x [m] by time [s]
+    track = WheelTrack("A", [OdometrySample("A", t, np.array([x, 0.0, 0.0]), np.eye(3)) for t, x in places.items()])
+    at = np.array([-1.0, 0.0, 0.5, 3.0, 5.0, 7.0, 9.25, 9.5, 11.0])
+    assert track.covers(at).tolist() == [True, True, True, True, True, False, True, True, True]
+    assert WheelTrack("A", []).covers(at).all()
+
+
 def test_clocks_that_differ_widen_the_way_of_a_robot_that_drives():
     _, wheels, end = driven(0)
     half = 101.0 + 0.31 * (end - 101)
