@@ -190,8 +190,8 @@ def scale_of(tested: Iterable[Agreement]) -> float:
 
     An error that all measurements share, such as a wrong mount, is no reason to reject a few of them.
     """
-    ratios = [one.chi2 / chdtri(one.dof, 0.5) for one in tested if one.dof]
-    return max(1.0, float(np.median(ratios))) if ratios else 1.0
+    chi2, dof = np.array([(one.chi2, one.dof) for one in tested if one.dof], float).reshape(-1, 2).T
+    return max(1.0, float(np.median(chi2 / chdtri(dof, 0.5)))) if len(dof) else 1.0
 
 
 def _suspects(fit: Fit) -> list[tuple[Cause, Agreement]]:

@@ -50,6 +50,12 @@ class Agreement:
         return f"an outlier: {self.sigmas:.0f} sigmas from the other measurements"
 
 
+def p_values(tested: Iterable[Agreement], scale: float = 1.0) -> Array:
+    """Return the p-values (n,) of tests, see `Agreement.p_value`."""
+    chi2, dof = np.array([(one.chi2, one.dof) for one in tested], float).reshape(-1, 2).T
+    return np.where(dof > 0, chdtrc(np.maximum(dof, 1), chi2 / scale), 1.0)
+
+
 UNCHECKED = Agreement(0.0, 0)  # of a measurement that nothing can contradict
 
 

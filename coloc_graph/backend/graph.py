@@ -338,9 +338,12 @@ class PoseGraph:
         if not out:
             return self
         kept = tuple(m for m in self.measurements if id(m) not in out)
-        graph = replace(self, measurements=kept, on_map=tuple(one for one in self.on_map if id(one) not in out))
+        graph = copy(self)  # of what was valid before
+        for derived in ("sighted", "ranged_points"):
+            vars(graph).pop(derived, None)
+        on_map = tuple(one for one in self.on_map if id(one) not in out)
         # a node stays one, and is disconnected, if all its measurements are rejected
-        vars(graph).update(nodes=self.nodes, times=self.times)
+        vars(graph).update(measurements=kept, on_map=on_map, nodes=self.nodes, times=self.times)
         return graph
 
     @cached_property

@@ -20,7 +20,14 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 SINGULAR_TOLERANCE = 1e-14  # pivot relative to the largest below which a variable is undetermined
+MAX_PARALLEL = 4  # factors on the same variables, more of which are summed up first
 MERGED_WIDTH = 100  # columns up to which a clique is merged into its parent: numpy takes as long for fewer
+
+
+def _summed_up(several: Sequence[tuple[Index, Array]]) -> tuple[Index, Array]:
+    """Return factors on the same variables as one, of no more rows than columns: columns and Jacobian of each."""
+    stacked = np.concatenate([A[:, np.argsort(columns)] for columns, A in several])
+    return np.sort(several[0][0]), np.linalg.qr(stacked, mode="r")
 
 
 @dataclass(eq=False)
@@ -75,10 +82,13 @@ class Marginals:
         factors = [linear.at(n) for n in range(linear.size())]
         at = [[self._place[int(key)] for key in factor.keys()] for factor in factors]  # noqa: SIM118  GTSAM's own
         columns = np.split(self._columns([n for some in at for n in some]), self._ends(at))
-        rows: dict[int, list[tuple[Index, Array]]] = defaultdict(list)
+        parallel: dict[tuple[int, ...], list[tuple[Index, Array]]] = defaultdict(list)
         for some, of_factor, factor in zip(at, columns, factors, strict=False):
-            rows[min(some)].append((of_factor, factor.jacobian()[0]))
-        self._cliques = self._grown(at)
+            parallel[tuple(sorted(some))].append((of_factor, factor.jacobian()[0]))
+        rows: dict[int, list[tuple[Index, Array]]] = defaultdict(list)
+        for variables, several in parallel.items():
+            rows[variables[0]] += several if len(several) <= MAX_PARALLEL else [_summed_up(several)]
+        self._cliques = self._grown(list(parallel))
         self._eliminate(rows)
         for clique, whole in self._spread():
             clique.covariance = whole[: clique.own]

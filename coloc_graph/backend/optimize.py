@@ -11,7 +11,7 @@ from scipy.special import chdtrc
 from coloc_graph.backend.batched_factors import BatchedFactors
 from coloc_graph.backend.calibration import size_of
 from coloc_graph.backend.chain import compose, spanning_tree
-from coloc_graph.backend.chi2_test import UNCHECKED, Agreement, agreements
+from coloc_graph.backend.chi2_test import Agreement, agreements, p_values
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
 from coloc_graph.backend.graph import Link, PoseGraph, point_of, pose_of
 from coloc_graph.backend.marginals import Marginals
@@ -24,6 +24,7 @@ LOOKED_INTO = 1e-3  # p-value of a residual alone below which a link of a larger
 LONG_RUN_STANCES = 30  # stances from which the mounts are estimated first, by a part of the run
 LONG_RUN_PARTS = 3  # number of such parts; the first is used
 MAX_ANCHORINGS = 4  # rounds of linearising spans at the estimated mounts; mounts 3 degrees off take two
+ROUGH_CHI2_PER_DOF = 2.0  # chi2/dof above which a fit among outliers need not converge
 MANY_ROBOTS = 20  # robots from which a clique holds a hundred variables, and Cholesky goes first
 
 
@@ -42,6 +43,7 @@ class Fit:
     values: gtsam.Values
     iterations: int
     batched: BatchedFactors
+    rough_above: float = np.inf  # half chi2 above which it did not need to converge
     without: tuple[Link, ...] = ()
 
     @cached_property
@@ -49,6 +51,11 @@ class Fit:
         """Chi-squared of all factors."""
         with self.batched, self.batched.held(self.values):
             return float(2 * self.factors.error(self.values))
+
+    @property
+    def is_rough(self) -> bool:
+        """True if it need not have converged."""
+        return self.chi2 / 2 > self.rough_above
 
     @cached_property
     def marginals(self) -> Marginals:
@@ -84,23 +91,36 @@ class Fit:
         with self.batched, self.batched.held(self.values):
             return self._agreements(kinds)
 
+    def residuals(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
+        """Test the residuals of the links of some kinds alone, as if all else were known; by index."""
+        with self.batched, self.batched.held(self.values):
+            return self._residuals(kinds)
+
+    def _residuals(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
+        of_kind = [(n, link, self.factor(n)) for n, link in enumerate(self.links) if isinstance(link, kinds)]
+        rows = self.factors_of.rows
+        return {n: Agreement(2 * factor.error(self.values), rows(link, factor)) for n, link, factor in of_kind}
+
     def _agreements(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
-        found: dict[int, Agreement] = {}
-        for index, link in enumerate(self.links):
-            if isinstance(link, kinds):
-                found[index] = UNCHECKED  # as yet
-                if len(self.links) > ALL_TESTED:
-                    factor = self.factor(index)
-                    found[index] = Agreement(2 * factor.error(self.values), self.factors_of.rows(link, factor))
-        among = [index for index, one in found.items() if not one.dof or one.p_value() <= LOOKED_INTO]
-        tested = agreements([self.factor(index) for index in among], self.values, self.marginals.joint)
+        found, among = dict[int, Agreement](), [n for n, link in enumerate(self.links) if isinstance(link, kinds)]
+        if len(self.links) > ALL_TESTED:
+            found = self._residuals(kinds)
+            among = [n for n, one in zip(among, p_values(found.values()), strict=True) if one <= LOOKED_INTO]
+        tested = agreements([self.factor(n) for n in among], self.values, self.marginals.joint)
         return found | dict(zip(among, tested, strict=True))
 
 
 def fit_graph(
-    method: Method, graph: PoseGraph, start: gtsam.Values | None = None, anchorings: int = MAX_ANCHORINGS
+    method: Method,
+    graph: PoseGraph,
+    start: gtsam.Values | None = None,
+    anchorings: int = MAX_ANCHORINGS,
+    *,
+    roughly: bool = False,
 ) -> Fit:
     """Optimise a graph from `start`, or from the composition along the spanning tree.
+
+    `roughly`: without convergence where chi2/dof stays above `ROUGH_CHI2_PER_DOF`.
 
     Variables that `start` lacks are composed; disconnected ones are left out. Raises `EstimationError` where
     measurements tie nothing to the reference, or the optimiser did not converge.
@@ -137,7 +157,7 @@ def fit_graph(
     values = composed(odometry_last=False)
     # two robots that are composed each by its own odometry end far apart after hundreds of stances
     others = composed(odometry_last=True) if mounts and not known else None
-    iterations = 0
+    iterations, rough_above = 0, np.inf
     for left in reversed(range(anchorings)):
         factors, links, batched = factors_of.of_graph(graph, poses_in(values))
         for key in map(int, factors.keyVector()):
@@ -149,13 +169,16 @@ def fit_graph(
                 values = others
             others = None
             many = len(graph.robots) >= MANY_ROBOTS or len(links) > ALL_TESTED
-            values, used = optimise(factors, values, roughly_first=many, held=batched.held)
+            if roughly:
+                rows = sum(factors.at(n).dim() for n in range(factors.size() - len(links), factors.size()))
+                rough_above = ROUGH_CHI2_PER_DOF * rows / 2
+            values, used = optimise(factors, values, roughly_first=many, rough_above=rough_above, held=batched.held)
         iterations += used
         # spans are linearised at the mounts known before: once more where the estimate is elsewhere
         if not left or factors_of.is_anchored(values):
             break
         factors_of = factors_for(method, graph, values)
-    return Fit(graph, factors_of, factors, links, values, iterations, batched)
+    return Fit(graph, factors_of, factors, links, values, iterations, batched, rough_above)
 
 
 def _mounts_first(graph: PoseGraph) -> gtsam.Values | None:

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from coloc_graph.backend.blame import SEARCHED, SIGMAS_ALONE, WarmStart, moved, scale_of
-from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, innovation
+from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, innovation, p_values
 from coloc_graph.backend.estimate import Bump, Rejection, rejection_of
 from coloc_graph.backend.factors import Method, poses_in
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
@@ -135,34 +135,37 @@ def find_outliers(method: Method, graph: PoseGraph, first: Mapping[int, Link], s
 def _search(method: Method, graph: PoseGraph, suspected: Mapping[int, Link], start: gtsam.Values | None) -> Found:
     """Reject the worst links and take back those that then agree, in turns; start from those `suspected`.
 
-    One link is rejected a round, of a large graph one of those at each pose. What alone ties a pose is taken back too,
-    up to `SIGMAS_ALONE`.
+    One link is rejected a round, of a large graph one of those at each pose, by residuals alone while its fit is too
+    bad to converge (`Fit.is_rough`). What alone ties a pose is taken back too, up to `SIGMAS_ALONE`.
     """
     suspected, at_rejection, alone = dict[int, Link](suspected), dict[int, Agreement](), set[int]()
+    large = roughly = len(graph.links) > ALL_TESTED
     # ends when a set repeats, or after the last round
     for left in reversed(range(MAX_ROUNDS)):
         try:
-            fit = _fitted(method, graph, suspected, start)
+            fit = _fitted(method, graph, suspected, start, roughly=roughly)
         except EstimationError:
             if not suspected:
                 raise
             # without these nothing ties the robots to each other: they disagree, and it is not known which are wrong
             return Found(graph, {}, fit_graph(method, graph, start))
-        large = len(graph.links) > ALL_TESTED
-        tested = fit.agreements(SEARCHED)
+        is_rough = left > 0 and fit.is_rough
+        tested = fit.residuals(SEARCHED) if is_rough else fit.agreements(SEARCHED)
         scale = scale_of(tested.values())
         kept = {index for index, off in tested.items() if id(fit.links[index]) in alone and off.sigmas < SIGMAS_ALONE}
-        wrong = [index for index in tested.keys() - kept if tested[index].p_value(scale) < REJECTION_P_VALUE]
+        is_wrong = p_values(tested.values(), scale) < REJECTION_P_VALUE
+        wrong = [index for index, one in zip(tested, is_wrong.tolist(), strict=True) if one and index not in kept]
         wrong.sort(key=lambda index: tested[index].log_p_value())
         refused = _apart(fit, wrong) if large else wrong[:1]
-        offs = {key: _innovation(fit, link) for key, link in suspected.items()}
+        roughly = bool(is_rough and refused)
+        offs = {} if is_rough else {key: _innovation(fit, link) for key, link in suspected.items()}
         again = {key for key, off in offs.items() if off.dof and off.p_value(scale) >= REJECTION_P_VALUE}
         untied = [key for key, off in offs.items() if not off.dof and at_rejection.get(key, off).sigmas < SIGMAS_ALONE]
         if not left and untied:
             for key in untied:
                 del suspected[key], offs[key]
             fit = _fitted(method, graph, suspected, start)
-        if not left or not (again or untied or refused):
+        if not left or not (is_rough or again or untied or refused):
             break
         if untied:  # one at a time, the last first: it was the least off, and may contradict the others
             again.add(untied[-1])
@@ -174,12 +177,16 @@ def _search(method: Method, graph: PoseGraph, suspected: Mapping[int, Link], sta
             at_rejection[id(fit.links[index])] = tested[index]
         if large:
             start = _upright(fit)
+    if fit.is_rough:
+        fit = _fitted(method, graph, suspected, fit.values)
     return Found(graph, {key: off if off.dof else at_rejection[key] for key, off in offs.items()}, fit)
 
 
-def _fitted(method: Method, graph: PoseGraph, out: Mapping[int, Link], start: gtsam.Values | None) -> Fit:
+def _fitted(
+    method: Method, graph: PoseGraph, out: Mapping[int, Link], start: gtsam.Values | None, *, roughly: bool = False
+) -> Fit:
     """Fit a graph without some links, between whose ends there are joint covariances."""
-    fit = fit_graph(method, graph.without(out.values()), start)
+    fit = fit_graph(method, graph.without(out.values()), start, roughly=roughly)
     return replace(fit, without=tuple(out.values()))
 
 
@@ -244,15 +251,18 @@ def _bumps(found: Found) -> Iterator[tuple[StayPut, set[int]]]:
                 if robot in graph.robots:
                     at[graph.key(robot, stance)].append((stance, id(link), id(link) in found.off))
     best: dict[int, tuple[StayPut, set[int]]] = {}
+    suspected = {key for key, every in at.items() if sum(out for _, _, out in every) >= MIN_BUMP_LINKS}
+    # stances of the first and the last link at a pose that was not rejected
+    right = {key: [stance for stance, _, out in at[key] if not out] for key in suspected}
+    ends = {key: (min(some), max(some)) for key, some in right.items() if some}
     for stay in graph.stay_puts:
         key = graph.key(stay.robot, stay.after)
-        if stay.slip is not None or sum(out for _, _, out in at[key]) < MIN_BUMP_LINKS:
+        if stay.slip is not None or key not in ends:
             continue
-        sides = [[one for one in at[key] if (one[0] < stay.after) == earlier] for earlier in (True, False)]
-        for side, other in (sides, reversed(sides)):
-            links = {number for _, number, _ in side}
-            if len(links) < max(MIN_BUMP_LINKS, len(best.get(key, (stay, ()))[1]) + 1):
-                continue
-            if all(out for _, _, out in side) and not all(out for _, _, out in other):
-                best[key] = stay, links
+        first, last = ends[key]
+        for is_rejected, earlier in ((stay.after <= first, True), (stay.after > last, False)):
+            if is_rejected:
+                links = {number for stance, number, _ in at[key] if (stance < stay.after) == earlier}
+                if len(links) >= max(MIN_BUMP_LINKS, len(best.get(key, (stay, ()))[1]) + 1):
+                    best[key] = stay, links
     yield from sorted(best.values(), key=lambda one: -len(one[1]))
