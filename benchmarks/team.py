@@ -159,7 +159,7 @@ def blinking_seed(seed: int, robots: int, stances: int, clock: float) -> list[di
             solution = solve(run, SolveOptions())
         rms, promised, anees = _errors(solution.estimate, world)
         poses = [m.relative_pose for m in solution.measurements if m.relative_pose is not None]
-        row = {"square": rms**2, "promised": promised**2, "anees": anees, "homographies": solution.used,
+        row = {"square": rms**2, "promised": promised**2, "anees": anees, "homographies": solution.count.used,
                "points": sum(m.homography.points for m in solution.measurements),
                "spans": sum(len(pose.spans) for pose in poses),
                "chi2": solution.estimate.chi2, "dof": solution.estimate.dof}  # fmt: skip
@@ -208,7 +208,7 @@ def sized(robots: int, stances: int) -> dict[str, float]:
         "robots": robots,
         "stances": stances,
         "poses": len(solution.estimate.graph.nodes),
-        "homographies": solution.used,
+        "homographies": solution.count.used,
         "seconds": taken,
         "front_end_s": measured,
         "graph_s": taken - measured,

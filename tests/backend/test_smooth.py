@@ -17,7 +17,7 @@ from coloc_graph.backend.chi2_test import Agreement
 from coloc_graph.backend.factors import Factors
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.optimize import fit_graph
-from coloc_graph.backend.outliers import gnc_outliers
+from coloc_graph.backend.outliers import find_outliers, gnc_outliers
 from coloc_graph.backend.solver import with_stack
 from coloc_graph.errors import EstimationError
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
@@ -125,6 +125,17 @@ def test_in_a_large_graph_a_few_wrong_homographies_are_found_from_where_the_fit_
         np.testing.assert_allclose(
             estimate.trajectories[robot].covariances, trajectory.covariances, rtol=1e-3, atol=1e-14
         )
+
+
+def test_a_large_graph_rejects_many_links_a_round(large, monkeypatch):
+    """One link a round finds as many wrong ones, or ends after the last round: it costs time."""
+    outliers, rounds = sys.modules["coloc_graph.backend.outliers"], []
+    fitted = outliers._fitted
+    monkeypatch.setattr(outliers, "_fitted", lambda *args, **options: rounds.append(1) or fitted(*args, **options))
+    team = team_of(8, 20, wrong=0.1)
+    found = find_outliers("smooth", graph_of_team(team), {}, None)
+    assert set(found.off) == set(map(id, team.wrong))
+    assert len(rounds) < len(team.wrong) / 3
 
 
 def test_of_many_residuals_a_little_too_much_is_no_suspicion(monkeypatch):
