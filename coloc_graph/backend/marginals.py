@@ -27,7 +27,7 @@ MERGED_WIDTH = 100  # columns up to which a clique is merged into its parent: nu
 def _summed_up(several: Sequence[tuple[Index, Array]]) -> tuple[Index, Array]:
     """Return factors on the same variables as one, of no more rows than columns: columns and Jacobian of each."""
     stacked = np.concatenate([A[:, np.argsort(columns)] for columns, A in several])
-    return np.sort(several[0][0]), np.linalg.qr(stacked, mode="r")
+    return np.sort(several[0][0]), np.triu(lapack.dgeqrf(stacked)[0][: stacked.shape[1]])
 
 
 @dataclass(eq=False)
