@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import viser
-from browser import browser, client_of, page_of, pixel_of, place_of, until  # noqa: F401  fixtures
+from browser import CHROMIUM, browser, client_of, page_of, pixel_of, place_of, until  # noqa: F401  fixtures
 from whole_graph import replay
 
 from coloc_graph.cli import main
@@ -255,6 +255,7 @@ def test_a_page_opens_from_its_file_and_plays(scene, page_of, tmp_path):
     assert until(lambda: page.evaluate(visible, "/robots/A") and page.evaluate(visible, "/floor"))
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine, which renders films")
 def test_a_film_moves_from_stance_to_stance(result, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(video, "STANCE_FRAMES", 1)
     monkeypatch.setattr(video, "MAX_STANCES", 2)
