@@ -26,8 +26,8 @@ def test_a_recorded_mission_gives_the_poses_of_online(folder):
     for one in found:
         poses = one.entered.estimate.poses
         assert poses.keys() == online[one.entered.stance.index].keys()
-        for name, pose in poses.items():  # recorded when ISAM2 took a body's tilt in the world's frame: 17 um off
-            np.testing.assert_allclose(pose.matrix(), online[one.entered.stance.index][name], atol=5e-5)
+        for name, pose in poses.items():  # bits depend on processor and libraries
+            np.testing.assert_allclose(pose.matrix(), online[one.entered.stance.index][name], atol=1e-6)
 
 
 def test_replay_says_what_differs_and_what_is_not_known(tmp_path, capsys):
