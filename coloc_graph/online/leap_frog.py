@@ -13,13 +13,14 @@ from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.decision_worker import DecisionWorker
 from coloc_graph.online.estimation_worker import EstimationWorker
 from coloc_graph.online.journal import row_of, row_of_entered
+from coloc_graph.online.leap_end import TurnToDrive, turn_to_drive
 from coloc_graph.online.leap_planner import Situation, StancePlan, StancePlanner
 from coloc_graph.online.mission import MissionOptions, roles
 from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import NEXT_STATES, WAITING, MissionState, StateChange, StateMachine
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.stance_attempt import OUT_OF_VIEW, StanceAttempt
-from coloc_graph.online.visibility import InView, Precision
+from coloc_graph.online.visibility import InView
 from coloc_graph.pipeline.incremental import EnteredStance
 from coloc_graph.robot_io.link.messages import Body, Capture, EndCapture, Halt, Recover
 from coloc_graph.run import Detections, Stance
@@ -79,6 +80,7 @@ class LeapFrog:
         self.states = StateMachine(self._note_state)
         self._plan: StancePlan | None = None
         self._leap: tuple[str, Planar] | None = None  # a leap that is still to be commanded
+        self._turned = False  # the observer that leapt has been turned to the drive
         self._failures = 0  # attempts at the present stance that failed
         self._missing: tuple[str, ...] = ()  # observers that did not see the mover in the last attempt
         self._captures = machine.time_ns() // 1_000_000  # capture numbers are unique across coordinators
@@ -162,7 +164,7 @@ class LeapFrog:
             return
         if plan.leap is not None and not set(self._anchors()) - {plan.leap[0]}:
             raise RobotError(f"{plan.leap[0]} is not sent off: no other observer stands where it stood before")
-        self._plan, self._leap = plan, plan.leap
+        self._plan, self._leap, self._turned = plan, plan.leap, False
         for robot in self._registry.robots.values():
             robot.arrived, robot.drive = True, None
         self._log.note("planned", **plan.as_row())
@@ -214,7 +216,9 @@ class LeapFrog:
     def _look(self) -> None:
         attempt = self._attempted()
         missing, mover = attempt.view.missing(), self._registry[self.mover]
-        if not missing:
+        if not self._turned and (turn := turn_to_drive(self._team, attempt.view, self._plan, mover.tracker.pose())):
+            self._turn(turn)
+        elif not missing:
             self._commander.drive(self.mover, attempt.whole_round() if attempt.to_middle else attempt.first_round())
             self._enter(MissionState.CAPTURING)
         elif not attempt.to_middle and self.states.lasted(GLANCE_TIME):
@@ -229,6 +233,13 @@ class LeapFrog:
                 "are said to stand, clear what is between them, and check that its lights are on"
             )
 
+    def _turn(self, turn: TurnToDrive) -> None:
+        """Turn the observer that leapt to the drive."""
+        self._turned, self.attempt = True, None
+        self._registry[turn.robot].tracker.displace(self._registry.utc(), turn.place)
+        self._commander.drive(turn.robot, [turn.place[:2]], turn.yaw, backwards=False)
+        self._enter(MissionState.PLACING, str(turn))
+
     def _capture(self) -> None:
         attempt = self._attempted()
         if not attempt.set_off:
@@ -242,9 +253,9 @@ class LeapFrog:
         found = self._worker.judged()
         if found is not None:
             attempt.precision = found
-            if self._enough(found, attempt):
-                planned = self._plan is not None and self._plan.duration is not None
-                self._end_capture("the stance is as long as planned" if planned else "the stance is precise enough")
+            lasted = self._registry.utc() - attempt.stance.start
+            if self._plan is not None and (reason := self._plan.ends(found, lasted, self._options)):
+                self._end_capture(reason)
                 return
         left = attempt.stance.start + self._options.longest - self._registry.utc()
         if not self._worker.judging and (stance := attempt.to_judge(left)) is not None:
@@ -254,13 +265,6 @@ class LeapFrog:
             self._commander.drive(self.mover, attempt.next_round())
         if left < 0:
             self._end_capture(f"{self._options.longest:g} s are over")
-
-    def _enough(self, found: Precision, attempt: StanceAttempt) -> bool:
-        """Return whether a stance, as it was judged, may end: it is precise enough, or has lasted as planned."""
-        planned = None if self._plan is None else self._plan.duration
-        if planned is None:
-            return found.suffices(self._options)
-        return not found.why and self._registry.utc() - attempt.stance.start >= planned
 
     def _keep_in_view(self, attempt: StanceAttempt) -> None:
         """Send the mover back where it has left an observer's view."""
@@ -405,11 +409,7 @@ class LeapFrog:
         if not self.stances:
             return ()
         before = self.stances[-1]
-        return tuple(
-            name
-            for name in self.observers
-            if name in before.observers and not self._registry[name].tracker.moved_since(before.end)
-        )
+        return self._registry.stand_since(before.end, [name for name in self.observers if name in before.observers])
 
     def _at_goal(self) -> bool:
         if self._options.stances is not None and len(self.stances) >= self._options.stances:

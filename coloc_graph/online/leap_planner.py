@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from coloc_graph.geometry.se2 import Planar, segment_distance
 from coloc_graph.online.formation import STAGGER, Formation
-from coloc_graph.online.visibility import InView
+from coloc_graph.online.mission import MissionOptions
+from coloc_graph.online.visibility import InView, Precision
 from coloc_graph.pipeline.incremental import EnteredStance
 from coloc_graph.team import Team
 
@@ -100,6 +101,12 @@ class StancePlan:
         way = itertools.pairwise([mover[:2], *self.placing.tolist()])
         leap = itertools.pairwise([leaper[:2], *self.detour, self.leap[1][:2]])
         return all(segment_distance(*one, *other) > self.passing for one, other in itertools.product(leap, way))
+
+    def ends(self, found: Precision, seconds: float, options: MissionOptions) -> str:
+        """Return why a stance, as it was judged, may end after `seconds` [s]; empty if it may not."""
+        if self.duration is None:
+            return "the stance is precise enough" if found.suffices(options) else ""
+        return "the stance is as long as planned" if not found.why and seconds >= self.duration else ""
 
     def drives(self, robot: str, mover: str) -> bool:
         """Return whether a robot drives in this plan, whose mover is `mover`."""

@@ -32,7 +32,7 @@ NEXT_STATES: dict[MissionState, tuple[MissionState, ...]] = {
     MissionState.SYNCHRONISING: (MissionState.PLANNING, MissionState.HOLDING),
     MissionState.PLANNING: (MissionState.PLACING, MissionState.HOLDING),
     MissionState.PLACING: (MissionState.LOOKING, MissionState.HOLDING),
-    MissionState.LOOKING: (MissionState.CAPTURING, MissionState.HOLDING),
+    MissionState.LOOKING: (MissionState.CAPTURING, MissionState.PLACING, MissionState.HOLDING),
     MissionState.CAPTURING: (MissionState.COLLECTING, MissionState.TURNING_BACK, MissionState.HOLDING),
     MissionState.TURNING_BACK: (MissionState.CAPTURING, MissionState.COLLECTING, MissionState.HOLDING),
     MissionState.COLLECTING: (MissionState.ESTIMATING, MissionState.HOLDING),

@@ -194,6 +194,10 @@ class RobotRegistry:
         """Return the present poses in the world, of all robots by default."""
         return {name: self.robots[name].tracker.pose() for name in names or self.robots}
 
+    def stand_since(self, time: float, names: Sequence[str]) -> tuple[str, ...]:
+        """Return those of some robots that have not moved since an instant [UTC s], by their wheels or otherwise."""
+        return tuple(name for name in names if not self.robots[name].tracker.moved_since(time))
+
     def stood(self, seconds: float) -> bool:
         """Return whether all robots have stood for `seconds` [s]."""
         since = [robot.stands_since() for robot in self.robots.values()]

@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -28,6 +28,9 @@ ALIKE = 0.15  # relative difference between the distance of two lights and the m
 CLEAR = 0.3  # distance of the mover from robots that stand [m]
 ASTRAY = 0.8  # largest distance of the mover from its tracked pose [m]
 TURNED = 1.3  # the same of its heading [rad]
+LEAPT_ASTRAY = 0.5  # largest distance of an observer that leapt from where its wheels have it [m]
+LEAPT_TURNED = 0.4  # the same of its heading [rad]
+BORDER = 4.0  # distance from the border of an image at which a marker is surely seen [px]
 DISPLACED = 0.1  # two observers that see the mover further apart do not both stand where they should [m]
 
 
@@ -50,6 +53,7 @@ class InView:
             name: View(team[name].camera, floor_pose(*place) @ team[name].mount.T_body_camera)
             for name, place in observers.items()
         }
+        self._T_body_camera = {name: team[name].mount.T_body_camera for name in observers}
         self._standing = dict(observers)
         self._seen: dict[str, deque[tuple[float, bool]]] = defaultdict(deque)
         self._newest: dict[str, Detections] = {}
@@ -83,30 +87,54 @@ class InView:
         view = self.views.get(seen.robot)
         if view is None or len(self._p_markers) < 2 or len(seen.uv) < 2:
             return None
-        places = _on_plane(view, seen.uv, float(self._p_markers[0, 2]))
-        model, first, second = self._p_markers[:2, :2], *np.triu_indices(len(places), 1)
-        arms = places[second] - places[first]
-        with np.errstate(invalid="ignore"):
-            alike = np.abs(np.hypot(*arms.T) / math.dist(*model) - 1) < ALIKE
-        arms, middles = arms[alike], (places[first] + places[second])[alike] / 2
-        # whichever of the two is the first marker
-        arms, middles = np.concatenate([arms, -arms]), np.concatenate([middles, middles])
-        along = model[1] - model[0]
-        yaw = np.arctan2(arms[:, 1], arms[:, 0]) - math.atan2(along[1], along[0])
-        off = wrap(yaw - expected[2])
-        c, s, (mx, my) = np.cos(yaw), np.sin(yaw), model.mean(axis=0)
-        xy = middles - np.stack([c * mx - s * my, s * mx + c * my], axis=1)
-        away = np.hypot(*(xy - expected[:2]).T)
-        others = [place[:2] for name, place in self._standing.items() if name != seen.robot]
-        clear = np.all([np.hypot(*(xy - place).T) > CLEAR for place in others], axis=0) if others else True
-        fits = np.flatnonzero((away < ASTRAY) & (np.abs(off) < TURNED) & clear)
-        if not len(fits):
+        standing = [place[:2] for name, place in self._standing.items() if name != seen.robot]
+        fits = _fits(view, seen.uv, self._p_markers, expected, (ASTRAY, TURNED), standing)
+        if not fits or (len(fits) > 1 and fits[1].cost < 2 * fits[0].cost):
             return None
-        cost = away[fits] + 0.3 * np.abs(off[fits])
-        best = fits[np.argmin(cost)]
-        if len(fits) > 1 and np.partition(cost, 1)[1] < 2 * cost.min():
-            return None
-        return float(xy[best, 0]), float(xy[best, 1]), expected[2] + float(off[best])
+        return fits[0].pose
+
+    def locate(self, observer: str, p_markers: Array, mover: Planar) -> Planar | None:
+        """Find an observer that leapt in the newest image of another, beside the mover.
+
+        Parameters
+        ----------
+        observer
+            Name of the observer, sought near the pose with which the views were made.
+        p_markers
+            Its markers in its body frame, (n, 3) [m].
+        mover
+            Tracked pose of the mover, whose lights must be others.
+
+        Returns
+        -------
+        tuple or None
+            Its pose in the world; None if no image shows both, or one shows several that fit.
+        """
+        for name, seen in self._newest.items():
+            if name == observer or len(p_markers) < 2 or len(seen.uv) < 4:
+                continue
+            standing = [place[:2] for other, place in self._standing.items() if other not in (name, observer)]
+            view, bounds = self.views[name], (LEAPT_ASTRAY, LEAPT_TURNED)
+            own = _fits(view, seen.uv, p_markers, self._standing[observer], bounds, standing)
+            movers = _fits(view, seen.uv, self._p_markers, mover, (ASTRAY, TURNED), standing)
+            both = [(one.cost + other.cost, one) for one in own for other in movers if not one.lights & other.lights]
+            if not both:
+                continue
+            best, found = min(both, key=lambda each: each[0])
+            if all(cost >= 2 * best for cost, one in both if one is not found):
+                return found.pose
+        return None
+
+    def covers(self, observer: str, place: Planar, patrol: Array) -> bool:
+        """Return whether an observer at `place` would see the mover at waypoints (n, 2) [m], however it is turned."""
+        camera, T_body_camera = self.views[observer].camera, self._T_body_camera[observer]
+        around = np.linspace(0.0, 2 * np.pi, 8, endpoint=False)
+        reach = np.linalg.norm(self._p_markers[:, :2], axis=1).max() * np.column_stack([np.cos(around), np.sin(around)])
+        points = (patrol[:, None] + reach).reshape(-1, 2)
+        points = np.column_stack([points, np.full(len(points), self._p_markers[0, 2])])
+        uv, inside = View(camera, floor_pose(*place) @ T_body_camera).project(points)
+        size = np.array([camera.width, camera.height])
+        return bool(inside.all() and (uv > BORDER).all() and (uv < size - BORDER).all())
 
     def displaced(self, mover: Planar) -> dict[str, Planar]:
         """Find observers whose newest image shows the standing mover elsewhere than another's does.
@@ -136,6 +164,51 @@ class InView:
             for name in self.views
             if not self._seen[name] or np.mean([shows for _, shows in self._seen[name]]) < SHARE
         ]
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Two lights of an image that may be a robot's, and its pose in the world then."""
+
+    cost: float
+    pose: Planar
+    lights: frozenset[int]
+
+
+def _fits(
+    view: View,
+    uv: Array,
+    p_markers: Array,
+    expected: Planar,
+    bounds: tuple[float, float],
+    standing: Sequence[tuple[float, float]],
+) -> list[_Fit]:
+    """Find lights as far apart as a robot's markers, best first.
+
+    The robot is near its `expected` pose, within `bounds` [m] and [rad], and clear of robots at `standing`.
+    """
+    places = _on_plane(view, uv, float(p_markers[0, 2]))
+    model, first, second = p_markers[:2, :2], *np.triu_indices(len(places), 1)
+    arms = places[second] - places[first]
+    with np.errstate(invalid="ignore"):
+        alike = np.abs(np.hypot(*arms.T) / math.dist(*model) - 1) < ALIKE
+    arms, middles = arms[alike], (places[first] + places[second])[alike] / 2
+    lights = [frozenset(pair) for pair in zip(first[alike].tolist(), second[alike].tolist(), strict=True)] * 2
+    # whichever of the two is the first marker
+    arms, middles = np.concatenate([arms, -arms]), np.concatenate([middles, middles])
+    along = model[1] - model[0]
+    yaw = np.arctan2(arms[:, 1], arms[:, 0]) - math.atan2(along[1], along[0])
+    off = wrap(yaw - expected[2])
+    c, s, (mx, my) = np.cos(yaw), np.sin(yaw), model.mean(axis=0)
+    xy = middles - np.stack([c * mx - s * my, s * mx + c * my], axis=1)
+    away = np.hypot(*(xy - expected[:2]).T)
+    clear = np.all([np.hypot(*(xy - place).T) > CLEAR for place in standing], axis=0) if standing else True
+    fits = np.flatnonzero((away < bounds[0]) & (np.abs(off) < bounds[1]) & clear)
+    cost = away + 0.3 * np.abs(off)
+    return [
+        _Fit(float(cost[n]), (float(xy[n, 0]), float(xy[n, 1]), expected[2] + float(off[n])), lights[n])
+        for n in sorted(fits.tolist(), key=lambda n: float(cost[n]))
+    ]
 
 
 def _apart(a: Planar, b: Planar) -> float:

@@ -5,9 +5,12 @@ import threading
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from coloc_graph.errors import RobotError
+from coloc_graph.geometry.lie import floor_pose
+from coloc_graph.geometry.se2 import compose, inverse
 from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.decision_worker import DecisionWorker
 from coloc_graph.online.estimation_worker import EstimationWorker
@@ -20,10 +23,11 @@ from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import MissionState
 from coloc_graph.online.record import Record
 from coloc_graph.online.robot_registry import RobotRegistry
+from coloc_graph.online.visibility import InView
 from coloc_graph.pipeline.incremental import IncrementalSolver
 from coloc_graph.planning.course import Course
 from coloc_graph.robot_io.link.messages import Capture, Drive, EndCapture, Event, Halt, Reply, Status, Wheels
-from coloc_graph.run import Stance
+from coloc_graph.run import Detections, Stance
 from coloc_graph.simulation.simulated_team import field_team
 
 OPTIONS = MissionOptions(goals=((5.0, 0.0),))
@@ -247,4 +251,57 @@ def test_nobody_leaps_without_an_anchor(tmp_path):
     mission.await_plan()
     assert mission.leap_frog.states.now == MissionState.HOLDING
     assert not any(isinstance(body, Drive) for _, body in mission.link.asked)
+    mission.close()
+
+
+TARGET, DRIVE = (1.3, 0.1, -0.1), np.array([[2.2, -0.05], [2.4, 0.1], [2.3, 0.0]])
+
+
+class Leaping(LeapPlanner):
+    """A leaps to `TARGET` for a drive through `DRIVE`."""
+
+    def plan(self, situation):
+        return replace(super().plan(situation), leap=("A", TARGET), patrol=DRIVE)
+
+
+@pytest.mark.parametrize(
+    ("astray", "turns"), [((-0.1, 0.2, 0.25), True), ((0.02, -0.02, 0.01), False)], ids=["astray", "there"]
+)
+def test_an_observer_that_leapt_and_looks_past_the_drive_is_turned_as_another_sees_it(tmp_path, astray, turns):
+    team = field_team()
+    mission = Mission(tmp_path, Leaping(team, "C", Formation(Course(((0.0, 0.0), (5.0, 0.0))), ("A", "B"))))
+    mission.step(MissionState.GATHERING)
+    for name in "ABC":
+        mission.report(name)
+    mission.leap_frog.stances.append(Stance(0, 0.0, mission.registry.utc(), ("A", "B"), ("C",)))
+    mission.step(MissionState.SYNCHRONISING)
+    mission.step(MissionState.PLANNING)
+    mission.await_plan()
+    # by their wheels both have arrived
+    for name, place in (("A", TARGET), ("C", (*DRIVE[0], 0.3))):
+        mission.registry[name].tracker.fix(mission.registry.utc(), place)
+        mission.registry[name].arrived = True
+    mission.leap_frog._leap = None
+    mission.step(MissionState.LOOKING)
+    truly = compose(TARGET, astray)
+    places = {"A": truly, "B": mission.registry.poses()["B"]}
+    view, capture, now = InView(team, "C", places), mission.leap_frog.attempt.capture, mission.registry.utc()
+    for observer in "AB":
+        uv = np.empty((0, 2))
+        for name, place in (("A", truly), ("C", (*DRIVE[0], 0.3))):
+            T = floor_pose(*place)
+            seen, inside = view.views[observer].project(team[name].markers.p_body @ T[:3, :3].T + T[:3, 3])
+            uv = np.concatenate([uv, seen[inside & (name != observer)]])
+        n = len(uv)
+        covariance, ones = np.tile(0.1 * np.eye(2), (n, 1, 1)), np.ones(n)
+        image = Detections(observer, now, uv, covariance, ("",) * n, np.zeros(n, np.uint8), ones, ones)
+        mission.leap_frog.take_image(capture, image)
+    mission.step(MissionState.PLACING if turns else MissionState.CAPTURING)
+    found = mission.registry.poses()["A"]
+    assert found == pytest.approx(truly if turns else TARGET, abs=1e-6)
+    if turns:
+        assert not view.covers("A", truly, DRIVE)
+        name, drive = mission.link.asked[-1]
+        yaw = compose(compose(found, inverse(mission.registry["A"].tracker.in_odometry(found))), (0, 0, drive.yaw))[2]
+        assert name == "A" and view.covers("A", (*truly[:2], yaw), DRIVE)
     mission.close()
