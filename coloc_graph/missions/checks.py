@@ -65,7 +65,9 @@ class Checks:
         moving = {name for name in self._team.names if self._field.fastest(name) > 0}
         for name in self._team.names:
             since = self._lost_since[name]
-            alive = led and self._runs(name) and not self._network.conditions[name].cut
+            line = self._field.lines.get(name)
+            held = line is not None and line.lost is None
+            alive = led and held and self._runs(name) and not self._network.conditions[name].cut
             if alive or name in self._field.unplugged:  # nobody stops a Create without its line
                 self._lost_since[name] = None
             elif since is None:

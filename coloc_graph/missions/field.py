@@ -14,7 +14,7 @@ from coloc_graph.missions.watchdog import SimulatedWatchdog
 from coloc_graph.robot_io.camera.source import WAIT, CameraSource, Clock, Frame
 from coloc_graph.robot_io.create import protocol as oi
 from coloc_graph.robot_io.create.firmware import Firmware
-from coloc_graph.robot_io.create.line import LEAVE, READ, RETURN_TIMEOUT
+from coloc_graph.robot_io.create.line import LEAVE, READ, RETURN_PERIOD
 from coloc_graph.robot_io.create.physics import Physics
 from coloc_graph.robot_io.create.state import STREAMED
 from coloc_graph.simulation.rig import true_team
@@ -47,6 +47,8 @@ class Field:
     ----------
     unplugged, frozen
         Robots whose serial line, and whose camera, does nothing.
+    lines
+        The line that was opened last to each robot's wheels.
     """
 
     def __init__(self, scheduler: Scheduler, team: Team, starts: Mapping[str, Planar], seed: int) -> None:
@@ -65,6 +67,7 @@ class Field:
         self._floor = UnevenFloor(sigma, stream(seed, "floor"))
         self.unplugged: set[str] = set()
         self.frozen: set[str] = set()
+        self.lines: dict[str, SimulatedLine] = {}
         self._rng = np.random.default_rng((seed, 7))
         self._mounts = {robot.name: robot.mount.T_body_camera for robot in self.true_team.robots}
         self._markers = {
@@ -172,6 +175,7 @@ class SimulatedLine:
             raise RobotError(f"cannot open the line of {robot}: check that it is plugged in, free and yours")
         self.send(bytes([oi.START]) + oi.stream(self.layouts[0]))
         self._watchdog = SimulatedWatchdog(field.scheduler, process, self._halt)
+        field.lines[robot] = self
 
     def send(self, data: bytes) -> None:
         """Write these bytes."""
@@ -213,16 +217,13 @@ class SimulatedLine:
         """Counts of valid and of damaged frames."""
         return self._good, 0
 
-    def stop_when_back(self, ended: Any) -> bool:
-        """Stop the robot if its line comes back."""
-        scheduler = self._field.scheduler
-        until = scheduler.now + round(1e9 * RETURN_TIMEOUT)
+    def stop_when_back(self, ended: Any) -> None:
+        """Stop the robot as soon as its line comes back."""
         self.close()
-        while scheduler.now < until and not ended.wait(0.05):
+        while not ended.wait(RETURN_PERIOD):
             if self._robot not in self._field.unplugged:
-                self._field.robots[self._robot].take(LEAVE, 1e-9 * scheduler.now)
-                return True
-        return False
+                self._field.robots[self._robot].take(LEAVE, 1e-9 * self._field.scheduler.now)
+                return
 
     def close(self) -> None:
         """Close the line."""

@@ -167,7 +167,8 @@ class RobotProgram:
             if on_step is not None:
                 on_step()
             now = machine.monotonic()
-            if self._wheels is not None and self._wheels_lost and now - reopened > REOPEN_PERIOD:
+            wheels = self._wheels
+            if wheels is not None and wheels.lost and not wheels.awaits_port and now - reopened > REOPEN_PERIOD:
                 reopened = now
                 machine.new_thread(target=self._reopen_wheels, name=f"wheels of {self.name}").start()
             if now - report >= REPORT_PERIOD:

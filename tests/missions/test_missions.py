@@ -55,6 +55,10 @@ KILLED_TWICE = [
 #: Faults of a mission in whose midst they happen, by what they are about.
 DIRECTED = {
     "the coordinator is killed twice": KILLED_TWICE,
+    "the mover's line is unplugged, for a moment and for long": [
+        Fault(7.6, "unplug", "C", 0.06),
+        Fault(14.0, "unplug", "C", 12.0),
+    ],
     "the mover's program is killed": [Fault(7.6, "kill", "C", 1.5)],
     "all links are cut": [Fault(7.6, "cut", name, 3.0) for name in "ABC"],
     "processes are stopped": [Fault(7.6, "stop", "C", 1.0), Fault(12.0, "stop", COORDINATOR, 3.0)],

@@ -297,6 +297,11 @@ class Create:
         return self._line is None or self._line.lost is not None
 
     @property
+    def awaits_port(self) -> bool:
+        """True while the port of a lost line is awaited, to stop the robot as soon as it is back; do not close then."""
+        return self._line is not None and self._line.lost is not None and self._threads[0].is_alive()
+
+    @property
     def frames(self) -> tuple[int, int]:
         """Counts of valid and of damaged frames since the line was opened."""
         return self._line.frames if self._line else (0, 0)

@@ -19,7 +19,7 @@ from coloc_graph.robot_io.create.watchdog import Watchdog
 ANSWER_TIMEOUT = 1.0  # s that a robot may take to answer at one baud rate
 WRITE = 0.2  # s that a write may take
 READ = 0.05  # s that a read waits for bytes
-RETURN_TIMEOUT = 10.0  # s to wait for a lost port
+RETURN_PERIOD = 0.05  # s between two attempts to open a lost port
 RELEASE_TIMEOUT = 0.5  # s to wait for a port that another driver held
 #: Commands that leave a robot standing, silent and in passive mode.
 LEAVE = oi.HALT + oi.pause_stream() + bytes([oi.START])
@@ -52,8 +52,8 @@ class Line(Protocol):
     def frames(self) -> tuple[int, int]:
         """Counts of valid and of damaged frames."""
 
-    def stop_when_back(self, ended: threading.Event) -> bool:
-        """Stop the robot if its port comes back; return whether it did."""
+    def stop_when_back(self, ended: threading.Event) -> None:
+        """Stop the robot as soon as its port comes back, unless `ended` is set before."""
 
     def close(self) -> None:
         """Close the line."""
@@ -193,16 +193,14 @@ class CreateLine:
                 self.lost = self.lost or "its watchdog process has ended"
             raise RobotError(f"the line on {self.port} is lost ({self.lost}): open it again")
 
-    def stop_when_back(self, ended: threading.Event) -> bool:
-        """Stop the robot if its port comes back within `RETURN_TIMEOUT`; return whether it did."""
-        until = machine.monotonic() + RETURN_TIMEOUT
+    def stop_when_back(self, ended: threading.Event) -> None:
+        """Stop the robot as soon as its port comes back, unless `ended` is set before."""
         self.close()
-        while machine.monotonic() < until and not ended.wait(0.05):
+        while not ended.wait(RETURN_PERIOD):
             with contextlib.suppress(OSError, ValueError), self._opened(self.model) as again:
                 again.write(LEAVE)
                 again.flush()
-                return True
-        return False
+                return
 
     def _opened(self, model: int) -> serial.Serial:
         return serial.Serial(self.port, WHEELS[model].baud, timeout=READ, write_timeout=0, exclusive=True)
