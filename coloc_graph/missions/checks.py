@@ -56,6 +56,7 @@ class Checks:
         self._gaps = 0
         self._link: CoordinatorLink | None = None
         self._recorded: deque[tuple[float, int]] = deque(maxlen=200)
+        self._ran = 0.0  # time for which coordinators were not stopped [s]
         self._origin: Planar | None = None
         self._newest: EnteredStance | None = None
 
@@ -81,10 +82,11 @@ class Checks:
             for a, b in itertools.combinations(poses, 2):
                 if math.dist(poses[a][:2], poses[b][:2]) < 2 * RADIUS:
                     self._violate(f"{a} and {b} collide")
-        coordinator = self.programs.coordinator
-        if coordinator is not None:
+        coordinator, process = self.programs.coordinator, self.programs.processes.get(COORDINATOR)
+        if coordinator is not None and process is not None and not process.stopped:
             record = coordinator._registry.record
-            self._recorded.append((now, sum(map(len, record._detections.values()))))
+            self._ran += MARGIN
+            self._recorded.append((self._ran, sum(map(len, record._detections.values()))))
 
     def _runs(self, name: str) -> bool:
         """Return whether a program, of a robot or of the coordinator, runs."""
@@ -166,8 +168,8 @@ class Checks:
 
     def look_at_record(self, folder: Path) -> None:
         """Check that the record of a coordinator that was killed now has all but the newest images."""
-        path, now = folder / "run.mcap", 1e-9 * self._scheduler.now
-        before = [n for t, n in self._recorded if t <= now - LOST_RECORD - MARGIN]
+        path = folder / "run.mcap"
+        before = [n for ran, n in self._recorded if ran <= self._ran - LOST_RECORD - MARGIN]
         self._recorded.clear()
         if not before:
             return
