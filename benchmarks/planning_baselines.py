@@ -17,7 +17,7 @@ import numpy as np
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.planning.belief import POSE, Belief
-from coloc_graph.planning.clearance import conflicts
+from coloc_graph.planning.clearance import apart, conflicts
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.gaits import ABREAST, LEAPS, TOE_INS, GaitSearch
@@ -120,7 +120,7 @@ class FixedGaits:
                 goal = self._scene.course.points[-1]
                 stance, promise = best_stance(predictor, belief, standing, anchors, mover, seconds, goal)
             else:
-                stance = PlannedStance(standing, anchors, mover, self._patrol(standing, stops[k][2]), seconds)
+                stance = PlannedStance(standing, anchors, mover, self._patrol(belief, standing, stops[k][2]), seconds)
                 promise = predictor.of_stance(belief, stance)
             if promise.points < MIN_POINTS:
                 raise InputError(f"stance {k} is void")
@@ -174,18 +174,19 @@ class FixedGaits:
             if (np.hypot(*(at[ahead:] - at[:-ahead]).T) < TO_ROBOT).any():
                 raise InputError("robots stand too near to each other")
 
-    def _patrol(self, standing: dict[str, Planar], heading: float) -> tuple[tuple[float, float], ...]:
+    def _patrol(self, belief: Belief, standing: dict[str, Planar], heading: float) -> tuple[tuple[float, float], ...]:
         """The patrol of a stance, or the longest part of it that is clear."""
         predictor, names = self._predictor, tuple(standing)
         model = predictor.model(names, self._scene.mover)
-        found = cells(model, np.array(list(standing.values())), predictor.margins(0.0, names), predictor.free)
+        slips = [belief.leapt.get(name, 0.0) for name in names]
+        found = cells(model, np.array(list(standing.values())), predictor.margins(0.0, names), predictor.free, slips)
         if len(found.places) < 2:
             raise InputError("the observers share no view")
         points = patrol(found.places, heading)
         parts = [points, points[:3], points[1:], points[:2], points[1:3], points[2:], (points[0], points[3])]
         others = [pose[:2] for pose in standing.values()]
         for part in parts:
-            if clear_way(part, others, predictor.free, to_robot=TO_ROBOT):
+            if clear_way(part, others, predictor.free, to_robot=apart(slips)):
                 return part
         raise InputError("no patrol is clear")
 

@@ -190,7 +190,7 @@ class HorizonPlanner:
         """Belief of the team with its robots at `poses`."""
         if self._belief is None:
             self._belief = Belief.start(self._team, poses)
-        return replace(self._belief, poses={name: poses[name] for name in self._belief.robots})
+        return replace(self._belief, poses={name: poses[name] for name in self._belief.robots}, leapt={})
 
     def _detour(self, poses: Mapping[str, Planar], leap: tuple[str, Planar] | None) -> tuple[tuple[float, float], ...]:
         """Return the waypoints of an observer before its target."""

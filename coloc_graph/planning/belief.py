@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +33,15 @@ class Belief:
 
     Of each robot in turn: pose (6,) in GTSAM's tangent, rotation first, body frame; mount (6,): height [m], tilt, roll,
     yaw [rad], x, y [m]; markers (2,): span (relative), height [m].
+
+    `leapt` are the distances of the planned leaps to where robots stand [m], without those whose place is known.
     """
 
     robots: tuple[str, ...]
     poses: Mapping[str, Planar]
     covariance: Array
     floor: tuple[float, float]
+    leapt: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def start(cls, team: Team, poses: Mapping[str, Planar]) -> "Belief":
@@ -84,7 +87,8 @@ class Belief:
         block[at : at + POSE, at : at + POSE] = F
         covariance = block @ self.covariance @ block.T
         covariance[..., at : at + POSE, at : at + POSE] += Q
-        return replace(self, poses={**self.poses, robot: target}, covariance=covariance)
+        leapt = {**self.leapt, robot: math.hypot(D[0], D[1])}
+        return replace(self, poses={**self.poses, robot: target}, covariance=covariance, leapt=leapt)
 
     def after_stance(self, observers: Sequence[str], mover: str, information: Array) -> "Belief":
         """Return what is known once a stance has brought `information` (d, d) on its variables."""

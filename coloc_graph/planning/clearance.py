@@ -1,14 +1,48 @@
-"""Distances that a plan keeps, or does not, between robots and to walls; `conflicts`."""
+"""Distances that a plan keeps, or does not, between robots and to walls; `apart`, `off_walls`, `conflicts`."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from coloc_graph.planning.plan import Plan
-from coloc_graph.planning.route import TO_ROBOT, TO_WALL, Free, clear_way, reachable
+from coloc_graph.geometry.se2 import Planar
+from coloc_graph.planning.plan import Plan, PlannedStance
+from coloc_graph.planning.route import TO_ROBOT, TO_WALL, Free, clear_way, from_way, reachable
+from coloc_graph.planning.slip import stop_sigma
+from coloc_graph.team.shared_view import BODY_RADIUS
 
 TOLERANCE = 0.01  # distances are taken to be kept to this [m]
+SAFE = 4.5  # robots touch nothing unless they stop further off than this number of standard deviations
+
+
+def apart(leapt: ArrayLike, other: ArrayLike | None = None, *, least: float = TO_ROBOT) -> NDArray[np.float64]:
+    """Return the distance, at `least`, of a way from where robots stop after leaps (...) [m].
+
+    With the leaps of the `other` ones (...) [m], that between where both stop.
+    """
+    sigma = stop_sigma(leapt)
+    if other is not None:
+        sigma = np.hypot(sigma, stop_sigma(other))
+    return np.maximum(least, 2 * BODY_RADIUS + SAFE * sigma)
+
+
+def off_walls(leapt: ArrayLike, *, least: float = TO_WALL) -> NDArray[np.float64]:
+    """Return the distance, at `least`, from walls of where robots are to stop after leaps (...) [m]."""
+    return np.maximum(least, BODY_RADIUS + SAFE * stop_sigma(leapt))
+
+
+def leapt_to(leapt: Mapping[str, float], before: Mapping[str, Planar], stance: PlannedStance) -> dict[str, float]:
+    """Return the distances of the leaps by which robots came to where they stand in a stance [m].
+
+    `leapt` are those of the stance `before`, whose robots' poses are these.
+    """
+    now = {
+        name: math.dist(before[name][:2], stance.standing[name][:2])
+        for name in stance.leapers
+        if name in before and before[name] != stance.standing[name]
+    }
+    return {**leapt, **now}
 
 
 def conflicts(plan: Plan, free: Free | None = None) -> list[tuple[int, str]]:
@@ -27,25 +61,30 @@ def conflicts(plan: Plan, free: Free | None = None) -> list[tuple[int, str]]:
         Number of the stance, and one sentence.
     """
     found: list[tuple[int, str]] = []
-    before: dict[str, tuple[float, float]] = {}
+    before: dict[str, Planar] = {}
+    leapt: dict[str, float] = {}
     for k, stance in enumerate(plan.stances):
         places = {name: pose[:2] for name, pose in stance.standing.items()}
         names = list(places)
+        leapt = leapt_to(leapt, before, stance)
+        slips = {name: leapt.get(name, 0.0) for name in names}
         for n, one in enumerate(names):
-            if free is not None and not free(np.array(places[one]), TO_WALL - TOLERANCE):
-                found.append((k, f"{one} stands less than {TO_WALL:g} m from a wall"))
+            room = float(off_walls(slips[one]))
+            if free is not None and not free(np.array(places[one]), room - TOLERANCE):
+                found.append((k, f"{one} stands less than {room:.2f} m from a wall"))
             for other in names[n + 1 :]:
-                apart = math.dist(places[one], places[other])
-                if apart < TO_ROBOT - TOLERANCE:
-                    found.append((k, f"{one} and {other} stand {apart:.2f} m apart: they need {TO_ROBOT:g} m"))
+                distance, room = math.dist(places[one], places[other]), float(apart(slips[one], slips[other]))
+                if distance < room - TOLERANCE:
+                    found.append((k, f"{one} and {other} stand {distance:.2f} m apart: they need {room:.2f} m"))
         for name in stance.leapers:
             if name in before:
                 others = [place for other, place in places.items() if other != name]
-                if not reaches(before[name], places[name], others, free):
+                if not reaches(before[name][:2], places[name], others, free):
                     found.append((k, f"{name} cannot leap there: robots or walls are in its way"))
-        if not clear_way(stance.waypoints, list(places.values()), free, to_robot=TO_ROBOT - TOLERANCE):
+        near = from_way(stance.waypoints, list(places.values())) < apart(list(slips.values())) - TOLERANCE
+        if near.any() or not clear_way(stance.waypoints, (), free):
             found.append((k, f"the drive of {stance.mover} comes too near to a robot or a wall"))
-        before = {**before, **places}
+        before = {**before, **stance.standing}
     return found
 
 

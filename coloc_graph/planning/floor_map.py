@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.image_file import read_image, to_8_bits, to_grey
@@ -47,9 +47,9 @@ class FloorMap:
         distance = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
         return cls(np.asarray(distance, float) * resolution, resolution, origin)
 
-    def clear(self, places: Array, distance: float) -> NDArray[np.bool_]:
-        """Return which places (..., 2) [m] are further than a distance [m] from all that is not free."""
-        return np.asarray(self._distance(np.asarray(places, float)) > distance)
+    def clear(self, places: Array, distance: ArrayLike) -> NDArray[np.bool_]:
+        """Return which places (..., 2) [m] are further than a distance (...) [m] from all that is not free."""
+        return np.asarray(self._distance(np.asarray(places, float)) > np.asarray(distance))
 
     def _distance(self, places: Array) -> Array:
         """Distance (...) from places (..., 2) to the nearest wall [m], 0 in it and beyond the map."""

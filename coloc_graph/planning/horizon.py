@@ -117,6 +117,7 @@ class Horizon:
         self.predictor, self.course, self.mover, self.timed = predictor, course, mover, timed
         self.observers, self.seconds, self.objective, self.depth = tuple(observers), seconds, objective, depth
         self._rng = np.random.default_rng(0) if rng is None else rng
+        self._roomy = not predictor.anew
         if predictor.floor_map is not None:
             for n, (x, y) in enumerate(course.points):
                 if not predictor.floor_map.clear(np.array([x, y]), 0.2):
@@ -138,7 +139,11 @@ class Horizon:
         InputError
             If the team cannot come to the goal.
         """
-        draft = self.draft(belief)
+        try:
+            draft = self.draft(belief)
+        except InputError:  # nearer to each other, which refining mends where it can
+            self._roomy = False
+            draft = self.draft(belief)
         return self.refined(draft) if self.objective == "goal" else draft
 
     def draft(self, belief: Belief) -> Mission:
@@ -385,8 +390,9 @@ class Horizon:
 
     def _leaps_of(self, node: Node, leaper: str, avoid: Sequence[Planar], *, in_lane: bool) -> list[Node]:
         leaps = possible_leaps(
-            node.belief, leaper, self.course, self.gait, self.observers, self.predictor, avoid, in_lane=in_lane
-        )
+            node.belief, leaper, self.course, self.gait, self.observers, self.predictor, avoid,
+            in_lane=in_lane, roomy=self._roomy,
+        )  # fmt: skip
         if not len(leaps.targets):
             return []
         observers = (*leaps.anchors, leaps.leaper)
@@ -464,7 +470,8 @@ class Horizon:
         target = x, y, yaw
         poses = {**node.belief.poses, leaps.leaper: target}
         C = node.belief.covariance if covariance is None else covariance
-        belief = replace(node.belief, poses=poses, covariance=C)
+        leapt = {**node.belief.leapt, leaps.leaper: math.dist(node.belief.poses[leaps.leaper][:2], target[:2])}
+        belief = replace(node.belief, poses=poses, covariance=C, leapt=leapt)
         choice = leaps.leaper, target, seconds
         left = node.seconds - seconds - self.timed * float(leaps.times[n])
         standing = {**node.standing, leaps.leaper: target}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.geometry.se2 import Planar, between, wrap
 from coloc_graph.planning.belief import Belief, leap_model
+from coloc_graph.planning.clearance import apart, off_walls
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
@@ -73,6 +74,7 @@ def possible_leaps(
     avoid: Sequence[Planar] = (),
     *,
     in_lane: bool = False,
+    roomy: bool = True,
 ) -> Leaps:
     """Find the leaps of an observer: those of a gait, and longer, shorter, wider ones; at corners also half turned.
 
@@ -86,6 +88,8 @@ def possible_leaps(
         Targets that have failed.
     in_lane
         True for targets in the gait's formation alone, and, at corners, beside the course.
+    roomy
+        True for targets that are so far from others as both may stop off.
     """
     ways = {name: course.way_of(belief.poses[name]) for name in observers}
     anchors = tuple(sorted((name for name in observers if name != leaper), key=lambda name: -ways[name]))
@@ -120,7 +124,8 @@ def possible_leaps(
         by_gait.append(own and advance == 1.0)
     places = np.array(targets).reshape(-1, 3)
     others = np.array([belief.poses[name][:2] for name in anchors])
-    good = _clear(np.array(belief.poses[leaper][:2]), places[:, :2], others, predictor.floor_map)
+    slips = [belief.leapt.get(name, 0.0) if roomy else None for name in anchors]
+    good = _clear(np.array(belief.poses[leaper][:2]), places[:, :2], others, slips, predictor.floor_map)
     for x, y, yaw in (*avoid, belief.poses[leaper]):
         near = np.hypot(places[:, 0] - x, places[:, 1] - y) < FAILED
         good &= ~(near & (np.abs(places[:, 2] - yaw) < FAILED))
@@ -137,23 +142,27 @@ def possible_leaps(
     return Leaps(leaper, anchors, places, kept, F, Q, margins, np.array(by_gait, bool)[good], times)
 
 
-def _clear(start: Array, targets: Array, others: Array, floor_map: FloorMap | None) -> NDArray[np.bool_]:
+def _clear(
+    start: Array, targets: Array, others: Array, slips: Sequence[float | None], floor_map: FloorMap | None
+) -> NDArray[np.bool_]:
     """Return which targets (n, 2) a robot can reach from `start`, clear of others and walls.
 
-    In a straight line, if there are such; else round what is in its way.
+    In a straight line, if there are such; else round what is in its way. The others come from leaps of `slips` [m]; None
+    to let that be.
     """
-    longest = float(np.hypot(*(targets - start).T).max(initial=STEP))
+    leapt = np.hypot(*(targets - start).T)
+    longest = float(leapt.max(initial=STEP))
     along = np.linspace(0.0, 1.0, int(np.ceil(longest / STEP)) + 1)[:, None]
     way = start + along * (targets - start)[:, None]
     good, straight = np.ones((2, len(targets)), bool)
-    for other in others:
-        good &= np.hypot(*np.moveaxis(targets - other, -1, 0)) > TO_ROBOT
+    for other, slip in zip(others, slips, strict=True):
+        good &= np.hypot(*np.moveaxis(targets - other, -1, 0)) > (TO_ROBOT if slip is None else apart(leapt, slip))
         # it may stand nearer already
         least = min(TO_ROBOT, float(np.hypot(*(start - other))) - 0.01)
         straight &= np.hypot(*np.moveaxis(way - other, -1, 0)).min(axis=1) > least
     if floor_map is not None:
         straight &= floor_map.clear(way, TO_WALL).all(axis=1)
-        good &= floor_map.clear(targets, TO_WALL)
+        good &= floor_map.clear(targets, off_walls(leapt, least=TO_WALL))
     # few are in the way of a pair; of more robots some are
     if not (good & straight).any():
         free = None if floor_map is None else floor_map.clear

@@ -146,7 +146,8 @@ def best_stance(
     """
     names = tuple(standing)
     margins = predictor.margins(leapt, names)
-    found = cells(predictor.model(names, mover), np.array(list(standing.values())), margins, predictor.free)
+    slips = [0.0 if predictor.anew and name in anchors else belief.leapt.get(name, 0.0) for name in names]
+    found = cells(predictor.model(names, mover), np.array(list(standing.values())), margins, predictor.free, slips)
     if len(found.places) < 2:
         raise InputError(
             f"{' and '.join(names)} have no common view of the floor where they are to stand: "

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from itertools import combinations, permutations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from coloc_graph.planning.clearance import apart
 from coloc_graph.planning.drive import SPEED, drive_through, there_and_back
 from coloc_graph.planning.route import Free, clear_way
 from coloc_graph.planning.stance_information import StanceModel
@@ -42,6 +43,8 @@ class Cells:
         Information (n, d, d) of one image of each camera there.
     standing
         Places (r, 2) of the robots that stand [m].
+    room
+        Distances (r,) that the mover keeps from each of them in any case [m].
     free
         Returns which places are free of walls; None without a map.
     """
@@ -49,32 +52,39 @@ class Cells:
     places: Array
     information: Array
     standing: Array
+    room: Array
     free: Free | None = None
 
     def clear(self, points: Array) -> bool:
         """Return whether a drive through points (n, 2) is clear of the robots that stand and of walls."""
-        return clear_way(points, self.standing, self.free, to_robot=CLEARANCE - CELL / 10)
+        return clear_way(points, self.standing, self.free, to_robot=np.maximum(CLEARANCE - CELL / 10, self.room))
 
 
-def cells(model: StanceModel, standing: Array, margins: Array, free: Free | None = None) -> Cells:
+def cells(
+    model: StanceModel, standing: Array, margins: Array, free: Free | None = None, leapt: ArrayLike = 0.0
+) -> Cells:
     """Find the places of the common view of observers at poses (r, 3), and what an image from each brings.
 
     Markers are at least `margins` (r, 2) [px] from the borders of the images: left and right, upper and lower.
+    The observers come from leaps of `leapt` () or (r,) [m].
     """
-    places = places_in_common_view(model, standing, margins, free)
+    room = np.broadcast_to(apart(leapt), len(standing))
+    places = places_in_common_view(model, standing, margins, room, free)
     if not len(places):
-        return Cells(places, np.zeros((0, model.variables, model.variables)), standing[:, :2], free)
+        return Cells(places, np.zeros((0, model.variables, model.variables)), standing[:, :2], room, free)
     drive = np.concatenate([np.column_stack([places, np.full(len(places), yaw)]) for yaw in YAWS])
     information = model.see(standing, drive).information
     mean = information.reshape(len(YAWS), len(places), *information.shape[1:]).mean(axis=0)
-    return Cells(places, mean, standing[:, :2], free)
+    return Cells(places, mean, standing[:, :2], room, free)
 
 
-def places_in_common_view(model: StanceModel, standing: Array, margins: Array, free: Free | None = None) -> Array:
+def places_in_common_view(
+    model: StanceModel, standing: Array, margins: Array, room: Array, free: Free | None = None
+) -> Array:
     """Places (n, 2) [m] where two cameras see all markers of the mover at any heading, clear of robots and walls."""
     xy = _grid(model, standing)
-    away = np.hypot(*np.moveaxis(xy[:, None] - standing[None, :, :2], -1, 0)).min(axis=1)
-    xy = xy[away > CLEARANCE]
+    away = np.hypot(*np.moveaxis(xy[:, None] - standing[None, :, :2], -1, 0))
+    xy = xy[(away > np.maximum(CLEARANCE, room)).all(axis=1)]
     if free is not None:
         xy = xy[free(xy, CLEARANCE / 2)]
     return np.asarray(xy[commonly_seen(model, standing, xy, margins)])

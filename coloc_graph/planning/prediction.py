@@ -1,7 +1,7 @@
 """Prediction of the covariance of a team after planned stances; `Predictor`."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +13,7 @@ from coloc_graph.planning.drive import SPEED, drive_through, leap_time, there_an
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.plan import Plan, PlannedStance
+from coloc_graph.planning.route import Free
 from coloc_graph.planning.slip import WheelErrors, view_margins
 from coloc_graph.planning.stance_information import StanceModel
 from coloc_graph.team import Team
@@ -68,7 +69,7 @@ class Predictor:
     _models: dict[tuple[tuple[str, ...], str], StanceModel] = field(default_factory=dict)
 
     @property
-    def free(self) -> Callable[[Array, float], NDArray[np.bool_]] | None:
+    def free(self) -> Free | None:
         """Returns which places (..., 2) [m] are free of walls by a distance [m]; None without a map."""
         return None if self.floor_map is None else self.floor_map.clear
 

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from coloc_graph.geometry.se2 import Planar, between
 from coloc_graph.planning.belief import OBSERVER, POSE, Belief, leap_model, updated
-from coloc_graph.planning.clearance import reaches
+from coloc_graph.planning.clearance import apart, leapt_to, off_walls, reaches
 from coloc_graph.planning.gaits import MIN_STANCE_DURATION
 from coloc_graph.planning.leaps import TO_WALL
 from coloc_graph.planning.mover_path import CLEARANCE, commonly_seen
 from coloc_graph.planning.plan import PlannedStance
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.rollout import end_weights, what_costs
-from coloc_graph.planning.route import clear_way
+from coloc_graph.planning.route import Free, clear_way, from_way
 from coloc_graph.planning.steps import Steps
 
 Array = NDArray[np.float64]
@@ -51,11 +51,12 @@ class _Chain:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Stance `k` of a chain while a sweep changes it: covariance and poses of the robots before its leaps."""
+    """Stance `k` of a chain while a sweep changes it: covariance, poses and leaps [m] of robots before its leaps."""
 
     k: int
     P: Array
     poses: Mapping[str, Planar]
+    leapt: Mapping[str, float]
 
 
 class Refinement:
@@ -199,14 +200,15 @@ class Refinement:
 
     def _sweep(self, belief: Belief, P: Array, chain: _Chain, step: float, worth: float) -> None:
         """Change each stance in turn: the mover's waypoints, and where those who leap to it stand."""
-        poses = dict(belief.poses)
+        poses, leapt = dict(belief.poses), dict(belief.leapt)
         for k in range(len(chain.stances)):
-            place = _Place(k, P, poses)
+            place = _Place(k, P, poses, leapt)
             self._improve(belief, chain, place, _drives(chain.stances[k]), step, worth)
             for name in _leapers(poses, chain.stances[k]):
                 self._improve(belief, chain, place, _stops(chain.stances, k, name), step, worth)
             leap = chain.leaps[k]
             P = updated(leap.A @ P @ leap.A.mT + leap.C, self._every, chain.information[k])
+            leapt = leapt_to(leapt, poses, chain.stances[k])
             poses = {**poses, **chain.stances[k].standing}
 
     def _improve(
@@ -270,33 +272,44 @@ class Refinement:
 
     def _possible(self, chain: _Chain, place: _Place, option: Window, least: Sequence[float]) -> bool:
         """Return whether robots can stand, leap and drive so, and the mover is seen as well as before."""
-        poses, free = dict(place.poses), self._predictor.free
-        for i, stance in enumerate(option):
+        poses, leapt, free = dict(place.poses), dict(place.leapt), self._predictor.free
+        stood, came = dict(place.poses), dict(place.leapt)
+        for i, old in enumerate(chain.stances[place.k :]):
+            stance = option[i] if i < len(option) else old
             at = {name: pose[:2] for name, pose in stance.standing.items()}
-            for name in _leapers(poses, stance):
+            for name in _leapers(poses, stance) if i < len(option) else ():
                 others = [other for one, other in at.items() if one != name]
                 if not reaches(poses[name][:2], at[name], others, free):
                     return False
-            if stance is not chain.stances[place.k + i]:
-                places = np.array(list(at.values()))
-                before = np.array([pose[:2] for pose in chain.stances[place.k + i].standing.values()])
-                if (_distances(places) < np.minimum(_distances(before), APART)).any():
-                    return False
-                if not (free is None or free(places, TO_WALL).all()):
-                    return False
-                drive = np.array(stance.waypoints)
-                if not (free is None or free(drive, CLEARANCE / 2).all()):
-                    return False
-                if np.hypot(*np.moveaxis(drive[:, None] - places, -1, 0)).min() < CLEARANCE:
-                    return False
-                if not clear_way(drive, places, free, to_robot=CLEARANCE):
-                    return False
-                if self._seen(poses, stance) < min(least[i], SEEN):
-                    return False
+            leapt, came = leapt_to(leapt, poses, stance), leapt_to(came, stood, old)
+            if i >= len(option) and leapt == came:
+                break
+            if not self._clear(stance, leapt, old, came):
+                return False
+            if stance is not old and self._seen(poses, stance) < min(least[i], SEEN):
+                return False
             poses.update(stance.standing)
-        if place.k + len(option) < len(chain.stances):
+            stood.update(old.standing)
+        return place.k + len(option) < len(chain.stances) or self._arrived(poses)
+
+    def _clear(
+        self, stance: PlannedStance, leapt: Mapping[str, float], old: PlannedStance, came: Mapping[str, float]
+    ) -> bool:
+        """Return whether a stance is clear of robots and walls, or no less than the `old` one.
+
+        Robots come to where they stand from leaps of `leapt` [m], in the old one of `came`.
+        """
+        spare, before = _spare(stance, leapt), _spare(old, came)
+        if (spare < np.minimum(before, 0.0) - 1e-9).any():
+            return False
+        free = self._predictor.free
+        if free is None:
             return True
-        return self._arrived(poses)
+        near = ~_off_walls(stance, leapt, free)
+        if stance is old:
+            return not (near & _off_walls(old, came, free)).any()
+        drive = np.array(stance.waypoints)
+        return not near.any() and bool(free(drive, CLEARANCE / 2).all()) and clear_way(drive, (), free)
 
     def _seen(self, poses: Mapping[str, Planar], stance: PlannedStance) -> float:
         """Share of a drive that lies in the common view; 0 if an end of it does not."""
@@ -311,9 +324,19 @@ class Refinement:
         return float(seen.mean()) if seen[0] and seen[-1] else 0.0
 
 
-def _distances(places: Array) -> Array:
-    """Distances (n, n) of places (n, 2) from each other [m]."""
-    return np.asarray(np.hypot(*np.moveaxis(places[:, None] - places, -1, 0)))
+def _spare(stance: PlannedStance, leapt: Mapping[str, float]) -> Array:
+    """Distances (n + 1, n) of robots, and of the mover's way, from those that stand, beyond what they need [m]."""
+    places = np.array([pose[:2] for pose in stance.standing.values()])
+    slips = np.array([leapt.get(name, 0.0) for name in stance.standing])
+    spare = np.hypot(*np.moveaxis(places[:, None] - places, -1, 0)) - apart(slips[:, None], slips, least=APART)
+    np.fill_diagonal(spare, 0.0)
+    return np.vstack([spare, from_way(stance.waypoints, places) - apart(slips, least=CLEARANCE)])
+
+
+def _off_walls(stance: PlannedStance, leapt: Mapping[str, float], free: Free) -> NDArray[np.bool_]:
+    """Return which robots that stand keep off walls."""
+    places = np.array([pose[:2] for pose in stance.standing.values()])
+    return free(places, off_walls([leapt.get(name, 0.0) for name in stance.standing], least=TO_WALL))
 
 
 def _leapers(poses: Mapping[str, Planar], stance: PlannedStance) -> list[str]:

@@ -1,4 +1,4 @@
-"""Ways of robots clear of others and of walls: `clear_way`, `route`, `reachable`, `polyline_length`."""
+"""Ways of robots clear of others and of walls: `clear_way`, `route`, `reachable`, `from_way`, `polyline_length`."""
 
 import itertools
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from coloc_graph.errors import InputError
 Array = NDArray[np.float64]
 
 #: Returns whether places (..., 2) [m] are free of walls by a distance [m].
-Free = Callable[[Array, float], NDArray[np.bool_]]
+Free = Callable[[Array, ArrayLike], NDArray[np.bool_]]
 
 TO_ROBOT = 0.42  # least distance between the middles of two robots, where they stand and on the way [m]
 TO_WALL = 0.22  # least distance of a driving robot's middle from walls [m]
@@ -24,10 +24,12 @@ ROUND = 2.5  # a way round goes this far beyond all robots [m]
 SLACK = 0.01  # a robot that stands nearer to another than it may does not come nearer than this less [m]
 
 
-def clear_way(points: ArrayLike, others: ArrayLike, free: Free | None = None, *, to_robot: float = TO_ROBOT) -> bool:
+def clear_way(
+    points: ArrayLike, others: ArrayLike, free: Free | None = None, *, to_robot: ArrayLike = TO_ROBOT
+) -> bool:
     """Return whether a polyline (n, 2) is clear of robots at `others` (m, 2) and of walls [m].
 
-    Where it begins it may be as near to them as it is.
+    It keeps a distance `to_robot` () or (m,) from robots [m]. Where it begins it may be as near to them as it is.
     """
     points, others = np.asarray(points, float), np.asarray(others, float).reshape(-1, 2)
     way = _sampled(points)
@@ -134,6 +136,12 @@ def _pulled(points: list[Array], others: Array, free: Free | None, to_robot: flo
 def polyline_length(points: ArrayLike) -> float:
     """Length of a polyline (n, 2) [m]."""
     return float(np.hypot(*np.diff(np.asarray(points, float), axis=0).T).sum())
+
+
+def from_way(points: ArrayLike, others: ArrayLike) -> Array:
+    """Return the least distances (m,) of robots at `others` (m, 2) from a polyline (n, 2) [m]."""
+    way = _sampled(np.asarray(points, float))
+    return np.asarray(np.hypot(*np.moveaxis(way[:, None] - np.asarray(others, float), -1, 0)).min(axis=0))
 
 
 def _sampled(points: Array) -> Array:

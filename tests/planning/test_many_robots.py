@@ -10,14 +10,14 @@ from coloc_graph.planning.clearance import conflicts
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.horizon import STRAGGLE, Horizon
-from coloc_graph.planning.plan import Plan
+from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.roles import best_roles, roles_of
 from coloc_graph.simulation import Imperfections, reference_team
 from coloc_graph.simulation.rig import stated_team
 
 FIELD = Imperfections(mount_sigma_deg=1.0, height_sigma=0.005, span_sigma=1e-4, floor_sigma_deg=0.1)
-COURSE = Course(((0.0, 0.0), (2.4, 0.0)))
+COURSE = Course(((0.0, 0.0), (3.0, 0.0)))
 new = msgspec.structs.replace
 
 
@@ -30,7 +30,7 @@ def team_of(count):
 def horizon_of(count):
     predictor = Predictor(team_of(count), 10.0)
     observers, mover, _ = roles_of(predictor.team)
-    planner = Horizon(predictor, COURSE, observers, mover, 90.0, timed=True, gait=Gait(0.6, 0.5, 25.0))
+    planner = Horizon(predictor, COURSE, observers, mover, 90.0, timed=True, gait=Gait(1.0, 0.5, 25.0))
     return planner, Belief.start(predictor.team, {**planner.starts(), mover: (1.5, 0.0, 0.0)})
 
 
@@ -77,6 +77,17 @@ def test_conflicts_name_the_robots_and_the_stance():
     plan = Plan((first, new_stance(first, near)))
     ((stance, sentence),) = [one for one in conflicts(plan) if "stand" in one[1]]
     assert stance == 1 and sentence == "A and B stand 0.20 m apart: they need 0.42 m"
+
+
+@pytest.mark.parametrize(("leap", "drive", "near"), [
+    (0.5, ((0.45, -1.0), (0.45, 1.0)), False),
+    (4.0, ((0.45, -1.0), (0.45, 1.0)), True),  # it stops off by 4 cm
+    (0.5, ((0.35, 0.0), (2.0, 0.0)), True),
+])  # fmt: skip
+def test_a_drive_keeps_off_a_robot_by_as_much_as_it_may_stop_off(leap, drive, near):
+    before = PlannedStance({"A": (-leap, 0.0, 0.0), "B": (0.0, 2.0, 0.0)}, (), "C", ((3.0, 0.0), (3.0, 1.0)), 5.0)
+    after = PlannedStance({**before.standing, "A": (0.0, 0.0, 0.0)}, ("B",), "C", drive, 5.0)
+    assert conflicts(Plan((before, after))) == [(1, "the drive of C comes too near to a robot or a wall")] * near
 
 
 def new_stance(stance, standing, anchors=("A", "C")):
