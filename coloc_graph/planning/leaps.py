@@ -147,8 +147,8 @@ def _clear(
 ) -> NDArray[np.bool_]:
     """Return which targets (n, 2) a robot can reach from `start`, clear of others and walls.
 
-    In a straight line, if there are such; else round what is in its way. The others come from leaps of `slips` [m]; None
-    to let that be.
+    In a straight line, if there are such; else round what is in its way. The others come from leaps of `slips` [m];
+    None to let that be.
     """
     leapt = np.hypot(*(targets - start).T)
     longest = float(leapt.max(initial=STEP))
