@@ -38,7 +38,7 @@ def measure(runs: int, stances: int, work: Path) -> dict[str, float]:
     for seed in range(runs):
         simulate("hallway", folder / f"{seed}.mcap", seed=seed, stances=stances)
     found = {f"{n}_s": seconds(folder, work / str(n), partial(workers, n)) for n in (1, 2)}
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as cluster:
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1") as cluster:
         found["dask_2_s"] = seconds(folder, work / "dask", partial(workers, cluster=cluster.scheduler_address))
     return found | {f"speedup_{name}": found["1_s"] / found[f"{name}_s"] for name in ("2", "dask_2")}
 

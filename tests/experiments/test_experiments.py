@@ -157,7 +157,7 @@ def test_more_processes_give_the_same_cells(single):
 def test_work_goes_to_a_cluster_where_one_is_named():
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as cluster:
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1") as cluster:
         done = spread(lambda n: (n, os.getpid()), [1, 2], cluster=cluster.scheduler_address)
     assert [n for n, _ in done] == [1, 2] and os.getpid() not in {process for _, process in done}
 

@@ -61,7 +61,7 @@ def test_a_robot_says_once_that_lights_are_left_out_of_its_images(tmp_path):
 class Standing:
     """Wheels that stand, and whose line can be lost."""
 
-    fault, moving, lost, state = None, False, False, SimpleNamespace(ticks=None, hazards=dict)
+    fault, moving, lost, awaits_port, state = None, False, False, False, SimpleNamespace(ticks=None, hazards=dict)
 
     def __init__(self, *_, **__):
         self.asked = []
@@ -107,8 +107,11 @@ def test_wheels_are_opened_again_only_if_their_line_was_lost_and_recover_only_if
         robot.run(Steps(3))
         robot._obey(Recover())
         assert robot._wheels.asked == ["recover"]
-        robot._wheels.lost = True
+        robot._wheels.lost = robot._wheels.awaits_port = True
         robot._obey(Recover())
+        robot.run(Steps(3))
+        assert robot._wheels.asked == ["recover"]  # its driver stops it first
+        robot._wheels.awaits_port = False
         robot.run(Steps(3))
         until = time.monotonic() + 10
         while robot._opening or ("open" not in robot._wheels.asked and time.monotonic() < until):

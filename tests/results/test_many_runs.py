@@ -104,7 +104,7 @@ def test_a_cluster_goes_on_when_a_worker_is_killed(folder, tmp_path, monkeypatch
     monkeypatch.setenv("PYTHONPATH", f"{SUPPORT}:{os.environ.get('PYTHONPATH', '')}")
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1") as cluster:
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1") as cluster:
         found = solved(folder, tmp_path / "out", partial(workers, cluster=cluster.scheduler_address))
     assert not found["a"].failed and not found["b"].failed and found["bad"].failed
     assert (tmp_path / "out" / "killed").exists()
