@@ -1,5 +1,6 @@
 """Record of a mission: the newest minutes in memory, everything in a run on disk; `Record`."""
 
+import contextlib
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -151,19 +152,25 @@ def _between(kept: Sequence[T], start: float | None, end: float | None) -> Seque
     return kept[first:last]
 
 
-def begun(path: str | Path, team: Team) -> Record:
-    """Begin a record that is at `path` as soon as it has its team: a coordinator killed before leaves none there."""
-    path = Path(path)
+@contextlib.contextmanager
+def _taking_place(path: Path, team: Team) -> Iterator[Record]:
+    """Fill a record that takes its place at `path` once it is whole and handed over; if that fails it is removed."""
     new = path.with_suffix(".new.mcap")
     record = Record(new, team)
     try:
-        record.hand_over()
+        yield record
         new.rename(path)
     except BaseException:
         record.__exit__(None, None, None)
         new.unlink(missing_ok=True)
         raise
     record.path = path
+
+
+def begun(path: str | Path, team: Team) -> Record:
+    """Begin a record that is at `path` as soon as it has its team: a coordinator killed before leaves none there."""
+    with _taking_place(Path(path), team) as record:
+        record.hand_over()
     return record
 
 
@@ -182,9 +189,8 @@ def continued(path: str | Path, team: Team) -> tuple[Record, Run]:
     if before.team != team:
         raise RunError(f"{path}: is of another team, or of another description of it: begin in a new folder")
     number = next(n for n in range(1, 10_000) if not path.with_suffix(f".{n}.mcap").exists())
-    kept, new = path.with_suffix(f".{number}.mcap"), path.with_suffix(".new.mcap")
-    record = Record(new, team)
-    try:
+    kept = path.with_suffix(f".{number}.mcap")
+    with _taking_place(path, team) as record:
         for robot in team.names:
             for detections in before.detections(robot):
                 record.take(detections)
@@ -199,10 +205,4 @@ def continued(path: str | Path, team: Team) -> tuple[Record, Run]:
             kept.hardlink_to(path)
         except OSError:  # a file system without hard links
             path.rename(kept)
-        new.rename(path)
-    except BaseException:
-        record.__exit__(None, None, None)
-        new.unlink(missing_ok=True)
-        raise
-    record.path = path
     return record, open_run(kept)
