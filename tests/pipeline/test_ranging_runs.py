@@ -404,6 +404,28 @@ def test_a_robot_is_placed_by_points_that_agree_and_not_by_those_that_do_not():
     assert placing.pose() == pytest.approx((1.0, -2.0, 0.7))
 
 
+def test_a_robot_is_not_placed_by_landmarks_of_unknown_positions(tmp_path):
+    names = ("K1", "K2", "U")
+    places = {"K1": (0.0, 3.0), "K2": (4.0, 3.0), "U": (2.0, -2.5)}  # m; that of U is not stated
+    landmarks = tuple(Landmark(name=name, position=None if name == "U" else places[name]) for name in names)
+    sensor = Ranging(range_sigma=0.05, bearing_sigma_deg=1.0)
+    team = Team(reference="A", robots=tuple(Robot(name=name, ranging=sensor) for name in "AB"), landmarks=landmarks)
+    start, path = np.array([1.0, -0.5]), tmp_path / "run.mcap"
+    with atomic_run(path, team) as writer:
+        for k in range(40):
+            xy = np.array([0.1 * k, 0.0])  # by its wheels, which count from its start
+            writer.write(OdometrySample("A", 100.0 + k, np.array([*xy, 0.0]), np.eye(3) * 1e-6))
+            # U alone is measured at first, and is at no place of the map yet
+            for name in ("U",) if k < 20 else names:
+                d = np.subtract(places[name], start + xy)
+                writer.write(Ranges("A", 100.0 + k, (name,), np.hypot(*d)[None], np.arctan2(d[1], d[0])[None]))
+    keyframes = keyframes_of(open_run(path))
+    found = filter_forward(team, keyframes)
+    assert found.placed_at[0] >= 20
+    assert found.whole()[0][0] == pytest.approx([*start, 0.0], abs=0.02)
+    assert found.landmark(keyframes.landmarks.index("U")) == pytest.approx(places["U"], abs=0.05)
+
+
 def write(path, *, odometry=True, target="L", ranging=True, away=False):
     sensor = Ranging(range_sigma=0.05, bearing_sigma_deg=0.5) if ranging else None
     robots = tuple(Robot(name=name, ranging=sensor or Ranging(range_sigma=1, bearing_sigma_deg=1)) for name in "AB")
