@@ -1,34 +1,42 @@
 """Hallway with ranges between the robots (UWB) beside their stances: the same worlds with and without the ranges.
 
 Ranges alone are those with wheel odometry, from the first stance on: its relative poses are the start, and who stayed
-put is known. They begin at the estimate with all measurements, which favours them.
+put is known. They are averaged at the poses of the estimate with all measurements, and in batch begin there, which
+favours them.
 
 python benchmarks/ranges.py [--seeds 12] [--stances 40] [--uwb-sigma 0.05] [--uwb-offset 0.1] [--uwb-nlos 0.05]
-    [--mount-sigma 0.3] [--incremental] [--json]
+    [--mount-sigma 0.3] [--incremental] [--rows FILE] [--json]
 """
 
 import argparse
 import json
 import sys
 import time
+from collections import defaultdict
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from monte_carlo import compared, over_seeds, simulated, solved
+from monte_carlo import compared, over_seeds, rms_interval, simulated, solved
 
-from coloc_graph.backend import Estimate, joint
+from coloc_graph.backend import Estimate, Estimator, PoseGraph, joint
 from coloc_graph.evaluation import Accuracy
-from coloc_graph.measurements import Odometry, Range
+from coloc_graph.measurements import Measurement, Odometry, Range
 from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.simulation import Imperfections
 from coloc_graph.simulation.uwb import with_ranged_landmarks
+from coloc_graph.team import Team
 
 
 def one_seed(
-    seed: int, wrong: Imperfections, stances: int, points: int, landmarks: int, incremental: bool
+    seed: int, wrong: Imperfections, stances: int, points: int, landmarks: int, incremental: bool, rows: str | None
 ) -> dict[str, list[float]]:
-    """Return, without and with ranges: end position error [cm] of A and B, heading [deg], NEES, chi2/dof, seconds."""
+    """Return, by what is used: end position error [cm] of A and B, heading [deg], NEES, chi2/dof, seconds.
+
+    They are also added to the file `rows`, a line of JSON for each seed.
+    """
     figures = {}
     for name, sigma in (("stances alone", 0.0), ("stances and ranges", wrong.uwb_sigma)):
         of_uwb = {"uwb_sigma": sigma} if sigma else dict.fromkeys(("uwb_sigma", "uwb_offset_sigma", "uwb_nlos"), 0.0)
@@ -38,13 +46,33 @@ def one_seed(
             world = with_ranged_landmarks(world, landmarks)
         solution, accuracy = solved(world, SolveOptions(incremental=incremental))
         figures[name] = _figures(solution.estimate, accuracy, solution.seconds_backend)
-    if not incremental:
-        graph, began = solution.estimate.graph, time.process_time()
-        first = graph.stances[0].index
-        kept = tuple(one for one in graph.measurements if isinstance(one, Odometry | Range) or one.stance == first)
-        alone = joint(replace(graph, measurements=kept), start=solution.estimate.values)
-        figures["ranges alone"] = _figures(alone, compared(world, alone.trajectories), time.process_time() - began)
+    graph, began = solution.estimate.graph, time.process_time()
+    first = graph.stances[0].index
+    kept = tuple(one for one in graph.measurements if isinstance(one, Odometry | Range) or one.stance == first)
+    alone = replace(graph, measurements=kept)
+    start = solution.estimate.values
+    estimate = by_stance(alone, world.team).estimate() if incremental else joint(alone, start=start)
+    accuracy = compared(world, estimate.trajectories)
+    figures["ranges alone"] = _figures(estimate, accuracy, time.process_time() - began)
+    if rows is not None:
+        with Path(rows).open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"seed": seed, **figures}) + "\n")
     return figures
+
+
+def by_stance(graph: PoseGraph, team: Team) -> Estimator:
+    """Return an estimator that took the measurements of a graph stance by stance."""
+    of_stance: dict[int, list[Measurement]] = defaultdict(list)
+    for one in graph.measurements:
+        of_stance[max(stance for _, stance in one.ends)].append(one)
+    estimator, before = Estimator.of(team), None
+    for stance in graph.stances:
+        measured = of_stance[stance.index]
+        estimator.add(stance, [one for one in measured if not isinstance(one, Range)], after=before)
+        if ranges := [one for one in measured if isinstance(one, Range)]:
+            estimator.insert(*ranges)
+        before = stance.index
+    return estimator
 
 
 def _figures(estimate: Estimate, accuracy: Accuracy, seconds: float) -> list[float]:
@@ -57,6 +85,28 @@ def _figures(estimate: Estimate, accuracy: Accuracy, seconds: float) -> list[flo
         seconds,
         float(len(estimate.rejected)),
     ]
+
+
+def summarised(every: list[dict[str, list[float]]]) -> dict[str, dict[str, Any]]:
+    """Return RMS and means over seeds, by what is used, and in how many seeds both are better than it alone."""
+    table = {}
+    ends = {name: np.sqrt((np.array([one[name][:2] for one in every]) ** 2).mean(axis=1)) for name in every[0]}
+    for name in every[0]:
+        rows = np.array([figures[name] for figures in every])
+        _, low, high = rms_interval(ends[name].tolist())
+        table[name] = {
+            "end_position_error_cm_rms": float(np.sqrt((rows[:, :2] ** 2).mean())),
+            "end_position_error_cm_rms_95": [low, high],
+            "heading_error_deg_rms": float(np.sqrt((rows[:, 2] ** 2).mean())),
+            "nees": float(rows[:, 3].mean()),
+            "nees_standard_error": float(rows[:, 3].std() / np.sqrt(len(rows))),
+            "chi2_per_dof": float(rows[:, 4].mean()),
+            "seconds_backend": float(rows[:, 5].mean()),
+            "rejected": float(rows[:, 6].mean()),
+            "both_are_better_in": int((ends["stances and ranges"] < ends[name]).sum()),
+            "end_position_errors_cm": ends[name].round(3).tolist(),
+        }
+    return table
 
 
 def main() -> int:
@@ -74,6 +124,7 @@ def main() -> int:
     parser.add_argument("--landmarks", type=int, default=0, help="landmarks that are ranged on the way")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--incremental", action="store_true")
+    parser.add_argument("--rows", metavar="FILE", help="add the figures of each seed to this file as they come")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     wrong = Imperfections(
@@ -85,32 +136,24 @@ def main() -> int:
     )
     work = partial(
         one_seed, wrong=wrong, stances=args.stances, points=args.points, landmarks=args.landmarks,
-        incremental=args.incremental,
+        incremental=args.incremental, rows=args.rows,
     )  # fmt: skip
-    every = over_seeds(work, range(args.first, args.first + args.seeds), args.processes)
-    table = {}
-    for name in every[0]:
-        rows = np.array([figures[name] for figures in every])
-        table[name] = {
-            "end_position_error_cm_rms": float(np.sqrt((rows[:, :2] ** 2).mean())),
-            "heading_error_deg_rms": float(np.sqrt((rows[:, 2] ** 2).mean())),
-            "nees": float(rows[:, 3].mean()),
-            "nees_standard_error": float(rows[:, 3].std() / np.sqrt(len(rows))),
-            "chi2_per_dof": float(rows[:, 4].mean()),
-            "seconds_backend": float(rows[:, 5].mean()),
-            "rejected": float(rows[:, 6].mean()),
-            "end_position_errors_cm": np.sqrt((rows[:, :2] ** 2).mean(axis=1)).round(3).tolist(),
-        }
+    table = summarised(over_seeds(work, range(args.first, args.first + args.seeds), args.processes))
     if args.json:
         print(json.dumps(table, indent=2))
         return 0
     print(f"hallway, {args.stances} stances, {args.points} points a stance, {args.seeds} seeds, {wrong}")
-    print(f"{'':20}{'end RMS':>10}{'heading':>11}{'NEES':>14}{'chi2/dof':>10}{'backend':>10}{'rejected':>10}")
+    print(
+        f"{'':20}{'end RMS':>10}{'95 %':>14}{'heading':>11}{'NEES':>14}{'chi2/dof':>10}{'backend':>10}{'rejected':>10}"
+        f"{'both better':>13}"
+    )
     for name, row in table.items():
+        low, high = row["end_position_error_cm_rms_95"]
         print(
-            f"{name:20}{row['end_position_error_cm_rms']:8.2f}cm{row['heading_error_deg_rms']:8.2f}deg"
-            f"{row['nees']:7.2f} +-{row['nees_standard_error']:4.2f}{row['chi2_per_dof']:10.2f}"
-            f"{row['seconds_backend']:9.2f}s{row['rejected']:10.1f}"
+            f"{name:20}{row['end_position_error_cm_rms']:8.2f}cm{low:7.2f} -{high:5.2f}"
+            f"{row['heading_error_deg_rms']:8.2f}deg{row['nees']:7.2f} +-{row['nees_standard_error']:4.2f}"
+            f"{row['chi2_per_dof']:10.2f}{row['seconds_backend']:9.2f}s{row['rejected']:10.1f}"
+            f"{row['both_are_better_in']:10d}/{args.seeds}"
         )
     return 0
 
