@@ -2,9 +2,9 @@
 
     python benchmarks/endless.py [--stances 100000] [--json FILE]
 
-The hallway of the paper is simulated once (`--block` stances) and its measurements come again and again: where one round
-ends and the next begins both observers move, one of them known by odometry, so that no measurement contradicts another. One
-homography in 200 is replaced by a wrong one. Times are of the thread's processor.
+The paper's hallway is simulated once (`--block` stances) and its measurements come again and again. Where one round
+ends and the next begins both observers move, one of them known by odometry, so that no measurement contradicts another.
+One homography in 200 is replaced by a wrong one. Times are of the thread's processor.
 """
 
 import argparse
@@ -61,9 +61,7 @@ def endless(graph: PoseGraph) -> Iterator[tuple[Stance, list[Measurement], int]]
     passed, seconds = 0, 0.0
     while True:
         for stance in graph.stances:
-            here = replace(
-                stance, index=stance.index + passed, start=stance.start + seconds, end=stance.end + seconds
-            )
+            here = replace(stance, index=stance.index + passed, start=stance.start + seconds, end=stance.end + seconds)
             taken = [later(one, passed, seconds) for one in by_stance[stance.index]]
             if stance is first:
                 here = replace(here, anchors=())

@@ -66,7 +66,10 @@ def agreement(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, jo
     distributed, and is the decrease of the sum of squares when they are left out.
     """
     A, b = _whitened(factors, values)
-    return _tested(A[None], b[None], joint[None])[0]
+    known, directions = np.linalg.eigh(A @ joint @ A.T)
+    kept = known < 1.0 - MIN_REDUNDANCY
+    along = (b @ directions)[kept]
+    return Agreement(float(along @ (along / (1.0 - known[kept]))), int(np.count_nonzero(kept)))
 
 
 def agreements(
@@ -106,16 +109,15 @@ def keys_of(factors: Iterable[gtsam.NonlinearFactor]) -> list[int]:
 
 def _whitened(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values) -> tuple[Array, Array]:
     """Whitened Jacobian (m, n) by all of their keys, and residual (m,), of the rows that are not zero."""
-    linear = gtsam.GaussianFactorGraph()
+    graph, ordering = gtsam.NonlinearFactorGraph(), gtsam.Ordering()
     for factor in factors:
-        linear.push_back(factor.linearize(values))
-    ordering = gtsam.Ordering()
+        graph.add(factor)
     for key in keys_of(factors):
         ordering.push_back(key)
-    return _weighing(*linear.jacobian(ordering))
+    return _weighing(*graph.linearize(values).jacobian(ordering))
 
 
 def _weighing(A: Array, b: Array) -> tuple[Array, Array]:
     """Return the rows of a Jacobian and a residual that are not zero."""
-    weighing = np.abs(A).max(axis=1) > 0
+    weighing = A.any(axis=1)
     return A[weighing], b[weighing]

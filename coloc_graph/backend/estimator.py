@@ -1,6 +1,6 @@
 """Incremental estimation stance by stance: ISAM2 with QR, and a log from which it can be rebuilt."""
 
-from collections.abc import Iterable, Iterator, Mapping, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
@@ -385,10 +385,7 @@ class Estimator(EstimatorState):
         self._rejected |= {id(one.measurement): one for one in rejected}
         self._newly = (set() if stance is not None else self._newly) | {id(one.measurement) for one in rejected}
         self._disconnected = plan.disconnected
-        said = self._at(next(reversed(self._stances.values())), rejected, agreement)
-        seen = self.landmarks.keys() & {one.seen for one in taken if isinstance(one, Sighting)}
-        landmarks = self.static_poses(seen) if seen else {}
-        said = replace(said, residuals=tuple(map(self.residual, taken)), landmarks=landmarks)
+        said = self._at(next(reversed(self._stances.values())), rejected, agreement, taken)
         self._forget()
         return said
 
@@ -419,9 +416,9 @@ class Estimator(EstimatorState):
     def _marginalise(self) -> None:
         """Marginalise the poses of old stances where mounts are calibrated, or the past is forgotten."""
         most = ceil(MAX_STANCES_PER_LAG * self.lag)
-        recent = list(islice(reversed(self._stances), most))
-        if not (self.robot_models or self.forgets) or len(recent) < most:
+        if not (self.robot_models or self.forgets) or len(self._stances) < most:
             return
+        recent = list(islice(reversed(self._stances), most))
         key, live = self._pose_keys.key, self._live
         find = self._pose_keys.find
         keep = {key((robot, index)) for robot in self.robots for index in recent[: self.lag]}
@@ -440,9 +437,20 @@ class Estimator(EstimatorState):
         nodes = (node for node in measurement.ends if node in self._pose_keys)
         return any(self._pose_keys.key(node) in self._live.marginalised for node in nodes)
 
-    def _at(self, stance: Stance, rejected: tuple[Rejection, ...], agreement: Agreement) -> StanceEstimate:
-        keys = {robot: self._pose_keys.key((robot, stance.index)) for robot in self.robots}
-        tied = {robot: key for robot, key in keys.items() if key in self._live.tied}
+    def _at(
+        self,
+        stance: Stance,
+        rejected: tuple[Rejection, ...],
+        agreement: Agreement,
+        taken: Sequence[Measurement] = (),
+    ) -> StanceEstimate:
+        """Return the poses of a stance, and what was `taken` in, as it fits them."""
+        tied = {}
+        for robot in self.robots:
+            key = self._pose_keys.key((robot, stance.index))
+            if key in self._live.tied:
+                tied[robot] = key
+        seen = self.landmarks.keys() & {one.seen for one in taken if isinstance(one, Sighting)}
         return StanceEstimate(
             stance.index,
             {robot: self._live.pose(key) for robot, key in tied.items()},
@@ -450,4 +458,6 @@ class Estimator(EstimatorState):
             tuple(robot for robot in stance.observers if robot not in tied),
             rejected,
             agreement,
+            self._residuals(taken),
+            self.static_poses(seen) if seen else {},
         )

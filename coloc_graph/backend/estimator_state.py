@@ -7,13 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.calibration import Variables
+from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.backend.checkpoint import Base, Entry, WaitingStance
 from coloc_graph.backend.estimate import Rejection
-from coloc_graph.backend.factors import Factors, Method
+from coloc_graph.backend.factors import Factors, Method, poses_in
 from coloc_graph.backend.forgetting import Past, require_all
 from coloc_graph.backend.graph import Link, PoseGraph, PoseKeys, instants_of, require_ends
-from coloc_graph.backend.isam2_graph import Isam2Graph, rebuilt
+from coloc_graph.backend.isam2_graph import Isam2Graph
 from coloc_graph.backend.landmarks import OnMap, StaticPose
+from coloc_graph.backend.optimize import fit_graph
+from coloc_graph.backend.solver import with_stack
 from coloc_graph.errors import EstimationError, MeasurementError
 from coloc_graph.measurements import Measurement, Node
 from coloc_graph.run import Stance
@@ -59,7 +62,7 @@ class EstimatorState:
         self._live = Isam2Graph(self._new_factors())
         if base.stances:
             kept = self.graph.without(one.measurement for one in self.rejected)
-            self._live, links = rebuilt(kept, self.method)
+            self._live, links = _rebuilt(kept, self.method)
             inside = set(map(id, links))
             self._disconnected = [one for one in kept.links if id(one) not in inside and len(set(self._keys(one))) == 2]
 
@@ -152,8 +155,14 @@ class EstimatorState:
 
     def residual(self, measurement: Measurement) -> float:
         """Return the RMS residual of a measurement in units of its noise; NaN where an end of it has no pose."""
-        i, j = self._keys(measurement)
-        return self._live.residual((measurement, i, j)) if i != j and {i, j} <= self._live.tied else float("nan")
+        return self._residuals([measurement])[0]
+
+    def _residuals(self, measurements: Sequence[Measurement]) -> tuple[float, ...]:
+        """Return the residual of each measurement, see `residual`."""
+        ties = {n: (one, *self._keys(one)) for n, one in enumerate(measurements)}
+        ties = {n: tie for n, tie in ties.items() if tie[1] != tie[2] and {*tie[1:]} <= self._live.tied}
+        found = dict(zip(ties, self._live.residuals(ties.values()), strict=True))
+        return tuple(found.get(n, float("nan")) for n in range(len(measurements)))
 
     def _checked(self, taken: Sequence[Measurement]) -> dict[Node, float]:
         """Check the ends of measurements and return the times at which moving robots were sighted."""
@@ -183,3 +192,15 @@ class EstimatorState:
             if (key := self._pose_keys.find((robot, index))) is not None and key in self._live.tied:
                 return key
         raise EstimationError(f"robot {robot} has no pose{'' if stance is None else f' at stance {stance}'}")
+
+
+def _rebuilt(graph: PoseGraph, method: Method) -> tuple[Isam2Graph, tuple[Link, ...]]:
+    """Return the ISAM2 graph of all that is tied to the reference, at its optimum, and the tied links."""
+    if not spanning_tree(graph, graph.links):
+        graph = graph.without(graph.measurements)  # nothing but the reference is tied yet
+    fit = with_stack(len(graph.nodes), lambda: fit_graph(method, graph))
+    live = Isam2Graph(fit.factors_of)
+    with fit.batched:
+        live.begin_with(fit.factors, fit.values)
+    live.tied = set(poses_in(fit.values))
+    return live, fit.links

@@ -165,6 +165,8 @@ class Factors:
 
     def expected(self, link: PoseLink, i: int, j: int, errors: Callable[[int], Array]) -> gtsam.Pose3:
         """Return the pose of a link's second end in its first; see `all_expected`."""
+        if self.variables is None:
+            return pose_of(link)
         return self.all_expected([(link, i, j)], errors)[0]
 
     def all_expected(

@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 INNOVATION_GATE = 0.05  # m, rad
 INNOVATION_GATE_SIGMAS = 6.0  # standard deviations of the odometry that predicts it
 
+# tested; odometry is seldom wrong by much, so that its prediction can reject a wrong homography
+_IMAGES = (RelativePose, Sighting)
+
 #: A link and the keys of its ends.
 Tie = tuple[Link, int, int]
 
@@ -78,8 +81,7 @@ class InsertionPlanner:
         near: list[Tie] = []
         far: list[Tie] = []
         rough: dict[int, float] = {}  # keys with initial values by odometry alone, with its sigma
-        # odometry first: it is seldom wrong by much, so that its prediction can reject a wrong homography
-        left = sorted(links, key=lambda link: isinstance(link, RelativePose | Sighting | Range))
+        left = sorted(links, key=lambda link: isinstance(link, (*_IMAGES, Range)))
         while left:
             still: list[Link] = []
             for link in left:
@@ -98,7 +100,7 @@ class InsertionPlanner:
                     continue
                 is_new = i not in self._tied or j not in self._tied
                 T_i_j = self._factors.expected(link, i, j, self._errors) if is_new else pose_of(link)
-                tested = isinstance(link, RelativePose | Sighting)
+                tested = isinstance(link, _IMAGES)
                 if i == j:
                     continue
                 if not has_i and not has_j:

@@ -1,6 +1,7 @@
 """The graph inside an estimator: ISAM2 with QR, insertion of links and removal of outliers."""
 
 from collections.abc import Collection, Iterable, Sequence
+from math import isfinite, sqrt
 from typing import NamedTuple
 
 import gtsam
@@ -9,15 +10,13 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from coloc_graph.backend.batched_factors import BatchedFactor, BatchedFactors
-from coloc_graph.backend.calibration import ANCHOR_TILT_SIGMA, PLANE, TILTS, is_calibration
-from coloc_graph.backend.chain import spanning_tree
+from coloc_graph.backend.calibration import ANCHOR_TILT_SIGMA, PLANE, TILTS, is_calibration, size_of
 from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, agreement, innovation, keys_of
-from coloc_graph.backend.factors import Factors, Method, calibrations_in, poses_in
+from coloc_graph.backend.factors import Factors, calibrations_in
 from coloc_graph.backend.fixed_lag import marginal_factor
-from coloc_graph.backend.graph import Link, PoseGraph
+from coloc_graph.backend.graph import Link
 from coloc_graph.backend.insertion import InsertionPlan, Tie
-from coloc_graph.backend.optimize import fit_graph
-from coloc_graph.backend.solver import RELINEARIZE_CALIBRATION, isam_parameters, joint_covariance, optimise, with_stack
+from coloc_graph.backend.solver import RELINEARIZE_CALIBRATION, isam_parameters, joint_covariance, optimise
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Sighting
 
@@ -46,7 +45,7 @@ class Outcome(NamedTuple):
 class Isam2Graph:
     """Poses that are `tied` to the reference, and calibration variables, kept optimised while links are inserted.
 
-    Not transactional: after an exception drop it and use `rebuilt`.
+    Not transactional: after an exception drop it and make it anew.
     """
 
     def __init__(self, factors_of: Factors) -> None:
@@ -55,6 +54,8 @@ class Isam2Graph:
         #: Poses that were marginalised: T_world_body and covariance (6, 6) at that time.
         self.marginalised: dict[int, tuple[gtsam.Pose3, Array]] = {}
         self._poses: dict[int, gtsam.Pose3] = {}  # estimates that were asked for since the last step
+        self._estimates = gtsam.Values()  # likewise, of variables that factors are on
+        self._covariances: dict[int, Array] = {}  # likewise, of poses
         self._calibrated: dict[int, Array] = {}  # calibration variables at the last linearisation of everything
         self._former: dict[int, Array] = {}  # planes of marginalised stances, at their estimates
         self._batched: dict[int, BatchedFactor] = {}  # factors of numpy models, by index
@@ -70,7 +71,7 @@ class Isam2Graph:
     ) -> "Isam2Graph":
         """Return the graph that began with some factors and values, as after `marginalise`."""
         graph = cls(factors_of)
-        graph._begin_with(factors, values)
+        graph.begin_with(factors, values)
         graph.tied = set(tied)
         return graph
 
@@ -92,7 +93,11 @@ class Isam2Graph:
 
     def covariance(self, key: int) -> Array:
         """Return the covariance (6, 6) of a tied key."""
-        return np.asarray(self.marginalised[key][1] if key in self.marginalised else self.isam.marginalCovariance(key))
+        if key in self.marginalised:
+            return self.marginalised[key][1]
+        if key not in self._covariances:
+            self._covariances[key] = np.asarray(self.isam.marginalCovariance(key))
+        return self._covariances[key].copy()
 
     def errors(self, key: int) -> Array:
         """Return the estimate of a calibration variable: as stated while no factor is on it."""
@@ -100,14 +105,19 @@ class Isam2Graph:
             return np.asarray(self.isam.calculateEstimateVector(key))
         return self._former.get(key, self.factors_of.nominal(key))
 
-    def residual(self, tie: Tie) -> float:
-        """Return the RMS residual of a link between tied keys in units of its noise."""
-        link, factor = self._made.get(id(tie[0]), (None, None))
-        if factor is None or link is not tie[0]:
-            factor = self.factors_of.of_link(*tie)
+    def residuals(self, ties: Iterable[Tie]) -> list[float]:
+        """Return the RMS residual of each of some links between tied keys, in units of its noise."""
+        links, factors = [tie[0] for tie in ties], [self._factor(tie) for tie in ties]
         with self._latest:
-            error = factor.error(self._known_of([factor]))
-        return float(np.sqrt(2 * error / self.factors_of.rows(tie[0], factor)))
+            known = self._known_of(factors)
+            errors = [factor.error(known) for factor in factors]
+        rows = map(self.factors_of.rows, links, factors)
+        return [sqrt(2 * error / count) for error, count in zip(errors, rows, strict=True)]
+
+    def _factor(self, tie: Tie) -> gtsam.NonlinearFactor:
+        """Return the factor of a link: that of the last insertion, or a new one."""
+        link, factor = self._made.get(id(tie[0]), (None, None))
+        return self.factors_of.of_link(*tie) if factor is None or link is not tie[0] else factor
 
     def values(self) -> gtsam.Values:
         """Return the estimates of all variables."""
@@ -159,19 +169,25 @@ class Isam2Graph:
             for index, factor, tie in zip(indices[first:], made[len(plan.ties) :], plan.near, strict=True)
         }
         rejected = self._enter_far([(InsertedLink(tie[0], far[id(tie)]), gates[id(tie)]) for tie in plan.far], inside)
-        if plan.far or not clear:
+        together = self._together(indices[:first], inside, plan)
+        # no single link is further off than all of them together
+        if (plan.far or not clear) and not (together.dof and together.chi2 < MAX_CLEAR_CHI2):
             rejected += self._take_out(inside)
-        factors_inside = self.isam.getFactorsUnsafe()
-        inserted = [factors_inside.at(index) for index in (*indices[:first], *inside)]
-        # what only determines new poses cannot be contradicted
-        checked = sum(factor.dim() for factor in inserted) > 6 * len(plan.start)
-        together = self._agreement(inserted) if checked else UNCHECKED
+            together = self._together(indices[:first], inside, plan)
         for key in plan.start:
-            if not np.isfinite(self.pose(key).translation()).all():
+            if not isfinite(self.pose(key).translation().sum()):
                 raise EstimationError("a pose came out as not finite")
         self.tied |= plan.start.keys()
         self._anchor()
         return Outcome(rejected, together)
+
+    def _together(self, first: Iterable[int], inside: Iterable[int], plan: InsertionPlan) -> Agreement:
+        """Test all factors that a plan has put in, its `first` ones and its tested links, against the graph before."""
+        factors = self.isam.getFactorsUnsafe()
+        inserted = [factors.at(index) for index in (*first, *inside)]
+        # what only determines new poses cannot be contradicted
+        checked = sum(factor.dim() for factor in inserted) > 6 * len(plan.start)
+        return self._agreement(inserted) if checked else UNCHECKED
 
     def _anchor(self) -> None:
         """Linearise further spans at the estimate of a mount, once its tilts are known well enough."""
@@ -215,21 +231,24 @@ class Isam2Graph:
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, instead_of: Sequence[int] = ()
     ) -> list[int]:
         """Insert factors, `instead_of` others, take one step, and return their indices."""
-        self._poses = {}
+        self._moved()
         indices = list(self.isam.update(factors, values, list(instead_of)).getNewFactorsIndices())
         for index in instead_of:
             self._batched.pop(index, None)
-        for n, index in enumerate(indices):
-            factor = factors.at(n)
-            if isinstance(factor, BatchedFactor):
-                self._batched[index] = factor
+        if self.factors_of.variables is not None:
+            made = map(factors.at, range(len(indices)))
+            self._batched |= {n: one for n, one in zip(indices, made, strict=True) if isinstance(one, BatchedFactor)}
         return indices
+
+    def _moved(self) -> None:
+        """Drop the estimates that were asked for, before a step."""
+        self._poses, self._estimates, self._covariances = {}, gtsam.Values(), {}
 
     def _linearise(self) -> None:
         """Linearise everything anew at its estimate, and take one step."""
         again = gtsam.ISAM2UpdateParams()
         again.force_relinearize = True
-        self._poses = {}
+        self._moved()
         with _batch(self._batched.values()):
             self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), again)
 
@@ -259,9 +278,9 @@ class Isam2Graph:
                 left.add(summary)
             for key in gone | planes:
                 values.erase(key)
-            self._begin_with(left, values)
+            self.begin_with(left, values)
 
-    def _begin_with(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    def begin_with(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         """Hold these factors and variables, and nothing else."""
         self.isam, self._batched, self.begun = self._new_isam(), {}, (factors, values)
         self._update(factors, values)
@@ -272,7 +291,8 @@ class Isam2Graph:
 
     def _with_known(self, new: gtsam.Values, factors: gtsam.NonlinearFactorGraph) -> gtsam.Values:
         """Return the initial values of new variables, and the estimates of all others that factors are on."""
-        values = gtsam.Values(new)
+        values = gtsam.Values(self._estimates)
+        values.insert(new)
         for key in map(int, factors.keyVector()):
             if not values.exists(key):
                 values.insert(key, self._known(key))
@@ -297,9 +317,8 @@ class Isam2Graph:
         passed: list[InsertedLink] = []
         factors, leading = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
         tested = [one.factor if gate is None else gate for one, gate in far]
-        known = self._known_of(tested)
         for (one, gate), factor in zip(far, tested, strict=True):
-            off = self._agreement([factor], known, inside=False)
+            off = self._agreement([factor], inside=False)
             if off.p_value() < REJECTION_P_VALUE:
                 rejected.append((one.link, off))
             else:
@@ -332,8 +351,7 @@ class Isam2Graph:
         rejected: list[tuple[Link, Agreement]] = []
         before = np.inf  # worst chi2 a step ago; it has converged where a step no longer lowers it
         while inside:
-            known = self._known_of(one.factor for one in inside.values())
-            among = {index: self._agreement([one.factor], known) for index, one in inside.items()}
+            among = {index: self._agreement([one.factor]) for index, one in inside.items()}
             worst = min(among, key=lambda index: among[index].p_value())
             if among[worst].p_value() >= REJECTION_P_VALUE:
                 break
@@ -347,37 +365,29 @@ class Isam2Graph:
             before = np.inf
         return rejected
 
-    def _agreement(
-        self, factors: list[gtsam.NonlinearFactor], known: gtsam.Values | None = None, *, inside: bool = True
-    ) -> Agreement:
+    def _agreement(self, factors: list[gtsam.NonlinearFactor], *, inside: bool = True) -> Agreement:
         if not factors:
             return UNCHECKED
-        joint = joint_covariance(self.isam, keys_of(factors))
-        return (agreement if inside else innovation)(
-            factors, self._known_of(factors) if known is None else known, joint
-        )
+        keys = keys_of(factors)
+        joint = joint_covariance(self.isam, keys)
+        begin = 0
+        for key in keys:
+            end = begin + size_of(key)
+            if not is_calibration(key):
+                self._covariances[key] = joint[begin:end, begin:end]
+            begin = end
+        return (agreement if inside else innovation)(factors, self._known_of(factors), joint)
 
     def _known_of(self, factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.Values:
-        """Return the estimates of all variables that factors are on, and those of the latest batch."""
-        values = gtsam.Values()
+        """Return the estimates of all variables that factors are on, and those of the latest batch, among others."""
+        values = self._estimates
         batch = (key for key in self._latest.keys if self.isam.valueExists(key))
-        for key in dict.fromkeys((*keys_of(factors), *batch)):
-            values.insert(key, self._known(key))
+        for key in (*keys_of(factors), *batch):
+            if not values.exists(key):
+                values.insert(key, self._known(key))
         return values
 
 
 def _batch(factors: Iterable[gtsam.NonlinearFactor]) -> BatchedFactors:
     """Return the context in which those of numpy models among factors are evaluated together."""
     return BatchedFactors([one.evaluator for one in factors if isinstance(one, BatchedFactor)])
-
-
-def rebuilt(graph: PoseGraph, method: Method) -> tuple[Isam2Graph, tuple[Link, ...]]:
-    """Return the ISAM2 graph of all that is tied to the reference, at its optimum, and the tied links."""
-    if not spanning_tree(graph, graph.links):
-        graph = graph.without(graph.measurements)  # nothing but the reference is tied yet
-    fit = with_stack(len(graph.nodes), lambda: fit_graph(method, graph))
-    live = Isam2Graph(fit.factors_of)
-    with fit.batched:
-        live._begin_with(fit.factors, fit.values)
-    live.tied = set(poses_in(fit.values))
-    return live, fit.links

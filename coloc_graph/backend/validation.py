@@ -20,6 +20,7 @@ MAX_DISTANCE = 1e6  # m: distance of two robots; m, rad: standard deviation
 MIN_SIGMA = 1e-9  # m, rad: standard deviation; a covariance of zero is not a measurement's
 ROUNDING = 1e-6  # error of a rotation, and of a covariance's symmetry relative to its largest entry
 _IDENTITY = np.eye(3)
+_EYE = np.eye(6)[None]
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -104,15 +105,17 @@ def _require_poses(measurements: Sequence[PoseMeasurement], floor: Floor | None)
 
 def _all_well(measurements: Sequence[PoseMeasurement], floor: Floor | None) -> bool:
     """Return whether all measurements pass the checks, in one vectorised pass."""
-    C = np.empty((len(measurements), 6, 6))
-    C[:] = np.eye(6)
-    for index, measured in enumerate(measurements):
-        known = slice(0, 6) if isinstance(measured, RelativePose) else slice(2, 5)
-        if np.shape(measured.covariance) != C[index, known, known].shape or (floor is None and known.start):
-            return False
-        C[index, known, known] = measured.covariance
     if any(m.T_i_j.shape != (4, 4) for m in measurements):
         return False
+    C = _EYE.repeat(len(measurements), axis=0)
+    for one, measured in zip(C, measurements, strict=True):
+        planar = not isinstance(measured, RelativePose)
+        if measured.covariance.shape != ((3, 3) if planar else (6, 6)) or (planar and floor is None):
+            return False
+        if planar:
+            one[2:5, 2:5] = measured.covariance
+        else:
+            one[:] = measured.covariance
     T = np.array([m.T_i_j for m in measurements])
     R = T[:, :3, :3]
     # NaN compares as False
@@ -122,10 +125,10 @@ def _all_well(measurements: Sequence[PoseMeasurement], floor: Floor | None) -> b
         return False
     if not np.abs(C).max() <= MAX_DISTANCE**2:
         return False
-    if (
-        np.abs(C - C.mT).max(axis=(1, 2)) > ROUNDING * np.array([np.abs(m.covariance).max() for m in measurements])
-    ).any():
-        return False
+    if not np.array_equal(C, C.mT):  # most are symmetric to the last bit
+        largest = np.array([np.abs(m.covariance).max() for m in measurements])
+        if (np.abs(C - C.mT).max(axis=(1, 2)) > ROUNDING * largest).any():
+            return False
     try:
         return bool(np.linalg.cholesky(C).diagonal(axis1=1, axis2=2).min() >= MIN_SIGMA)
     except np.linalg.LinAlgError:

@@ -112,6 +112,23 @@ def test_a_stance_gives_where_its_robots_stand(team):
         assert np.array_equal(found.covariances[robot], estimator.covariance(robot))
 
 
+def test_a_stance_gives_covariances_and_residuals_of_the_last_step():
+    made = team_of(3, 12, rotating=False)
+    estimator = Estimator("A", made.robots, made.floor)
+    for stance in made.stances:
+        taken = of_stance(made, stance.index)
+        found = estimator.add(stance, taken)
+        for robot, C in found.covariances.items():
+            alone = estimator._live.isam.marginalCovariance(estimator._pose_keys.key((robot, stance.index)))
+            sigmas = np.sqrt(alone.diagonal())
+            np.testing.assert_allclose(C / np.outer(sigmas, sigmas), alone / np.outer(sigmas, sigmas), atol=1e-8)
+        for one, residual in zip(taken, found.residuals, strict=True):
+            T_i, T_j = (estimator.pose(*node) for node in one.ends)
+            e = np.asarray(gtsam.Pose3(one.T_i_j).localCoordinates(T_i.between(T_j)))
+            e = e if len(one.covariance) == 6 else e[2:5]
+            assert residual == pytest.approx(np.sqrt(e @ np.linalg.solve(one.covariance, e) / len(e)), rel=1e-6)
+
+
 def test_a_stance_agrees_with_those_before_by_what_chi2_rises_when_it_comes(team):
     estimator = Estimator("A", team.robots, team.floor)
     for stance in team.stances:
