@@ -18,7 +18,7 @@ from coloc_graph.experiments.paper import ANGLES, BASELINES, RECORDED
 from coloc_graph.experiments.pool import Progress, check, spread
 from coloc_graph.frontend import FrontendOptions, decompose_with_normal, fit_homography, measure_pair
 from coloc_graph.frontend.homography.ml_pose import most_likely_pose
-from coloc_graph.frontend.stance import overlap
+from coloc_graph.frontend.homography.overlap import overlap
 from coloc_graph.frontend.stance_tracks import stance_plane
 from coloc_graph.run import open_run
 from coloc_graph.simulation import simulate

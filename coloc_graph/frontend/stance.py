@@ -1,8 +1,9 @@
 """Measure the homography and the relative pose between two observers in one stance, from images or detections."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -12,8 +13,10 @@ from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.eq2_pose import relative_pose
 from coloc_graph.frontend.homography.fit import HomographyFit, fit_homography, persisting
 from coloc_graph.frontend.homography.fit_checks import require_agreement, require_determined
+from coloc_graph.frontend.homography.floor_tilt import FloorTilt
 from coloc_graph.frontend.homography.marker_span import marker_spans
 from coloc_graph.frontend.homography.ml_pose import most_likely_pose
+from coloc_graph.frontend.homography.overlap import overlap
 from coloc_graph.frontend.homography.plane import distance_from_span
 from coloc_graph.frontend.homography.plane_tilts import plausible_planes
 from coloc_graph.frontend.homography.plane_view import (
@@ -350,7 +353,9 @@ def _measured(
         if seen.options.criterion != "transfer":
             raise
         doubt = str(why)  # the paper's chain composes every homography that it can fit
-    fit = persisting(fit, found.pairs, found.markers, found.times)
+    tilt = _floor_tilt(seen, fit, found)
+    fit = persisting(fit, found.pairs, found.markers, found.times, None if tilt is None else tilt.products)
+    fit = fit if tilt is None else tilt.widened(fit, found)
     require_determined(fit)
     own = information_weight(found, (seen.robot_i, seen.robot_j), seen.pairs, seen.tracks, _window(seen.run))
     fit = replace(fit, information=own * fit.information)
@@ -378,6 +383,16 @@ def _measured(
     return PairMeasurement(
         measurement, pose, found, tracks=(seen.tracks_i, seen.tracks_j), fit=fit, cameras=seen.cameras
     )
+
+
+def _floor_tilt(seen: _Seen, fit: HomographyFit, found: Correspondences) -> FloorTilt | None:
+    """Effect of the floor's slope under a lone mover; None where the floor, its markers or the planes are not known."""
+    floor, carried = seen.team.floor, stance_markers(seen.run, seen.stance) is not None
+    by_mount = seen.plane.normal_from_mount and seen.plane.d_from_mount
+    if floor is None or not floor.tilt_sigma_deg or not (carried and by_mount and seen.alone):
+        return None
+    planes = (seen.plane, stance_plane(seen.run, seen.stance, seen.robot_j))
+    return FloorTilt.of(fit, found, planes, seen.cameras, math.radians(floor.tilt_sigma_deg))
 
 
 def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[MarkerSpan, ...]:
@@ -460,18 +475,3 @@ def _unusable(
         overlap_px=nan,
         unusable=why,
     )
-
-
-def overlap(H_j_i: Array, camera_i: Camera, camera_j: Camera, step: int = 4) -> float:
-    """Number of pixels of image i that show a part of the plane that image j shows too, sampled every `step` [px]."""
-    # beyond the plane's horizon the third coordinate changes sign, and `project` says behind
-    _, inside = camera_j.project(_rays(camera_i, step) @ H_j_i.T)
-    return float(inside.sum() * step**2)
-
-
-@lru_cache(maxsize=100)
-def _rays(camera: Camera, step: int) -> Array:
-    """Rays (x, y, 1) of a grid of pixels, (n, 3)."""
-    u, v = np.meshgrid(np.arange(step / 2, camera.width, step), np.arange(step / 2, camera.height, step))
-    x = camera.normalise(np.stack([u.ravel(), v.ravel()], axis=1))
-    return np.concatenate([x, np.ones((len(x), 1))], axis=1)

@@ -32,7 +32,7 @@ def shared_error(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64
     added = np.zeros((8, 8))
     if not any(root.shape[2] for root in roots):
         return added
-    sensitivity = _Sensitivity(fit, pairs)
+    sensitivity = Sensitivity(fit, pairs)
     among = groups[fit.inliers]
     for group in np.unique(among):
         for by_error in sensitivity.of(roots, among == group):
@@ -40,7 +40,7 @@ def shared_error(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64
     return added
 
 
-class _Sensitivity:
+class Sensitivity:
     """Effect of shifts of its points on a homography."""
 
     def __init__(self, fit: HomographyFit, pairs: PointPairs) -> None:
@@ -61,6 +61,18 @@ class _Sensitivity:
             made.append(self._weighted[:, np.tile(own, 2)] @ whitened)
         return made[0], made[1]
 
+    def whitened(self, shifts: tuple[Array, Array]) -> Array:
+        """Changes (m, 2) of the whitened residuals of the m inliers by shifts (m, 2) in image i and in image j."""
+        at = self._at
+        moved = shifts[1] - (at.by_z @ shifts[0][..., None])[..., 0]
+        along = at.g0 * moved[:, 0]
+        return np.stack([along, at.g1 * (moved[:, 1] - at.k * along)], axis=1)
+
+    def by_points(self, whitened: Array) -> Array:
+        """Derivatives (8, m) by numbers each of which changes the whitened residuals of one inlier by (m, 2)."""
+        first, second = np.split(self._weighted, 2, axis=1)
+        return np.asarray(first * whitened[:, 0] + second * whitened[:, 1])
+
 
 def by_lenses(fit: HomographyFit, found: Correspondences, camera_i: Camera, camera_j: Camera) -> Array | None:
     """Derivatives (2, 8, q) of a homography by the terms that its cameras' lens models leave; None of exact lenses.
@@ -72,7 +84,7 @@ def by_lenses(fit: HomographyFit, found: Correspondences, camera_i: Camera, came
     sides = (camera_i, found.uv_i, found.pairs.x_i), (camera_j, found.uv_j, found.pairs.x_j)
     in_i, in_j = (camera.per_pixel(x) @ camera.lens_terms(uv) for camera, uv, x in sides)
     every = np.ones(int(fit.inliers.sum()), bool)
-    return np.array(_Sensitivity(fit, found.pairs).of((in_i, in_j), every))
+    return np.array(Sensitivity(fit, found.pairs).of((in_i, in_j), every))
 
 
 def bias_root(uv: Array, x: Array, camera: Camera) -> Array:
