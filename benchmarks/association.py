@@ -89,7 +89,8 @@ def scene(seed: int, *, lockstep: bool) -> tuple[str, float, int]:
     began = time.perf_counter()
     try:
         candidates = Candidates(both[0], both[1], ROBOT.camera, ROBOT.camera)
-        found = associate(candidates)
+        made = associate(candidates)
+        found = made if isinstance(made, Association) else None
         n = sum(len(candidates.indices[ab]) for ab in found.chosen) if found else 0
     except DegenerateGeometry:
         found, n = None, 0

@@ -76,8 +76,13 @@ def why_broken(tracks: StanceTracks, robot_i: str, robot_j: str, end: float) -> 
         remedy = "keep the mover in both fields of view, and check exposure and threshold of the lights"
     elif any(path.step > FAST * path.apart for path in paths):
         remedy = "record more images a second, or let the mover drive and turn slower"
+    elif min(len(path.lights) for path in paths) < MIN_SAMPLES:
+        remedy = "let the mover drive further and turn, or record for longer"
     elif any(len(path) < MIN_SEEN * (path.lights >= 2).sum() for path in paths):
-        remedy = "check heights, tilt, span and units in the team: on the marker plane few lights are a span apart"
+        remedy = (
+            "keep the mover in both fields of view, and check heights, tilt, span and units in the team: on the marker "
+            "plane few lights are a span apart"
+        )
     else:
         remedy = "let the mover drive further and turn, or record for longer"
     return f"{'; '.join(saw)}: {remedy}"

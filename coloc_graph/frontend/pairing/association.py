@@ -49,6 +49,23 @@ class Association:
     rivals: tuple[tuple[tuple[Pair, ...], float], ...] = ()
 
 
+@dataclass(frozen=True)
+class Unassociated:
+    """Reason why no pairing of tracks is certain, and its remedy."""
+
+    what: str
+    remedy: str
+
+
+NO_HOMOGRAPHY = Unassociated(
+    "no homography takes one of them to another", "look for reflections and other lights, and calibrate the lenses"
+)
+IMPLAUSIBLE = Unassociated(
+    "what fits has the observers on no common floor, or lights that are not a span apart",
+    "let the moving robot turn and drive further; if it does, look for reflections, and check heights, tilts and spans",
+)
+
+
 class Tracks(Protocol):
     """Tracks of two cameras i and j by index, and the pairs of them that share samples."""
 
@@ -80,16 +97,24 @@ class _Hypothesis:
     weight: float  # log posterior, unnormalised
 
 
-def associate(tracks: Tracks) -> Association | None:
-    """Find the most probable pairing of tracks and its rivals; None if no homography explains any."""
+def associate(tracks: Tracks) -> Association | Unassociated:
+    """Find the most probable pairing of tracks and its rivals, or why no homography explains any."""
     by_size = sorted(tracks.indices, key=lambda ab: -len(tracks.indices[ab]))
     some = _Subsampled(by_size, {ab: tracks.points([ab]) for ab in by_size})
-    found = _refined(tracks, some, _starts(tracks, some))
+    if not some.large:
+        return Unassociated(
+            f"no two of them share {MIN_SHARED} images", "keep the mover in both fields of view, or record for longer"
+        )
+    why: list[Unassociated] = []
+    found = _refined(tracks, some, _starts(tracks, some), why)
     if not found:
-        return None
+        return why[0] if why else NO_HOMOGRAPHY
     best = max(found, key=lambda one: one.weight)
-    if _explained(tracks, best.chosen) < tracks.least:
-        return None
+    if (share := _explained(tracks, best.chosen)) < tracks.least:
+        return Unassociated(
+            f"the best one explains {100 * share:.0f} % of what a camera saw",
+            "look for reflections and other lights, or let the moving robot turn and drive further",
+        )
     rivals = [one for one in found if one.weight > best.weight - MAX_LOG_ODDS and not some.alike(one, best)]
     shares = np.exp([one.weight - best.weight for one in rivals])
     whole = 1 + float(shares.sum())
@@ -141,8 +166,6 @@ class _Subsampled:
 def _starts(tracks: Tracks, some: _Subsampled) -> list[tuple[Array, set[Pair]]]:
     """Homographies of single pairs and of couples of pairs, with these pairs; those that explain most come first."""
     large = some.large
-    if not large:
-        return []
     couples = np.array(_couples(tracks, large), np.int64).reshape(-1, 2)
     both_i, both_j = (x[couples].reshape(len(couples), 2 * SUBSAMPLES, 2) for x in (some.few.x_i, some.few.x_j))
     H = np.concatenate([_direct(some.few.x_i, some.few.x_j), _direct(both_i, both_j)])
@@ -196,8 +219,10 @@ def _centred(x: Array) -> tuple[Array, Array]:
     return (x - middle) * scale[:, None, None], T
 
 
-def _refined(tracks: Tracks, some: _Subsampled, starts: Sequence[tuple[Array, set[Pair]]]) -> list[_Hypothesis]:
-    """Refine starts to fits to all the tracks that they explain."""
+def _refined(
+    tracks: Tracks, some: _Subsampled, starts: Sequence[tuple[Array, set[Pair]]], why: list[Unassociated]
+) -> list[_Hypothesis]:
+    """Refine starts to fits to all the tracks that they explain; `why` gets the reasons of those that fail."""
     seen: dict[tuple[Pair, ...], tuple[Array, float] | None] = {}
     tried = 0
     for start, own in starts:
@@ -213,7 +238,9 @@ def _refined(tracks: Tracks, some: _Subsampled, starts: Sequence[tuple[Array, se
             seen[chosen] = None  # until it proves stable
             try:
                 fit = fit_homography(tracks.points(chosen))
-            except DegenerateGeometry:
+            except DegenerateGeometry as error:
+                what, _, remedy = str(error).partition(": ")
+                why.append(Unassociated(what, remedy or IMPLAUSIBLE.remedy))
                 break
             again = tuple(tracks.claimed(some.near(fit.H, FIT_GATE)))
             if again == chosen:
@@ -221,6 +248,7 @@ def _refined(tracks: Tracks, some: _Subsampled, starts: Sequence[tuple[Array, se
                 break
             chosen = again
     found = {chosen: one for chosen, one in seen.items() if one is not None and tracks.plausible(one[0], chosen)}
+    why += [IMPLAUSIBLE] * (any(seen.values()) and not found)
     against = {chosen: _unseen(tracks, H, chosen) for chosen, (H, _) in found.items()}
     sizes = {chosen: sum(len(some.pairs[ab]) for ab in chosen) for chosen in found}
     # noise larger than stated is so for all hypotheses: estimate it from the one that leaves least unpaired

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import DegenerateGeometry
 from coloc_graph.frontend.homography.refinement import PointPairs
-from coloc_graph.frontend.pairing.association import HIDDEN, HIDDEN_ALONE, MIN_POSTERIOR, MIN_SHARE_ALONE, associate
+from coloc_graph.frontend.pairing.association import (
+    HIDDEN,
+    HIDDEN_ALONE,
+    MIN_POSTERIOR,
+    MIN_SHARE_ALONE,
+    Unassociated,
+    associate,
+)
 from coloc_graph.frontend.tracks.interpolation import MAX_GAP
 from coloc_graph.frontend.tracks.track import Track
 from coloc_graph.team import Camera
@@ -205,11 +212,8 @@ def _chosen(
         return list(candidates.indices), candidates.join(list(candidates.indices))
     found = associate(candidates)
     pair = f"{tracks_i[0].robot} and {tracks_j[0].robot}"
-    if found is None:
-        raise UnpairedTracks(
-            f"no pairing of the tracks of {pair} fits one homography",
-            "let the moving robot turn and drive further, look for reflections, and calibrate the lenses",
-        )
+    if isinstance(found, Unassociated):
+        raise UnpairedTracks(f"no pairing of the tracks of {pair} fits one homography ({found.what})", found.remedy)
     if found.posterior < MIN_POSTERIOR:
         raise UnpairedTracks(
             f"the association of the tracks of {pair} is ambiguous: {len(found.rivals) + 1} pairings each fit a "
