@@ -234,6 +234,7 @@ def optimise(
     *,
     roughly_first: bool = False,
     rough_above: float = np.inf,
+    negligible: float = 0.0,
     held: Callable[[gtsam.Values], AbstractContextManager[object]] = nullcontext,
 ) -> tuple[gtsam.Values, int]:
     """Optimise by Gauss-Newton, or by Levenberg-Marquardt with QR where that fails; return values and iterations.
@@ -241,7 +242,7 @@ def optimise(
     Gauss-Newton evaluates all factors at some values within the context `held`, given these values.
     `roughly_first` begins Levenberg-Marquardt with Cholesky, which takes a thirtieth of the time where cliques are
     large, and may get stuck; QR continues from there. Where the error stays `rough_above` this, the search ends once a
-    step lowers it by less than `ROBUST_TOLERANCE` of it.
+    step lowers it by less than `ROBUST_TOLERANCE` of it; in any case once one lowers it by less than `negligible`.
 
     Raises
     ------
@@ -256,6 +257,7 @@ def optimise(
     if not np.isfinite(before):
         raise EstimationError("the graph's error is not finite at the initial values: a measurement is not finite")
     limits = lm_parameters()
+    limits.setAbsoluteErrorTol(max(limits.getAbsoluteErrorTol(), negligible))
     absolute, relative = limits.getAbsoluteErrorTol(), limits.getRelativeErrorTol()
 
     def tolerance(cost: float) -> float:
@@ -274,7 +276,7 @@ def optimise(
         if factors.error(there) < before:
             values, used = optimise(factors, there, rough_above=rough_above)
             return values, used + int(rough.iterations())
-    optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, lm_parameters())
+    optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, limits)
     values = optimiser.optimize()
     after = optimiser.error()
     if optimiser.iterations() >= MAX_ITERATIONS:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from coloc_graph.cli.place import add_force
 
 if TYPE_CHECKING:
+    from coloc_graph.exchange.range_graph import RangeGraph
     from coloc_graph.results.folder import Result
 
 FORMATS = (
@@ -153,30 +154,63 @@ def _ranging(result: "Result", form: str, out: Path) -> int:
 def _range_graph(args: argparse.Namespace, out: Path, result: "Result | None" = None) -> int:
     """Write the graph of a result, or of a file, in a format of the field's benchmarks."""
     from coloc_graph.cli.printing import counted
-    from coloc_graph.exchange.g2o import read_g2o
-    from coloc_graph.exchange.range_graph_files import WRITERS, of_pose_graph, read_range_graph
+    from coloc_graph.exchange.range_graph_files import WRITERS, read_range_graph
+    from coloc_graph.results.folder import RANGING_GRAPH
 
-    robots = ""
+    said = ""
     if result is None:
         graph = read_range_graph(args.result)
+    elif (result.path / RANGING_GRAPH).exists():
+        graph, said = _with_ranges(result)
     else:
-        times = {
-            (robot, int(stance)): float(time)
-            for robot, one in result.trajectories.items()
-            if one.stances is not None
-            for stance, time in zip(one.stances, one.times, strict=True)
-        }
-        poses = result.path / "graph.g2o"
-        graph, letters = of_pose_graph(read_g2o(poses), times)
-        robots = "; robots " + ", ".join(f"{letter} = {robot}" for robot, letter in letters.items()) + _left_out(poses)
+        graph, said = _without_ranges(result)
     out.parent.mkdir(parents=True, exist_ok=True)
     WRITERS[args.format](graph, out)
     relative = f"{len(graph.relatives)} relative poses and positions"
     print(
         f"wrote {out}: {counted(len(graph.names), 'variable')}, {counted(len(graph.priors), 'prior')}, {relative}, "
-        f"{counted(len(graph.ranges), 'range')}, {counted(len(graph.bearings), 'bearing')}{robots}"
+        f"{counted(len(graph.ranges), 'range')}, {counted(len(graph.bearings), 'bearing')}{said}"
     )
     return 0
+
+
+def _with_ranges(result: "Result") -> "tuple[RangeGraph, str]":
+    """Return the graph of a result with stances and ranges, the letters of its robots, and what it does not hold."""
+    from coloc_graph.cli.printing import counted
+    from coloc_graph.exchange.jrl import read_jrl
+    from coloc_graph.exchange.range_graph import is_landmark
+    from coloc_graph.exchange.stance_graph import group_letters
+    from coloc_graph.results.folder import MEASUREMENTS, RANGING_GRAPH
+    from coloc_graph.results.measurement_table import read_measurements
+
+    graph, team = read_jrl(result.path / RANGING_GRAPH), result.config.team
+    there = {name[0] for name in graph.initial}
+    letters = ", ".join(f"{letter} = {group}" for group, letter in group_letters(team).items() if letter in there)
+    points = ", ".join(f"{name} = {team.landmarks[int(name[1:])].name}" for name in graph.initial if is_landmark(name))
+    said = f"; robots {letters}" + (f"; landmarks {points}" if points else "")
+    rows = read_measurements(result.path / MEASUREMENTS, ["range"])
+    rejected, bearings = (sum(row["used"] == used and bool(row[cell]) for row in rows)
+                          for used, cell in (("no", "kind"), ("yes", "bearing")))  # fmt: skip
+    lost = [counted(rejected, "rejected pair")] if rejected else []
+    lost += [f"{counted(bearings, 'mean bearing')}, which ranges do not hold"] if bearings else []
+    return graph, said + (f"; left out: {' and '.join(lost)}" if lost else "")
+
+
+def _without_ranges(result: "Result") -> "tuple[RangeGraph, str]":
+    """Return the graph of a result with stances alone, the letters of its robots, and what it does not hold."""
+    from coloc_graph.exchange.g2o import read_g2o
+    from coloc_graph.exchange.range_graph_files import of_pose_graph
+
+    times = {
+        (robot, int(stance)): float(time)
+        for robot, one in result.trajectories.items()
+        if one.stances is not None
+        for stance, time in zip(one.stances, one.times, strict=True)
+    }
+    poses = result.path / "graph.g2o"
+    graph, letters = of_pose_graph(read_g2o(poses), times)
+    robots = "; robots " + ", ".join(f"{letter} = {robot}" for robot, letter in letters.items())
+    return graph, robots + _left_out(poses)
 
 
 def _truth(result: "Result", run_path: str | None, out: Path) -> int:

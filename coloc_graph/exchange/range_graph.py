@@ -7,6 +7,7 @@ landmark. Poses are `gtsam.Pose2` or `gtsam.Pose3`, positions arrays of shape (2
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -126,7 +127,7 @@ class RangeGraph:
         """All measurements, by kind."""
         return (*self.priors, *self.relatives, *self.ranges, *self.bearings)
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of all variables: those with values first, then those that are only measured."""
         found = dict.fromkeys((*self.truth, *self.initial, *self.times))

@@ -15,7 +15,8 @@ from coloc_graph.measurements import Node
 
 WRITERS: dict[str, Callable[[RangeGraph, Path], None]] = {"pyfg": pyfg.write_pyfg, "jrl": jrl.write_jrl}
 SUFFIXES = (".pyfg", ".jrl", ".g2o")
-_LETTERS = [letter for letter in string.ascii_letters if letter != LANDMARK]
+#: PyFactorGraph knows capital letters only.
+_LETTERS = [letter for letter in string.ascii_uppercase + string.ascii_lowercase if letter != LANDMARK]
 
 
 def read_range_graph(path: str | Path) -> RangeGraph:
@@ -80,7 +81,7 @@ def of_pose_graph(graph: G2oGraph, times: Mapping[Node, float]) -> tuple[RangeGr
 
 
 def letters_of(robots: Iterable[str]) -> dict[str, str]:
-    """Return a letter for each robot, its own first one where that is free."""
+    """Return a letter for each robot: its own first one as a capital where that is free, else the first that is."""
     letters: dict[str, str] = {}
     for robot in robots:
         letters[robot] = _free(robot, letters)
@@ -98,7 +99,7 @@ def _symbol(key: int) -> str:
 
 def _free(robot: str, letters: Mapping[str, str]) -> str:
     taken = set(letters.values())
-    found = next((one for one in (robot[:1], *_LETTERS) if one in _LETTERS and one not in taken), None)
+    found = next((one for one in (robot[:1].upper(), *_LETTERS) if one in _LETTERS and one not in taken), None)
     if found is None:
         raise InputError(f"the formats name robots by one letter, and there are more than {len(_LETTERS)}: export g2o")
     return found

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 GAUGE_SIGMA = 1e-6  # m, rad: of the first pose, which is the world
 OUTLIER_SIGMAS = 5.0  # residual in standard deviations above which a range is an outlier
 ROBUST_SIGMAS = 3.0  # parameter of Geman and McClure's weights, by which outliers are found
+NEGLIGIBLE = 1e-4  # half chi2 below which a step gains nothing: 0.01 standard deviations
 NEES_POSES = 200  # poses whose NEES is evaluated, evenly spread
 
 
@@ -101,7 +102,7 @@ def solve_range_graph(path: str | Path) -> RangeGraphSolution:
             factor: Any = measured.at(n)
             noise = gtsam.noiseModel.Robust.Create(weight, factor.noiseModel()) if ranges else factor.noiseModel()
             robust.add(factor.cloneWithNewNoiseModel(noise))
-        return optimise(robust, start)
+        return optimise(robust, start, rough_above=0.0, negligible=NEGLIGIBLE)
 
     values, used = with_stack(start.size(), robustly)
     kept = gtsam.NonlinearFactorGraph()
@@ -111,7 +112,7 @@ def solve_range_graph(path: str | Path) -> RangeGraphSolution:
     for n in range(measured.size()):
         if n not in outliers:
             kept.add(measured.at(n))
-    values, more = with_stack(start.size(), lambda: optimise(kept, values))
+    values, more = with_stack(start.size(), lambda: optimise(kept, values, negligible=NEGLIGIBLE))
     rows = sum(int(kept.at(n).dim()) for n in range(kept.size()))
     found = {
         name: values.atPoint2(key_of(name)) if is_landmark(name) else values.atPose2(key_of(name))

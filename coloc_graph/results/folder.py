@@ -1,9 +1,9 @@
 """The folder of a result: atomic writing, and reading.
 
 A folder holds summary.json, trajectories/<robot>.tum (and .cov.csv), measurements.csv, config.toml and report.html;
-of a run with stances also graph.g2o, graph.dot and factors.zip; of a ranging run graph.jrl, and of an incremental
-estimate online/<robot>.tum; where landmarks were measured, landmarks.csv; and team.toml, the calibrated team, where
-anything was calibrated.
+of a run with stances also graph.g2o, graph.dot and factors.zip; where there are ranges, graph.jrl; of an incremental
+estimate of a ranging run online/<robot>.tum; where landmarks were measured, landmarks.csv; and team.toml, the
+calibrated team, where anything was calibrated.
 """
 
 import json

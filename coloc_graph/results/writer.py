@@ -22,6 +22,7 @@ from coloc_graph.exchange.jrl import write_jrl
 from coloc_graph.exchange.landmarks import landmark_rows, landmarks_csv, map_row
 from coloc_graph.exchange.ranging_factors import ranging_gtsam_files
 from coloc_graph.exchange.ranging_graph import ranging_graph
+from coloc_graph.exchange.stance_graph import ranges_in, stance_graph
 from coloc_graph.exchange.tum import write_tum
 from coloc_graph.geometry.trajectory import Trajectory
 from coloc_graph.pipeline.solution import Solution
@@ -133,6 +134,8 @@ def write_result(solution: Solution, out: str | Path) -> Accuracy | None:
             write_gtsam(ranging_gtsam_files(estimate, solution.run.team), part / GTSAM_FACTORS)
         else:
             write_g2o(estimate, part / "graph.g2o")
+            if ranges_in(estimate):
+                write_jrl(stance_graph(estimate, solution.run.team), part / RANGING_GRAPH)
             write_gtsam(gtsam_files(estimate), part / GTSAM_FACTORS)
             (part / "graph.dot").write_text(to_dot(estimate.graph), encoding="utf-8")
         (part / MEASUREMENTS).write_text(measurement_table(solution), encoding="utf-8")

@@ -12,7 +12,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.exchange.jrl import read_jrl, write_jrl
 from coloc_graph.exchange.pyfg import read_pyfg, write_pyfg
 from coloc_graph.exchange.range_graph import RangeValue, factors_of, key_of, values_of
-from coloc_graph.exchange.range_graph_files import read_range_graph
+from coloc_graph.exchange.range_graph_files import letters_of, read_range_graph
 
 PLANAR = """\
 VERTEX_SE2 1248362857.7 A0 1.25 3.0 -1.5
@@ -190,6 +190,14 @@ def test_a_result_is_exported_with_the_optimum_of_graph_g2o(result, tmp_path, fo
     off = [again.atPose3(key).range(values.atPose3(key)) for key in values.keys()]  # noqa: SIM118
     assert len(off) == 17 and max(off) < 1e-3
     assert graph.times["C0"] > 1e9 and len({one.time for one in graph.relatives}) > 7
+
+
+def test_letters_are_capitals_as_long_as_there_are_some():
+    """PyFactorGraph knows no other names of robots, and L are landmarks."""
+    robots = ("R1", "R2", "r3", "Lena", "alpha")
+    letters = letters_of(robots)
+    assert letters["R1"] == "R" and set(letters.values()) <= set("ABCDEFGHIJKMNOPQRSTUVWXYZ")
+    assert len(set(letters.values())) == len(robots)
 
 
 def test_graphs_of_files_are_converted(tmp_path, capsys):

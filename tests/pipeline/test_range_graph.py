@@ -70,6 +70,17 @@ def test_truth_is_not_read(rng, tmp_path):
     assert all(right.values[name].equals(wrong.values[name], 1e-9) for name in right.values if name != "L1")
 
 
+def test_relative_poses_between_robots_tie_them(rng, tmp_path):
+    graph = graph_of(rng, straight=True, landmark=False)  # by ranges alone it could be mirrored
+    i, j = graph.truth["A20"], graph.truth["B30"]
+    seen = RelativeValue(20.0, "B30", "A20", j.between(i).retract(np.array([0.01, -0.01, 0.005])), STEP)
+    both = RangeGraph(True, graph.times, graph.truth, {}, (), (seen, *graph.relatives), graph.ranges)
+    write_pyfg(both, tmp_path / "tied.pyfg")
+    found = solve_range_graph(tmp_path / "tied.pyfg")
+    assert found.errors.position < 0.15 and not found.rejected
+    assert 0.6 < found.chi2 / found.dof < 1.4
+
+
 def test_mirrored_and_floating_teams_are_diagnosed(rng, tmp_path):
     for name, graph, why in (
         (

@@ -16,6 +16,9 @@ from coloc_graph.errors import EstimationError, MeasurementError
 from coloc_graph.exchange.dot import to_dot
 from coloc_graph.exchange.g2o import read_g2o
 from coloc_graph.exchange.g2o_writer import write_g2o
+from coloc_graph.exchange.range_graph import factors_of, key_of, values_of
+from coloc_graph.exchange.range_graph_files import read_range_graph
+from coloc_graph.exchange.stance_graph import ranges_in, stance_graph
 from coloc_graph.frontend import WheelTrack
 from coloc_graph.frontend.ranged_landmarks import locate
 from coloc_graph.frontend.stance_ranges import OUTLIER_SIGMAS, Standing, ranges_of_stances
@@ -25,6 +28,7 @@ from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.pipeline.contents import unused_in, unused_ranges
 from coloc_graph.pipeline.explanations import warnings_of_graph
 from coloc_graph.pipeline.inspection import inspect
+from coloc_graph.pipeline.range_graph import solve_range_graph
 from coloc_graph.pipeline.ranges import unusable_ranges
 from coloc_graph.results.measurement_table import measurement_table
 from coloc_graph.results.writer import write_result
@@ -134,7 +138,7 @@ def test_incremental_estimate_of_stances_and_ranges_is_that_of_the_batch(mixed, 
         np.testing.assert_allclose(live.estimate.trajectories[robot].positions, one.positions, atol=3e-3)
 
 
-def test_bearings_while_both_stand_count_and_calibrate_their_sensor(mixed, copied, rng, tmp_path):
+def test_bearings_while_both_stand_count_and_calibrate_their_sensor(mixed, copied, rng, tmp_path, capsys):
     run, truth, true = open_run(mixed), read_truth(mixed), read_true_team(mixed)
     offset, sigma = np.deg2rad([3.0, 2.0])
 
@@ -171,9 +175,12 @@ def test_bearings_while_both_stand_count_and_calibrate_their_sensor(mixed, copie
         assert sensor.bearing_offset_sigma_deg < 1.0
         assert abs(sensor.bearing_offset_deg - 3.0) < 4 * sensor.bearing_offset_sigma_deg
     assert 0.6 < found.estimate.chi2 / found.estimate.dof < 1.4
+    write_result(found, tmp_path / "result")
+    assert main(["export", "jrl", str(tmp_path / "result"), "--out", str(tmp_path / "graph.jrl")]) == 0
+    assert f"left out: {len(used)} mean bearings, which" in capsys.readouterr().out
 
 
-def test_a_blocked_pair_is_an_outlier_with_a_reason(mixed, copied, tmp_path):
+def test_a_blocked_pair_is_an_outlier_with_a_reason(mixed, copied, tmp_path, capsys):
     run = open_run(mixed)
     stance = run.stances[2]
     blocked = [
@@ -189,6 +196,9 @@ def test_a_blocked_pair_is_an_outlier_with_a_reason(mixed, copied, tmp_path):
     rows = list(csv.DictReader(measurement_table(found).splitlines()))
     (row,) = (one for one in rows if one["kind"] == "range" and one["used"] == "no")
     assert "line of sight" in row["reason"] and float(row["range"]) > 1.0 and int(row["points"]) > 50
+    write_result(found, tmp_path / "result")
+    assert main(["export", "pyfg", str(tmp_path / "result"), "--out", str(tmp_path / "graph.pyfg")]) == 0
+    assert "left out: 1 rejected pair\n" in capsys.readouterr().out
     live = solve(open_run(tmp_path / "blocked.mcap"), SolveOptions(incremental=True)).estimate
     assert [str(one.measurement)[:15] for one in live.rejected] == ["range of B by A"]
 
@@ -255,8 +265,10 @@ def test_every_part_of_a_result_with_ranges_is_written(landmarks_solved, tmp_pat
     for kind in ("g2o", "gtsam", "dot", "pyfg", "jrl"):
         capsys.readouterr()
         assert main(["export", kind, str(out), "--out", str(tmp_path / f"graph.{kind}")]) == 0
-        assert ("ranges, which a pose graph cannot express" in capsys.readouterr().out) == (
-            kind in ("g2o", "pyfg", "jrl")
+        said = capsys.readouterr().out
+        assert ("ranges, which a pose graph cannot express" in said) == (kind == "g2o")
+        assert ("robots A = A, B = B, C = C; landmarks L0 = U1, L1 = U2, L2 = U3, L3 = U4\n" in said) == (
+            kind in ("pyfg", "jrl")
         )
     rows = list(csv.DictReader((out / "landmarks.csv").read_text().splitlines()))
     assert all(int(row["measurements"]) > 5 and row["yaw_deg"] in ("", "nan") for row in rows)
@@ -268,6 +280,53 @@ def test_every_part_of_a_result_with_ranges_is_written(landmarks_solved, tmp_pat
     assert "range sensor errors" in (tmp_path / "graph.gtsam" / "keys.csv").read_text()
     assert main(["view", str(out), "--export", str(tmp_path / "page.html")]) == 0
     capsys.readouterr()
+
+
+def test_exported_ranges_have_the_estimate_as_optimum(landmarks_solved, tmp_path, rng):
+    estimate, team = landmarks_solved.estimate, landmarks_solved.run.team
+    write_result(landmarks_solved, tmp_path / "result")
+    for kind in ("pyfg", "jrl"):
+        path = tmp_path / f"graph.{kind}"
+        assert main(["export", kind, str(tmp_path / "result"), "--out", str(path)]) == 0
+        graph = read_range_graph(path)
+        assert len(graph.ranges) == sum(len(one.range) for one in ranges_in(estimate)) > 100
+        exact = values_of(graph.truth or graph.initial)
+        for robot, trajectory in estimate.trajectories.items():
+            here = graph.times[f"{robot}0"], exact.atPose2(key_of(f"{robot}0")).translation()
+            assert here[0] == pytest.approx(trajectory.times[0], abs=1e-6)
+            assert here[1] == pytest.approx(trajectory.positions[0, :2], abs=1e-9)
+        factors, reference = factors_of(graph), key_of("A0")
+        fixed = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+        factors.add(gtsam.PriorFactorPose2(reference, exact.atPose2(reference), fixed))
+        off = gtsam.VectorValues()
+        for key in exact.keys():  # noqa: SIM118
+            of_point = chr(gtsam.symbolChr(key)) == "L"
+            off.insert(key, 0.03 * (key != reference) * rng.standard_normal(2 if of_point else 3))
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setRelativeErrorTol(1e-14)
+        parameters.setLinearSolverType("MULTIFRONTAL_QR")
+        found = gtsam.LevenbergMarquardtOptimizer(factors, exact.retract(off), parameters).optimize()
+        distances = exact.localCoordinates(found)
+        assert max(np.abs(distances.at(key)).max() for key in exact.keys()) < 1e-6  # noqa: SIM118
+    # by their own measurements alone, from no initial values
+    errors = solve_range_graph(tmp_path / "graph.pyfg").errors
+    assert max(errors.position, errors.landmarks) < 1e-3
+    # ranges are as they were read, but for offsets: what the estimate does not explain is still in them
+    graph, sigma = stance_graph(estimate, team), team["A"].ranging.range_sigma
+    values = graph.initial
+    residuals = [
+        one.distance - np.linalg.norm(values[one.first].translation() - _position(values[one.second]))
+        for one in graph.ranges
+    ]
+    assert sigma / 10 < np.std(residuals) < sigma
+    calibrated = estimate.calibration.sensors
+    (one, *_) = (one for one in ranges_in(estimate) if one.target == "B" and not one.moved.any())
+    offsets = sum(calibrated[name].ranging.offset for name in (one.robot, one.target))
+    assert min(abs(far.distance + offsets - one.range[0]) for far in graph.ranges if far.time == one.time) < 0.01
+
+
+def _position(value):
+    return value.translation() if hasattr(value, "translation") else value
 
 
 def test_checkpoints_keep_ranges(solution, tmp_path):

@@ -558,7 +558,7 @@ def test_factors_for_gtsam_have_the_estimate_as_optimum_and_its_covariances(run,
     found, _ = script["solve"](factors, exact)
     covariances = script["covariances"](factors, found, names)
     assert np.nanmax(np.abs(batch.estimate.ranging.residuals)) > 4.0  # robust weights are active
-    for robot, letter in zip(run.team.names, "Rab", strict=True):
+    for robot, letter in zip(run.team.names, "RAB", strict=True):
         trajectory = batch.estimate.trajectories[robot]
         for n in range(0, len(trajectory), 9):
             x, y, yaw = found.atPose2(key := key_of(f"{letter}{n}")).localCoordinates(exact.atPose2(key))
@@ -571,7 +571,7 @@ def test_the_graph_of_a_ranging_run_has_the_estimate_as_optimum(run, batch):
     graph = ranging_graph(batch.estimate, run.team)
     start = values_of(graph.initial)
     found = gtsam.LevenbergMarquardtOptimizer(factors_of(graph), start).optimize()
-    for robot, letter in zip(run.team.names, "Rab", strict=True):
+    for robot, letter in zip(run.team.names, "RAB", strict=True):
         trajectory = batch.estimate.trajectories[robot]
         solved = np.array([found.atPose2(key_of(f"{letter}{n}")).translation() for n in range(len(trajectory))])
         off = np.hypot(*(solved - trajectory.positions[:, :2]).T)
