@@ -8,6 +8,8 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from coloc_graph.backend.estimate import Estimate, make_estimate
 from coloc_graph.backend.factors import GAUGE_SIGMA, link_covariance
@@ -75,7 +77,7 @@ def spanning_tree(graph: PoseGraph, links: Sequence[Link], *, odometry_last: boo
     neighbours: dict[int, list[tuple[int, int, bool]]] = defaultdict(list)
     lengths = []
     for index, link in enumerate(tying):
-        i, j = map(graph.pose_keys.key, link.ends)
+        i, j = graph.ends[id(link)]
         neighbours[i].append((j, index, True))
         neighbours[j].append((i, index, False))
         C = link_covariance(link)
@@ -96,6 +98,15 @@ def spanning_tree(graph: PoseGraph, links: Sequence[Link], *, odometry_last: boo
             if to not in reached:
                 heapq.heappush(waiting, (length + lengths[through], through, at, to, along))
     return steps
+
+
+def tied_keys(graph: PoseGraph) -> set[int]:
+    """Return the keys of the reference and of every pose that links other than ranges tie to it."""
+    ends = np.array([graph.ends[id(one)] for one in graph.links if not isinstance(one, Range)], np.int64).reshape(-1, 2)
+    keys, index = np.unique(np.append(ends, graph.reference_key), return_inverse=True)
+    i, j = index[:-1].reshape(-1, 2).T
+    _, part = connected_components(coo_array((np.ones(len(i)), (i, j)), (len(keys), len(keys))), directed=False)
+    return set(keys[part == part[index[-1]]].tolist())
 
 
 def compose(

@@ -18,7 +18,7 @@ REJECTION_P_VALUE = 1e-6  # probability by noise below which a measurement is re
 MIN_REDUNDANCY = 1e-3  # redundancy (share of variance) below which a direction of a residual is unchecked
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Agreement:
     """Test statistic of a measurement against all others: `chi2` with `dof` degrees of freedom.
 
@@ -76,6 +76,16 @@ def agreements(
     factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, joint: Callable[[Sequence[int]], Array]
 ) -> list[Agreement]:
     """Test each of some factors that are in a fit, as `agreement`; `joint` gives the joint covariance of keys."""
+    return _each(factors, values, joint, _tested)
+
+
+def _each(
+    factors: Sequence[gtsam.NonlinearFactor],
+    values: gtsam.Values,
+    joint: Callable[[Sequence[int]], Array],
+    test: Callable[[Array, Array, Array], list[Agreement]],
+) -> list[Agreement]:
+    """Test each of some factors by its whitened Jacobian, residual and joint covariance, those of one shape at once."""
     alike: dict[tuple[int, ...], list[tuple[int, Array, Array, Array]]] = defaultdict(list)
     for n, factor in enumerate(factors):
         A, b = _weighing(*factor.linearize(values).jacobian())
@@ -83,8 +93,14 @@ def agreements(
     found = dict[int, Agreement]()
     for some in alike.values():
         numbers, *stacks = zip(*some, strict=True)
-        found.update(zip(numbers, _tested(*map(np.array, stacks)), strict=True))
+        found.update(zip(numbers, test(*map(np.array, stacks)), strict=True))
     return [found[n] for n in range(len(factors))]
+
+
+def _innovative(A: Array, b: Array, joint: Array) -> list[Agreement]:
+    """Tests of n whitened residuals that are not in a fit, as `_tested`."""
+    weighed = np.linalg.solve(np.eye(b.shape[1]) + A @ joint @ A.mT, b[..., None])[..., 0]
+    return [Agreement(chi2, b.shape[1]) for chi2 in (b * weighed).sum(axis=1).tolist()]
 
 
 def _tested(A: Array, b: Array, joint: Array) -> list[Agreement]:
@@ -96,10 +112,17 @@ def _tested(A: Array, b: Array, joint: Array) -> list[Agreement]:
     return [Agreement(*one) for one in zip(squares.sum(axis=1).tolist(), kept.sum(axis=1).tolist(), strict=True)]
 
 
+def innovations(
+    factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, joint: Callable[[Sequence[int]], Array]
+) -> list[Agreement]:
+    """Test each of some factors that are not in a fit, as `innovation`; `joint` gives the joint covariance of keys."""
+    return _each(factors, values, joint, _innovative)
+
+
 def innovation(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, joint: Array) -> Agreement:
     """Test factors that are not in the fit: e^T (I + A P A^T)^-1 e."""
     A, b = _whitened(factors, values)
-    return Agreement(float(b @ np.linalg.solve(np.eye(len(b)) + A @ joint @ A.T, b)), len(b))
+    return _innovative(A[None], b[None], joint[None])[0]
 
 
 def keys_of(factors: Iterable[gtsam.NonlinearFactor]) -> list[int]:

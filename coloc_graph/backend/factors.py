@@ -80,6 +80,7 @@ class Factors:
     def __init__(self, floor: Floor | None, variables: Variables | None = None) -> None:
         self.floor, self.variables = floor, variables
         self._ready: dict[int, gtsam.NonlinearFactor] = {}
+        self._between: dict[int, tuple[Link, gtsam.NonlinearFactor]] = {}  # of links of a graph, by identity
         tilt, height = GAUGE_SIGMA, GAUGE_SIGMA
         if floor is not None:
             tilt = max(float(np.deg2rad(floor.tilt_sigma_deg)), MIN_FLOOR_SIGMA)
@@ -102,7 +103,7 @@ class Factors:
 
     def rows(self, link: Link, factor: gtsam.NonlinearFactor) -> int:
         """Return the number of residuals of a link, given its factor."""
-        if self._as_seen(link):
+        if isinstance(link, Range) or (self.variables is not None and self._as_seen(link)):
             return int(factor.dim())
         return 6 if isinstance(link, RelativePose | StayPut) else 3
 
@@ -157,6 +158,15 @@ class Factors:
             assert isinstance(link, RelativePose)
             return homography_factors([(link, i, j)], self.variables, self.floor is not None)[0]
         return self.between(link, i, j, pose_of(link))
+
+    def _again(self, link: Link, i: int, j: int) -> gtsam.NonlinearFactor:
+        """Return the factor of a link of a graph; where poses alone are estimated, as it was made before."""
+        if self.variables is not None:
+            return self.of_link(link, i, j)
+        before = self._between.get(id(link))
+        if before is None or before[0] is not link:
+            before = self._between[id(link)] = link, self.of_link(link, i, j)
+        return before[1]
 
     @staticmethod
     def between(link: PoseLink, i: int, j: int, T_i_j: gtsam.Pose3) -> gtsam.NonlinearFactor:
@@ -228,11 +238,10 @@ class Factors:
         for name in graph.ranged_points:
             if graph.pose_keys.static()[name] in wanted:
                 factors.add(self.of_point(graph.pose_keys.static()[name]))
-        key_of = graph.pose_keys.key
-        ends = [(link, key_of(link.ends[0]), key_of(link.ends[1])) for link in graph.links]
+        ends = [(link, *graph.ends[id(link)]) for link in graph.links]
         ends = [(link, i, j) for link, i, j in ends if i in wanted and j in wanted and i != j]
         self._make_ready(ends)
-        links, made = [link for link, _, _ in ends], [self.of_link(*one) for one in ends]
+        links, made = [link for link, _, _ in ends], [self._again(*one) for one in ends]
         for key in sorted({key for factor in made for key in factor.keys()[2:]}):
             factors.add(self.calibration_prior(key))
         for factor in made:

@@ -316,6 +316,12 @@ class PoseGraph:
         slipping = (stay for stay in self.stay_puts if stay.slip is not None)
         return (*self.measurements, *slipping, *positions_of(self.on_map, self.sighted))
 
+    @cached_property
+    def ends(self) -> dict[int, tuple[int, int]]:
+        """Keys of the ends of each link, by its identity."""
+        key = self.pose_keys.key
+        return {id(link): (key(link.ends[0]), key(link.ends[1])) for link in self.links}
+
     def key(self, robot: str, stance: int) -> int:
         """Return GTSAM's key of a robot's pose at a stance."""
         return self.pose_keys.key((robot, stance))
@@ -338,12 +344,14 @@ class PoseGraph:
         if not out:
             return self
         kept = tuple(m for m in self.measurements if id(m) not in out)
-        graph = copy(self)  # of what was valid before
+        # of what was valid before, with the same nodes, their times, and the same stay-put constraints
+        _ = self.nodes, self.times, self.ends
+        graph = copy(self)
         for derived in ("sighted", "ranged_points"):
             vars(graph).pop(derived, None)
         on_map = tuple(one for one in self.on_map if id(one) not in out)
         # a node stays one, and is disconnected, if all its measurements are rejected
-        vars(graph).update(measurements=kept, on_map=on_map, nodes=self.nodes, times=self.times)
+        vars(graph).update(measurements=kept, on_map=on_map)
         return graph
 
     @cached_property

@@ -80,11 +80,13 @@ class Marginals:
         self._begin: Index = np.cumsum([0, *self._sizes])  # first scalar column of each variable
         self._at = np.zeros(int(self._begin[-1]), int)  # scratch: where the columns of one clique are in it
         factors = [linear.at(n) for n in range(linear.size())]
-        at = [[self._place[int(key)] for key in factor.keys()] for factor in factors]  # noqa: SIM118  GTSAM's own
-        columns = np.split(self._columns([n for some in at for n in some]), self._ends(at))
+        at = [tuple(self._place[int(key)] for key in factor.keys()) for factor in factors]  # noqa: SIM118  GTSAM's own
+        distinct = list(dict.fromkeys(at))  # many factors are on the same variables
+        split = np.split(self._columns([n for some in distinct for n in some]), self._ends(distinct))
+        columns = dict(zip(distinct, split, strict=False))
         parallel: dict[tuple[int, ...], list[tuple[Index, Array]]] = defaultdict(list)
-        for some, of_factor, factor in zip(at, columns, factors, strict=False):
-            parallel[tuple(sorted(some))].append((of_factor, factor.jacobian()[0]))
+        for some, factor in zip(at, factors, strict=True):
+            parallel[tuple(sorted(some))].append((columns[some], factor.jacobian()[0]))
         rows: dict[int, list[tuple[Index, Array]]] = defaultdict(list)
         for variables, several in parallel.items():
             rows[variables[0]] += several if len(several) <= MAX_PARALLEL else [_summed_up(several)]
@@ -101,8 +103,9 @@ class Marginals:
         return first + np.arange(len(first))
 
     def _ends(self, groups: Sequence[Sequence[int]]) -> Index:
-        """Return the index of the column after the last of each group of variables."""
-        ends: Index = np.cumsum([sum(self._sizes[n] for n in group) for group in groups])
+        """Return the index of the column after the last of each group of variables, none of which is empty."""
+        sizes = np.array([self._sizes[n] for group in groups for n in group], int)
+        ends: Index = np.cumsum(sizes)[np.cumsum([len(group) for group in groups]) - 1]
         return ends
 
     def has(self, key: int) -> bool:

@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 
 from coloc_graph.backend.batched_factors import BatchedFactors
 from coloc_graph.backend.calibration import size_of
-from coloc_graph.backend.chain import compose, spanning_tree
+from coloc_graph.backend.chain import compose, spanning_tree, tied_keys
 from coloc_graph.backend.chi2_test import Agreement, agreements, p_values
 from coloc_graph.backend.factors import Factors, Method, calibrations_in, factors_for, poses_in
 from coloc_graph.backend.graph import Link, PoseGraph, point_of, pose_of
@@ -64,7 +64,7 @@ class Fit:
             linear = self.factors.linearize(self.values)
         for link in self.without:
             # no information, but its ends then share a clique
-            i, j = map(self.graph.pose_keys.key, link.ends)
+            i, j = self.graph.ends[id(link)]
             if i != j and self.values.exists(i) and self.values.exists(j):
                 nothing = np.zeros((1, 6))
                 unit = gtsam.noiseModel.Unit.Create(1)
@@ -97,9 +97,13 @@ class Fit:
             return self._residuals(kinds)
 
     def _residuals(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
-        of_kind = [(n, link, self.factor(n)) for n, link in enumerate(self.links) if isinstance(link, kinds)]
-        rows = self.factors_of.rows
-        return {n: Agreement(2 * factor.error(self.values), rows(link, factor)) for n, link, factor in of_kind}
+        rows, at, first = self.factors_of.rows, self.factors.at, self.factors.size() - len(self.links)
+        found = dict[int, Agreement]()
+        for n, link in enumerate(self.links):
+            if isinstance(link, kinds):
+                factor = at(first + n)
+                found[n] = Agreement(2 * factor.error(self.values), rows(link, factor))
+        return found
 
     def _agreements(self, kinds: type | tuple[type, ...]) -> dict[int, Agreement]:
         found, among = dict[int, Agreement](), [n for n, link in enumerate(self.links) if isinstance(link, kinds)]
@@ -117,8 +121,11 @@ def fit_graph(
     anchorings: int = MAX_ANCHORINGS,
     *,
     roughly: bool = False,
+    before: Fit | None = None,
 ) -> Fit:
     """Optimise a graph from `start`, or from the composition along the spanning tree.
+
+    Factors of poses alone are those of the fit `before`, of the same graph with other links.
 
     `roughly`: without convergence where chi2/dof stays above `ROUGH_CHI2_PER_DOF`.
 
@@ -128,6 +135,8 @@ def fit_graph(
     if method == "joint" and start is None:
         start = _mounts_first(graph)
     factors_of = factors_for(method, graph, start)
+    if before is not None and factors_of.variables is None and before.factors_of.variables is None:
+        factors_of = before.factors_of
     mounts = {} if start is None else calibrations_in(start)
 
     def errors(key: int) -> Array:
@@ -136,14 +145,20 @@ def fit_graph(
     expected: dict[int, gtsam.Pose3] = {}  # poses of links' second ends in their first, by identity
     known = {} if start is None else {key: start.atPose3(key) for key in poses_in(start)}
 
-    def composed(*, odometry_last: bool) -> gtsam.Values:
-        steps, values = spanning_tree(graph, graph.links, odometry_last=odometry_last), gtsam.Values()
+    def along_tree(odometry_last: bool) -> dict[int, gtsam.Pose3]:
+        steps = spanning_tree(graph, graph.links, odometry_last=odometry_last)
         if mounts:
             new = [one.link for one in steps if one.to not in known and id(one.link) not in expected]
-            key_of = graph.pose_keys.key
-            of_ends = [(link, key_of(link.ends[0]), key_of(link.ends[1])) for link in new]
+            of_ends = [(link, *graph.ends[id(link)]) for link in new]
             expected.update(zip(map(id, new), factors_of.all_expected(of_ends, errors), strict=True))
-        poses = compose(graph, steps, factors_of.start, lambda link: expected.get(id(link)) or pose_of(link), known)
+        return compose(graph, steps, factors_of.start, lambda link: expected.get(id(link)) or pose_of(link), known)
+
+    def composed(*, odometry_last: bool) -> gtsam.Values:
+        values = gtsam.Values()
+        tied = tied_keys(graph) if known else set()
+        poses = (
+            {key: known[key] for key in tied} if len(tied) > 1 and tied <= known.keys() else along_tree(odometry_last)
+        )
         for key, pose in poses.items():
             values.insert(key, pose)
         for name, ranges in graph.ranged_points.items():

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from coloc_graph.backend.blame import SEARCHED, SIGMAS_ALONE, WarmStart, moved, scale_of
-from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, innovation, p_values
+from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, UNCHECKED, Agreement, innovations, p_values
 from coloc_graph.backend.estimate import Bump, Rejection, rejection_of
 from coloc_graph.backend.factors import Method, poses_in
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
@@ -26,6 +26,7 @@ from coloc_graph.measurements import Measurement, Range, RelativePose, Sighting
 
 REJECTION_PRICE = 30.0  # chi2 that one more outlier must explain
 MAX_ROUNDS = 20  # rounds of rejecting the worst links and taking back those that then agree
+MAX_AT_POSE_WHILE_ROUGH = 2  # links at a pose that are rejected in a round of a rough fit; right ones are taken back
 MIN_PARALLEL = 3  # relative poses between the same two poses from which they are compared with each other
 GROSS_SIGMAS = 8.0  # standard deviations beyond which two of them contradict each other
 MIN_BUMP_LINKS = 3  # rejected links on one side of a stay-put constraint from which a bump is tried
@@ -135,15 +136,16 @@ def find_outliers(method: Method, graph: PoseGraph, first: Mapping[int, Link], s
 def _search(method: Method, graph: PoseGraph, suspected: Mapping[int, Link], start: gtsam.Values | None) -> Found:
     """Reject the worst links and take back those that then agree, in turns; start from those `suspected`.
 
-    One link is rejected a round, of a large graph one of those at each pose, by residuals alone while its fit is too
+    One link is rejected a round, of a large graph one at each pose; two, and by residuals alone, while its fit is too
     bad to converge (`Fit.is_rough`). What alone ties a pose is taken back too, up to `SIGMAS_ALONE`.
     """
     suspected, at_rejection, alone = dict[int, Link](suspected), dict[int, Agreement](), set[int]()
+    before: Fit | None = None
     large = roughly = len(graph.links) > ALL_TESTED
     # ends when a set repeats, or after the last round
     for left in reversed(range(MAX_ROUNDS)):
         try:
-            fit = _fitted(method, graph, suspected, start, roughly=roughly)
+            before = fit = _fitted(method, graph, suspected, start, roughly=roughly, before=before)
         except EstimationError:
             if not suspected:
                 raise
@@ -156,15 +158,15 @@ def _search(method: Method, graph: PoseGraph, suspected: Mapping[int, Link], sta
         is_wrong = p_values(tested.values(), scale) < REJECTION_P_VALUE
         wrong = [index for index, one in zip(tested, is_wrong.tolist(), strict=True) if one and index not in kept]
         wrong.sort(key=lambda index: tested[index].log_p_value())
-        refused = _apart(fit, wrong) if large else wrong[:1]
+        refused = _apart(fit, wrong, MAX_AT_POSE_WHILE_ROUGH if is_rough else 1) if large else wrong[:1]
         roughly = bool(is_rough and refused)
-        offs = {} if is_rough else {key: _innovation(fit, link) for key, link in suspected.items()}
+        offs = {} if is_rough else _innovations(fit, suspected)
         again = {key for key, off in offs.items() if off.dof and off.p_value(scale) >= REJECTION_P_VALUE}
         untied = [key for key, off in offs.items() if not off.dof and at_rejection.get(key, off).sigmas < SIGMAS_ALONE]
         if not left and untied:
             for key in untied:
                 del suspected[key], offs[key]
-            fit = _fitted(method, graph, suspected, start)
+            fit = _fitted(method, graph, suspected, start, before=fit)
         if not left or not (is_rough or again or untied or refused):
             break
         if untied:  # one at a time, the last first: it was the least off, and may contradict the others
@@ -178,15 +180,21 @@ def _search(method: Method, graph: PoseGraph, suspected: Mapping[int, Link], sta
         if large:
             start = _upright(fit)
     if fit.is_rough:
-        fit = _fitted(method, graph, suspected, fit.values)
+        fit = _fitted(method, graph, suspected, fit.values, before=fit)
     return Found(graph, {key: off if off.dof else at_rejection[key] for key, off in offs.items()}, fit)
 
 
 def _fitted(
-    method: Method, graph: PoseGraph, out: Mapping[int, Link], start: gtsam.Values | None, *, roughly: bool = False
+    method: Method,
+    graph: PoseGraph,
+    out: Mapping[int, Link],
+    start: gtsam.Values | None,
+    *,
+    roughly: bool = False,
+    before: Fit | None = None,
 ) -> Fit:
-    """Fit a graph without some links, between whose ends there are joint covariances."""
-    fit = fit_graph(method, graph.without(out.values()), start, roughly=roughly)
+    """Fit a graph without some links, between whose ends there are joint covariances; `before` without others."""
+    fit = fit_graph(method, graph.without(out.values()), start, roughly=roughly, before=before)
     return replace(fit, without=tuple(out.values()))
 
 
@@ -199,24 +207,24 @@ def _upright(fit: Fit) -> gtsam.Values:
     return values
 
 
-def _apart(fit: Fit, worst_first: list[int]) -> list[int]:
-    """Return the links of which no other one at the same pose is worse: an outlier distorts those around it."""
-    taken, chosen = set[int](), []
+def _apart(fit: Fit, worst_first: list[int], most: int) -> list[int]:
+    """Return the links that are among the worst so many at both of their poses: an outlier distorts those around it."""
+    worse, chosen = defaultdict[int, int](int), []
     for index in worst_first:
-        poses = set(map(fit.graph.pose_keys.key, fit.links[index].ends))
-        if not poses & taken:
+        poses = set(fit.graph.ends[id(fit.links[index])])
+        if all(worse[pose] < most for pose in poses):
             chosen.append(index)
-        taken |= poses
+        for pose in poses:
+            worse[pose] += 1
     return chosen
 
 
-def _innovation(fit: Fit, link: Link) -> Agreement:
-    """Agreement of a link that is not in the fit; `UNCHECKED` where an end of it has no pose there."""
-    i, j = map(fit.graph.pose_keys.key, link.ends)
-    factor = fit.factors_of.of_link(link, i, j)
-    if not all(map(fit.values.exists, factor.keys())):
-        return UNCHECKED
-    return innovation([factor], fit.values, fit.marginals.joint(list(factor.keys())))
+def _innovations(fit: Fit, out: Mapping[int, Link]) -> dict[int, Agreement]:
+    """Agreement of links that are not in the fit; `UNCHECKED` where an end of one has no pose there."""
+    made = {key: fit.factors_of.of_link(link, *fit.graph.ends[key]) for key, link in out.items()}
+    made = {key: factor for key, factor in made.items() if all(map(fit.values.exists, factor.keys()))}
+    tested = innovations(list(made.values()), fit.values, fit.marginals.joint)
+    return dict.fromkeys(out, UNCHECKED) | dict(zip(made, tested, strict=True))
 
 
 def _with_bumps(method: Method, found: Found) -> Found:

@@ -290,6 +290,22 @@ def test_joint_covariances_hold_the_single_ones_and_say_how_poses_move_together(
     assert np.array_equal(twice[:6, :6], twice[6:, :6])
 
 
+def test_a_fit_without_some_links_begun_at_another_is_that_made_anew():
+    graph = graph_of_team(team_of(4, 8))
+    fit = fit_graph("smooth", graph)
+    node = "C", graph.stances[-1].index  # C and D stay tied to each other
+    untied = [one for one in graph.measurements if len({robot in "AB" for robot, _ in one.ends}) == 2]
+    for out in ([one for one in graph.relative_poses if one.stance == 3][:1], untied):
+        without = graph.without(out)
+        again, anew = fit_graph("smooth", without, fit.values, before=fit), fit_graph("smooth", without)
+        assert again.factors_of is fit.factors_of and again.links == anew.links
+        assert set(again.values.keys()) == set(anew.values.keys())
+        assert again.values.exists(graph.key(*node)) == (out is not untied)
+        assert again.chi2 == pytest.approx(anew.chi2, rel=1e-6) and again.dof == anew.dof < fit.dof
+        for key in anew.values.keys():  # noqa: SIM118  GTSAM's own
+            assert again.values.atPose3(key).equals(anew.values.atPose3(key), 1e-6)
+
+
 def test_covariances_are_those_of_the_dense_inverse():
     fit = fit_graph("smooth", graph_of_team(team_of(4, 8)))
     linear = fit.factors.linearize(fit.values)
