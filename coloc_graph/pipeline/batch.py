@@ -49,7 +49,7 @@ from coloc_graph.pipeline.lever_arm import LeverArm, find_lever_arms, with_lever
 from coloc_graph.pipeline.moves import infer_moves, moves_unstated
 from coloc_graph.pipeline.odometry_checks import CheckedRun
 from coloc_graph.pipeline.options import METHODS, SolveOptions
-from coloc_graph.pipeline.ranges import ranges_of_run
+from coloc_graph.pipeline.ranges import ranges_of_run, with_outside
 from coloc_graph.pipeline.shared_errors import learn_shared_errors
 from coloc_graph.pipeline.solution import Solution
 from coloc_graph.run import Run, Stance
@@ -320,7 +320,7 @@ def _by_stance(run: Run, options: SolveOptions, measure: "_Counted", on_update: 
     said = [*solver.warnings, *map(str, arms.values())]
     warnings = _warnings(run, options, estimate, solver.measured, said, solver.unused)
     missing = without_poses(run, options, estimate, solver.measured, solver.unused)
-    left_out = unused_ranges(solver.ranges)
+    left_out = unused_ranges(with_outside(run, solver.ranges)) if options.method == "joint" else ()
     return _Solved(estimate, warnings, sum(frontend), solver.measured, updates, {}, missing, solver.noise, left_out)
 
 

@@ -11,7 +11,14 @@ from coloc_graph.backend import Estimate
 from coloc_graph.backend.graph import PoseKeys
 from coloc_graph.backend.landmarks import ALWAYS
 from coloc_graph.frontend import WheelTrack
-from coloc_graph.frontend.stance_ranges import NO_ODOMETRY, StanceRanges, Standing, locate_landmarks, ranges_of_stances
+from coloc_graph.frontend.stance_ranges import (
+    NO_ODOMETRY,
+    StanceRanges,
+    Standing,
+    locate_landmarks,
+    merged,
+    ranges_of_stances,
+)
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Sighting
 from coloc_graph.run import OdometrySample, Ranges, Run, Stance
@@ -76,6 +83,15 @@ def unusable_ranges(run: Run) -> StanceRanges:
             measures = sensor.bearing_sigma_deg > 0 or sensor.across_sigma > 0
             bearings += int(np.count_nonzero(seen.astype(bool) & ~(used & measures)))
     return StanceRanges((), {why: count for why, count in unused.items() if count}, bearings)
+
+
+def with_outside(run: Run, found: StanceRanges) -> StanceRanges:
+    """Return the ranges of a run's stances, counting those from before the first of these or after the last, too."""
+    start, end, team = run.stances[0].start, run.stances[-1].end, run.team
+    robots = [robot for robot in team.names if team.floor is not None and team[robot].ranging is not None]
+    out = [one for robot in robots for one in run.ranges(robot) if not start <= one.time <= end]
+    count, bearings = _count(out), sum(int(np.isfinite(_bearings(one)).sum()) for one in out)
+    return merged([found, StanceRanges((), {OUTSIDE: count} if count else {}, bearings)])
 
 
 def _bearings(one: Ranges) -> Any:

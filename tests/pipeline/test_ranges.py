@@ -29,7 +29,7 @@ from coloc_graph.pipeline.contents import unused_in, unused_ranges
 from coloc_graph.pipeline.explanations import warnings_of_graph
 from coloc_graph.pipeline.inspection import inspect
 from coloc_graph.pipeline.range_graph import solve_range_graph
-from coloc_graph.pipeline.ranges import unusable_ranges
+from coloc_graph.pipeline.ranges import OUTSIDE, unusable_ranges
 from coloc_graph.results.measurement_table import measurement_table
 from coloc_graph.results.writer import write_result
 from coloc_graph.run import OdometrySample, Ranges, open_run, read_true_team, read_truth
@@ -401,6 +401,11 @@ def test_ranges_that_no_estimate_can_use_are_named_with_their_count(mixed, copie
     driving = "C drives and has no odometry then"
     (said,) = [one.what for one in inspect(open_run(bare)) if driving in one.what]
     assert 0.8 * reasons[driving] < int(said.split()[2]) <= reasons[driving]
+    late = [dataclasses.replace(one, time=one.time + 1e4) for one in records]
+    away = open_run(copied(mixed, tmp_path / "away.mcap", more=late))
+    for incremental in (False, True):
+        (unused,) = solve(away, SolveOptions(incremental=incremental)).unused
+        assert (unused.count, unused.reason) == (sum(len(one.targets) for one in late), OUTSIDE)
     (unused,) = unused_in(run, SolveOptions("smooth"))
     assert str(unused).endswith("range records not used: `smooth` calibrates no range sensors; use `joint`")
 
