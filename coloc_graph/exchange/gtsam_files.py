@@ -2,8 +2,8 @@
 
 Of `chain` and `smooth` the factors are those that were solved. Of `joint` the homographies and sighted markers, which
 GTSAM has no factors for, are linearised at the optimum: `LinearContainerFactor` on poses, mounts, markers and clocks.
-The prior of a body's tilt is `AttitudeFactorPose3`, since GTSAM does not serialise ours: the same optimum, but a
-smaller sigma of the heading where that is 0.05 rad and more (`Factors.of_pose`).
+So is the prior of a body's tilt, which GTSAM does not serialise; its residual is in the body frame and hardly bends.
+`AttitudeFactorPose3` would make the sigmas of uncertain headings too small (`Factors.of_pose`).
 """
 
 import csv
@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import gtsam
-import numpy as np
 
 from coloc_graph.backend import Estimate
 from coloc_graph.backend.calibration import CLOCKS, MARKERS, MOUNT, PLANE, RANGING
@@ -24,7 +23,6 @@ from coloc_graph.exchange.relative_edges import used_links
 
 SCRIPT = Path(__file__).with_name("gtsam_script.txt")  # text, since it runs where coloc-graph is not
 EPOCH = (1980, 1, 1, 0, 0, 0)  # time of all members of the archive, so that its bytes are reproducible
-UP = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 CALIBRATIONS = {
     MOUNT: "mount errors: height [m], tilt, roll [rad]",
     MARKERS: "marker errors: span (relative), height [m]",
@@ -57,7 +55,7 @@ def gtsam_files(estimate: Estimate) -> dict[str, str]:
 
 
 def portable_factors(estimate: Estimate) -> gtsam.NonlinearFactorGraph:
-    """Return the factors of an estimate, those in Python linearised at its values."""
+    """Return the factors of an estimate, those that GTSAM does not serialise linearised at its values."""
     values = estimate.values
     if estimate.method == "chain":
         graph, key = estimate.graph, estimate.graph.pose_keys.key
@@ -70,15 +68,12 @@ def portable_factors(estimate: Estimate) -> gtsam.NonlinearFactorGraph:
     used = estimate.graph.without(one.measurement for one in estimate.rejected)
     factors_of = Factors(used.floor, estimate.calibration.variables)
     made, _, batched = factors_of.of_graph(used, poses_in(values))
-    level = gtsam.noiseModel.Isotropic.Sigma(2, factors_of.gauge_sigmas[0])
     factors = gtsam.NonlinearFactorGraph()
     with batched:
         for n in range(made.size()):
             factor = made.at(n)
-            if isinstance(factor, gtsam.CustomFactor):
+            if isinstance(factor, gtsam.CustomFactor | gtsam.MagPoseFactorPose3):
                 factor = gtsam.LinearContainerFactor(factor.linearize(values), values)
-            elif isinstance(factor, gtsam.MagPoseFactorPose3):
-                factor = gtsam.AttitudeFactorPose3(factor.keys()[0], UP, level)
             factors.add(factor)
     return factors
 

@@ -16,6 +16,7 @@ from coloc_graph.exchange.g2o_writer import write_g2o
 from coloc_graph.exchange.gtsam_files import gtsam_files, unpack_gtsam, write_gtsam
 from coloc_graph.exchange.relative_edges import UPRIGHT, relative_edges
 from coloc_graph.simulation import Imperfections, simulate
+from coloc_graph.team import Floor
 
 STARTS = np.array([0.01, 0.01, 0.02, 0.05, 0.05, 0.02])  # rad, m: errors of the initial poses
 
@@ -50,13 +51,18 @@ def test_a_stock_optimiser_returns_to_our_poses_of_graph_g2o(estimate, tmp_path)
     assert all(np.isfinite(marginals.marginalCovariance(key)).all() for key in keys)
 
 
-def test_a_bare_script_gets_our_poses_and_covariances(estimate, tmp_path):
-    write_gtsam(gtsam_files(estimate), tmp_path / "factors.zip")
-    unpack_gtsam(tmp_path / "factors.zip", tmp_path / "out")
-    spec = importlib.util.spec_from_file_location("solve_factors", tmp_path / "out" / "solve.py")
+def exported(estimate, folder):
+    """The script of exported factors, and what it loads: factors, values, names of the keys."""
+    write_gtsam(gtsam_files(estimate), folder / "factors.zip")
+    unpack_gtsam(folder / "factors.zip", folder / "out")
+    spec = importlib.util.spec_from_file_location("solve_factors", folder / "out" / "solve.py")
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
-    factors, values, names = script.load()
+    return script, *script.load()
+
+
+def test_a_bare_script_gets_our_poses_and_covariances(estimate, tmp_path):
+    script, factors, values, names = exported(estimate, tmp_path)
     assert set(names) == set(values.keys())
     found, iterations = script.solve(factors, script.perturbed(values, names, 0.05))
     assert iterations > 0
@@ -70,6 +76,21 @@ def test_a_bare_script_gets_our_poses_and_covariances(estimate, tmp_path):
             assert np.abs(off / np.sqrt(C.diagonal())).max() < 0.01  # asked is 0.1
             ratio = np.sqrt(covariances[key].diagonal() / C.diagonal())
             np.testing.assert_allclose(ratio, 1, atol=1e-3)  # asked is 0.02
+
+
+def test_a_bare_script_gets_sigmas_of_uncertain_headings(tmp_path):
+    """A tilt must not tell a heading, as it seems to in the world frame where headings are uncertain."""
+    estimate = smooth(graph_of_team(team_of(3, 250, floor=Floor(tilt_sigma_deg=0.3), odometry=False, sightings=False)))
+    script, factors, values, names = exported(estimate, tmp_path)
+    found, iterations = script.solve(factors, script.perturbed(values, names, 0.05))
+    assert iterations > 0
+    covariances = script.covariances(factors, found, names)
+    for robot, trajectory in estimate.trajectories.items():
+        last = int(trajectory.stances[-1])
+        C, key = estimate.covariance(robot, last), estimate.graph.key(robot, last)
+        off = estimate.pose(robot, last).localCoordinates(found.atPose3(key))
+        assert C[2, 2] > 0.05**2 and np.sqrt(off @ np.linalg.solve(C, off)) < 0.01
+        np.testing.assert_allclose(np.sqrt(covariances[key].diagonal() / C.diagonal()), 1, atol=1e-3)
 
 
 def test_edges_know_no_more_of_height_roll_and_pitch_than_the_floor():
