@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from monte_carlo import compared, over_seeds, rms_interval, simulated, solved
+from monte_carlo import compared, over_seeds, simulated, solved
+from numpy.typing import NDArray
 
 from coloc_graph.backend import Estimate, Estimator, PoseGraph, joint
 from coloc_graph.evaluation import Accuracy
@@ -28,6 +29,8 @@ from coloc_graph.pipeline.options import SolveOptions
 from coloc_graph.simulation import Imperfections
 from coloc_graph.simulation.uwb import with_ranged_landmarks
 from coloc_graph.team import Team
+
+DRAWS = 20000  # of the bootstrap
 
 
 def one_seed(
@@ -88,25 +91,40 @@ def _figures(estimate: Estimate, accuracy: Accuracy, seconds: float) -> list[flo
 
 
 def summarised(every: list[dict[str, list[float]]]) -> dict[str, dict[str, Any]]:
-    """Return RMS and means over seeds, by what is used, and in how many seeds both are better than it alone."""
-    table = {}
-    ends = {name: np.sqrt((np.array([one[name][:2] for one in every]) ** 2).mean(axis=1)) for name in every[0]}
-    for name in every[0]:
+    """Return RMS and means over seeds, by what is used, with 95 % intervals by a bootstrap of seeds.
+
+    "both" compares stances and ranges together with each of these.
+    """
+    drawn = np.random.default_rng(0).integers(0, len(every), (DRAWS, len(every)))
+    squares = {name: (np.array([one[name][:2] for one in every]) ** 2).mean(axis=1) for name in every[0]}
+    both, table = squares["stances and ranges"], {}
+    for name, square in squares.items():
         rows = np.array([figures[name] for figures in every])
-        _, low, high = rms_interval(ends[name].tolist())
         table[name] = {
-            "end_position_error_cm_rms": float(np.sqrt((rows[:, :2] ** 2).mean())),
-            "end_position_error_cm_rms_95": [low, high],
+            "end_position_error_cm_rms": float(np.sqrt(square.mean())),
+            "end_position_error_cm_rms_95": _interval(np.sqrt(square[drawn].mean(axis=1))),
+            "both_better_in": int((both < square).sum()),
+            "both_over_this": float(np.sqrt(both.mean() / square.mean())),
+            "both_over_this_95": _interval(np.sqrt(both[drawn].mean(axis=1) / square[drawn].mean(axis=1))),
             "heading_error_deg_rms": float(np.sqrt((rows[:, 2] ** 2).mean())),
             "nees": float(rows[:, 3].mean()),
-            "nees_standard_error": float(rows[:, 3].std() / np.sqrt(len(rows))),
+            "nees_95": _interval(rows[:, 3][drawn].mean(axis=1)),
             "chi2_per_dof": float(rows[:, 4].mean()),
             "seconds_backend": float(rows[:, 5].mean()),
             "rejected": float(rows[:, 6].mean()),
-            "both_are_better_in": int((ends["stances and ranges"] < ends[name]).sum()),
-            "end_position_errors_cm": ends[name].round(3).tolist(),
+            "end_position_errors_cm": np.sqrt(square).round(3).tolist(),
         }
     return table
+
+
+def _interval(drawn: NDArray[np.float64]) -> tuple[float, float]:
+    low, high = np.quantile(drawn, (0.025, 0.975)).tolist()
+    return low, high
+
+
+def _shown(row: dict[str, Any], name: str) -> str:
+    low, high = row[f"{name}_95"]
+    return f"{row[name]:.2f} ({low:.2f}-{high:.2f})"
 
 
 def main() -> int:
@@ -143,17 +161,13 @@ def main() -> int:
         print(json.dumps(table, indent=2))
         return 0
     print(f"hallway, {args.stances} stances, {args.points} points a stance, {args.seeds} seeds, {wrong}")
-    print(
-        f"{'':20}{'end RMS':>10}{'95 %':>14}{'heading':>11}{'NEES':>14}{'chi2/dof':>10}{'backend':>10}{'rejected':>10}"
-        f"{'both better':>13}"
-    )
+    print(f"{'':20}{'end RMS [cm]':>20}{'both better, both / this':>32}{'heading':>11}{'NEES':>18}")
     for name, row in table.items():
-        low, high = row["end_position_error_cm_rms_95"]
         print(
-            f"{name:20}{row['end_position_error_cm_rms']:8.2f}cm{low:7.2f} -{high:5.2f}"
-            f"{row['heading_error_deg_rms']:8.2f}deg{row['nees']:7.2f} +-{row['nees_standard_error']:4.2f}"
-            f"{row['chi2_per_dof']:10.2f}{row['seconds_backend']:9.2f}s{row['rejected']:10.1f}"
-            f"{row['both_are_better_in']:10d}/{args.seeds}"
+            f"{name:20}{_shown(row, 'end_position_error_cm_rms'):>20}"
+            f"{row['both_better_in']:>8}/{args.seeds}{_shown(row, 'both_over_this'):>20}"
+            f"{row['heading_error_deg_rms']:8.2f}deg{_shown(row, 'nees'):>18}; chi2/dof {row['chi2_per_dof']:.2f}, "
+            f"backend {row['seconds_backend']:.2f} s, rejected {row['rejected']:.1f}"
         )
     return 0
 
