@@ -115,11 +115,11 @@ class _Reader:
                     raise InputError(f"{tag} does not fit {second}; correct its key")
                 if kind == "Range":
                     variance = float(_covariance(one, 1)[0, 0])
-                    taken = RangeValue(time, first, second, _scalar(one["measurement"]), variance)
+                    taken = RangeValue(time, first, second, _distance(one["measurement"]), variance)
                 else:
                     measured = one["measurement"]
                     bearing = _bearing(measured["bearing"], planar=planar)
-                    distance = _scalar(measured["range"])
+                    distance = _distance(measured["range"])
                     taken = BearingRangeValue(
                         time, first, second, bearing, distance, _covariance(one, 2 if planar else 3)
                     )
@@ -198,6 +198,12 @@ def _finite(*numbers: Any) -> list[float]:
 
 def _scalar(measured: Any) -> float:
     (value,) = _finite(measured["value"] if isinstance(measured, dict) else measured)
+    return value
+
+
+def _distance(measured: Any) -> float:
+    if (value := _scalar(measured)) < 0:
+        raise InputError(f"the range {value!r} is below 0; correct it")
     return value
 
 

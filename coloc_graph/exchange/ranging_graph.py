@@ -118,7 +118,7 @@ def _bearings(
     sigmas = stated.sigmas(robot, m.range[used]) * problem.noise[robot]
     C = J @ ((sigmas**2 / share * (1 + off)[:, None])[:, :, None] * J.mT)
     moved = (J @ residuals[..., None])[..., 0]
-    bearing, distance = np.arctan2(points[:, 1], points[:, 0]) - moved[:, 0], distance - moved[:, 1]
+    bearing, distance = np.arctan2(points[:, 1], points[:, 0]) - moved[:, 0], np.maximum(distance - moved[:, 1], 0.0)
     for n, one in enumerate(problem.measurements[row] for row in used.tolist()):
         ends = f"{names[one.robot]}{one.keyframe}", names[one.target]
         if one.target_keyframe >= 0:

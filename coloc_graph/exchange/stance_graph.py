@@ -160,6 +160,7 @@ class _Poses:
         slope = sensor.scale * expected.by_errors[:, 0, 1] / np.hypot(xy[:, 0] - sensor.x, xy[:, 1] - sensor.y)
         distance = np.linalg.norm(other - mine, axis=1) - off / slope
         variance = np.abs(one.covariance).sum(axis=1) / slope**2
+        distance = np.maximum(distance, np.sqrt(variance))  # without its offset it may be below 0, which no format has
         for i, j, value, noise in zip(*ends, distance.tolist(), variance.tolist(), strict=True):
             yield RangeValue(one.time, i, j, value, noise)
 

@@ -141,6 +141,7 @@ def test_a_wrong_line_of_pyfg_is_one_sentence(tmp_path, line, words):
         (lambda data: data["measurements"]["A"][0]["measurements"][0].update(type="SmartFactor"), "is no measurement"),
         (lambda data: data["measurements"]["A"][0]["measurements"][1].update(covariance=[]), "0 numbers, not 1"),
         (lambda data: data["measurements"]["A"][0]["measurements"][1].update(key1=-4), "is no key of 64 bits"),
+        (lambda data: data["measurements"]["A"][0]["measurements"][1].update(measurement=-2.0), "-2.0 is below 0"),
         (lambda data: data["measurements"]["A"][0].update(stamp="late"), "could not convert string to float"),
         (lambda data: data["groundtruth"]["A"][0].update(type="Point3", z=0), "two dimensions is mixed with one"),
     ],
