@@ -40,6 +40,8 @@ Array = NDArray[np.float64]
 SUFFIX = ".jrl"
 FIRST_LANDMARK = 1_000_000_000  # least number of a landmark's key
 MIN_NS = 1e15  # stamps from here on are nanoseconds, smaller ones are taken as they are: steps, or seconds
+UNIT = "stamp_unit"  # entry of our own files whose stamps are nanoseconds and smaller than that
+NS = "ns"
 _REMEDY = "give a dataset in the JSON Robot Log format"
 _SIZES = {"Pose2": 3, "Pose3": 6, "Point2": 2, "Point3": 3}
 _MEASURED = ("Pose2", "Pose3", "2D", "3D")
@@ -64,13 +66,14 @@ def read_jrl(path: str | Path) -> RangeGraph:
     try:
         entries = dataset["measurements"]
         marked = dataset.get("outlier_factors", {})
+        least = 0.0 if dataset.get(UNIT) == NS else MIN_NS
         for robot, rows in entries.items():
             outliers = {tuple(one) for one in marked.get(robot, [])}
             for number, entry in enumerate(rows):
                 stamp = float(entry["stamp"])
                 for place, one in enumerate(entry.get("measurements", [])):
                     where = f"measurement {place} of entry {number} of robot {robot}"
-                    reader.take(stamp * 1e-9 if stamp >= MIN_NS else stamp, one, outlier=(number, place) in outliers)
+                    reader.take(stamp * 1e-9 if stamp >= least else stamp, one, outlier=(number, place) in outliers)
         values = {}
         for kind in ("groundtruth", "initialization"):
             where = kind
@@ -237,9 +240,11 @@ def write_jrl(graph: RangeGraph, path: str | Path, name: str = "") -> None:
         A name has no GTSAM key.
     """
     path = Path(path)
-    in_ns = all(time >= MIN_NS * 1e-9 for time in graph.times.values())
-    if not in_ns and any(time != round(time) or time < 0 for time in _all_times(graph)):
-        raise InputError(f"{path}: JRL holds times as UTC nanoseconds or as whole steps: give UTC seconds")
+    times = _all_times(graph)
+    if any(time < 0 for time in times):
+        raise InputError(f"{path}: JRL holds no times before 0: give UTC seconds")
+    are_utc, are_steps = all(time >= MIN_NS * 1e-9 for time in graph.times.values()), all(map(_is_whole, times))
+    in_ns = are_utc or not are_steps
     entries: dict[str, dict[int, list[dict[str, Any]]]] = defaultdict(lambda: defaultdict(list))
     marked: dict[str, list[tuple[int, int]]] = defaultdict(list)
     places = []
@@ -274,7 +279,13 @@ def write_jrl(graph: RangeGraph, path: str | Path, name: str = "") -> None:
             dataset[kind] = rows_of
     if marked:
         dataset["outlier_factors"] = marked
+    if in_ns and not are_utc:
+        dataset[UNIT] = NS
     write_atomically(path, json.dumps(dataset) + "\n")
+
+
+def _is_whole(time: float) -> bool:
+    return time == round(time)
 
 
 def _all_times(graph: RangeGraph) -> list[float]:

@@ -84,6 +84,20 @@ def test_jrl_is_written_as_its_own_parser_reads_it(tmp_path):
     assert {one["key"] for one in dataset["groundtruth"]["B"]} == {gtsam.symbol("B", 3)}
 
 
+def test_times_of_a_simulated_clock_are_kept(tmp_path):
+    text = PLANAR.replace("1248362857.7", "0.75").replace("1248362857.9", "1.5")
+    (tmp_path / "a.pyfg").write_text(text)
+    graph = read_pyfg(tmp_path / "a.pyfg")
+    write_jrl(graph, tmp_path / "a.jrl")
+    again = read_jrl(tmp_path / "a.jrl")
+    assert again.times == graph.times and [one.time for one in again.ranges] == [0.75, 1.5]
+    stamps = [one["stamp"] for one in json.loads((tmp_path / "a.jrl").read_text())["measurements"]["A"]]
+    assert stamps == [750_000_000, 1_500_000_000]  # whole numbers, as its parser asks
+    (tmp_path / "a.pyfg").write_text(text.replace("1.5 A1 1.5", "-1.5 A1 1.5"))
+    with pytest.raises(InputError, match="no times before 0"):
+        write_jrl(read_pyfg(tmp_path / "a.pyfg"), tmp_path / "a.jrl")
+
+
 def test_jrl_as_its_description_has_it_is_read(tmp_path):
     def pose(key, x):
         return {"key": key, "type": "Pose2", "x": x, "y": 0.0, "theta": 0.0}
