@@ -12,11 +12,12 @@ from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.online.leap_planner import Situation, StancePlan, StancePromise
 from coloc_graph.pipeline.incremental import EnteredStance
+from coloc_graph.planning.beam import Decision
 from coloc_graph.planning.belief import Belief
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
-from coloc_graph.planning.horizon import Decision, Horizon
+from coloc_graph.planning.horizon import Horizon
 from coloc_graph.planning.mission import best_stance
 from coloc_graph.planning.plan import PlannedStance
 from coloc_graph.planning.prediction import Predictor
@@ -88,6 +89,7 @@ class HorizonPlanner:
         self._belief: Belief | None = None
         self._decision: Decision | None = None
         self._plan: StancePlan | None = None
+        self._leaper: str | None = None  # the observer that was sent off last
         self._stood: list[Mapping[str, Planar]] = []  # where the observers stood in each stance
 
     def plan(self, situation: Situation) -> StancePlan:
@@ -108,10 +110,10 @@ class HorizonPlanner:
             decision = before
         elif index == 0:
             decision = self._horizon.first(belief)
+        elif len(situation.moved) == len(self._observers):
+            decision = self._without_anchor(belief, situation, before)
         elif attempt < RETRIES and situation.moved:
             # one has set off already, under an earlier coordinator or in a failed attempt
-            decision = self._where_they_stand(belief, situation.moved)
-        elif len(situation.moved) == len(self._observers):
             decision = self._where_they_stand(belief, situation.moved)
         else:
             failed = () if before is None or not before.ahead else (before.ahead[0][1],)
@@ -119,6 +121,7 @@ class HorizonPlanner:
             decision = self._horizon.next(belief, max(self._left, 0.0), failed, leaper)
         self._decision = decision
         leap = decision.ahead[0][:2] if decision.ahead else None
+        self._leaper = self._leaper if leap is None else leap[0]
         if leap is not None and attempt and leap[0] in situation.missing:
             # it may have ended where it does not look at the views any more, and sees nothing that would correct it
             x, y, yaw = leap[1]
@@ -233,6 +236,17 @@ class HorizonPlanner:
             self._predictor, belief, standing, anchors, self._mover, seconds, self._horizon.goal, 0.0
         )
         return Decision(stance, promise, (), reason="all stay where they stand")
+
+    def _without_anchor(self, belief: Belief, situation: Situation, before: Decision | None) -> Decision:
+        """Let all stay where they stand, or where they share no view there the one that leapt last leap on.
+
+        A stance is then tied to the one before by the wheel odometry of that one; one that was pushed stays.
+        """
+        if situation.attempt <= RETRIES:
+            with contextlib.suppress(InputError):
+                return self._where_they_stand(belief, situation.moved)
+        failed = () if before is None or not before.ahead else (before.ahead[0][1],)
+        return self._horizon.next(belief, max(self._left, 0.0), failed, self._leaper or situation.moved[0])
 
     def _promise(self, decision: Decision) -> StancePromise:
         belief, standing = decision.promise.belief, decision.stance.standing

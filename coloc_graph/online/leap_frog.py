@@ -162,7 +162,7 @@ class LeapFrog:
         plan = self._decisions.decided()
         if plan is None:
             return
-        if plan.leap is not None and not set(self._anchors()) - {plan.leap[0]}:
+        if plan.leap is not None and self._anchors() == (plan.leap[0],):
             raise RobotError(f"{plan.leap[0]} is not sent off: no other observer stands where it stood before")
         self._plan, self._leap, self._turned = plan, plan.leap, False
         for robot in self._registry.robots.values():

@@ -1,20 +1,49 @@
-"""Plans that are followed at the same time while stances are looked ahead: `Node`, `different`."""
+"""Plans that are followed at the same time while stances are looked ahead, and the choice: `Node`, `Decision`."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.planning.belief import Belief
+from coloc_graph.planning.plan import PlannedStance
+from coloc_graph.planning.prediction import Promise
 
 DIFFERENT = 0.15  # poses are compared one by one from this distance on, in which a radian counts as 0.5 m [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """A planned stance with its promise, and where the team is to stand in the stances after it.
+
+    Attributes
+    ----------
+    stance, promise
+        The next stance, and what it promises.
+    ahead
+        Leaper, its target and the duration of each stance looked ahead, the next one first.
+    expected
+        Expected sigma of the observers' last poses at the end of the mission [m], as `Rollout.end_variance` has it; NaN
+        where it is not computed.
+    reason
+        What decided, in one line for people.
+    """
+
+    stance: PlannedStance
+    promise: Promise
+    ahead: tuple[tuple[str, Planar, float], ...]
+    expected: float = math.nan
+    reason: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
     """A team after some planned stances: what it is believed to be, and how it came there.
 
-    `by_gait` is true if the first of its leaps is that of the gait.
+    `by_gait` is true if the first of its leaps is that of the gait, `aside` if by it a robot makes way for another.
     """
 
     belief: Belief
@@ -23,6 +52,30 @@ class Node:
     score: float
     choices: tuple[tuple[str, Planar, float], ...] = ()
     by_gait: bool = False
+    aside: bool = False
+
+    def after(
+        self,
+        leaper: str,
+        target: Planar,
+        seconds: float,
+        left: float,
+        score: float,
+        covariance: NDArray[np.float64] | None,
+        *,
+        by_gait: bool,
+    ) -> "Node":
+        """Return the team after a leap and a stance of `seconds`, with `left` [s] and, if it is known, a covariance."""
+        belief = self.belief
+        leapt = math.dist(belief.poses[leaper][:2], target[:2])
+        belief = replace(
+            belief,
+            poses={**belief.poses, leaper: target},
+            covariance=belief.covariance if covariance is None else covariance,
+            leapt={**belief.leapt, leaper: leapt},
+        )
+        standing, choices = {**self.standing, leaper: target}, (*self.choices, (leaper, target, seconds))
+        return Node(belief, standing, left, score, choices, by_gait, self.aside)
 
 
 def different(nodes: Sequence[Node], beam: int) -> list[Node]:
@@ -37,3 +90,11 @@ def different(nodes: Sequence[Node], beam: int) -> list[Node]:
         if len(chosen) >= beam and any(one.by_gait for one in chosen):
             break
     return chosen
+
+
+def first_leaps(nodes: Sequence[Node]) -> list[Node]:
+    """Of nodes, the best first, those of different first leaps."""
+    kept: dict[tuple[str, Planar], Node] = {}
+    for node in nodes:
+        kept.setdefault(node.choices[0][:2], node)
+    return list(kept.values())

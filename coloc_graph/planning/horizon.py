@@ -1,9 +1,9 @@
 """The next stances, chosen from where a team really is: `Horizon`."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain, combinations
 from typing import Any, Literal
 
 import numpy as np
@@ -11,19 +11,21 @@ from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar, wrap
-from coloc_graph.planning.beam import Node, different
+from coloc_graph.planning.beam import Decision, Node, different, first_leaps
 from coloc_graph.planning.belief import Belief, updated
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.drive import effective_seconds
+from coloc_graph.planning.durations import MAX_STANCE_DURATION, SHARES, durations
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.gaits import MIN_STANCE_DURATION
-from coloc_graph.planning.leaps import BEND, Leaps, possible_leaps
+from coloc_graph.planning.leaps import BEND, Leaps, leaps_beside, possible_leaps, steps_aside
 from coloc_graph.planning.mission import Mission, best_stance
 from coloc_graph.planning.mover_path import evenly_seen
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor, Promise
 from coloc_graph.planning.refinement import Refinement
 from coloc_graph.planning.rollout import Rollout
+from coloc_graph.planning.ways_out import NARROW, in_the_way, require_way, stuck
 
 Array = NDArray[np.float64]
 
@@ -32,10 +34,8 @@ BEAM = 4  # plans that are followed from one stance to the next
 MANY_BEAM = 3  # the same of more than two observers
 CORNER_BEAM = 30  # the same before a corner
 CORNER = 3.0  # a corner is near from this distance along the course on [m]
-SHARES = (0.6, 1.0, 1.7)  # durations of a stance that are compared, relative to the pace of the mission
 FINALISTS = 3  # first leaps whose stances are planned to be compared, with the gait's own
 PREFERRED = 1.03  # the gait's own leap is left for one that promises a variance this much smaller
-MAX_STANCE_DURATION = 60.0  # longest duration of a stance [s]
 ROW = 0.6  # distance between rows of observers at the beginning [m]
 STRAGGLE = 2.2  # an observer further behind the foremost one than this leaps next [m]
 MIN_CELLS = 3  # cells of the common view without which a stance is not planned
@@ -46,30 +46,6 @@ ARRIVED = 0.1  # the goal is reached within this distance along the course [m]
 #: What decides between stances: the variance at the goal with the cost to go, the information gained, the size of the
 #: common view, or nothing.
 Objective = Literal["goal", "information", "view", "random"]
-
-
-@dataclass(frozen=True, eq=False)
-class Decision:
-    """A planned stance with its promise, and where the team is to stand in the stances after it.
-
-    Attributes
-    ----------
-    stance, promise
-        The next stance, and what it promises.
-    ahead
-        Leaper, its target and the duration of each stance looked ahead, the next one first.
-    expected
-        Expected sigma of the observers' last poses at the end of the mission [m], as `Rollout.end_variance` has it; NaN
-        where it is not computed.
-    reason
-        What decided, in one line for people.
-    """
-
-    stance: PlannedStance
-    promise: Promise
-    ahead: tuple[tuple[str, Planar, float], ...]
-    expected: float = math.nan
-    reason: str = ""
 
 
 class Horizon:
@@ -243,12 +219,50 @@ class Horizon:
         Raises
         ------
         InputError
-            If no observer can leap anywhere from where it shares a view with the others.
+            If no observer can leap anywhere from where it shares a view with the others, not even after another makes
+            way.
         """
+        problem: InputError | None = None
+        given = belief, seconds, avoid, leaper
+        for nodes in chain(self._ahead(*given), () if self._roomy else self._otherwise(*given)):
+            if self.objective != "goal":
+                stance, promise = self._planned(belief, nodes[0].choices[0])
+                return Decision(stance, promise, nodes[0].choices)
+            try:
+                return self._decided(belief, seconds, nodes)
+            except InputError as error:
+                problem = error
+        why = in_the_way(belief, self.course, self.gait, self.observers, self.predictor)
+        if problem is not None and why == NARROW:
+            raise problem
+        raise stuck(self._stuck_at(belief.poses), why) from problem
+
+    def _decided(self, belief: Belief, seconds: float, nodes: Sequence[Node]) -> Decision:
+        """Choose among plans, the best first.
+
+        Raises
+        ------
+        InputError
+            If the mover cannot drive in the first stance of any.
+        """
+        variance, node, stance, promise = self._finalist(belief, seconds, nodes)
+        leaper, target, duration = node.choices[0]
+        reason = self._rollout_of(promise.belief.poses, leaper).reason(
+            promise.belief, leaper, seconds - self._spent(duration, belief, leaper, target)
+        )
+        if node.aside:
+            reason += f"; {leaper} makes way for {node.choices[1][0]}"
+        elif not node.by_gait:
+            reason += "; this leap promises less than the gait's own"
+        return Decision(stance, promise, node.choices, math.sqrt(variance), reason)
+
+    def _ahead(
+        self, belief: Belief, seconds: float, avoid: Sequence[Planar], leaper: str | None
+    ) -> Iterator[list[Node]]:
+        """Yield plans of the next stances along the course, the best first; then those of the next stance alone."""
         standing = {name: belief.poses[name] for name in self.observers}
         many = self._beam(standing)
-        beam = [Node(belief, standing, seconds, 0.0)]
-        best = beam
+        beam, first = [Node(belief, standing, seconds, 0.0)], list[Node]()
         for depth in range(self.depth):
             grown = [
                 child
@@ -260,22 +274,32 @@ class Horizon:
             if not grown:
                 break
             grown.sort(key=lambda node: node.score)
-            best = beam = different(grown, many)
-            if self.objective != "goal" or self.arrived(best[0].standing):
+            first = first or grown
+            beam = different(grown, many)
+            if self.objective != "goal" or self.arrived(beam[0].standing):
                 break
-        if not best[0].choices:
-            raise self._stuck(standing)
-        if self.objective != "goal":
-            stance, promise = self._planned(belief, best[0].choices[0])
-            return Decision(stance, promise, best[0].choices)
-        variance, node, stance, promise = self._finalist(belief, seconds, best)
-        leaper, target, duration = node.choices[0]
-        reason = self._rollout_of(promise.belief.poses, leaper).reason(
-            promise.belief, leaper, seconds - self._spent(duration, belief, leaper, target)
-        )
-        if not node.by_gait:
-            reason += "; this leap promises less than the gait's own"
-        return Decision(stance, promise, node.choices, math.sqrt(variance), reason)
+        if first:
+            yield beam
+            yield different(first, CORNER_BEAM)
+
+    def _otherwise(
+        self, belief: Belief, seconds: float, avoid: Sequence[Planar], leaper: str | None
+    ) -> Iterator[list[Node]]:
+        """Yield plans for where no leap along the course is possible, the best first of each kind.
+
+        A robot makes way, and one leaps on after that; or a robot comes beside another to look where that one looks.
+        """
+        node = Node(belief, {name: belief.poses[name] for name in self.observers}, seconds, 0.0)
+
+        def grown(kind: Callable[..., Leaps]) -> list[Node]:
+            given = self.course, self.gait, self.observers, self.predictor, avoid
+            names = self.observers if leaper is None else (leaper,)
+            found = [one for name in names for one in self._grown(node, kind(belief, name, *given))]
+            return sorted(found, key=lambda one: one.score)
+
+        steps = [replace(one, aside=True) for one in different(grown(steps_aside), CORNER_BEAM)]
+        after = [one for step in steps for one in self._expand(step, (), in_lane=False)]
+        yield from filter(None, (sorted(after, key=lambda one: one.score), grown(leaps_beside)))
 
     def _beam(self, standing: Mapping[str, Planar]) -> int:
         """Number of plans that are followed from one stance to the next: more before a corner, where most end."""
@@ -295,14 +319,11 @@ class Horizon:
         """
         left = [self.remaining(standing) for standing in before]
         if len(left) > STALLED and min(left[-STALLED:]) > min(left[:-STALLED]) - ARRIVED:
-            raise self._stuck(before[-1])
+            raise stuck(self._stuck_at(before[-1]))
 
-    def _stuck(self, standing: Mapping[str, Planar]) -> InputError:
-        gone = self.course.length - self.remaining(standing)
-        return InputError(
-            f"no observer can leap on from where the team stands, {gone:.1f} m along the course: the way is too "
-            "narrow for the robots, or their cameras share no view there"
-        )
+    def _stuck_at(self, standing: Mapping[str, Planar]) -> float:
+        """Return the way along the course at which a team is [m]."""
+        return self.course.length - self.remaining(standing)
 
     def _planned(self, belief: Belief, choice: tuple[str, Planar, float]) -> tuple[PlannedStance, Promise]:
         """Plan the mover's drive of a stance after a leap."""
@@ -323,10 +344,14 @@ class Horizon:
         """
         found: list[tuple[float, float, Node, PlannedStance, Promise]] = []
         problem: InputError | None = None
-        for node in _first_leaps(nodes):
+        for node in first_leaps(nodes):
+            if len(found) >= FINALISTS and not node.by_gait:
+                continue
             leaper, target, duration = node.choices[0]
             try:
                 stance, promise = self._planned(belief, node.choices[0])
+                if self.predictor.anew:  # else it is not known where the mover will be
+                    require_way(belief, stance, self.observers, self.predictor)
             except InputError as error:
                 problem = error
                 continue
@@ -393,6 +418,10 @@ class Horizon:
             node.belief, leaper, self.course, self.gait, self.observers, self.predictor, avoid,
             in_lane=in_lane, roomy=self._roomy,
         )  # fmt: skip
+        return self._grown(node, leaps)
+
+    def _grown(self, node: Node, leaps: Leaps) -> list[Node]:
+        """Return the next stances of a team after leaps, each with its score."""
         if not len(leaps.targets):
             return []
         observers = (*leaps.anchors, leaps.leaper)
@@ -413,36 +442,22 @@ class Horizon:
 
     def _durations(self, node: Node, leaps: Leaps, n: int) -> Array:
         """Durations of a stance that are compared, (3,) [s]."""
-        left = max(self.remaining(node.standing), ARRIVED)
-        leapt = leaps.times[n] if self.timed else 0.0
-        seconds = node.seconds - leapt
-        if leaps.gains[n] > left - ARRIVED:
-            return np.full(len(SHARES), min(max(seconds, MIN_STANCE_DURATION), MAX_STANCE_DURATION))
-        # the leaps of the way that remains after this one
-        share = min(max(leaps.gains[n], 0.3 * self.gait.leap) / left, 1.0)
-        share *= max(seconds - (1 / share - 1) * leapt, 0.0)
-        longest = min(MAX_STANCE_DURATION, max(seconds, MIN_STANCE_DURATION))
-        return np.asarray(np.clip(share * np.array(SHARES), MIN_STANCE_DURATION, longest))
+        leapt, left = self.timed * float(leaps.times[n]), max(self.remaining(node.standing), ARRIVED)
+        return durations(node.seconds, float(leaps.gains[n]), left, leapt, self.gait.leap, last=ARRIVED)
 
     def _scored(
         self, node: Node, leaps: Leaps, seen: NDArray[np.int64], observers: tuple[str, ...], information: Array
     ) -> list[Node]:
-        belief, at = node.belief, node.belief.index(leaps.leaper)
-        pose = slice(at, at + 6)
-        F, Q = leaps.F[seen], leaps.Q[seen]
-        P = np.repeat(belief.covariance[None], len(seen), axis=0)
-        P[:, pose] = F @ P[:, pose]
-        P[:, :, pose] = P[:, :, pose] @ F.mT
-        P[:, pose, pose] += Q
-        durations = np.array([self._durations(node, leaps, int(n)) for n in seen])
+        belief, P = node.belief, leaps.covariances(node.belief, seen)
+        each = np.array([self._durations(node, leaps, int(n)) for n in seen])
         rows = belief.rows(observers, self.mover)
-        spread = effective_seconds(durations, self.predictor.speed)
+        spread = effective_seconds(each, self.predictor.speed)
         after = updated(P[:, None], rows, spread[:, :, None, None] * information[:, None])
         if self.objective == "information":
             value = -np.linalg.slogdet(np.eye(len(rows)) + information @ P[:, rows[:, None], rows])[1]
             return [
                 self._child(node, leaps, int(n), float(t[1]), float(v), C[1])
-                for n, t, v, C in zip(seen, durations, value, after, strict=True)
+                for n, t, v, C in zip(seen, each, value, after, strict=True)
             ]
         rollout, targets = self._rollout_of(belief.poses, leaps.leaper), leaps.targets[seen]
         used = rollout.rows(belief)
@@ -453,37 +468,20 @@ class Horizon:
                 after[:, k][:, used[:, None], used],
                 poses,
                 leaps.leaper,
-                node.seconds - durations[:, k] - self.timed * leaps.times[seen],
+                node.seconds - each[:, k] - self.timed * leaps.times[seen],
             )
             for k in range(len(SHARES))
         ], axis=1)  # fmt: skip
         best = value.argmin(axis=1)
         return [
-            self._child(node, leaps, int(n), float(durations[k, b]), float(value[k, b]), after[k, b])
+            self._child(node, leaps, int(n), float(each[k, b]), float(value[k, b]), after[k, b])
             for k, (n, b) in enumerate(zip(seen, best, strict=True))
         ]
 
     def _child(
         self, node: Node, leaps: Leaps, n: int, seconds: float, score: float, covariance: Array | None = None
     ) -> Node:
-        x, y, yaw = leaps.targets[n].tolist()
-        target = x, y, yaw
-        poses = {**node.belief.poses, leaps.leaper: target}
-        C = node.belief.covariance if covariance is None else covariance
-        leapt = {**node.belief.leapt, leaps.leaper: math.dist(node.belief.poses[leaps.leaper][:2], target[:2])}
-        belief = replace(node.belief, poses=poses, covariance=C, leapt=leapt)
-        choice = leaps.leaper, target, seconds
         left = node.seconds - seconds - self.timed * float(leaps.times[n])
-        standing = {**node.standing, leaps.leaper: target}
+        x, y, yaw = leaps.targets[n].tolist()
         by_gait = node.by_gait if node.choices else bool(leaps.by_gait[n])
-        return Node(belief, standing, left, score, (*node.choices, choice), by_gait)
-
-
-def _first_leaps(nodes: Sequence[Node]) -> list[Node]:
-    """Of nodes, the best first, those of the first `FINALISTS` different first leaps, and of the gait's own."""
-    kept: dict[tuple[str, Planar], Node] = {}
-    for node in nodes:
-        first = node.choices[0][:2]
-        if first not in kept and (node.by_gait or len(kept) < FINALISTS):
-            kept[first] = node
-    return list(kept.values())
+        return node.after(leaps.leaper, (x, y, yaw), seconds, left, score, covariance, by_gait=by_gait)

@@ -1,5 +1,6 @@
 """Targets to which an observer can leap: clear of walls and robots, on its way too; `Leaps`, `possible_leaps`."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -8,20 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.geometry.se2 import Planar, between, wrap
-from coloc_graph.planning.belief import Belief, leap_model
+from coloc_graph.planning.belief import POSE, Belief, leap_model
 from coloc_graph.planning.clearance import apart, off_walls
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.prediction import Predictor
-from coloc_graph.planning.route import TO_ROBOT, reachable
+from coloc_graph.planning.route import TO_ROBOT, clear_way, reachable
 
 Array = NDArray[np.float64]
 
 ADVANCES = (0.25, 0.5, 0.7, 0.85, 1.0, 1.15, 1.35)  # of a target ahead of the front observer, in leaps of the gait
+BEHIND = (-1.2, -0.8, -0.4)  # the same of larger teams once the front has come to the goal
 WIDTHS = (0.7, 1.0, 1.7)  # of a target's distance from the course, in those of the gait
 TOE_INS = (0.0, 1.0, 1.5)  # of a target's heading against the course, in those of the gait
 AHEAD = 0.8  # a robot may look along the course this far ahead of where it stands [m]
+COME_UP = 0.3  # by which a robot comes up at least to one in front of it [m]
 TURNS = (0.0, 0.35, 0.7, 1.0)  # share of a corner by which a target is turned
 BEND = 0.1  # turn of the course that is a corner [rad]
 MAX_LEAP = 1.5  # advance of a target [m]
@@ -29,6 +32,9 @@ TO_WALL = 0.25  # least distance of a robot's middle from walls [m]
 STEP = 0.1  # distance between places of a leap that are checked [m]
 MANY = 4  # observers from which on fewer targets are compared, each of which costs more
 FAILED = 0.15  # targets nearer to one that failed are avoided [m]
+ASIDE = (0.25, 0.45)  # lengths of a step aside [m]
+DIRECTIONS = 8  # directions of a step aside
+BESIDE = (-0.3, 0.0, 0.3)  # distances ahead of a robot, beside which another comes to look where it looks [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +69,16 @@ class Leaps:
     by_gait: NDArray[np.bool_]
     times: Array
 
+    def covariances(self, belief: Belief, which: NDArray[np.int64]) -> Array:
+        """Return the covariances (b, d, d) of a team after some (b,) of these leaps; `belief` is before them."""
+        at = belief.index(self.leaper)
+        pose = slice(at, at + POSE)
+        F, P = self.F[which], np.repeat(belief.covariance[None], len(which), axis=0)
+        P[:, pose] = F @ P[:, pose]
+        P[:, :, pose] = P[:, :, pose] @ F.mT
+        P[:, pose, pose] += self.Q[which]
+        return P
+
 
 def possible_leaps(
     belief: Belief,
@@ -75,6 +91,7 @@ def possible_leaps(
     *,
     in_lane: bool = False,
     roomy: bool = True,
+    absent: Sequence[str] = (),
 ) -> Leaps:
     """Find the leaps of an observer: those of a gait, and longer, shorter, wider ones; at corners also half turned.
 
@@ -90,6 +107,8 @@ def possible_leaps(
         True for targets in the gait's formation alone, and, at corners, beside the course.
     roomy
         True for targets that are so far from others as both may stop off.
+    absent
+        Robots that are taken to be in nobody's way, to find out whether they are.
     """
     ways = {name: course.way_of(belief.poses[name]) for name in observers}
     anchors = tuple(sorted((name for name in observers if name != leaper), key=lambda name: -ways[name]))
@@ -103,13 +122,18 @@ def possible_leaps(
     before = course.at(front)[2]
     turning = any(abs(float(wrap(course.at(front + ahead)[2] - before))) > BEND for ahead in (AHEAD, 2 * AHEAD))
     toe_ins = TOE_INS if len(observers) < MANY else TOE_INS[:2]
+    advances: tuple[float, ...] = ADVANCES
+    if len(observers) > 2 and front > course.length - ADVANCES[0] * gait.leap:
+        advances = (*BEHIND, *ADVANCES)  # the front is there: others come up to it
     ahead_of = {}
-    for advance in ADVANCES:
+    for advance in advances:
         way = front + min(advance * gait.leap, MAX_LEAP)
         # near a corner a robot may look into it
         ahead_of[advance] = way, course.at(way), float(wrap(course.at(way + AHEAD)[2] - before))
-    for advance, side, width, toe, turned in product(ADVANCES, (-1.0, 1.0), WIDTHS, toe_ins, TURNS):
+    for advance, side, width, toe, turned in product(advances, (-1.0, 1.0), WIDTHS, toe_ins, TURNS):
         way, (x, y, heading), bend = ahead_of[advance]
+        if advance < 0 and way < ways[leaper] + COME_UP:
+            continue
         straight = abs(bend) < BEND
         if straight and turned < 1.0:
             continue
@@ -123,23 +147,106 @@ def possible_leaps(
         gains.append((way - ways[leaper]) / len(observers))
         by_gait.append(own and advance == 1.0)
     places = np.array(targets).reshape(-1, 3)
-    others = np.array([belief.poses[name][:2] for name in anchors])
-    slips = [belief.leapt.get(name, 0.0) if roomy else None for name in anchors]
+    present = [name for name in anchors if name not in absent]
+    others = np.array([belief.poses[name][:2] for name in present]).reshape(-1, 2)
+    slips = [belief.leapt.get(name, 0.0) if roomy else None for name in present]
     good = _clear(np.array(belief.poses[leaper][:2]), places[:, :2], others, slips, predictor.floor_map)
-    for x, y, yaw in (*avoid, belief.poses[leaper]):
+    good &= ~_failed(places, (*avoid, belief.poses[leaper]))
+    return _leaps(
+        belief, leaper, anchors, predictor, places[good], np.array(gains)[good], np.array(by_gait, bool)[good]
+    )
+
+
+def steps_aside(
+    belief: Belief,
+    leaper: str,
+    course: Course,
+    gait: Gait,
+    observers: Sequence[str],
+    predictor: Predictor,
+    avoid: Sequence[Planar] = (),
+) -> Leaps:
+    """Find short leaps of an observer that makes way: in all directions, straight, near to robots that stand.
+
+    They stop off by so little that they need less room (`apart`).
+    """
+    ways = {name: course.way_of(belief.poses[name]) for name in observers}
+    anchors = tuple(sorted((name for name in observers if name != leaper), key=lambda name: -ways[name]))
+    x, y, yaw = belief.poses[leaper]
+    toe_in, ahead = math.radians(gait.toe_in_deg), course.at(ways[leaper])[2] - predictor.camera_yaw(leaper)
+    looks = (yaw, ahead, ahead + toe_in, ahead - toe_in)
+    angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    places = np.array([(x + step * np.cos(a), y + step * np.sin(a), w) for step, a, w in product(ASIDE, angles, looks)])
+    leapt = np.hypot(*(places[:, :2] - (x, y)).T)
+    room = apart(leapt, least=0.0)
+    others = np.array([belief.poses[name][:2] for name in anchors])
+    away = np.hypot(*np.moveaxis(places[:, None, :2] - others, -1, 0))
+    good = ~_failed(places, avoid) & (away > room[:, None]).all(axis=1)
+    if (free := predictor.free) is not None:
+        good &= free(places[:, :2], off_walls(leapt, least=TO_WALL))
+    good &= np.array([
+        clear_way(np.array([(x, y), place]), others, free, to_robot=one)
+        for place, one in zip(places[:, :2], room.tolist(), strict=True)
+    ])  # fmt: skip
+    places = places[good]
+    gains = np.array([course.way_of(place) - ways[leaper] for place in places.tolist()]) / len(observers)
+    return _leaps(belief, leaper, anchors, predictor, places, gains, np.zeros(len(places), bool))
+
+
+def leaps_beside(
+    belief: Belief,
+    leaper: str,
+    course: Course,
+    gait: Gait,
+    observers: Sequence[str],
+    predictor: Predictor,
+    avoid: Sequence[Planar] = (),
+) -> Leaps:
+    """Find leaps of an observer to beside each of the others, to look where that one looks, not along the course."""
+    anchors = tuple(name for name in observers if name != leaper)
+    targets = []
+    for name, side, width, ahead, toe in product(anchors, (-1.0, 1.0), WIDTHS, BESIDE, TOE_INS):
+        x, y, yaw = belief.poses[name]
+        looks = yaw + predictor.camera_yaw(name)
+        c, s = math.cos(looks), math.sin(looks)
+        lateral, turn = side * width * gait.abreast, -2 * side * toe * math.radians(gait.toe_in_deg)
+        place = x + ahead * c - lateral * s, y + ahead * s + lateral * c
+        targets.append((*place, looks + turn - predictor.camera_yaw(leaper)))
+    places, start = np.array(targets), np.array(belief.poses[leaper][:2])
+    others = np.array([belief.poses[name][:2] for name in anchors])
+    good = _clear(start, places[:, :2], others, [None] * len(anchors), predictor.floor_map)
+    places = places[good & ~_failed(places, avoid)]
+    way = course.way_of(belief.poses[leaper])
+    gains = np.array([course.way_of(place) - way for place in places.tolist()]) / len(observers)
+    return _leaps(belief, leaper, anchors, predictor, places, gains, np.zeros(len(places), bool))
+
+
+def _failed(places: Array, avoid: Sequence[Planar]) -> NDArray[np.bool_]:
+    """Return which targets (n, 3) are nearly one of those to `avoid`."""
+    failed = np.zeros(len(places), bool)
+    for x, y, yaw in avoid:
         near = np.hypot(places[:, 0] - x, places[:, 1] - y) < FAILED
-        good &= ~(near & (np.abs(places[:, 2] - yaw) < FAILED))
-    places, kept = places[good], np.array(gains)[good]
-    made = [
-        leap_model(between(belief.poses[leaper], (x, y, yaw)), belief.floor, predictor.wheels)
-        for x, y, yaw in places.tolist()
-    ]
+        failed |= near & (np.abs(places[:, 2] - yaw) < FAILED)
+    return failed
+
+
+def _leaps(
+    belief: Belief,
+    leaper: str,
+    anchors: tuple[str, ...],
+    predictor: Predictor,
+    places: Array,
+    gains: Array,
+    by_gait: NDArray[np.bool_],
+) -> Leaps:
+    """Leaps to targets (n, 3), with what they do to what is known."""
+    start, targets = belief.poses[leaper], [(x, y, yaw) for x, y, yaw in places.tolist()]
+    made = [leap_model(between(start, target), belief.floor, predictor.wheels) for target in targets]
     F = np.array([one for one, _ in made]).reshape(-1, 6, 6)
     Q = np.array([one for _, one in made]).reshape(-1, 6, 6)
-    leapt = np.hypot(*(places[:, :2] - np.array(belief.poses[leaper][:2])).T)
-    margins = predictor.margins(leapt, (*anchors, leaper))
-    times = np.array([predictor.leap_time(belief.poses[leaper], (x, y, w)) for x, y, w in places.tolist()])
-    return Leaps(leaper, anchors, places, kept, F, Q, margins, np.array(by_gait, bool)[good], times)
+    margins = predictor.margins(np.hypot(*(places[:, :2] - np.array(start[:2])).T), (*anchors, leaper))
+    times = np.array([predictor.leap_time(start, target) for target in targets])
+    return Leaps(leaper, anchors, places, gains, F, Q, margins, by_gait, times)
 
 
 def _clear(

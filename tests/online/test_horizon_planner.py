@@ -13,6 +13,7 @@ from coloc_graph.online.leap_planner import Situation
 from coloc_graph.online.mission import in_world
 from coloc_graph.online.record import Record
 from coloc_graph.online.robot_registry import RobotRegistry
+from coloc_graph.online.visibility import InView
 from coloc_graph.pipeline.incremental import IncrementalSolver, measure_stance
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import Gait
@@ -136,6 +137,22 @@ def test_where_no_anchor_is_left_nobody_leaps(mission):
     mission.plan(0)
     for attempt in range(3):
         assert mission.plan(1, attempt, ("A", "B")).leap is None
+
+
+def test_where_one_was_pushed_so_that_none_shares_a_view_the_other_leaps_on(mission):
+    mission.plan(0)
+    leaper, target = mission.plan(1).leap
+    (pushed,) = {"A", "B"} - {leaper}
+    x, y, yaw = mission.registry.poses()[pushed]
+    mission.registry[leaper].tracker.displace(math.inf, target)
+    mission.registry[pushed].tracker.displace(math.inf, (x + 0.1, y, yaw + math.copysign(1.2, yaw)))
+    plan = mission.plan(1, 1, ("A", "B"))
+    assert plan.leap is not None and plan.leap[0] == leaper
+    # it comes to where both see the drive
+    views = InView(mission.team, "C", {**mission.registry.poses(("A", "B")), leaper: plan.leap[1]})
+    height = mission.team["C"].markers.height
+    places = np.column_stack([plan.patrol[:-1], np.full(len(plan.patrol) - 1, height)])
+    assert all(view.project(places)[1].all() for view in views.views.values())
 
 
 def test_an_observer_waits_until_the_mover_is_out_of_its_way(mission):
