@@ -71,7 +71,7 @@ class McapBag:
             if index.lost is not None
         ]
 
-    def messages(self, connections: Sequence[McapTopic]) -> Iterator[tuple[McapTopic, int, memoryview]]:
+    def messages(self, connections: Sequence[McapTopic]) -> Iterator[tuple[McapTopic, int, bytes]]:
         """Yield messages of some topics: topic, time of reception [ns], and data, in that order in each file."""
         wanted = {(one.topic, one.msgtype): one for one in connections}
         for index in self._indexes:
@@ -86,9 +86,9 @@ class McapBag:
         """Do nothing: files are open only while messages are read."""
 
 
-def _in_order(index: Index, channels: dict[int, McapTopic]) -> Iterator[tuple[McapTopic, int, memoryview]]:
+def _in_order(index: Index, channels: dict[int, McapTopic]) -> Iterator[tuple[McapTopic, int, bytes]]:
     """Messages of some channels by time, across chunks that overlap in time."""
-    waiting: list[tuple[int, int, McapTopic, memoryview]] = []
+    waiting: list[tuple[int, int, McapTopic, bytes]] = []
     number = 0
     with index.path.open("rb") as file:
         for chunk in sorted(index.chunks, key=lambda one: one.start):

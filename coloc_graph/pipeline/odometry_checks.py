@@ -3,7 +3,8 @@
 A recording whose odometry is right is passed on as it is.
 """
 
-from collections.abc import Iterator, Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,11 +37,15 @@ class Samples:
     covariances: Array
 
     @classmethod
-    def of(cls, robot: str, samples: Sequence[OdometrySample]) -> "Samples":
-        """Stack samples."""
-        poses = np.array([one.pose for one in samples]).reshape(-1, 3)
-        covariances = np.array([one.covariance for one in samples]).reshape(-1, 3, 3)
-        return cls(robot, np.array([one.time for one in samples]), poses, covariances)
+    def of(cls, robot: str, samples: Iterable[OdometrySample]) -> "Samples":
+        """Stack samples, holding none: 100,000 objects in a list cost the garbage collector a second."""
+        stacked = array("d")
+        for one in samples:
+            stacked.append(one.time)
+            stacked.frombytes(np.asarray(one.pose, float).tobytes())
+            stacked.frombytes(np.asarray(one.covariance, float).tobytes())
+        rows = np.array(stacked).reshape(-1, 13)
+        return cls(robot, rows[:, 0], rows[:, 1:4], rows[:, 4:].reshape(-1, 3, 3))
 
     def between(self, start: float | None = None, end: float | None = None) -> Iterator[OdometrySample]:
         """Yield the samples from `start` to `end` [UTC s]."""
@@ -58,7 +63,7 @@ class CheckedRun:
         self._odometry: dict[str, Samples] = {}
         said: list[str] = []
         for robot in run.team.names:
-            self._odometry[robot], sentences = checked(Samples.of(robot, list(run.odometry(robot))), run.stances)
+            self._odometry[robot], sentences = checked(Samples.of(robot, run.odometry(robot)), run.stances)
             said += sentences
         self.warnings = (*run.warnings, *said)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
+import msgspec
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -32,12 +33,15 @@ class ChannelInfo(NamedTuple):
     encoding: str
 
 
-class Message(NamedTuple):
-    """One message as in the file: `ns` is its time [UTC ns], `position` its index among the records of its chunk."""
+class Message(msgspec.Struct, frozen=True, gc=False):
+    """One message as in the file: `ns` is its time [UTC ns], `position` its index among the records of its chunk.
+
+    Hundreds of thousands are cached: the garbage collector, for which each would be an object, does not see them.
+    """
 
     channel: int
     ns: int
-    data: memoryview
+    data: bytes
     position: int
 
 
@@ -160,7 +164,7 @@ def messages(path: Path, file: BinaryIO, chunk: ChunkInfo) -> Iterator[Message]:
         channel, _, ns, _ = _MESSAGE.unpack_from(body)
         if not start <= ns <= end:
             raise damaged(path, chunk.offset, "a message outside of its chunk's time")
-        yield Message(channel, ns, body[_MESSAGE.size :], position)
+        yield Message(channel, ns, bytes(body[_MESSAGE.size :]), position)
 
 
 def learn(path: Path, file: BinaryIO, chunk: ChunkInfo, known: Definitions) -> None:

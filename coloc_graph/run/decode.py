@@ -33,19 +33,19 @@ class MalformedError(ValueError):
     """Message that does not have its topic's format; its text is the reason."""
 
 
-def _json(data: memoryview, kind: type[T]) -> T:
+def _json(data: bytes, kind: type[T]) -> T:
     try:
         return msgspec.json.decode(data, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OverflowError) as error:
         raise MalformedError(str(error)) from error
 
 
-def decode_team(data: memoryview) -> Team:
+def decode_team(data: bytes) -> Team:
     """Decode a team from its JSON."""
     return _json(data, Team)
 
 
-def decode_detections(robot: str, ns: int, data: memoryview) -> Detections:
+def decode_detections(robot: str, ns: int, data: bytes) -> Detections:
     """Decode the detections in one image."""
     wire = _json(data, schemas.DetectionsWire)
     n = len(wire.u)
@@ -66,7 +66,7 @@ def decode_detections(robot: str, ns: int, data: memoryview) -> Detections:
     )
 
 
-def decode_odometry(robot: str, ns: int, data: memoryview) -> OdometrySample:
+def decode_odometry(robot: str, ns: int, data: bytes) -> OdometrySample:
     """Decode one sample of a robot's odometry."""
     wire = _json(data, schemas.OdometryWire)
     return OdometrySample(
@@ -74,12 +74,12 @@ def decode_odometry(robot: str, ns: int, data: memoryview) -> OdometrySample:
     )
 
 
-def decode_motion(robot: str, ns: int, data: memoryview) -> Motion:
+def decode_motion(robot: str, ns: int, data: bytes) -> Motion:
     """Decode the begin or the end of a movement."""
     return Motion(robot, schemas.to_seconds(ns), _json(data, schemas.MotionWire).moving)
 
 
-def decode_ranges(robot: str, ns: int, data: memoryview) -> Ranges:
+def decode_ranges(robot: str, ns: int, data: bytes) -> Ranges:
     """Decode the measurements of a range and bearing sensor at one time."""
     wire = _json(data, schemas.RangesWire)
     if len(wire.target) != len(wire.range) or len(wire.bearing) not in (0, len(wire.target)):
@@ -94,7 +94,7 @@ def decode_ranges(robot: str, ns: int, data: memoryview) -> Ranges:
     return Ranges(robot, time, tuple(wire.target), np.array(wire.range, float), bearing)
 
 
-def decode_stance(ns: int, data: memoryview) -> Stance:
+def decode_stance(ns: int, data: bytes) -> Stance:
     """Decode a stance; its start is the message's time."""
     wire = _json(data, schemas.StanceWire)
     end = schemas.to_seconds(wire.end_ns) if abs(wire.end_ns) < 2**64 else -1.0
@@ -106,7 +106,7 @@ def decode_stance(ns: int, data: memoryview) -> Stance:
     return stance
 
 
-def decode_planes(ns: int, data: memoryview) -> Planes:
+def decode_planes(ns: int, data: bytes) -> Planes:
     """Decode the marker planes of one stance."""
     wire = _json(data, schemas.PlanesWire)
     planes = Planes(wire.stance, schemas.to_seconds(ns), wire.planes, wire.sigmas)
@@ -117,21 +117,21 @@ def decode_planes(ns: int, data: memoryview) -> Planes:
     return planes
 
 
-def decode_clocks(ns: int, data: memoryview) -> Clocks:
+def decode_clocks(ns: int, data: bytes) -> Clocks:
     """Errors of clocks by which the run's stamps were corrected."""
     wire = _json(data, schemas.ClocksWire)
     found = (RobotClock(one.robot, one.offset, one.drift, one.steps, one.jitter, one.known) for one in wire.clocks)
     return Clocks(schemas.to_seconds(ns), tuple(found))
 
 
-def decode_image(robot: str, ns: int, schema: str, data: memoryview) -> Image:
+def decode_image(robot: str, ns: int, schema: str, data: bytes) -> Image:
     """An image, whichever way it is encoded."""
     message = _protobuf(schema, ns, data)
     pixels = _raw(message) if schema == schemas.RAW_IMAGE else _decompress(message)
     return Image(robot, schemas.to_seconds(ns), pixels)
 
 
-def decode_pose(ns: int, data: memoryview) -> Array:
+def decode_pose(ns: int, data: bytes) -> Array:
     """T_world_body (4, 4) [m]."""
     message = _protobuf(schemas.POSE_IN_FRAME, ns, data)
     if message.frame_id != "world":
@@ -152,7 +152,7 @@ def decode_pose(ns: int, data: memoryview) -> Array:
     )
 
 
-def _protobuf(schema: str, ns: int, data: memoryview) -> Any:
+def _protobuf(schema: str, ns: int, data: bytes) -> Any:
     from google.protobuf.message import DecodeError
 
     message = schemas.protobuf_type(schema)()

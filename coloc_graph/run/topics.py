@@ -23,7 +23,7 @@ class Item(NamedTuple):
 
     ns: int
     schema: str
-    data: memoryview
+    data: bytes
 
 
 def _chunks(index: Index, topic: str) -> tuple[dict[int, str], list[ChunkInfo]]:
