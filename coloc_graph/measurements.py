@@ -405,9 +405,10 @@ class RangeBearings:
     target, target_keyframe : (n,) int
         Number of the measured robot and of its keyframe; of a landmark the number of robots plus its own, and -1.
     range, bearing : (n,) float
-        Range [m] and bearing [rad].
+        Range [m] and bearing [rad]; a bearing of NaN was not measured.
     share : (n, 2) float
-        Share of the information of range and bearing that is new: successive errors of a target are correlated.
+        Share of the information of range and bearing that is new: successive errors of a target are correlated. 0 of
+        a bearing that was not measured.
     """
 
     time: Array
@@ -429,9 +430,9 @@ class RangeBearings:
 
 @dataclass(frozen=True, eq=False)
 class RangeBearing:
-    """One measurement of range [m] and bearing [rad] at a time [UTC s], of `target` by `robot`, each at a keyframe.
+    """One measurement of range [m] and bearing [rad], NaN if there is none, of `target` by `robot`, each at a keyframe.
 
-    `row` is its index in the `RangeBearings` of the run; a landmark's `target_keyframe` is -1.
+    `time` is in UTC seconds, `row` its index in the `RangeBearings` of the run; a landmark's `target_keyframe` is -1.
     """
 
     row: int
@@ -493,7 +494,7 @@ class Keyframes:
         return tuple(begin + len(times) for begin, times in zip(self.begins, self.times, strict=True))
 
     def between(self, after: float, until: float) -> "Keyframes":
-        """Return what came from one time to before another [UTC s], as `IncrementalKeyframes` takes it.
+        """Return what came from one time to before another [UTC s], as `KeyframeEstimator` takes it.
 
         Each robot's last keyframe before it comes first, for the step to the next one.
         """

@@ -1,7 +1,8 @@
 """Measurements to an estimate: the pose graph with stay-put constraints, in batch and as it happens (no images).
 
-`PoseGraph` holds what was measured, `chain` composes it as the paper does, `smooth` optimises it, `Estimator` keeps
-it optimised while stances come in, `diagnose` says what is not tied and what would tie it.
+`PoseGraph` holds what was measured in stances, `KeyframeGraph` what was measured without. `chain` composes as the paper
+does, `smooth` optimises poses, `joint` calibration too; `Estimator` keeps a graph optimised while measurements come in,
+`diagnose` says what is not tied and what would tie it.
 """
 
 from coloc_graph.backend.gtsam_version import require_gtsam
@@ -16,6 +17,7 @@ from coloc_graph.backend.estimate import Bump, Estimate, Rejection, StanceEstima
 from coloc_graph.backend.estimator import Estimator  # noqa: E402
 from coloc_graph.backend.factors import Method  # noqa: E402
 from coloc_graph.backend.graph import PoseGraph, StayPut  # noqa: E402
+from coloc_graph.backend.ranging import KeyframeGraph  # noqa: E402
 
 __all__ = [
     "Bump",
@@ -23,6 +25,7 @@ __all__ = [
     "DisconnectedComponent",
     "Estimate",
     "Estimator",
+    "KeyframeGraph",
     "Method",
     "PoseGraph",
     "Rejection",

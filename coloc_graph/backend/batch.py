@@ -15,6 +15,8 @@ from coloc_graph.backend.factors import Method, require_robot_models
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
 from coloc_graph.backend.optimize import ALL_TESTED, Fit, fit_graph
 from coloc_graph.backend.outliers import Found, find_outliers, gnc_outliers, parallel_outliers
+from coloc_graph.backend.planar import optimise_keyframes
+from coloc_graph.backend.ranging import KeyframeGraph
 from coloc_graph.backend.solver import with_stack
 
 MIN_FIT_P_VALUE = 1e-4  # probability of a fit as bad as this by noise below which outliers are searched for
@@ -52,10 +54,11 @@ def smooth(graph: PoseGraph, *, reject: bool = True, start: gtsam.Values | None 
     return with_stack(len(graph.nodes), lambda: _optimised("smooth", graph, reject, start))
 
 
-def joint(graph: PoseGraph, *, reject: bool = True, start: gtsam.Values | None = None) -> Estimate:
-    """Estimate the most likely poses, mounts, markers and clocks together, given the images.
+def joint(graph: PoseGraph | KeyframeGraph, *, reject: bool = True, start: gtsam.Values | None = None) -> Estimate:
+    """Estimate the most likely poses, mounts, markers, clocks, wheels and range sensors together.
 
-    Parameters and results are those of `smooth`; the estimate holds a `Calibration` as well.
+    Parameters and results are those of `smooth`; the estimate holds a `Calibration` as well. A `KeyframeGraph` needs no
+    `start`, and its outliers are weighed down, not searched for.
 
     Raises
     ------
@@ -67,6 +70,8 @@ def joint(graph: PoseGraph, *, reject: bool = True, start: gtsam.Values | None =
     Each homography is a factor on two poses and two mounts. The team's statements with a tolerance are priors;
     statements without a tolerance are exact.
     """
+    if isinstance(graph, KeyframeGraph):
+        return optimise_keyframes(graph.team, graph.keyframes)
     require_robot_models(graph.robots, graph.robot_models)
     return with_stack(len(graph.nodes), lambda: _optimised("joint", graph, reject, start))
 

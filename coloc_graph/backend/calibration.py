@@ -347,9 +347,9 @@ class Calibration:
 
     @property
     def unobservable(self) -> tuple[Row, ...]:
-        """Yaws and positions of mounts, and numbers of range sensors, of which the measurements say next to nothing."""
+        """Yaws and positions of mounts, and numbers of other sensors, of which the measurements say next to nothing."""
         mounts = (row for mount in self.mounts.values() for row in mount.rows[:3])
-        sensors = (row for one in self.sensors.values() if one.robot.name not in self.driven for row in one.rows)
+        sensors = (row for one in self.sensors.values() for row in one.rows)
         return tuple(
             row
             for row in (*mounts, *sensors)

@@ -1,10 +1,12 @@
-"""Connectivity check before solving: disconnected parts of a graph, and measurements that would connect them."""
+"""Check before solving: parts of a graph that nothing ties to the reference, and measurements that would."""
 
 from collections import defaultdict
 from dataclasses import dataclass
 
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.backend.graph import PoseGraph
+from coloc_graph.backend.planar import unlocated
+from coloc_graph.backend.ranging import KeyframeGraph
 from coloc_graph.measurements import Node, Range
 
 
@@ -18,20 +20,31 @@ class DisconnectedComponent:
         The robots and stances.
     remedy : str
         What would connect them.
+    robot : str or None
+        Of keyframes, the robot.
     """
 
     nodes: tuple[Node, ...]
     remedy: str
+    robot: str | None = None
 
     def __str__(self) -> str:
+        if self.robot is not None:
+            return f"robot {self.robot} has no pose: {self.remedy}"
         robots = ", ".join(dict.fromkeys(robot for robot, _ in self.nodes))
         first, last = self.nodes[0][1], self.nodes[-1][1]
         when = f"stance {first}" if first == last else f"stances {first} to {last}"
         return f"{robots} at {when}: not tied to the reference; {self.remedy}"
 
 
-def diagnose(graph: PoseGraph) -> tuple[DisconnectedComponent, ...]:
-    """Find the disconnected parts of a graph, each with a remedy; () where all is connected to the reference."""
+def diagnose(graph: PoseGraph | KeyframeGraph) -> tuple[DisconnectedComponent, ...]:
+    """Find the disconnected parts of a graph, each with a remedy; () where all is connected to the reference.
+
+    Of keyframes a part is a robot that its measurements leave without a pose, as where ranges fit two mirrored ones.
+    """
+    if isinstance(graph, KeyframeGraph):
+        missing = unlocated(graph.team, graph.keyframes)
+        return tuple(DisconnectedComponent(tuple(graph.nodes_of(one)), why, one) for one, why in missing.items())
     tied = {graph.reference_key, *(step.to for step in spanning_tree(graph, graph.links))}
     neighbours: dict[int, list[int]] = defaultdict(list)
     for link in graph.links:

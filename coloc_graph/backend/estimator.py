@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import islice
 from math import ceil
 from pathlib import Path
+from typing import Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ from coloc_graph.backend.graph import (
 )
 from coloc_graph.backend.insertion import InsertionPlan, InsertionPlanner
 from coloc_graph.backend.landmarks import landmarks_of, map_positions, positions_of
+from coloc_graph.backend.planar import LAG as SECONDS
+from coloc_graph.backend.planar import KeyframeEstimator
 from coloc_graph.backend.validation import require_valid
 from coloc_graph.errors import EstimationError, InputError, MeasurementError
 from coloc_graph.measurements import Measurement, Range, RelativePose, Sighting
@@ -165,12 +168,34 @@ class Estimator(EstimatorState):
                 self._replay(base, journal[:count])
             raise
 
+    @overload
     @classmethod
-    def of(cls, team: Team, method: Method = "joint", lag: int = LAG, *, forgets: bool = False) -> "Estimator":
-        """Return the estimator of a team: with its mounts to be calibrated, or of poses alone (`smooth`)."""
+    def of(cls, team: Team, method: Method = "joint", lag: int = LAG, *, forgets: bool = False) -> "Estimator": ...
+
+    @overload
+    @classmethod
+    def of(
+        cls, team: Team, method: Literal["ranging"], lag: float = SECONDS, *, forgets: bool = False
+    ) -> KeyframeEstimator: ...
+
+    @classmethod
+    def of(
+        cls,
+        team: Team,
+        method: Method | Literal["ranging"] = "joint",
+        lag: float | None = None,
+        *,
+        forgets: bool = False,
+    ) -> "Estimator | KeyframeEstimator":
+        """Return the estimator of a team: with its mounts to be calibrated, or of poses alone (`smooth`).
+
+        By method `ranging` that of keyframes in place of stances, with a lag in seconds (`KeyframeEstimator`).
+        """
+        if method == "ranging":
+            return KeyframeEstimator(team, lag=SECONDS if lag is None else lag, forgets=forgets)
         robot_models = {robot.name: robot for robot in team.robots} if method == "joint" else None
         known = team.reference, team.names, team.floor, slips_of(team), robot_models, landmarks_of(team)
-        return cls(*known, lag, forgets=forgets)
+        return cls(*known, LAG if lag is None else int(lag), forgets=forgets)
 
     def __repr__(self) -> str:
         return (

@@ -116,7 +116,8 @@ class Keys:
                 if size:
                     block = np.zeros((len(index), J.shape[1], size))
                     offset = int(columns[index[0], begin] - self.first[keys[index[0], slot]])
-                    block[:, :, offset : offset + end - begin] = J[index, :, begin:end]
+                    width = min(end - begin, size - offset)  # a key may have fewer, as a landmark has no heading
+                    block[:, :, offset : offset + width] = J[index, :, begin : begin + width]
                     parts.append((keys[index, slot], block))
             yield index, parts
 

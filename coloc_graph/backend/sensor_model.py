@@ -86,6 +86,20 @@ class Expected(NamedTuple):
     by_errors: Array
 
 
+class Linearised(NamedTuple):
+    """Predicted measurements between poses of the floor: `values` (n, 2) as of `Expected`.
+
+    With their derivatives by the observer's x, y and heading in the world (n, 2, 3), by the target's (n, 2, 3), and by
+    the errors of the observer's sensor (n, 2, 7) and of the target's (n, 2, 7), None where no range is two-way.
+    """
+
+    values: Array
+    by_pose: Array
+    by_target: Array
+    by_errors: Array
+    by_target_errors: Array | None
+
+
 class Sensors:
     """Range and bearing sensors of a team as functions of their errors; `robots` (n,) are observers by number."""
 
@@ -104,11 +118,18 @@ class Sensors:
             *("depth_sigma", "robot_offset_sigma"),
         )
         self.tolerances[:, 2] = np.deg2rad(self.tolerances[:, 2])
+        self.two_way = np.array([one.two_way for one in ranging], bool)
+        #: True of the sensors that measure bearings.
+        self.has_bearings = np.array([one.has_bearings for one in ranging], bool)
 
     def sigmas(self, robots: NDArray[np.int64], ranges: Array) -> Array:
-        """Return standard deviations (n, 2) of ranges [m] and bearings [rad] at measured `ranges` (n,)."""
+        """Return standard deviations (n, 2) of ranges [m] and bearings [rad] at measured `ranges` (n,).
+
+        That of a bearing is infinite where none is measured.
+        """
         range_sigma, per_m2, bearing_sigma, across = self._noise[robots].T
-        return np.stack([range_sigma + per_m2 * ranges**2, np.hypot(bearing_sigma, across / ranges)], axis=-1)
+        bearing = np.where(self.has_bearings[robots], np.hypot(bearing_sigma, across / ranges), np.inf)
+        return np.stack([range_sigma + per_m2 * ranges**2, bearing], axis=-1)
 
     def expected(self, robots: NDArray[np.int64], xy: Array, errors: Array, of_robot: NDArray[np.bool_]) -> Expected:
         """Predict the measurements of targets at xy (n, 2) in the body, robots or landmarks, with errors (n, 7)."""
@@ -130,6 +151,56 @@ class Sensors:
         by_errors[:, 1, 2] = 1.0
         by_errors[:, :, 3:5] = -by_xy
         return Expected(values, by_xy, by_errors)
+
+    def between(
+        self,
+        robots: NDArray[np.int64],
+        poses: Array,
+        targets: NDArray[np.int64] | None,
+        there: Array,
+        errors: Array,
+        of_robot: NDArray[np.bool_],
+    ) -> Linearised:
+        """Predict measurements between poses (n, 3) and targets at `there` (n, 3); a landmark's heading is nothing.
+
+        `targets` (n,) are the robots whose antennas are ranged, -1 where a range is that to the origin of a body or to
+        a landmark; None where all are. `errors` (robots, 7) are those of all sensors.
+        """
+        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        dx, dy = (there[:, :2] - poses[:, :2]).T
+        if targets is not None:
+            two_way = targets >= 0
+            other = (self._stated[targets] + errors[targets]) * two_way[:, None]
+            C, S = np.cos(there[:, 2]), np.sin(there[:, 2])
+            ax, ay = C * other[:, 3] - S * other[:, 4], S * other[:, 3] + C * other[:, 4]
+            dx, dy = dx + ax, dy + ay
+        xy = np.stack([c * dx + s * dy, -s * dx + c * dy], axis=-1)
+        expected = self.expected(robots, xy, errors[robots], of_robot)
+        by_target, by_pose = np.zeros((len(xy), 2, 3)), np.empty((len(xy), 2, 3))
+        by_target[:, :, 0] = c[:, None] * expected.by_xy[:, :, 0] - s[:, None] * expected.by_xy[:, :, 1]
+        by_target[:, :, 1] = s[:, None] * expected.by_xy[:, :, 0] + c[:, None] * expected.by_xy[:, :, 1]
+        by_pose[:, :, :2] = -by_target[:, :, :2]
+        by_pose[:, :, 2] = expected.by_xy[:, :, 0] * xy[:, None, 1] - expected.by_xy[:, :, 1] * xy[:, None, 0]
+        if targets is None:
+            return Linearised(expected.values, by_pose, by_target, expected.by_errors, None)
+        expected.values[:, 0] += other[:, 0]
+        by_target[:, :, 2] = by_target[:, :, 1] * ax[:, None] - by_target[:, :, 0] * ay[:, None]
+        by_other = np.zeros((len(xy), 2, RANGING))
+        by_other[:, 0, 0] = two_way
+        by_other[:, :, 3] = (by_target[:, :, 0] * C[:, None] + by_target[:, :, 1] * S[:, None]) * two_way[:, None]
+        by_other[:, :, 4] = (by_target[:, :, 1] * C[:, None] - by_target[:, :, 0] * S[:, None]) * two_way[:, None]
+        return Linearised(expected.values, by_pose, by_target, expected.by_errors, by_other)
+
+    def distance(self, robot: int, range_: float, target: int | None) -> float:
+        """Return the distance [m] that a range says, without calibration errors; `target` is the robot measured."""
+        offset, scale, *_, more = self._stated[robot].tolist()
+        delay = self._stated[target, 0] if target is not None and self.two_way[robot] else 0.0
+        return float((range_ - offset - more * (target is not None) - delay) / scale)
+
+    def antenna(self, robot: int) -> tuple[float, float]:
+        """Return the stated position of a robot's sensor on its body [m]."""
+        x, y = self._stated[robot, 3:5].tolist()
+        return x, y
 
     def place(self, robot: int, range_: float, bearing: float, of_robot: bool) -> tuple[float, float]:
         """Return the position in the body of a measured target, without calibration errors."""

@@ -58,11 +58,12 @@ def require_following(before: Keyframes, new: Keyframes) -> None:
     last = np.minimum(m.target, robots - 1)
     there = (begins[m.robot] <= m.keyframe) & (m.keyframe < ends[m.robot])
     there &= (m.target >= robots) | ((begins[last] <= m.target_keyframe) & (m.target_keyframe < ends[last]))
-    valid = np.isfinite(m.range) & (m.range > 0) & np.isfinite(m.bearing) & (m.share > 0).all(axis=1)
+    share = np.where(np.isfinite(m.bearing)[:, None], m.share, m.share[:, :1])
+    valid = np.isfinite(m.range) & (m.range > 0) & ~np.isinf(m.bearing) & (share > 0).all(axis=1)
     for row in np.flatnonzero(~(there & valid))[:1].tolist():
         why = "is of a keyframe that has not come, or has left the window"
         if not valid[row]:
-            why = "has a range or bearing that is not finite, a range of 0 or less, or a share of 0"
+            why = "has a range that is not finite, a range of 0 or less, an infinite bearing, or a share of 0"
         names = *new.robots, *new.landmarks
         raise MeasurementError(
             f"the range of {names[m.target[row]]} by {names[m.robot[row]]} at {m.time[row]:.3f} s {why}"

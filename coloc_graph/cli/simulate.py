@@ -13,6 +13,13 @@ if TYPE_CHECKING:
 #: Scenarios with a gait, and the leap of each [m].
 GAITS = {"hallway": 0.185, "six-step": 0.185, "landmarks": 0.25, "team": 0.45}
 
+#: Options that do not apply to the scenario drives.
+WITH_STANCES = (
+    *("stances", "points", "fisheye", "noise", "mount_sigma", "mount_yaw_sigma", "height_sigma", "span_sigma"),
+    *("floor_sigma", "clock_offset", "time_jitter", "l", "theta", "leap", "plan", "map", "team", "at_once", "blink"),
+    *("length", "laps", "landmark_every", "fps", "image_format", "messy"),
+)
+
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command and its arguments."""
@@ -21,7 +28,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
         help="simulate a team and write its run, with ground truth",
         description="Simulate a team in a scenario and write its run, with ground truth.",
     )
-    command.add_argument("scenario", help="single-step, six-step, hallway, team or landmarks")
+    command.add_argument("scenario", help="single-step, six-step, hallway, team, landmarks, or drives (ranges alone)")
     add_out(command)
     command.add_argument(
         "--depth", choices=("tracks", "images"), default="tracks",
@@ -50,8 +57,9 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     uwb.add_argument("--uwb-sigma", type=float, default=0.0, help="noise of a range, m (default: 0, no ranges)")
     uwb.add_argument("--uwb-offset", type=float, default=0.0, help="offsets of the sensors (1 sigma), m (default: 0)")
     uwb.add_argument("--uwb-nlos", type=float, default=0.0, help="share without line of sight, 0 to 1 (default: 0)")
-    uwb.add_argument("--uwb-landmarks", type=int, default=0, metavar="N", help="landmarks that are ranged, unknown to "
-                     "the team (default: 0)")  # fmt: skip
+    uwb.add_argument("--uwb-landmarks", type=int, metavar="N", help="landmarks that are ranged, unknown to the team "
+                     "without --known (default: 0; drives 4)")  # fmt: skip
+    uwb.add_argument("--seconds", type=float, help="duration of drives, s (default: 60)")
 
     single = command.add_argument_group("formation, or a plan instead")
     single.add_argument("-l", type=float, help="distance between the observers, m (default: 0.8; hallway 0.74)")
@@ -64,7 +72,7 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     single.add_argument("--team", metavar="TEAM.toml", help="with --plan: its robots (default: those of the reference)")
 
     team = command.add_argument_group("scenario team")
-    team.add_argument("--robots", type=int, help="number of robots (default: 10)")
+    team.add_argument("--robots", type=int, help="number of robots (default: 10; drives 3)")
     team.add_argument("--at-once", type=int, help="number of robots that move at once (default: a quarter)")
     team.add_argument("--blink", action="store_true", help="robots are told apart by blinking; markers have no names")
 
@@ -90,6 +98,10 @@ def run(args: argparse.Namespace) -> int:
     from coloc_graph.team import read_team
 
     require_run_place(args.out, force=args.force)
+    if args.scenario == "drives":
+        return _drives(args)
+    if args.seconds is not None:
+        raise InputError(f"--seconds belongs to drives, not to {args.scenario}; leave it out")
     other = {"tracks": ("fps", "image_format"), "images": ("noise",)}[args.depth]
     for name in other:
         if getattr(args, name) is not None and not (name == "fps" and args.plan is not None):
@@ -132,10 +144,35 @@ def run(args: argparse.Namespace) -> int:
             fps=10.0 if args.fps is None else args.fps,
             image_format=args.image_format or "jpeg",
             messy=args.messy,
-            uwb_landmarks=args.uwb_landmarks,
+            uwb_landmarks=args.uwb_landmarks or 0,
             fisheye_deg=args.fisheye,
             progress=report,
         )
+    print(args.out)
+    return 0
+
+
+def _drives(args: argparse.Namespace) -> int:
+    """Simulate robots that range while they drive."""
+    from coloc_graph.errors import InputError
+    from coloc_graph.simulation.drives import simulate_drives
+
+    for name in WITH_STANCES:
+        if getattr(args, name):
+            raise InputError(f"--{name.replace('_', '-')} does not apply to drives, without stances; leave it out")
+    if args.depth != "tracks":
+        raise InputError("drives have no cameras: leave out --depth")
+    simulate_drives(
+        args.out,
+        seed=args.seed,
+        robots=3 if args.robots is None else args.robots,
+        seconds=60.0 if args.seconds is None else args.seconds,
+        sigma=args.uwb_sigma or 0.05,
+        offset_sigma=args.uwb_offset,
+        nlos=args.uwb_nlos,
+        landmarks=4 if args.uwb_landmarks is None else args.uwb_landmarks,
+        known=args.known,
+    )
     print(args.out)
     return 0
 

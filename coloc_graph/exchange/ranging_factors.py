@@ -80,19 +80,20 @@ class _Portable:
         self._turns[:, :2, :2] = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
         keyframes, letters = factors.keyframes, letters_of(factors.keyframes.robots)
         robots = len(keyframes.robots)
+        sensors = ("all robots",) if factors.radios else keyframes.robots
         number = np.arange(len(factors)) - factors.first[factors.robot]
         robot = factors.robot.tolist()
         marks = {one.name: n for n, one in enumerate(team.landmarks)}
         self._keys = [
             *(key_of(f"{letters[keyframes.robots[one]]}{k}") for one, k in zip(robot, number.tolist(), strict=True)),
             *(gtsam.mrsymbol(ord(WHEELS_KEY), one + 1, 0) for one in range(robots)),
-            *(gtsam.mrsymbol(ord(SENSOR_KEY), one + 1, 0) for one in range(robots)),
+            *(gtsam.mrsymbol(ord(SENSOR_KEY), one + 1, 0) for one in range(len(sensors))),
             *(key_of(f"{LANDMARK}{marks[name]}") for name in keyframes.landmarks),
         ]
         self._names = [
             *(("planar pose", f"{keyframes.robots[one]}@{k}") for one, k in zip(robot, number.tolist(), strict=True)),
             *((WHEELS_KIND, name) for name in keyframes.robots),
-            *((SENSOR_KIND, name) for name in keyframes.robots),
+            *((SENSOR_KIND, name) for name in sensors),
             *(("position", f"landmark {name}") for name in keyframes.landmarks),
         ]
 

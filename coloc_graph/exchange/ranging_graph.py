@@ -3,7 +3,8 @@
 Errors of wheels and sensors are taken as estimated, without their uncertainty (`ranging_factors` has it).
 A measurement becomes the bearing and range of its target from the robot's body, with the covariance that noise,
 correlation in time and robust weight leave it: one with the gradient of the original, so that the optimum is the
-estimate. Outliers are left out.
+estimate. A range without a bearing is that from body to body, in whose direction antennas off the middle are not.
+Outliers are left out.
 """
 
 from collections import Counter
@@ -64,13 +65,15 @@ def ranging_graph(estimate: Estimate, team: Team) -> RangeGraph:
     wheels = {name: calibrated[name].wheels or team[name].wheels or Wheels() for name in problem.robots}
     stated = [team[name].ranging or Ranging(range_sigma=1.0, bearing_sigma_deg=1.0) for name in problem.robots]
     sensors = [calibrated[name].ranging or one for name, one in zip(problem.robots, stated, strict=True)]
+    measured = tuple(_measured(estimate, Sensors(stated), Sensors(sensors), {**letters, **marks}))
     return RangeGraph(
         planar=True,
         times=times,
         initial={**initial, **{marks[name]: np.array(at) for name, at in places.items()}},
         priors=tuple(priors),
         relatives=tuple(_steps(estimate, wheels, letters)),
-        bearings=tuple(_bearings(estimate, Sensors(stated), Sensors(sensors), {**letters, **marks})),
+        bearings=tuple(one for one in measured if isinstance(one, BearingRangeValue)),
+        ranges=tuple(one for one in measured if isinstance(one, RangeValue)),
     )
 
 
@@ -89,41 +92,58 @@ def _steps(estimate: Estimate, wheels: dict[str, Wheels], letters: dict[str, str
             yield RelativeValue(float(keyframes.times[own][number + 1]), *ends, gtsam.Pose2(*step), C)
 
 
-def _bearings(
+def _measured(
     estimate: Estimate, stated: Sensors, sensors: Sensors, names: dict[str, str]
-) -> Iterator[BearingRangeValue]:
+) -> Iterator[BearingRangeValue | RangeValue]:
     problem = estimate.ranging
     m, used = problem.keyframes.measured, np.flatnonzero(problem.used)
+    if not len(used):
+        return
     robot, of_robot = m.robot[used], m.target[used] < len(problem.robots)
     row_of = {name: dict(zip(of.tolist(), range(len(of)), strict=True)) for name, of in problem.numbers.items()}
-    rows, places = [], []
+    ends = []
     for one in (problem.measurements[row] for row in used.tolist()):
-        rows.append(estimate.trajectories[one.robot].T_world_body[row_of[one.robot][one.keyframe]])
+        here = estimate.trajectories[one.robot].T_world_body[row_of[one.robot][one.keyframe]]
         if one.target in row_of:
-            at = estimate.trajectories[one.target].positions[row_of[one.target][one.target_keyframe]]
+            there = estimate.trajectories[one.target].T_world_body[row_of[one.target][one.target_keyframe]]
         else:
-            at = np.array(estimate.landmarks[one.target].planar[:2])
-        places.append((at[0], at[1], 0.0, 1.0))
-    points = (se3_inverse(np.array(rows)) @ np.array(places)[..., None])[:, :2, 0]
-    expected = sensors.expected(robot, points, np.zeros((len(used), RANGING)), of_robot)
+            there = estimate.landmarks[one.target].T_world_body.matrix()
+        ends.append((here, there))
+    T_here, T_there = np.array(ends).transpose(1, 0, 2, 3)
+    poses, targets = (np.column_stack([T[:, :2, 3], yaw(T)]) for T in (T_here, T_there))
+    points = (se3_inverse(T_here) @ T_there[:, :, 3:])[:, :2, 0]
+    nothing = np.zeros((len(problem.robots), RANGING))
+    antennas = np.where(sensors.two_way[robot] & of_robot, m.target[used], -1)
+    expected = sensors.between(robot, poses, antennas, targets, nothing, of_robot)
     residuals = expected.values - np.stack([m.range[used], m.bearing[used]], axis=-1)
     residuals[:, 1] = wrap(residuals[:, 1])
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    by_xy = expected.by_target[:, :, :2] @ np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
     distance = np.hypot(*points.T)
-    polar = np.empty_like(expected.by_xy)
+    polar = np.empty_like(by_xy)
     polar[:, 0, 0], polar[:, 0, 1] = -points[:, 1] / distance**2, points[:, 0] / distance**2
     polar[:, 1] = points / distance[:, None]
-    J = polar @ np.linalg.inv(expected.by_xy)
+    J = polar @ np.linalg.inv(by_xy)
     share = m.share[used]
-    off = (share * problem.residuals[used] ** 2).sum(axis=1) / CAUCHY**2
+    off = np.nansum(share * problem.residuals[used] ** 2, axis=1) / CAUCHY**2
     sigmas = stated.sigmas(robot, m.range[used]) * problem.noise[robot]
-    C = J @ ((sigmas**2 / share * (1 + off)[:, None])[:, :, None] * J.mT)
-    moved = (J @ residuals[..., None])[..., 0]
-    bearing, distance = np.arctan2(points[:, 1], points[:, 0]) - moved[:, 0], np.maximum(distance - moved[:, 1], 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variances = sigmas**2 / share * (1 + off)[:, None]
+        C = J @ (variances[:, :, None] * J.mT)
+        moved = (J @ residuals[..., None])[..., 0]
+    bearing = np.arctan2(points[:, 1], points[:, 0]) - moved[:, 0]
+    alone = np.isnan(bearing)
+    scales = np.array([sensors.ranging[one].scale for one in robot.tolist()])
+    distance = np.maximum(distance - np.where(alone, residuals[:, 0] / scales, moved[:, 1]), 0.0)
     for n, one in enumerate(problem.measurements[row] for row in used.tolist()):
-        ends = f"{names[one.robot]}{one.keyframe}", names[one.target]
+        first, second = f"{names[one.robot]}{one.keyframe}", names[one.target]
         if one.target_keyframe >= 0:
-            ends = ends[0], f"{ends[1]}{one.target_keyframe}"
-        yield BearingRangeValue(one.time, *ends, float(bearing[n]), float(distance[n]), (C[n] + C[n].T) / 2)
+            second = f"{second}{one.target_keyframe}"
+        if alone[n]:
+            yield RangeValue(one.time, first, second, float(distance[n]), float(variances[n, 0] / scales[n] ** 2))
+        else:
+            whole = (C[n] + C[n].T) / 2
+            yield BearingRangeValue(one.time, first, second, float(bearing[n]), float(distance[n]), whole)
 
 
 def without_bearings(graph: RangeGraph) -> tuple[RangeGraph, str]:
@@ -148,7 +168,7 @@ def planar_g2o(graph: RangeGraph, robots: dict[str, str]) -> tuple[str, str]:
     `robots` are names by letter.
     """
     poses = {name: number for number, name in enumerate(name for name in graph.initial if not is_landmark(name))}
-    marks, ends = len(graph.initial) - len(poses), len(graph.bearings)
+    marks, ends = len(graph.initial) - len(poses), len(graph.bearings) + len(graph.ranges)
     said = (
         f"left out: {ends} ranges and bearings and {marks} landmarks, which a pose graph cannot express; the poses are "
         "those with them, and jrl, pyfg or gtsam hold them"
@@ -175,7 +195,8 @@ def planar_dot(graph: RangeGraph, robots: dict[str, str], landmarks: Iterable[st
     """Draw robots and landmarks, one box for all poses of a robot, with the number of measurements between them."""
     marks = dict(enumerate(landmarks))
     counts = Counter(name[0] for name in graph.initial if not is_landmark(name))
-    pairs = Counter((one.first[0], one.second if is_landmark(one.second) else one.second[0]) for one in graph.bearings)
+    ends = [(one.first, one.second) for one in graph.bearings] + [(one.first, one.second) for one in graph.ranges]
+    pairs = Counter((first[0], second if is_landmark(second) else second[0]) for first, second in ends)
     lines = ["graph ranging {", "  node [shape=box, style=rounded, fontname=Helvetica];"]
     lines += [f'  {letter} [label="{robots[letter]}: {count} poses"];' for letter, count in counts.items()]
     lines += [

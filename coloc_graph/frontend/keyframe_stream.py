@@ -72,6 +72,7 @@ class KeyframeStream:
         self._measured = [-np.inf] * len(self.names)  # time of the last measurement
         self._count = [0] * len(self.names)  # keyframes that were made
         self._pairs: dict[tuple[int, int], float] = {}  # time at which a robot measured a target last
+        self._has_bearings = [one.ranging is None or one.ranging.has_bearings for one in team.robots]
         #: Number of ranges that were measured while there was no odometry.
         self.outside = 0
 
@@ -84,16 +85,16 @@ class KeyframeStream:
                 self._odometry[self._numbers[one.robot]].append(one)
 
     def take(self, until: float = np.inf) -> Keyframes:
-        """Return what follows the keyframes taken before, as `IncrementalKeyframes.add` takes it.
+        """Return what follows the keyframes taken before, as `KeyframeEstimator.add` takes it.
 
         Of what was measured before a time [UTC s], when all of it and the odometry up to it, later by its delay, have
-        been added. Robots without bearings are left out.
+        been added.
         """
         paths = [path_of(samples) for samples in self._odometry]
         rows: list[tuple[float, int, int, float, float]] = []
         for one in self._ranges:
-            if one.time < until and one.bearing is not None:
-                rows += self._rows(one, one.bearing, paths)
+            if one.time < until:
+                rows += self._rows(one, paths)
         self._ranges = [one for one in self._ranges if one.time >= until]
         rows.sort()
         table = np.array(rows).reshape(-1, 5)
@@ -107,16 +108,17 @@ class KeyframeStream:
             late = min(float(at[-1]) if len(at) else until, until) - wheels.delay - DELAY_SIGMAS * wheels.delay_sigma
             if path is not None and np.isfinite(late):
                 del self._odometry[n][: max(int(np.searchsorted(path.times, late)) - 1, 0)]
-        share = self._shares(time, robot, target)
+        share = np.where(np.isfinite(table[:, 3:5]), self._shares(time, robot, target), 0.0)
         measured = RangeBearings(
             time, robot, keyframe, target, target_keyframe, table[:, 3].copy(), table[:, 4].copy(), share
         )
         return Keyframes(self.names, self.landmarks, tuple(times), tuple(steps), measured, begins=tuple(begins))
 
-    def _rows(
-        self, one: Ranges, bearings: Array, paths: list[OdometryPath | None]
-    ) -> Iterable[tuple[float, int, int, float, float]]:
+    def _rows(self, one: Ranges, paths: list[OdometryPath | None]) -> Iterable[tuple[float, int, int, float, float]]:
         robot = self._numbers[one.robot]
+        # bearings whose noise is not stated are none
+        has = one.bearing is not None and self._has_bearings[robot]
+        bearings = one.bearing if has and one.bearing is not None else np.full(len(one.targets), np.nan)
         for target, distance, bearing in zip(one.targets, one.range.tolist(), bearings.tolist(), strict=True):
             number = self._numbers[target]
             if number < len(paths) and not self._between_robots:

@@ -10,7 +10,7 @@ from coloc_graph.frontend.keyframe_stream import DELAY_SIGMAS, KeyframeStream, O
 from coloc_graph.frontend.sensor_delay import SensorDelay, sensor_delay
 from coloc_graph.measurements import Keyframes
 from coloc_graph.run import OdometrySample, Ranges, Run
-from coloc_graph.team import Wheels
+from coloc_graph.team import Team, Wheels
 
 Array = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ LATE_SIGMAS = 5.0  # standard deviations by which it must differ too
 
 
 def keyframes_of(run: Run, *, between_robots: bool = True) -> Keyframes:
-    """Make the keyframes of a run with ranges and bearings.
+    """Make the keyframes of a run with ranges, with or without bearings.
 
     Parameters
     ----------
@@ -54,10 +54,11 @@ def keyframes_of(run: Run, *, between_robots: bool = True) -> Keyframes:
                 f"{'ahead of' if by > 0 else 'behind'} that of its odometry (1 sigma {sigma:.3f} s, by how bearings "
                 "change while it turns); the times of its measurements were corrected"
             )
-        if any(one.bearing is None for one in ranges[robot]):
-            raise InputError(
-                f"{run.path}: {robot} measured ranges without bearings, and the run holds no stances: ranges alone "
-                "leave robots on circles, and mirrored; record stances, or bearings"
+        bearings = sum(len(one.targets) for one in ranges[robot] if one.bearing is not None)
+        if bearings and not _has_bearings(run.team, robot):
+            warnings.append(
+                f"{run.path}: {bearings} bearings of {robot} are not used: the team states no noise for them; add "
+                "bearing_sigma_deg to its [robots.ranging]"
             )
         stream.add(*samples[robot], *ranges[robot])
     keyframes = stream.take()
@@ -84,12 +85,8 @@ def _late(
         seen = [
             (one.time, standing[target], distance, bearing)
             for one in ranges[robot]
-            for target, distance, bearing in zip(
-                one.targets,
-                one.range.tolist(),
-                ([np.nan] * len(one.targets) if one.bearing is None else one.bearing.tolist()),
-                strict=True,
-            )
+            if one.bearing is not None and _has_bearings(run.team, robot)
+            for target, distance, bearing in zip(one.targets, one.range.tolist(), one.bearing.tolist(), strict=True)
             if target in standing
         ]
         if path is None or not seen:
@@ -108,6 +105,11 @@ def _late(
         if abs(off) > max(tolerated, LATE_SIGMAS * delay.sigma):
             late[robot] = off, delay.sigma
     return late
+
+
+def _has_bearings(team: Team, robot: str) -> bool:
+    ranging = team[robot].ranging
+    return ranging is not None and ranging.has_bearings
 
 
 def _require_noise(run: Run, robot: str) -> None:

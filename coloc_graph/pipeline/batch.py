@@ -6,16 +6,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from coloc_graph.backend import Estimate, PoseGraph, chain, diagnose, joint, smooth
-from coloc_graph.backend.planar import (
-    LAG,
-    NONE_LOCATED,
-    UNLOCATED,
-    UPDATE_PERIOD,
-    IncrementalKeyframes,
-    Latest,
-    optimise_keyframes,
-)
+from coloc_graph.backend import Estimate, Estimator, KeyframeGraph, PoseGraph, chain, diagnose, joint, smooth
+from coloc_graph.backend.planar import LAG, UPDATE_PERIOD, Latest
 from coloc_graph.errors import EstimationError
 from coloc_graph.frontend import PairMeasurement, UnusedSighting, describe_unused, share_clock_offsets
 from coloc_graph.frontend.keyframes import keyframes_of
@@ -329,10 +321,10 @@ def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_up
     started = time.perf_counter()
     keyframes = keyframes_of(run, between_robots=options.between_robots)
     seconds = time.perf_counter() - started
-    updates: list[float] = []
+    graph, updates = KeyframeGraph(run.team, keyframes), list[float]()
     online: Mapping[str, Trajectory] = {}
     if options.incremental:
-        incremental = IncrementalKeyframes(run.team, lag=LAG if options.lag is None else options.lag)
+        incremental = Estimator.of(run.team, "ranging", LAG if options.lag is None else options.lag)
         begin, end = keyframes.measured.time[[0, -1]].tolist()
         count = int((end - begin) / UPDATE_PERIOD) + 1
         for number in range(count):
@@ -346,10 +338,14 @@ def _by_ranges(run: Run, options: SolveOptions, progress: Progress | None, on_up
                 progress(number + 1, count)
         estimate, online = incremental.estimate(), incremental.online
     else:
-        estimate = optimise_keyframes(run.team, keyframes)
-    if not estimate.trajectories:
-        raise EstimationError(f"{run.path}: {NONE_LOCATED}")
-    missing = dict.fromkeys((name for name in keyframes.robots if name not in estimate.trajectories), UNLOCATED)
+        try:
+            estimate = joint(graph)
+        except EstimationError as failure:
+            raise EstimationError(f"{run.path}: {failure}") from failure
+    loose = diagnose(graph) if len(estimate.trajectories) < len(run.team.names) else ()
+    if not estimate.ranging.used.any():
+        raise EstimationError(f"{run.path}: no measurement could be used; {'; '.join(map(str, loose))}")
+    missing = {part.robot: part.remedy for part in loose if part.robot is not None}
     warnings = [*keyframes.warnings, *warnings_of_ranges(estimate)]
     return _Solved(estimate, warnings, seconds, (), tuple(updates), online, missing)
 

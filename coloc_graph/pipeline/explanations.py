@@ -185,7 +185,7 @@ def _p_value(p_value: float) -> str:
 def warnings_of_ranges(estimate: Estimate) -> list[str]:
     """Warnings of the estimate of a ranging run: outliers, unlikely calibrations."""
     outliers = [_outliers(estimate.ranging)] if estimate.rejected else []
-    return [*outliers, *_far(estimate)]
+    return [*outliers, *_far(estimate), *_unobservable(estimate), *_misfit(estimate)]
 
 
 def _outliers(problem: RangingProblem) -> str:

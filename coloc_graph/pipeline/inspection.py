@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coloc_graph.backend.planar import NONE_LOCATED, unlocated
+from coloc_graph.backend import KeyframeGraph, diagnose
 from coloc_graph.errors import DegenerateGeometry, InputError
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.frontend.landmarks import describe_unused, sight_landmarks
@@ -94,10 +94,7 @@ def _ranging_findings(run: Run) -> list[Finding]:
     if not findings:
         try:
             keyframes = keyframes_of(run)
-            without = unlocated(run.team, keyframes)
-            said = [*keyframes.warnings, *(f"robot {robot} has no pose: {why}" for robot, why in without.items())]
-            if len(without) == len(run.team.names):
-                said = [*keyframes.warnings, NONE_LOCATED]
+            said = [*keyframes.warnings, *map(str, diagnose(KeyframeGraph(run.team, keyframes)))]
         except InputError as why:
             said = [str(why)]
         findings += [Finding("run", one.removeprefix(f"{run.path}: ")) for one in said]

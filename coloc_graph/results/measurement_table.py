@@ -122,6 +122,7 @@ def _ranges(solution: Solution) -> Iterator[dict[str, Any]]:
     for one, (share_range, share_bearing), (of_range, of_bearing) in zip(
         problem.measurements, shares, residuals, strict=True
     ):
+        bearing = {"bearing": one.bearing, "share_bearing": share_bearing, "residual_bearing": of_bearing}
         yield _row(
             "range",
             problem.reason(one.row),
@@ -130,11 +131,9 @@ def _ranges(solution: Solution) -> Iterator[dict[str, Any]]:
             index_i=one.keyframe,
             robot_j=one.target,
             index_j=one.target_keyframe if one.target_keyframe >= 0 else "",
-            residual=math.sqrt((of_range**2 + of_bearing**2) / 2),
+            residual=problem.residual(one),
             range=one.range,
-            bearing=one.bearing,
             share_range=share_range,
-            share_bearing=share_bearing,
             residual_range=of_range,
-            residual_bearing=of_bearing,
+            **({} if math.isnan(one.bearing) else bearing),
         )

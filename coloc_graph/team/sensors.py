@@ -66,6 +66,11 @@ class Ranging(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         tolerances = ("offset_sigma", "scale_sigma", "bearing_offset_sigma_deg", "depth_sigma", "robot_offset_sigma")
         require_not_negative(self, (*noise, *tolerances, "place_sigma"))
 
+    @property
+    def has_bearings(self) -> bool:
+        """True if it measures bearings: their noise is stated."""
+        return self.bearing_sigma_deg > 0 or self.across_sigma > 0
+
 
 class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Calibration of wheel odometry; its noise is in the run, sample by sample.

@@ -9,9 +9,9 @@ from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.floor_poses import in_body
 from coloc_graph.backend.marginals import Marginals
 from coloc_graph.backend.planar.factors import KeyframeFactors, State, robust
-from coloc_graph.backend.planar.filter import INITIAL_PERIOD, NONE_LOCATED, Filter, filter_forward
+from coloc_graph.backend.planar.filter import INITIAL_PERIOD, Filter, filter_forward
 from coloc_graph.backend.planar.problem import KeyframeProblem
-from coloc_graph.backend.planar.summary import measured_off, ranging_estimate
+from coloc_graph.backend.planar.summary import ranging_estimate
 from coloc_graph.backend.ranging import outliers_of
 from coloc_graph.backend.solver import Optimum, gauss_newton
 from coloc_graph.errors import EstimationError
@@ -49,7 +49,8 @@ def optimise_keyframes(team: Team, keyframes: Keyframes, *, calibrate_noise: boo
     """
     filtered = filter_forward(team, keyframes, period=INITIAL_PERIOD)
     if not filtered.placed_at:
-        raise EstimationError(NONE_LOCATED)
+        name, why = next(iter(filtered.unlocated().items()))
+        raise EstimationError(f"no robot can be localised, as {name}: {why}")
     factors = KeyframeFactors(keyframes, filtered.models)
     seen = np.flatnonzero(np.isfinite(filtered.landmarks[:, 0])).tolist()
     problem, optimum = _fitted(factors, _start(filtered, factors), seen)
@@ -104,18 +105,19 @@ def _noise(problem: KeyframeProblem, state: State, marginals: Marginals) -> tupl
     The fit absorbs a part of each squared residual. Of a measurement with a share s, of which it absorbs h, it leaves
     s (1 - h) degrees of freedom, and not s - h, since correlated errors are not fitted as independent ones would be.
     """
-    factors, index = problem.factors, problem.measured
-    m, rows = factors.keyframes.measured, robust(factors.measured(state, index))[0]
-    taken = np.zeros((len(index), 2))  # absorbed part, in units of the noise
-    for some, parts in factors.keys.blocks(rows):
+    factors = problem.factors
+    m, off = factors.keyframes.measured, factors.off(state)
+    taken = np.full((len(m), 2), np.nan)  # absorbed part, in units of the noise
+    for some, parts in factors.keys.blocks(robust(factors.measured(state, problem.measured))[0]):
         keys, jacobians = zip(*parts, strict=True)
-        taken[some] = marginals.variances([factors.keys.names[one] for one in keys], jacobians)
-    share, robots = m.share[index], m.robot[index]
-    off = measured_off(factors, state)[index]
-    good = ~outliers_of(off)
+        taken[problem.measured[some]] = marginals.variances([factors.keys.names[one] for one in keys], jacobians)
+    taken[~np.isfinite(off)] = np.nan  # no bearing
+    good = np.isfinite(taken[:, 0]) & ~outliers_of(off)
     noise = factors.noise.copy()
-    for robot in np.unique(robots[good]).tolist():
-        own = good & (robots == robot)
-        mean = (share[own] * off[own] ** 2).sum(axis=0) / share[own].sum(axis=0)
-        noise[robot] *= np.sqrt(mean / np.maximum(1 - taken[own].mean(axis=0), MIN_REDUNDANCY))
-    return np.clip(noise, *NOISE_RANGE), float(((1 - share) * taken)[good].sum())
+    for robot in np.unique(m.robot[good]).tolist():
+        own = good & (m.robot == robot)
+        for kind in np.flatnonzero(np.isfinite(taken[own]).any(axis=0)).tolist():
+            there = own & np.isfinite(taken[:, kind])
+            mean = (m.share[there, kind] * off[there, kind] ** 2).sum() / m.share[there, kind].sum()
+            noise[robot, kind] *= np.sqrt(mean / max(1 - taken[there, kind].mean(), MIN_REDUNDANCY))
+    return np.clip(noise, *NOISE_RANGE), float(np.nansum(((1 - m.share) * taken)[good]))

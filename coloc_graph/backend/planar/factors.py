@@ -70,6 +70,8 @@ class KeyframeFactors:
         self._known_before[self._marks :] = np.where(known[:, None], models.map, 0.0).ravel()
         self._step_first: Index = np.cumsum([0, *map(len, models.wheels)])
         self._sigmas_measured = models.sensors.sigmas(m.robot, m.range)
+        #: True if ranges are on the errors of two sensors: those of all are one key then, since a factor has three.
+        self.radios = bool((models.sensors.two_way[m.robot] & self.of_robot).any())
         self._landmark: Index = np.maximum(m.target - robots, 0) if landmarks else np.zeros(len(m), int)
 
     def __len__(self) -> int:
@@ -151,29 +153,38 @@ class KeyframeFactors:
 
     def measured(self, state: State, index: Index) -> Rows:
         """Linearise some ranges and bearings (n,), weighted by their shares of new information."""
-        m = self.keyframes.measured
+        m, sensors = self.keyframes.measured, self.models.sensors
         robots, observer, of_robot = m.robot[index], self.observer[index], self.of_robot[index]
         seen, landmark = np.maximum(self.seen[index], 0), self._landmark[index]
-        pose, there = state.poses[observer], state.poses[seen, :2]
+        there = state.poses[seen]
         if len(self.keyframes.landmarks):
-            there = np.where(of_robot[:, None], there, self.landmarks(state.shared)[landmark])
-        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        dx, dy = (there - pose[:, :2]).T
-        xy = np.stack([c * dx + s * dy, -s * dx + c * dy], axis=-1)
-        expected = self.models.sensors.expected(robots, xy, self.ranging(state.shared)[robots], of_robot)
-        J = np.empty((len(index), 2, 6 + RANGING))
-        J[:, :, 3] = c[:, None] * expected.by_xy[:, :, 0] - s[:, None] * expected.by_xy[:, :, 1]
-        J[:, :, 4] = s[:, None] * expected.by_xy[:, :, 0] + c[:, None] * expected.by_xy[:, :, 1]
-        J[:, :, :2] = -J[:, :, 3:5]
-        J[:, :, 2] = expected.by_xy[:, :, 0] * xy[:, None, 1] - expected.by_xy[:, :, 1] * xy[:, None, 0]
-        J[:, :, 5:-1] = expected.by_errors
-        J[:, 0, -1] = expected.values[:, 0] - m.range[index]
-        J[:, 1, -1] = wrap(expected.values[:, 1] - m.bearing[index])
-        J *= (np.sqrt(m.share[index]) / (self._sigmas_measured[index] * self.noise[robots]))[:, :, None]
-        target = np.where(of_robot, 3 * seen, self._shared(self._marks + 2 * landmark))
-        errors = self._shared(self._ranging + RANGING * robots[:, None] + np.arange(RANGING))
-        columns = [3 * observer[:, None] + np.arange(3), target[:, None] + np.arange(2), errors]
-        return Rows(J, np.concatenate(columns, axis=1), (0, 3, 5))
+            there = np.where(of_robot[:, None], there, self.landmarks(state.shared)[landmark][:, [0, 1, 1]])
+        targets = np.where(sensors.two_way[robots] & of_robot, m.target[index], -1) if self.radios else None
+        found = sensors.between(robots, state.poses[observer], targets, there, self.ranging(state.shared), of_robot)
+        off = np.stack([found.values[:, 0] - m.range[index], wrap(found.values[:, 1] - m.bearing[index])], axis=-1)
+        errors, of_errors = found.by_errors, RANGING * robots[:, None] + np.arange(RANGING)
+        if targets is not None and found.by_target_errors is not None:
+            errors = np.zeros((len(index), 2, len(self.keyframes.robots), RANGING))
+            rows = np.arange(len(index))
+            errors[rows, :, robots] = found.by_errors
+            errors[rows, :, targets] += found.by_target_errors  # 0 of those that are not two-way
+            errors = errors.reshape(len(index), 2, self._marks - self._ranging)
+            of_errors = np.broadcast_to(np.arange(errors.shape[2]), (len(index), errors.shape[2]))
+        weights = np.sqrt(m.share[index]) / (self._sigmas_measured[index] * self.noise[robots])
+        off = np.where(weights > 0, off, 0.0)  # a bearing that was not measured
+        J = np.concatenate([found.by_pose, found.by_target, errors, off[:, :, None]], axis=2) * weights[:, :, None]
+        ends, place = np.arange(3), self._shared(self._marks + 2 * landmark)[:, None] + np.array([0, 1, 1])
+        columns = [3 * observer[:, None] + ends, np.where(of_robot[:, None], 3 * seen[:, None] + ends, place)]
+        return Rows(J, np.concatenate([*columns, self._shared(self._ranging + of_errors)], axis=1), (0, 3, 6))
+
+    def off(self, state: State) -> Array:
+        """Return residuals (m, 2) of all measurements in units of their sigmas, without shares.
+
+        NaN where an end has no pose, or where none was measured.
+        """
+        m = self.keyframes.measured
+        with np.errstate(invalid="ignore"):
+            return self.measured(state, np.arange(len(m))).residuals / np.sqrt(m.share)
 
     @cached_property
     def keys(self) -> Keys:
@@ -182,10 +193,12 @@ class KeyframeFactors:
         GTSAM's keys number the poses by keyframe and robot, and are the same whatever is in the window.
         """
         robots, landmarks = len(self.keyframes.robots), len(self.keyframes.landmarks)
-        sizes = np.repeat([3, WHEELS, RANGING, 2], [len(self), robots, robots, landmarks])
+        sensors = 1 if self.radios else robots
+        of_sensors = RANGING * robots // max(sensors, 1)
+        sizes = np.repeat([3, WHEELS, of_sensors, 2], [len(self), robots, sensors, landmarks])
         number = np.arange(len(self)) - self.first[self.robot] + np.array(self.keyframes.begins)[self.robot]
         names = np.concatenate(
-            [pose_key(self.keyframes, self.robot, number), SHARED + np.arange(2 * robots + landmarks)]
+            [pose_key(self.keyframes, self.robot, number), SHARED + np.arange(robots + sensors + landmarks)]
         )
         return Keys(names, sizes, np.concatenate([np.ones(3 * len(self), bool), self.free]))
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.backend.planar.initial_pose import RigidAlignmentRansac
+from coloc_graph.backend.planar.range_alignment import RangeAlignment
 from coloc_graph.backend.sensor_model import (
     RANGING,
     WHEELS,
@@ -26,15 +27,13 @@ from coloc_graph.team import Ranging, Team, Wheels
 
 Array = NDArray[np.float64]
 
-INNOVATION_GATE = 18.4  # squared Mahalanobis distance (two dimensions, p-value 1e-4) above which one is rejected
+INNOVATION_GATES = (15.1, 18.4)  # squared Mahalanobis distance of one and two dimensions that has a p-value of 1e-4
+ALIGNMENT_PERIOD = 0.5  # s between ranges of one pair without a bearing, by which something is placed
 INITIAL_PERIOD = 1.0  # s between measurements of one target by one robot, for initial values
 INITIAL_SIGMAS = (0.15, 0.15, 0.1)  # m, m, rad: of a robot's initial pose
 LANDMARK_SIGMA = 30.0  # m: of a landmark's initial position
-#: Reason for which a robot has no pose, and for which none has.
-UNLOCATED = "it must be measured together with two robots or landmarks of known positions"
-NONE_LOCATED = (
-    "no robot can be localised: a robot must observe at least two landmarks with known positions, several times"
-)
+#: Reason for which a robot has no pose.
+UNLOCATED = "measure it together with two robots or landmarks of known positions, several times"
 
 
 class Models:
@@ -82,13 +81,13 @@ def aligned(values: Sequence[Array], before: Keyframes, now: Keyframes) -> list[
 
 
 def unlocated(team: Team, keyframes: Keyframes) -> dict[str, str]:
-    """Return the reason by robot that no measurements locate; it ends as soon as all are located."""
+    """Return by robot that no measurements locate what would; it ends as soon as all are located."""
     one = Filter(team, keyframes, INITIAL_PERIOD)
     for index in range(len(keyframes.measured)):
         if len(one.placed_at) == len(keyframes.robots):
             break
         one.take(index)
-    return dict.fromkeys((name for n, name in enumerate(keyframes.robots) if n not in one.placed_at), UNLOCATED)
+    return one.unlocated()
 
 
 class Filter:
@@ -120,6 +119,8 @@ class Filter:
         self._at = [0] * robots
         self._placed = [False] * robots
         self._placing = [RigidAlignmentRansac() for _ in range(robots)]
+        self._aligning: dict[int, RangeAlignment] = {}  # by robot, or number of robots plus landmark
+        self._aligned_at: dict[tuple[int, int], float] = {}
         # odometry pose of each robot in a frame of its own, until it has an initial pose
         self._own: list[Pose] = [(0.0, 0.0, 0.0)] * robots
         reference = keyframes.robots.index(team.reference)
@@ -163,15 +164,20 @@ class Filter:
     def take(self, index: int) -> None:
         """Process the next measurement."""
         m = self.keyframes.measured
-        robot, target = int(m.robot[index]), int(m.target[index])
-        range_, bearing, time = float(m.range[index]), float(m.bearing[index]), float(m.time[index])
+        robot, target, time = int(m.robot[index]), int(m.target[index]), float(m.time[index])
         if time - self._used_at.get((robot, target), -math.inf) < self._period:
             return
         begins = self.keyframes.begins
         self.go(robot, int(m.keyframe[index]) - begins[robot])
         if target < self._robots:
             self.go(target, int(m.target_keyframe[index]) - begins[target])
-        if self._ready(robot, target, range_, bearing):
+        range_, bearing = float(m.range[index]), float(m.bearing[index])
+        both = (self._knows(robot) and self._knows(target)) or (
+            self._align(robot, target, range_, time)
+            if math.isnan(bearing)
+            else self._ready(robot, target, range_, bearing)
+        )
+        if both:
             self.used[index] = self._update(robot, target, range_, bearing, m.share[index].tolist())
             if self.used[index]:
                 self._used_at[robot, target] = time
@@ -200,34 +206,78 @@ class Filter:
         at = self._marks + 2 * number
         return self.mean[at : at + 2] if self._known[number] else None
 
+    def unlocated(self) -> dict[str, str]:
+        """Return by robot that has no pose what would give it one."""
+        return {
+            name: self._aligning[n].why if n in self._aligning else UNLOCATED
+            for n, name in enumerate(self.keyframes.robots)
+            if n not in self.placed_at
+        }
+
+    def _knows(self, target: int) -> bool:
+        """Return whether a robot has a pose, or a landmark (the number of robots plus its own) a position."""
+        return self._placed[target] if target < self._robots else bool(self._known[target - self._robots])
+
     def _ready(self, robot: int, target: int, range_: float, bearing: float) -> bool:
-        """Return whether both ends of a measurement have poses; otherwise use it for an initial one."""
+        """Use a measurement for the initial pose of one of its ends; return whether it may update both."""
         is_robot = target < self._robots
         seen = self.models.sensors.place(robot, range_, bearing, is_robot)
         if not self._placed[robot]:
-            if is_robot and self._placed[target]:
-                self._place(robot, compose(self._own[robot], (*seen, 0.0))[:2], self._pose(target)[:2])
-            elif not is_robot and self._known[target - self._robots]:
-                at = self._marks + 2 * (target - self._robots)
-                world = float(self.mean[at]), float(self.mean[at + 1])
-                self._place(robot, compose(self._own[robot], (*seen, 0.0))[:2], world)
+            if self._knows(target):
+                self._place(robot, compose(self._own[robot], (*seen, 0.0))[:2], self._point(target))
             return False
         world = compose(self._pose(robot), (*seen, 0.0))[:2]
-        if is_robot and not self._placed[target]:
+        if is_robot:
             self._place(target, self._own[target][:2], world)
             return False
-        if not is_robot and not self._known[target - self._robots]:
-            at = self._marks + 2 * (target - self._robots)
-            self.mean[at : at + 2] = world
-            self.P[at : at + 2, at : at + 2] = np.eye(2) * LANDMARK_SIGMA**2
-            self._known[target - self._robots] = True
+        self._place_landmark(target, world, LANDMARK_SIGMA)
         return True
+
+    def _align(self, robot: int, target: int, range_: float, time: float) -> bool:
+        """Use a range without a bearing as `_ready` does; no end has an initial pose that it may update."""
+        placed = self._placed[robot]
+        if placed == self._knows(target) or time - self._aligned_at.get((robot, target), -math.inf) < ALIGNMENT_PERIOD:
+            return False
+        self._aligned_at[robot, target] = time
+        sensors, is_robot = self.models.sensors, target < self._robots
+        antenna = sensors.antenna(robot)
+        other = sensors.antenna(target) if is_robot and sensors.two_way[robot] else (0.0, 0.0)
+        loose = target if placed else robot
+        world = self._point(robot, antenna) if placed else self._point(target, other)
+        own = (0.0, 0.0)
+        if loose < self._robots:
+            own = compose(self._own[loose], (*(other if placed else antenna), 0.0))[:2]
+        aligning = self._aligning.setdefault(loose, RangeAlignment(turns=loose < self._robots))
+        sigmas = [sensors.ranging[robot].range_sigma, sensors.ranging[robot].offset_sigma]
+        aligning.add(own, world, sensors.distance(robot, range_, target if is_robot else None), math.hypot(*sigmas))
+        pose = aligning.pose()
+        if pose is not None and loose < self._robots:
+            self._begin(loose, pose)
+        elif pose is not None:
+            self._place_landmark(loose, pose[:2], INITIAL_SIGMAS[0])
+        return False
+
+    def _point(self, target: int, antenna: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+        """Return the position of a landmark, or of a point of a robot's body [m]."""
+        if target < self._robots:
+            return compose(self._pose(target), (*antenna, 0.0))[:2]
+        at = self._marks + 2 * (target - self._robots)
+        return float(self.mean[at]), float(self.mean[at + 1])
+
+    def _place_landmark(self, target: int, world: tuple[float, float], sigma: float) -> None:
+        at = self._marks + 2 * (target - self._robots)
+        self.mean[at : at + 2] = world
+        self.P[at : at + 2, at : at + 2] = np.eye(2) * sigma**2
+        self._known[target - self._robots] = True
 
     def _place(self, robot: int, local: tuple[float, float], world: tuple[float, float]) -> None:
         self._placing[robot].add(local, world)
         frame = self._placing[robot].pose()
-        if frame is None:
-            return
+        if frame is not None:
+            self._begin(robot, frame)
+
+    def _begin(self, robot: int, frame: Pose) -> None:
+        """Give a robot its initial pose, by that of its own frame in the world."""
         at = slice(3 * robot, 3 * robot + 3)
         self.mean[at] = compose(frame, self._own[robot])
         self.P[at, at] = np.diag(np.square(INITIAL_SIGMAS))
@@ -270,27 +320,35 @@ class Filter:
             self._note(robot)
 
     def _update(self, robot: int, target: int, range_: float, bearing: float, share: list[float]) -> bool:
-        is_robot = target < self._robots
+        is_robot, sensors = target < self._robots, self.models.sensors
         to = 3 * target if is_robot else self._marks + 2 * (target - self._robots)
-        errors = slice(self._ranging + RANGING * robot, self._ranging + RANGING * (robot + 1))
-        pose, one = self._pose(robot), np.array([robot])
-        dx, dy = float(self.mean[to]) - pose[0], float(self.mean[to + 1]) - pose[1]
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        x, y = c * dx + s * dy, -s * dx + c * dy
-        sensors = self.models.sensors
-        expected = sensors.expected(one, np.array([[x, y]]), self.mean[errors][None], np.array([is_robot]))
-        by_xy = expected.by_xy[0]
-        by_target = by_xy @ np.array([[c, s], [-s, c]])
-        H = np.hstack([-by_target, by_xy @ np.array([[y], [-x]]), by_target, expected.by_errors[0]])
-        columns = [3 * robot, 3 * robot + 1, 3 * robot + 2, to, to + 1, *range(errors.start, errors.stop)]
+        one, targets = np.array([robot]), np.array([target]) if is_robot and sensors.two_way[robot] else None
+        there, pose = self.mean[None, [to, to + 1, to + 1 + is_robot]], self.mean[None, 3 * robot : 3 * robot + 3]
+        found = sensors.between(one, pose, targets, there, self.ranging, np.array([is_robot]))
+        parts = [found.by_pose[0], found.by_target[0, :, : 2 + is_robot], found.by_errors[0]]
+        begin = self._ranging + RANGING * robot
+        columns = [
+            3 * robot,
+            3 * robot + 1,
+            3 * robot + 2,
+            *range(to, to + 2 + is_robot),
+            *range(begin, begin + RANGING),
+        ]
+        if found.by_target_errors is not None:
+            parts.append(found.by_target_errors[0])
+            columns += range(self._ranging + RANGING * target, self._ranging + RANGING * (target + 1))
+        H = np.hstack(parts)
         PH = self.P[:, columns] @ H.T
-        sigmas = sensors.sigmas(one, np.array([range_]))[0]
-        S = H @ PH[columns] + np.diag(np.square(sigmas) / share)
-        off = np.array([range_, bearing]) - expected.values[0]
-        off[1] = wrap(off[1])
-        (a, b), (_, d) = S.tolist()
-        information = np.array([[d, -b], [-b, a]]) / (a * d - b * b)  # a third of the time of `linalg.solve`
-        if off @ information @ off > INNOVATION_GATE:
+        variances = (sensors.sigmas(one, np.array([range_]))[0] ** 2).tolist()
+        S, off = PH[columns].T @ H.T, np.array([range_, bearing]) - found.values[0]
+        if math.isnan(bearing):
+            information, PH, off = 1 / (S[:1, :1] + variances[0] / share[0]), PH[:, :1], off[:1]
+        else:
+            off[1] = wrap(off[1])
+            (a, b), (_, d) = S.tolist()
+            a, d = a + variances[0] / share[0], d + variances[1] / share[1]
+            information = np.array([[d, -b], [-b, a]]) / (a * d - b * b)  # a third of the time of `linalg.solve`
+        if off @ information @ off > INNOVATION_GATES[len(off) - 1]:
             return False
         gain = PH @ information
         self.mean += gain @ off

@@ -1,4 +1,4 @@
-"""Fixed-lag smoother of a ranging run, with earlier poses marginalised: `IncrementalKeyframes`.
+"""Fixed-lag smoother of a ranging run, with earlier poses marginalised: `KeyframeEstimator`.
 
 A filter gives initial values of robots and landmarks. The estimate of a keyframe is kept twice: at its time, and when
 it leaves the window, corrected by later measurements.
@@ -59,7 +59,7 @@ class _Log:
         return poses, C
 
 
-class IncrementalKeyframes:
+class KeyframeEstimator:
     """Fixed-lag smoother of a ranging run, to which keyframes are added as they come.
 
     Parameters

@@ -21,12 +21,6 @@ from coloc_graph.team import Landmark
 Array = NDArray[np.float64]
 
 
-def measured_off(factors: KeyframeFactors, state: State) -> Array:
-    """Return residuals (n, 2) in units of the measurements' sigmas, without shares; NaN where an end has no pose."""
-    m = factors.keyframes.measured
-    return factors.measured(state, np.arange(len(m))).residuals / np.sqrt(m.share)
-
-
 def trajectories_of(factors: KeyframeFactors, poses: Array, covariances: Array) -> dict[str, Trajectory]:
     """Return the trajectories of robots that have any poses (n, 3), NaN where there is none; covariances of bodies."""
     found, ends = {}, factors.first[1:-1]
@@ -57,11 +51,11 @@ def ranging_estimate(
     keyframes, models, located = factors.keyframes, factors.models, np.isfinite(state.poses[:, 0])
     valid = np.zeros(len(keyframes.measured), bool)
     valid[factors.measured_between(located, seen)] = True
-    off = np.where(valid[:, None], measured_off(factors, state), np.nan)
+    off = np.where(valid[:, None], factors.off(state), np.nan)
     good = valid & ~outliers_of(off)
     share = keyframes.measured.share[good]
     steps = factors.steps(state, factors.steps_between(located)).residuals
-    chi2 = float((share * off[good] ** 2).sum() + (steps**2).sum())
+    chi2 = float(np.nansum(share * off[good] ** 2) + (steps**2).sum())
     dof = float(share.sum()) + 3.0 * len(steps) - 3.0 * located.sum()
     numbers, disconnected, sensors = {}, [], {}
     for robot, (name, there) in enumerate(zip(keyframes.robots, np.split(located, factors.first[1:-1]), strict=True)):
@@ -84,7 +78,7 @@ def ranging_estimate(
                 positions[name] = Landmark(name=name, position=tuple(position.tolist()), position_sigma=sigma)
                 dof -= 2
     directions = np.deg2rad([each.wheels.direction_sigma_deg for each in models.wheels])
-    problem = RangingProblem(keyframes, numbers, off, factors.noise, models.map_known, directions, marginals)
+    problem = RangingProblem(models.team, keyframes, numbers, off, factors.noise, directions, marginals)
     return Estimate(
         method="ranging",
         source=problem,
