@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from coloc_graph.backend.solver import optimise, with_stack
 from coloc_graph.errors import EstimationError, InputError
-from coloc_graph.exchange.range_graph import RangeGraph, RangeValue, factors_of, is_landmark, key_of, values_of
+from coloc_graph.exchange.range_graph import (
+    RangeGraph,
+    RangeValue,
+    factors_of,
+    is_landmark,
+    is_pose,
+    key_of,
+    values_of,
+)
 from coloc_graph.exchange.range_graph_files import read_range_graph
 from coloc_graph.geometry.se2 import wrap
 from coloc_graph.pipeline.range_graph_start import initial_values
@@ -23,6 +31,7 @@ GAUGE_SIGMA = 1e-6  # m, rad: of the first pose, which is the world
 OUTLIER_SIGMAS = 5.0  # residual in standard deviations above which a range is an outlier
 ROBUST_SIGMAS = 3.0  # parameter of Geman and McClure's weights, by which outliers are found
 NEGLIGIBLE = 1e-4  # half chi2 below which a step gains nothing: 0.01 standard deviations
+MAX_OUTLIERS = 0.5  # share of the ranges, above which they are no outliers
 NEES_POSES = 200  # poses whose NEES is evaluated, evenly spread
 
 
@@ -84,13 +93,13 @@ def solve_range_graph(path: str | Path) -> RangeGraphSolution:
     path, began = Path(path), time.perf_counter()
     graph = read_range_graph(path)
     try:
-        start = values_of(initial_values(graph))
+        placed, free = _as_priors_say(graph, initial_values(graph))
     except (InputError, EstimationError) as error:
         raise type(error)(f"{path}: {error}") from error
-    measured = factors_of(graph)
+    start, measured = values_of(placed), factors_of(graph)
     first = next(name for name in graph.names if not is_landmark(name))
     gauge = gtsam.PriorFactorPose2(
-        key_of(first), start.atPose2(key_of(first)), gtsam.noiseModel.Isotropic.Sigma(3, GAUGE_SIGMA)
+        key_of(first), start.atPose2(key_of(first)), gtsam.noiseModel.Diagonal.Sigmas(np.where(free, GAUGE_SIGMA, 1e4))
     )
     is_range = [isinstance(measured.at(n), _RANGES) for n in range(measured.size())]
 
@@ -109,6 +118,11 @@ def solve_range_graph(path: str | Path) -> RangeGraphSolution:
     kept.add(gauge)
     off = [float(np.sqrt(2 * measured.at(n).error(values))) for n in range(measured.size())]
     outliers = {n for n, ranges in enumerate(is_range) if ranges and off[n] > OUTLIER_SIGMAS}
+    if len(outliers) > MAX_OUTLIERS * len(graph.ranges):
+        raise EstimationError(
+            f"{path}: {len(outliers)} of {len(graph.ranges)} ranges contradict the others, and it is not known which "
+            "are wrong; check their noise, who ranged whom, and the odometry"
+        )
     for n in range(measured.size()):
         if n not in outliers:
             kept.add(measured.at(n))
@@ -130,6 +144,25 @@ def solve_range_graph(path: str | Path) -> RangeGraphSolution:
         seconds=time.perf_counter() - began,
         errors=_errors(graph, found, kept, values, first),
     )
+
+
+def _as_priors_say(graph: RangeGraph, start: Mapping[str, Any]) -> tuple[dict[str, Any], NDArray[np.bool_]]:
+    """Move initial values to where priors of poses or landmarks put them.
+
+    Returns them with what is still free of x, y and heading of the world, (3,).
+    """
+    posed = next((one for one in graph.priors if is_pose(one.value)), None)
+    points = [one for one in graph.priors if not is_pose(one.value)]
+    T, free = gtsam.Pose2(), np.ones(3, bool)
+    if posed is not None:
+        T, free = posed.value.compose(start[posed.name].inverse()), np.zeros(3, bool)
+    elif points:
+        here = np.array([start[one.name] for one in points])
+        true = np.array([one.value for one in points])
+        R, t = _aligned(here, true) if len(points) > 1 else (np.eye(2), (true - here)[0])
+        T, free = gtsam.Pose2(gtsam.Rot2.fromCosSin(R[0, 0], R[1, 0]), t), np.array([False, False, len(points) == 1])
+    moved = {name: T.compose(one) if is_pose(one) else T.transformFrom(one) for name, one in start.items()}
+    return moved, free
 
 
 _RANGES = (gtsam.RangeFactorPose2, gtsam.RangeFactor2D)

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,11 +8,15 @@ from msgspec.structs import replace as with_fields
 from coloc_graph.backend import Estimator, KeyframeGraph, diagnose, joint
 from coloc_graph.backend.planar.range_alignment import MIRRORED, OPEN, RangeAlignment
 from coloc_graph.cli import main
+from coloc_graph.errors import EstimationError
+from coloc_graph.exchange.pyfg import write_pyfg
+from coloc_graph.exchange.range_graph_files import letters_of
 from coloc_graph.exchange.ranging_factors import ranging_gtsam_files
 from coloc_graph.exchange.ranging_graph import ranging_graph
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.measurements import RangeBearing
 from coloc_graph.pipeline.batch import SolveOptions, solve
+from coloc_graph.pipeline.range_graph import solve_range_graph
 from coloc_graph.results.writer import assess
 from coloc_graph.run import OdometrySample, Ranges, RunWriter, open_run, read_true_team
 from coloc_graph.simulation.drives import simulate_drives
@@ -178,6 +183,24 @@ def test_what_other_programs_get_has_our_optimum(run, tmp_path):
     np.testing.assert_allclose(np.sort(np.linalg.eigvalsh(C[:2, :2])), np.sort(np.linalg.eigvalsh(ours)), rtol=0.02)
     portable = ranging_graph(estimate, run.team)
     assert not portable.bearings and len(portable.ranges) == int(estimate.ranging.used.sum())
+
+
+def test_an_exported_range_graph_is_solved_where_its_priors_put_it(run, tmp_path):
+    estimate = solve(run).estimate
+    write_pyfg(ranging_graph(estimate, run.team), tmp_path / "graph.pyfg")
+    solution = solve_range_graph(tmp_path / "graph.pyfg")
+    path, letter = estimate.trajectories["R2"], letters_of(estimate.ranging.robots)["R2"]
+    here = np.array([solution.values[f"{letter}{n}"].translation() for n in range(len(path.times))])
+    assert np.abs(here - path.positions[:, :2]).max() < 0.02
+    assert solution.errors.position < 0.01 and len(solution.rejected) < 5
+
+
+def test_ranges_of_which_most_are_wrong_give_no_poses(run, tmp_path, rng):
+    graph = ranging_graph(solve(run).estimate, run.team)
+    wrong = [replace(one, distance=rng.uniform(1.0, 6.0)) if rng.random() < 0.8 else one for one in graph.ranges]
+    write_pyfg(replace(graph, ranges=tuple(wrong)), tmp_path / "graph.pyfg")
+    with pytest.raises(EstimationError, match=r"graph.pyfg: .*(contradict the others|leave open|two arrangements)"):
+        solve_range_graph(tmp_path / "graph.pyfg")
 
 
 @pytest.mark.parametrize(
