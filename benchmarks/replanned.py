@@ -167,7 +167,8 @@ def main() -> int:
     kept = {}
     if args.keep and args.keep.exists():
         for row in map(json.loads, args.keep.read_text(encoding="utf-8").splitlines()):
-            kept[row.pop("on"), row.pop("seed")] = Outcome(**row)
+            key = row.pop("on"), row.pop("seed")
+            kept[key] = Outcome(**row)
     for floor in args.on:
         found = []
         for seed in range(args.first, args.first + args.seeds):

@@ -12,8 +12,10 @@ from coloc_graph.planning.clearance import apart
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.horizon import Horizon
+from coloc_graph.planning.leaps import steps_aside
 from coloc_graph.planning.plan import PlannedStance
 from coloc_graph.planning.prediction import Predictor
+from coloc_graph.planning.route import TO_ROBOT
 from coloc_graph.planning.ways_out import require_way
 from coloc_graph.simulation import Imperfections, reference_team
 from coloc_graph.simulation.floor_plans import FLOOR_PLANS, FloorPlan
@@ -70,6 +72,15 @@ def test_one_that_stands_in_another_s_way_steps_aside_and_the_other_leaps_on():
     require_clear(NARROW, ABREAST, decision)
     after = horizon.next(decision.promise.belief, 90.0)
     assert after.ahead[0][0] != leaper and "makes way" not in after.reason
+
+
+def test_a_step_aside_needs_less_room_than_a_leap_and_touches_nothing():
+    poses = {**ABREAST, "B": (3.0, -0.29, 0.0)}
+    horizon, belief = horizon_of(NARROW), Belief.start(TEAM, poses)
+    found = steps_aside(belief, "C", horizon.course, horizon.gait, horizon.observers, horizon.predictor).targets
+    away = np.min([np.hypot(*(found[:, :2] - poses[name][:2]).T) for name in "AB"], axis=0)
+    assert 2 * RADIUS + 0.04 < away.min() < TO_ROBOT
+    assert NARROW.distance(found[:, :2]).min() > RADIUS + 0.03
 
 
 def test_where_no_leap_along_the_course_shares_a_view_one_comes_beside_another():
