@@ -2,7 +2,7 @@
 
     python benchmarks/planning.py [--seeds 40]           a straight 7.2 m at depth tracks, equal images in all
     python benchmarks/planning.py --images 8             the same from rendered images
-    python benchmarks/planning.py --on L                 on with walls: L, U, pillars, rooms
+    python benchmarks/planning.py --on L                 with walls: L, U, pillars, rooms, slalom, offset
     python benchmarks/planning.py --robots 4             a larger team
     python benchmarks/planning.py --safety 1000 --on L   how near robots come to each other and to walls
     python benchmarks/planning.py --length 21.5          a longer way
@@ -33,6 +33,7 @@ from pathlib import Path
 import numpy as np
 from monte_carlo import over_seeds, solved, truth_of
 from planning_baselines import MOUNT_SIGMA_DEG, NAMES, Scene, missions, mounted
+from scipy.stats import beta
 
 from coloc_graph.errors import ColocError
 from coloc_graph.evaluation import align
@@ -131,6 +132,20 @@ def bootstrapped(squares: np.ndarray) -> tuple[float, float, float]:
 def promised_ratio(outcomes: Sequence[Outcome], sigma: float) -> tuple[float, float, float]:
     """Promised sigma of the end as a share of the RMS, with its bootstrap interval (95 %)."""
     return bootstrapped(np.array([(sigma**2, np.square(one.end).mean()) for one in outcomes if not one.failed]))
+
+
+def stated_ratio(outcomes: Sequence[Outcome]) -> tuple[float, float, float]:
+    """RMS of the end's sigmas that the estimator states as a share of the RMS, with its bootstrap interval (95 %)."""
+    return bootstrapped(np.array([(one.stated**2, np.square(one.end).mean()) for one in outcomes if not one.failed]))
+
+
+def share_interval(count: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Exact (Clopper-Pearson) interval of a share `count` of `total`."""
+    low, high = (1 - confidence) / 2, (1 + confidence) / 2
+    return (
+        float(beta.ppf(low, count, total - count + 1)) if count else 0.0,
+        float(beta.ppf(high, count + 1, total - count)) if count < total else 1.0,
+    )
 
 
 class Kept:
@@ -264,7 +279,8 @@ def table(made: dict[str, Mission], found: dict[str, list[Outcome]], fps: float)
             print(f"{name:8} no seeds yet: there was no time for one", flush=True)
             continue
         mission = made[name]
-        promised = promised_ratio(runs, mission.end_sigma)
+        promised, stated = promised_ratio(runs, mission.end_sigma), stated_ratio(runs)
+        void, attempts = sum(one.void for one in runs), sum(one.stances for one in runs)
         ratios = {
             base: {what: ratio(runs, found[base], what) for what in ("end", "heading")}
             for base in bases
@@ -279,10 +295,12 @@ def table(made: dict[str, Mission], found: dict[str, list[Outcome]], fps: float)
             "promised_mm": 1e3 * mission.end_sigma,
             "stated_mm": 1e3 * math.sqrt(np.mean([one.stated**2 for one in runs if not one.failed])),
             "promised_over_realised": promised,
+            "stated_over_realised": stated,
             "heading_deg": rms(runs, "heading"),
             "promised_heading_deg": math.degrees(mission.heading_sigma),
             "ratios": ratios,
-            "void": sum(one.void for one in runs) / sum(one.stances for one in runs),
+            "void": void / attempts,
+            "void_interval": share_interval(void, attempts),
             "failed": [one.failed for one in runs if one.failed],
         }
         rows[name] = row
@@ -290,8 +308,9 @@ def table(made: dict[str, Mission], found: dict[str, list[Outcome]], fps: float)
             f"{name:8} {len(runs):3} seeds {row['stances']:3} stances {row['images']:5} images "
             f"{mission.duration:4.0f} s"
             f"  end {row['end_mm']:5.1f} mm (promised {row['promised_mm']:5.1f}, stated {row['stated_mm']:5.1f}, "
-            f"promised over realised {interval(promised)})  heading {row['heading_deg']:.3f} deg "
-            f"({row['promised_heading_deg']:.3f})  void {100 * row['void']:.1f} %"
+            f"over realised: promised {interval(promised)}, stated {interval(stated)})  "
+            f"heading {row['heading_deg']:.3f} deg ({row['promised_heading_deg']:.3f})  "
+            f"void {void} of {attempts} (at most {100 * row['void_interval'][1]:.2f} %)"
             + "".join(
                 f"  of {base}: end {interval(one['end'])}, heading {interval(one['heading'])}"
                 for base, one in ratios.items()

@@ -1,4 +1,4 @@
-"""Floors with walls for planned missions: corridors, a hall with pillars, two rooms; `FLOOR_PLANS`."""
+"""Floors with walls for planned missions: corridors, halls with pillars, two rooms; `FLOOR_PLANS`."""
 
 from dataclasses import dataclass
 
@@ -88,5 +88,26 @@ def _rooms() -> FloorPlan:
     return FloorPlan((*_box(-1.5, -2.0, 10.0, 2.0), *middle), ((7.2, 0.0),))
 
 
-#: Floor plans, by name: an L and a U corridor 2 m wide, a hall with pillars, two rooms with a doorway of 1.4 m.
-FLOOR_PLANS = {"L": _corridor_l(), "U": _corridor_u(), "pillars": _pillars(), "rooms": _rooms()}
+def _slalom() -> FloorPlan:
+    half = 0.3  # of a pillar [m]
+    pillars = tuple((x - half, -half, x + half, half) for x in (2.4, 5.0))
+    return FloorPlan((*_box(-1.5, -3.0, 10.0, 3.0), *pillars), ((2.4, -0.9), (5.0, 0.9), (7.2, 0.0)))
+
+
+def _offset() -> FloorPlan:
+    middle, door = 1.5, 0.7
+    walls = (3.5, -2.0, 3.5 + THICK, middle - door), (3.5, middle + door, 3.5 + THICK, 3.0)
+    return FloorPlan((*_box(-1.5, -2.0, 10.0, 3.0), *walls), ((2.8, middle), (4.5, middle), (7.2, 0.0)))
+
+
+#: Floor plans, by name: an L and a U corridor 2 m wide; a hall with pillars beside the way, and two rooms with a doorway
+#: of 1.4 m in it; a hall with two pillars 0.6 m wide on the line from start to goal, one passed on the right and one on
+#: the left, and two rooms whose doorway of 1.4 m is 1.5 m beside that line.
+FLOOR_PLANS = {
+    "L": _corridor_l(),
+    "U": _corridor_u(),
+    "pillars": _pillars(),
+    "rooms": _rooms(),
+    "slalom": _slalom(),
+    "offset": _offset(),
+}
