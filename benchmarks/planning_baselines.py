@@ -34,7 +34,7 @@ from coloc_graph.team import Team
 
 FIG_4 = Gait.of_paper(0.6, 40.0)  # best distance and angle of the paper's Fig. 4
 WINDOWS = (0.0, 0.5, 1.0)  # of the direction at a corner, in leaps
-SCREENED = 40  # gaits, the best by evenly spread images, of which patrols are planned where the way is straight
+SCREENED = 40  # gaits of two observers on a straight way, the best by evenly spread images, whose patrols are planned
 REFINED = 5  # gaits, the best with their patrols, whose drives are designed
 MOUNT_SIGMA_DEG = 0.05  # sigma of tilts and rolls with which mounts count as known
 MOVER_START = (1.5, 0.0, 0.0)
@@ -147,7 +147,9 @@ class FixedGaits:
         search = GaitSearch(Predictor(scene.team, scene.fps), length, scene.observers[:2], scene.mover, gaits)
         ranked = [one.gait for one, _ in search.ranked(capture=scene.capture)]
         ways = list(product(ranked, WINDOWS if self._bends else (0.0,)))
-        patrols = self._possible(ways if self._bends else ways[:SCREENED])
+        # the rank is that of two observers: it says little about corners, and about more observers
+        screened = not self._bends and len(scene.observers) == 2
+        patrols = self._possible(ways[:SCREENED] if screened else ways)
         if not patrols:
             raise InputError("no fixed gait of the grid can go this way")
         if not designed:
