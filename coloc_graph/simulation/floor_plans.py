@@ -100,9 +100,9 @@ def _offset() -> FloorPlan:
     return FloorPlan((*_box(-1.5, -2.0, 10.0, 3.0), *walls), ((2.8, middle), (4.5, middle), (7.2, 0.0)))
 
 
-#: Floor plans, by name: an L and a U corridor 2 m wide; a hall with pillars beside the way, and two rooms with a doorway
-#: of 1.4 m in it; a hall with two pillars 0.6 m wide on the line from start to goal, one passed on the right and one on
-#: the left, and two rooms whose doorway of 1.4 m is 1.5 m beside that line.
+#: Floor plans, by name: an L and a U corridor 2 m wide; a hall with pillars beside the way, and two rooms with a
+#: doorway of 1.4 m in it; a hall with two pillars 0.6 m wide on the line from start to goal, one passed on the right,
+#: one on the left, and two rooms whose doorway of 1.4 m is 1.5 m beside that line.
 FLOOR_PLANS = {
     "L": _corridor_l(),
     "U": _corridor_u(),
