@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from coloc_graph.backend.cause import Cause, or_else, to_check
-from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, Agreement, agreement, keys_of
+from coloc_graph.backend.chi2_test import REJECTION_P_VALUE, Agreement, agreement_by_covariance, keys_of
 from coloc_graph.backend.estimate import NO_LINE_OF_SIGHT, Bump, Rejection
 from coloc_graph.backend.factors import Method, calibrations_in
 from coloc_graph.backend.graph import Link, PoseGraph, StayPut
@@ -208,7 +208,7 @@ def _suspects(fit: Fit) -> list[tuple[Cause, Agreement]]:
     for cause in worst_first[:MAX_GROUPS]:
         factors = [fit.factor(index) for index in sorted(places[id(link)] for link in cause.links)]
         with fit.batched:
-            one = agreement(factors, fit.values, fit.marginals.joint(keys_of(factors)))
+            one = agreement_by_covariance(factors, fit.values, fit.marginals.joint(keys_of(factors)))
         if one.dof:
             found.append((cause, one))
     return sorted(found, key=lambda pair: pair[1].dof - pair[1].chi2)

@@ -59,17 +59,24 @@ def p_values(tested: Iterable[Agreement], scale: float = 1.0) -> Array:
 UNCHECKED = Agreement(0.0, 0)  # of a measurement that nothing can contradict
 
 
-def agreement(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, joint: Array) -> Agreement:
-    """Test factors that are in a fit, by the joint covariance of their `keys_of`.
+def agreement(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, root: Array) -> Agreement:
+    """Test factors that are in a fit, by a root S of the joint covariance P = S S^T of their `keys_of`.
 
     The covariance of a whitened residual e = A x - b after the fit is I - A P A^T: e^T (I - A P A^T)^-1 e is chi2
     distributed, and is the decrease of the sum of squares when they are left out.
     """
     A, b = _whitened(factors, values)
-    known, directions = np.linalg.eigh(A @ joint @ A.T)
+    spread = A @ root
+    known, directions = np.linalg.eigh(spread @ spread.T)
     kept = known < 1.0 - MIN_REDUNDANCY
     along = (b @ directions)[kept]
     return Agreement(float(along @ (along / (1.0 - known[kept]))), int(np.count_nonzero(kept)))
+
+
+def agreement_by_covariance(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, joint: Array) -> Agreement:
+    """Test factors that are in a fit, as `agreement`, by the joint covariance of their `keys_of`."""
+    A, b = _whitened(factors, values)
+    return _tested(A[None], b[None], joint[None])[0]
 
 
 def agreements(
@@ -119,10 +126,11 @@ def innovations(
     return _each(factors, values, joint, _innovative)
 
 
-def innovation(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, joint: Array) -> Agreement:
-    """Test factors that are not in the fit: e^T (I + A P A^T)^-1 e."""
+def innovation(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, root: Array) -> Agreement:
+    """Test factors that are not in the fit, as `agreement`: e^T (I + A P A^T)^-1 e."""
     A, b = _whitened(factors, values)
-    return _innovative(A[None], b[None], joint[None])[0]
+    spread = A @ root
+    return Agreement(float(b @ np.linalg.solve(np.eye(len(b)) + spread @ spread.T, b)), len(b))
 
 
 def keys_of(factors: Iterable[gtsam.NonlinearFactor]) -> list[int]:

@@ -16,7 +16,7 @@ from coloc_graph.backend.factors import Factors, calibrations_in
 from coloc_graph.backend.fixed_lag import marginal_factor
 from coloc_graph.backend.graph import Link
 from coloc_graph.backend.insertion import InsertionPlan, Tie
-from coloc_graph.backend.solver import RELINEARIZE_CALIBRATION, isam_parameters, joint_covariance, optimise
+from coloc_graph.backend.solver import RELINEARIZE_CALIBRATION, covariance_root, isam_parameters, optimise
 from coloc_graph.errors import EstimationError
 from coloc_graph.measurements import Sighting
 
@@ -96,7 +96,8 @@ class Isam2Graph:
         if key in self.marginalised:
             return self.marginalised[key][1]
         if key not in self._covariances:
-            self._covariances[key] = np.asarray(self.isam.marginalCovariance(key))
+            root = covariance_root(self.isam, [key])
+            self._covariances[key] = root @ root.T
         return self._covariances[key].copy()
 
     def errors(self, key: int) -> Array:
@@ -369,14 +370,14 @@ class Isam2Graph:
         if not factors:
             return UNCHECKED
         keys = keys_of(factors)
-        joint = joint_covariance(self.isam, keys)
+        root = covariance_root(self.isam, keys)
         begin = 0
         for key in keys:
             end = begin + size_of(key)
             if not is_calibration(key):
-                self._covariances[key] = joint[begin:end, begin:end]
+                self._covariances[key] = root[begin:end] @ root[begin:end].T
             begin = end
-        return (agreement if inside else innovation)(factors, self._known_of(factors), joint)
+        return (agreement if inside else innovation)(factors, self._known_of(factors), root)
 
     def _known_of(self, factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.Values:
         """Return the estimates of all variables that factors are on, and those of the latest batch, among others."""
