@@ -38,6 +38,9 @@ RELINEARIZE_TRANSLATION = 1e9  # m: never
 # and half a milliradian is then a fifth of its noise; the pixels of a sighting tell a tenth of a millimetre
 RELINEARIZE_TILT_JOINT = 5e-4  # rad, roll and pitch
 RELINEARIZE_HEADING_JOINT = 5e-3  # rad
+# in a mission of a kilometre all poses of the lag shift by a metre at once; with a tilt of half a milliradian that lifts a
+# body by a quarter of a millimetre, which a floor even to a tenth of that contradicts
+RELINEARIZE_TRANSLATION_JOINT = 0.1  # m
 RELINEARIZE_CALIBRATION = 3e-4  # change of a calibration variable [m, rad, relative, s]
 
 # each fit of graduated non-convexity begins where the one before it ended
@@ -104,7 +107,8 @@ def isam_parameters(*, calibrates: bool = False) -> gtsam.ISAM2Params:
     tilt = RELINEARIZE_TILT_JOINT if calibrates else RELINEARIZE_ROTATION
     heading = RELINEARIZE_HEADING_JOINT if calibrates else RELINEARIZE_ROTATION
     thresholds = gtsam.ISAM2ThresholdMap()
-    thresholds.insert(("x", np.array([tilt, tilt, heading] + [RELINEARIZE_TRANSLATION] * 3)))
+    moved = RELINEARIZE_TRANSLATION_JOINT if calibrates else RELINEARIZE_TRANSLATION
+    thresholds.insert(("x", np.array([tilt, tilt, heading] + [moved] * 3)))
     for kind, size in SIZES.items():
         thresholds.insert((chr(kind), np.full(size, RELINEARIZE_CALIBRATION)))
     parameters.setRelinearizeThreshold(thresholds)
