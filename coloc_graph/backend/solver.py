@@ -38,8 +38,8 @@ RELINEARIZE_TRANSLATION = 1e9  # m: never
 # and half a milliradian is then a fifth of its noise; the pixels of a sighting tell a tenth of a millimetre
 RELINEARIZE_TILT_JOINT = 5e-4  # rad, roll and pitch
 RELINEARIZE_HEADING_JOINT = 5e-3  # rad
-# in a mission of a kilometre all poses of the lag shift by a metre at once; with a tilt of half a milliradian that lifts a
-# body by a quarter of a millimetre, which a floor even to a tenth of that contradicts
+# in a mission of a kilometre all poses of the lag shift by a metre at once; with a tilt of half a milliradian that
+# lifts a body by a quarter of a millimetre, which a floor even to a tenth of that contradicts
 RELINEARIZE_TRANSLATION_JOINT = 0.1  # m
 RELINEARIZE_CALIBRATION = 3e-4  # change of a calibration variable [m, rad, relative, s]
 
@@ -305,7 +305,7 @@ def _one_step(problem: Nonlinear, values: gtsam.Values) -> gtsam.Values:
 
 
 def covariance_root(isam: gtsam.ISAM2, keys: Sequence[int]) -> Array:
-    """Return S, upper triangular, of the joint covariance S S^T of different variables, in the order given.
+    """Return a root S of the joint covariance S S^T of different variables, in the order given.
 
     In the covariance itself, by GTSAM the inverse of the information, too few digits are left of relative poses: after
     600 stances with a position known to metres they came out a thousand times too uncertain.
@@ -315,8 +315,14 @@ def covariance_root(isam: gtsam.ISAM2, keys: Sequence[int]) -> Array:
     EstimationError
         A variable is undetermined.
     """
-    R = isam.jointBayesNet(list(keys), gtsam.EliminateQR).matrix()[0]
-    S, singular = lapack.dtrtri(R)
+    net = isam.jointBayesNet(list(keys), gtsam.EliminateQR)
+    S, singular = lapack.dtrtri(net.matrix()[0])
     if singular:
         raise EstimationError("a variable of the graph is undetermined: it has neither measurement nor prior")
-    return np.asarray(S)
+    # the order of elimination is GTSAM's own
+    rows, end = dict[int, Array](), 0
+    for n in range(net.size()):
+        one = net.at(n)
+        begin, end = end, end + one.R().shape[0]
+        rows[one.firstFrontalKey()] = S[begin:end]
+    return np.concatenate([rows[key] for key in keys])

@@ -10,6 +10,8 @@ from teams import fed, graph_of_team, largest_difference, of_stance, team_of
 from whole_graph import replay
 
 from coloc_graph.backend import Estimator, smooth
+from coloc_graph.backend.chi2_test import agreement
+from coloc_graph.backend.solver import covariance_root, isam_parameters
 from coloc_graph.errors import EstimationError, InputError, MeasurementError
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Odometry, RelativePose, Sighting
@@ -127,6 +129,23 @@ def test_a_stance_gives_covariances_and_residuals_of_the_last_step():
             e = np.asarray(gtsam.Pose3(one.T_i_j).localCoordinates(T_i.between(T_j)))
             e = e if len(one.covariance) == 6 else e[2:5]
             assert residual == pytest.approx(np.sqrt(e @ np.linalg.solve(one.covariance, e) / len(e)), rel=1e-6)
+
+
+def test_measurements_are_tested_alike_where_the_position_is_known_to_metres_alone():
+    """GTSAM's covariance of both poses has no digits left of their relative one."""
+    isam, factors, values = gtsam.ISAM2(isam_parameters()), gtsam.NonlinearFactorGraph(), gtsam.Values()
+    first = gtsam.Pose3(gtsam.Rot3(), np.array([1000.0, 0.0, 0.0]))
+    step, precise = gtsam.Pose3(floor_pose(1.0, 0.2, 0.3)), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
+    prior = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3, 1e-3, 0.05, 50.0, 50.0, 1e-3]))
+    factors.add(gtsam.PriorFactorPose3(0, first, prior))
+    between = [gtsam.BetweenFactorPose3(0, 1, step.retract(np.full(6, off)), precise) for off in (-1e-4, 1e-4)]
+    for one in between:
+        factors.add(one)
+    values.insert(0, first)
+    values.insert(1, first.compose(step))
+    isam.update(factors, values)
+    off = agreement(between[:1], isam.calculateEstimate(), covariance_root(isam, [0, 1]))
+    assert off.dof == 6 and off.chi2 == pytest.approx(12, rel=1e-3)  # 6 rows, each off by root two of its sigmas
 
 
 def test_a_stance_agrees_with_those_before_by_what_chi2_rises_when_it_comes(team):
