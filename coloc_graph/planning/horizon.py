@@ -411,12 +411,16 @@ class Horizon:
             if grown and (number > 1 or straggles or len(self.observers) == 2):
                 break
             grown += self._leaps_of(node, name, avoid, in_lane=in_lane)
+            if not grown and number == 0:
+                grown += self._leaps_of(node, name, avoid, come_up=True)
         return grown
 
-    def _leaps_of(self, node: Node, leaper: str, avoid: Sequence[Planar], *, in_lane: bool) -> list[Node]:
+    def _leaps_of(
+        self, node: Node, leaper: str, avoid: Sequence[Planar], *, in_lane: bool = False, come_up: bool = False
+    ) -> list[Node]:
         leaps = possible_leaps(
             node.belief, leaper, self.course, self.gait, self.observers, self.predictor, avoid,
-            in_lane=in_lane, roomy=self._roomy,
+            in_lane=in_lane, roomy=self._roomy, come_up=come_up,
         )  # fmt: skip
         return self._grown(node, leaps)
 

@@ -20,7 +20,7 @@ from coloc_graph.planning.route import TO_ROBOT, clear_way, reachable
 Array = NDArray[np.float64]
 
 ADVANCES = (0.25, 0.5, 0.7, 0.85, 1.0, 1.15, 1.35)  # of a target ahead of the front observer, in leaps of the gait
-BEHIND = (-1.2, -0.8, -0.4)  # the same of larger teams once the front has come to the goal
+BEHIND = (-1.2, -0.8, -0.4)  # the same of one that comes up once the front is at the goal
 WIDTHS = (0.7, 1.0, 1.7)  # of a target's distance from the course, in those of the gait
 TOE_INS = (0.0, 1.0, 1.5)  # of a target's heading against the course, in those of the gait
 AHEAD = 0.8  # a robot may look along the course this far ahead of where it stands [m]
@@ -91,6 +91,7 @@ def possible_leaps(
     *,
     in_lane: bool = False,
     roomy: bool = True,
+    come_up: bool = False,
     absent: Sequence[str] = (),
 ) -> Leaps:
     """Find the leaps of an observer: those of a gait, and longer, shorter, wider ones; at corners also half turned.
@@ -107,6 +108,8 @@ def possible_leaps(
         True for targets in the gait's formation alone, and, at corners, beside the course.
     roomy
         True for targets that are so far from others as both may stop off.
+    come_up
+        True for targets behind the foremost robot, once that is at the goal.
     absent
         Robots that are taken to be in nobody's way, to find out whether they are.
     """
@@ -123,8 +126,8 @@ def possible_leaps(
     turning = any(abs(float(wrap(course.at(front + ahead)[2] - before))) > BEND for ahead in (AHEAD, 2 * AHEAD))
     toe_ins = TOE_INS if len(observers) < MANY else TOE_INS[:2]
     advances: tuple[float, ...] = ADVANCES
-    if len(observers) > 2 and front > course.length - ADVANCES[0] * gait.leap:
-        advances = (*BEHIND, *ADVANCES)  # the front is there: others come up to it
+    if come_up:
+        advances = BEHIND if front > course.length - ADVANCES[0] * gait.leap else ()
     ahead_of = {}
     for advance in advances:
         way = front + min(advance * gait.leap, MAX_LEAP)
