@@ -1,4 +1,4 @@
-"""coloc import images TEAM.toml A=SOURCE B=SOURCE, tracks TEAM.toml TRACKS.csv, mrclam DIR or ros BAG MAP.toml."""
+"""coloc import images|tracks|ranges TEAM.toml FILES, mrclam DIR or ros BAG MAP.toml."""
 
 import argparse
 
@@ -7,7 +7,7 @@ from coloc_graph.cli.place import add_out, require_run_place
 
 def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Add the command and its arguments."""
-    command = commands.add_parser("import", help="convert images, tracks, a ROS bag or MR.CLAM data to a run")
+    command = commands.add_parser("import", help="convert images, tracks, ranges, a ROS bag or MR.CLAM data to a run")
     kinds = command.add_subparsers(dest="kind", required=True, metavar="KIND")
     tracks = kinds.add_parser("tracks", help="import marker tracks from a CSV: stance,time,robot,marker,u,v[,sigma]")
     tracks.add_argument("team", metavar="TEAM.toml", help="description of the team")
@@ -17,6 +17,19 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     tracks.add_argument("--ranges", metavar="RANGES.csv", help="ranges between robots: time,robot,target,range")
     add_out(tracks)
     tracks.set_defaults(run=run_tracks)
+    ranges = kinds.add_parser("ranges", help="import ranges and odometry of robots that drive, from two CSV files")
+    ranges.add_argument("team", metavar="TEAM.toml", help="description of the team")
+    ranges.add_argument("ranges", metavar="RANGES.csv", help="time,robot,target,range[,bearing]: UTC s, m, rad")
+    ranges.add_argument("odometry", metavar="ODOMETRY.csv", help="time,robot,x,y,yaw: UTC s, m, rad, in any frame")
+    ranges.add_argument(
+        "--along", type=float, default=0.02, help="odometry noise of the way, m per root of a metre (default: 0.02)"
+    )
+    ranges.add_argument(
+        "--turn", type=float, default=0.02,
+        help="odometry noise of the heading, rad per root of a radian turned or metre driven (default: 0.02)",
+    )  # fmt: skip
+    add_out(ranges)
+    ranges.set_defaults(run=run_ranges)
     mrclam = kinds.add_parser("mrclam", help="import a UTIAS MR.CLAM dataset: ranges and bearings, odometry, truth")
     mrclam.add_argument("folder", metavar="DIR", help="folder of the dataset")
     mrclam.add_argument("--map-unknown", action="store_true", help="leave the landmarks' positions unknown")
@@ -80,6 +93,20 @@ def run_mrclam(args: argparse.Namespace) -> int:
         f"{args.out}: {counted(summary.measurements, 'measurement')} in {summary.seconds:.0f} s, "
         f"{counted(len(summary.robots), 'robot')}, {counted(len(summary.landmarks), 'landmark')}"
         f"{', whose positions are unknown' if args.map_unknown else ''}"
+    )
+    return 0
+
+
+def run_ranges(args: argparse.Namespace) -> int:
+    """Import ranges and odometry and print a summary."""
+    from coloc_graph.cli.printing import counted
+    from coloc_graph.exchange.ranging_csv import import_ranges
+
+    require_run_place(args.out, force=args.force)
+    found = import_ranges(args.team, args.ranges, args.odometry, args.out, along=args.along, turn=args.turn)
+    print(
+        f"{args.out}: {counted(found.ranges, 'range')} and {counted(found.samples, 'odometry sample')} in "
+        f"{found.seconds:.0f} s of {', '.join(found.robots)}"
     )
     return 0
 

@@ -122,6 +122,13 @@ def read_table(path: Path, what: str, header: Sequence[str], *, optional: Sequen
     return Table(path, {name: list(column) for name, column in zip(found, columns, strict=True)}, lines)
 
 
+def require_other_file(out: Path, *inputs: str | Path | None) -> None:
+    """Raise `TracksError` where the run to write is one of the files to read."""
+    for path in inputs:
+        if path is not None and out.resolve() == Path(path).resolve():
+            raise TracksError(f"{out}: is an input and the run to write; give the run a name of its own")
+
+
 def _text(path: Path, what: str) -> str:
     data = read_bytes(path, f"give the path of a CSV with {what}", error=TracksError)
     return decode_text(path, data, f"save the {what} as CSV in UTF-8", error=TracksError)

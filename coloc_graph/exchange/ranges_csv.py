@@ -19,7 +19,8 @@ def read_ranges(path: str | Path, team: Team, start: float, end: float) -> list[
     Parameters
     ----------
     path
-        CSV with time [UTC s], robot (that measured), target (another robot, or a landmark of the team), range [m].
+        CSV with time [UTC s], robot (that measured), target (another robot, or a landmark of the team), range [m], and
+        bearing [rad, positive to the left] where the sensors measure it.
     team
         The team; robots that measure have a `Ranging`.
     start, end
@@ -35,7 +36,7 @@ def read_ranges(path: str | Path, team: Team, start: float, end: float) -> list[
     TracksError
         A row is wrong, or none is of the run's time. The sentence names file and line.
     """
-    table = read_table(Path(path), "ranges", HEADER)
+    table = read_table(Path(path), "ranges", HEADER, optional=("bearing",))
     robots, times, ranges = table.robots(team), table.numbers("time"), table.numbers("range")
     targets = table.columns["target"]
     known = {*team.names, *(one.name for one in team.landmarks)}
@@ -52,10 +53,17 @@ def read_ranges(path: str | Path, team: Team, start: float, end: float) -> list[
         raise TracksError(
             f"{path}: no range is of the run's time, {start:.3f} to {end:.3f} s; give UTC seconds by the robots' clocks"
         )
+    bearings = table.numbers("bearing") if "bearing" in table.columns else None
     found: dict[tuple[float, int], list[int]] = defaultdict(list)
     for row, key in enumerate(zip(times.tolist(), robots.tolist(), strict=True)):
         found[key].append(row)
     return [
-        Ranges(team.names[robot], time, tuple(targets[row] for row in rows), np.array(ranges[rows]))
+        Ranges(
+            team.names[robot],
+            time,
+            tuple(targets[row] for row in rows),
+            np.array(ranges[rows]),
+            None if bearings is None else np.array(bearings[rows]),
+        )
         for (time, robot), rows in sorted(found.items())
     ]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import TracksError
-from coloc_graph.exchange.csv_table import Table, first, read_table
+from coloc_graph.exchange.csv_table import Table, first, read_table, require_other_file
 from coloc_graph.exchange.ranges_csv import read_ranges
 from coloc_graph.run import Detections, Motion, Planes, RunWriter, Stance, atomic_run
 from coloc_graph.run.schemas import to_ns, to_seconds
@@ -94,7 +94,7 @@ def import_tracks(
         The run cannot be written.
     """
     tracks_path, out = Path(tracks_path), Path(out)
-    _require_other_file(out, team_path, tracks_path, planes_path, moves_path, ranges_path)
+    require_other_file(out, team_path, tracks_path, planes_path, moves_path, ranges_path)
     team = read_team(team_path)
     tracks = _read_tracks(tracks_path, team)
     observers = _observers(tracks, team)
@@ -114,12 +114,6 @@ def import_tracks(
         observers=tuple(name for name in team.names if any(name in stance.observers for stance in stances)),
         warnings=tuple(_warnings(tracks, team, stances, moves_known=moves_path is not None)),
     )
-
-
-def _require_other_file(out: Path, *inputs: str | Path | None) -> None:
-    for path in inputs:
-        if path is not None and out.resolve() == Path(path).resolve():
-            raise TracksError(f"{out}: is an input and the run to write; give the run a name of its own")
 
 
 def _read_tracks(path: Path, team: Team) -> _Tracks:

@@ -20,7 +20,7 @@ from coloc_graph.pipeline.range_graph import solve_range_graph
 from coloc_graph.results.writer import assess
 from coloc_graph.run import OdometrySample, Ranges, RunWriter, open_run, read_true_team
 from coloc_graph.simulation.drives import simulate_drives
-from coloc_graph.team import Floor, Landmark, Ranging, Robot, Team, Wheels
+from coloc_graph.team import Floor, Landmark, Ranging, Robot, Team, Wheels, write_team
 
 WRONG = {"sigma": 0.05, "offset_sigma": 0.1, "nlos": 0.05}
 
@@ -230,3 +230,58 @@ def test_drives_are_simulated_solved_and_judged_from_the_command_line(tmp_path, 
     for kind in ("g2o", "dot", "jrl", "pyfg"):
         assert main(["export", kind, str(result), "--out", str(tmp_path / f"graph.{kind}")]) == 0
     assert "ranges and bearings" in capsys.readouterr().out
+
+
+@pytest.fixture
+def csvs(run, tmp_path):
+    """A run as a team.toml and CSV files of ranges and odometry."""
+    write_team(run.team, tmp_path / "team.toml")
+    names = run.team.names
+    ranges = [
+        f"{one.time!r},{name},{target},{distance!r}"
+        for name in names for one in run.ranges(name)
+        for target, distance in zip(one.targets, one.range.tolist(), strict=True)
+    ]  # fmt: skip
+    odometry = [
+        ",".join([repr(one.time), name, *map(repr, one.pose.tolist())]) for name in names for one in run.odometry(name)
+    ]
+    (tmp_path / "ranges.csv").write_text("\n".join(["time,robot,target,range", *ranges]))
+    (tmp_path / "odometry.csv").write_text("\n".join(["time,robot,x,y,yaw", *odometry]))
+    return tmp_path
+
+
+def imported(folder):
+    files = [str(folder / name) for name in ("team.toml", "ranges.csv", "odometry.csv")]
+    return main(["import", "ranges", *files, "--along", "0.01", "--turn", "0.01", "--out", str(folder / "own.mcap")])
+
+
+def test_ranges_and_odometry_are_imported_from_csv(run, csvs, capsys):
+    assert imported(csvs) == 0
+    assert f"{sum(len(one.targets) for name in run.team.names for one in run.ranges(name))} ranges and" in (
+        capsys.readouterr().out
+    )
+    ours, theirs = solve(run).estimate, solve(open_run(csvs / "own.mcap")).estimate
+    path, other = ours.trajectories["R3"], theirs.trajectories["R3"]
+    sigma = np.sqrt(path.covariances[:, 3:5, 3:5].trace(axis1=1, axis2=2))
+    assert (np.linalg.norm(path.positions - other.positions, axis=1) < sigma).all()
+
+
+@pytest.mark.parametrize(
+    ("file", "row", "why"),
+    [
+        ("ranges.csv", "1700000001.0,R1,R1,2.0", "R1 ranges itself"),
+        ("ranges.csv", "1700000001.0,R1,Q,2.0", "target `Q` is neither a robot nor a landmark"),
+        ("ranges.csv", "1700000001.0,R1,R2,-2.0", "`range` is -2"),
+        ("ranges.csv", "1700000001.0,R1,R2,nan", "`range` is `nan`"),
+        ("odometry.csv", "1700000000.0,R1,0,0,0", "the time of R1 does not increase"),
+        ("odometry.csv", "1700000001.0,Q,0,0,0", "robot `Q` is not in the team"),
+        ("odometry.csv", "1700000001.0,R1,0,inf,0", "`y` is `inf`"),
+    ],
+)
+def test_wrong_rows_are_named_with_their_line(csvs, capsys, file, row, why):
+    text = (csvs / file).read_text()
+    (csvs / file).write_text(f"{text}\n{row}\n")
+    assert imported(csvs) == 2
+    error = capsys.readouterr().err
+    assert f"{file}, line {len(text.splitlines()) + 1}: " in error and why in error
+    assert not (csvs / "own.mcap").exists()
