@@ -23,7 +23,7 @@ FLOOR = 1e-5  # m, rad: least standard deviation of a step
 
 @dataclass(frozen=True)
 class ImportedRanges:
-    """What was written: numbers of ranges and of odometry samples, duration [s], and the robots that have odometry."""
+    """Summary of an import: numbers of ranges and of odometry samples, duration [s], and robots with odometry."""
 
     ranges: int
     samples: int

@@ -6,7 +6,7 @@ needed, and those of other messages do no harm.
 
 import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,7 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 ODOMETRY = "nav_msgs/msg/Odometry"
+RANGE = "sensor_msgs/msg/Range"
 POSE = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TF = "tf2_msgs/msg/TFMessage"
@@ -93,6 +94,9 @@ class Bag:
         """Decode a message to an object with the fields of its type, the same for ROS 1 and ROS 2."""
         kind = TF if message.type == OLD_TF else message.type
         read = self._store.deserialize_cdr if self.ros2 else self._store.deserialize_ros1
+        if self.ros2 and kind == RANGE:
+            with suppress(Exception):  # before ROS 2 Jazzy it ended without a variance
+                return read(message.data + bytes(4), kind)
         try:
             return read(message.data, kind)
         except Exception as error:  # of a damaged message rosbags raises whatever it stumbles over
@@ -121,11 +125,17 @@ class Bag:
         if kind == OLD_TF or not connection.digest or kind not in self._store.fielddefs:
             return
         known = self._store.hash_rihs01(kind) if self.ros2 else self._store.generate_msgdef(kind)[1]
-        if connection.digest not in (known, "*"):
+        if connection.digest not in (known, *self._before_jazzy(kind), "*"):
             raise BagError(
                 f"{self.path}: {connection.topic} has messages of a {kind} that is not the standard one "
                 f"({connection.digest}); record the standard message"
             )
+
+    def _before_jazzy(self, kind: str) -> tuple[str, ...]:
+        """Digest of an older standard message that `decode` takes too."""
+        from rosbags.typesys import Stores, get_typestore
+
+        return (get_typestore(Stores.ROS2_HUMBLE).hash_rihs01(kind),) if self.ros2 and kind == RANGE else ()
 
 
 @contextmanager

@@ -19,12 +19,13 @@ from coloc_graph.exchange.ros_robots import (
     odometry_of,
     of_motion,
     of_team,
+    ranges_of,
     seconds,
     truth_of,
     with_cameras,
 )
 from coloc_graph.exchange.stances import Movements, derive_stances
-from coloc_graph.run import Clocks, EncodedImage, Image, Motion, OdometrySample, RunWriter, Stance, atomic_run
+from coloc_graph.run import Clocks, EncodedImage, Image, Motion, OdometrySample, Ranges, RunWriter, Stance, atomic_run
 from coloc_graph.run.encode import ImageFormat
 from coloc_graph.run.schemas import to_seconds
 from coloc_graph.team import Team
@@ -40,7 +41,7 @@ class RosSummary:
     Attributes
     ----------
     counts
-        Numbers of images, odometry samples and true poses.
+        Numbers of images, odometry samples, ranges and true poses.
     stances, observers
         Number of stances, and robots that observe in any of them.
     stood
@@ -109,8 +110,10 @@ def import_ros(
                 f"{bag.path}: observers' clocks may still differ by {1e3 * recording.clocks.sigma:.0f} ms (1 sigma): "
                 "the run's team states that as `clock_sigma`, and a solve finds the offset where the motion shows it"
             )
-        odometry = {}
+        odometry, ranges = {}, list[Ranges]()
         for robot in the_map.robots:
+            found, said = ranges_of(bag, robot, recording)
+            ranges, warnings = [*ranges, *found], [*warnings, *said]
             if robot.odometry:
                 odometry[robot.name], said = odometry_of(bag, robot, recording)
                 warnings += said
@@ -119,14 +122,16 @@ def import_ros(
         stances = _stances(bag, map_path, the_map, team, recording, moves)
         with atomic_run(out, team, image_format=image_format) as writer:
             if records := recording.clocks.records():
-                writer.write(Clocks(stances[0].start, records))
-            events = _Events(writer, stances, odometry, moves, truth)
+                begin = min(one.start for one in moves) if not stances else stances[0].start
+                writer.write(Clocks(begin, records))
+            events = _Events(writer, stances, odometry, ranges, moves, truth)
             _write_images(bag, images, recording, team, events, lambda done: told(count + done))
             events.write_until(np.inf)
         told(total)
     counts = {
         "images": sum(len(recording.orders[topic].ns) for topic in images),
         "odometry samples": sum(map(len, odometry.values())),
+        "ranges": len(ranges),
         "true poses": sum(map(len, truth.values())),
     }
     warnings = [
@@ -144,11 +149,11 @@ def import_ros(
 def _stances(
     bag: Bag, map_path: Path, the_map: RosMap, team: Team, recording: Recording, moves: list[Movements]
 ) -> list[Stance]:
-    """Return the stances, at least one."""
+    """Return the stances, at least one unless robots measured ranges."""
     cameras = {robot.name: seconds(recording.orders[robot.image].ns) for robot in the_map.robots if robot.image}
     marked = {robot.name for robot in team.robots if robot.markers is not None}
     found = derive_stances(moves, cameras, marked, the_map.motion)
-    if found:
+    if found or any(robot.ranges for robot in the_map.robots):
         return found
     if len(cameras) < 2:
         raise BagError(f"{map_path}: {len(cameras)} of its robots have an `image`; a stance needs two that watch")
@@ -172,14 +177,16 @@ class _Events:
         writer: RunWriter,
         stances: list[Stance],
         odometry: Mapping[str, list[OdometrySample]],
+        ranges: list[Ranges],
         moves: list[Movements],
         truth: Mapping[str, list[tuple[float, Array]]],
     ) -> None:
         self._writer = writer
-        records: list[tuple[float, Stance | Motion | OdometrySample | tuple[str, Array]]] = [
+        records: list[tuple[float, Stance | Motion | OdometrySample | Ranges | tuple[str, Array]]] = [
             *((stance.start, stance) for stance in stances),
             *((motion.time, motion) for one in moves for motion in one.motions()),
             *((sample.time, sample) for samples in odometry.values() for sample in samples),
+            *((one.time, one) for one in ranges),
             *((time, (robot, T)) for robot, poses in truth.items() for time, T in poses),
         ]
         self._rest = sorted(records, key=lambda one: one[0], reverse=True)

@@ -41,6 +41,8 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     ----------
     rectified
         True if the images are rectified, so that the camera is P of its camera_info without distortion.
+    ranges
+        Topics of ranges by target: another robot, or a landmark of the team.
     truth_tf
         Two frames of tf whose transform is T_world_body: world, body.
     motion
@@ -53,6 +55,7 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     rectified: bool = False
     odometry: str | None = None
     odometry_sigmas: OdometrySigmas | None = None
+    ranges: dict[str, str] = {}
     truth: str | None = None
     truth_tf: tuple[str, str] | None = None
     motion: MotionSource = "odometry"
@@ -72,8 +75,9 @@ class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     @property
     def topics(self) -> dict[str, str]:
-        """Topics by kind: image, camera_info, odometry, truth."""
+        """Topics by kind: image, camera_info, odometry, truth, and `range of` each target."""
         every = {kind: getattr(self, kind) for kind in ("image", "camera_info", "odometry", "truth")}
+        every |= {f"range of {target}": topic for target, topic in self.ranges.items()}
         return {kind: topic for kind, topic in every.items() if topic is not None}
 
 
@@ -111,7 +115,9 @@ class RosMap(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 def _with_full_names(robot: RobotTopics) -> RobotTopics:
-    return msgspec.structs.replace(robot, **{kind: full_name(topic) for kind, topic in robot.topics.items()})
+    ranges = {target: full_name(topic) for target, topic in robot.ranges.items()}
+    named = {kind: full_name(topic) for kind, topic in robot.topics.items() if not kind.startswith("range of ")}
+    return msgspec.structs.replace(robot, ranges=ranges, **named)
 
 
 def read_map(path: str | Path) -> tuple[RosMap, Team]:
@@ -131,5 +137,11 @@ def read_map(path: str | Path) -> tuple[RosMap, Team]:
             raise BagError(
                 f"{path}: robot `{robot.name}` is not in the team ({', '.join(team.names)}) - at "
                 f"`$.robots[{number}].name`; correct the name, or add the robot to {found.team}"
+            )
+        known = {*team.names, *(one.name for one in team.landmarks)} - {robot.name}
+        if unknown := [target for target in robot.ranges if target not in known]:
+            raise BagError(
+                f"{path}: `{unknown[0]}` is no other robot or landmark of the team - at `$.robots[{number}].ranges`; "
+                f"correct the name, or add it to {found.team}"
             )
     return found, team

@@ -16,6 +16,7 @@ from coloc_graph.exchange.ros_bag import (
     OLD_TF,
     POSE,
     POSE_WITH_COVARIANCE,
+    RANGE,
     TF,
     Bag,
     BagMessage,
@@ -35,6 +36,7 @@ TYPES = {
     "camera_info": (CAMERA_INFO,),
     "odometry": (ODOMETRY,),
     "truth": (POSE, POSE_WITH_COVARIANCE, ODOMETRY),
+    "range": (RANGE,),
 }
 TF_TOPICS = {"/tf": False, "/tf_static": True}
 TELL_EVERY = 100  # messages between two reports of progress
@@ -100,13 +102,14 @@ def require_topics(bag: Bag, the_map: RosMap) -> None:
     """Raise `BagError` for a topic of the map that the bag lacks or has with another type; it lists candidates."""
     for robot in the_map.robots:
         for kind, name in robot.topics.items():
-            fitting = [topic for topic in bag.topics.values() if {*topic.types} & {*TYPES[kind]}]
+            wanted = TYPES[kind.partition(" ")[0]]
+            fitting = [topic for topic in bag.topics.values() if {*topic.types} & {*wanted}]
             could_be = ", ".join(topic.name for topic in fitting) or "none"
-            types, which = " or ".join(TYPES[kind]), f"which the map has as `{kind}` of {robot.name}"
+            types, which = " or ".join(wanted), f"which the map has as `{kind}` of {robot.name}"
             if name not in bag.topics:
                 raise BagError(f"{bag.path}: has no topic {name}, {which}; of {types} it has: {could_be}")
             topic = bag.topics[name]
-            if len(topic.types) != 1 or topic.types[0] not in TYPES[kind]:
+            if len(topic.types) != 1 or topic.types[0] not in wanted:
                 has = " and ".join(topic.types)
                 raise BagError(f"{bag.path}: the messages of {name}, {which}, are {has}; of {types} it has: {could_be}")
             if not topic.count:
@@ -144,7 +147,7 @@ def read_recording(bag: Bag, the_map: RosMap, told: Callable[[int], None]) -> Re
         stamps[message.topic].append(bag.stamp(message))
         received[message.topic].append(message.received)
         if kinds[message.topic] != "image":
-            values[message.topic].append(_READ[kinds[message.topic]](bag, message))
+            values[message.topic].append(_READ[kinds[message.topic].partition(" ")[0]](bag, message))
     for topic, every in received.items():
         if not every:
             raise BagError(
@@ -230,6 +233,13 @@ def _pose(bag: Bag, message: BagMessage, pose: Any) -> Array:
     return T
 
 
+def _range(bag: Bag, message: BagMessage) -> float:
+    """Range [m]; NaN outside the sensor's limits, where nothing was measured (REP 117)."""
+    found = bag.decode(message)
+    value = float(found.range)
+    return value if found.min_range <= value <= found.max_range and 0 < value < np.inf else float("nan")
+
+
 def _camera_info(bag: Bag, message: BagMessage) -> BagMessage:
     return message
 
@@ -251,4 +261,5 @@ _READ: dict[str, Callable[[Bag, BagMessage], Any]] = {
     "camera_info": _camera_info,
     "odometry": _odometry,
     "truth": _truth,
+    "range": _range,
 }

@@ -16,7 +16,7 @@ from coloc_graph.exchange.ros_poses import grown_increments, stated_increments
 from coloc_graph.exchange.ros_read import Recording
 from coloc_graph.exchange.stances import Movements, movements
 from coloc_graph.geometry.lie import yaw
-from coloc_graph.run import OdometrySample
+from coloc_graph.run import OdometrySample, Ranges
 from coloc_graph.run.odometry_breaks import find_breaks, join_breaks
 from coloc_graph.run.schemas import to_seconds
 from coloc_graph.team import Team
@@ -116,6 +116,22 @@ def _of_body(bag: Bag, robot: RobotTopics, recording: Recording) -> tuple[Array,
         f"{bag.path}: {robot.odometry} (`odometry` of {robot.name}) is of the frame `{frame}`, which may not be the "
         "body's, and is taken for it; record /tf_static, which says where it is on the body, or odometry of base_link"
     ]
+
+
+def ranges_of(bag: Bag, robot: RobotTopics, recording: Recording) -> tuple[list[Ranges], list[str]]:
+    """Ranges that a robot measured, and sentences on readings outside the limits of the sensor, which are none."""
+    records, said = [], []
+    for target, topic in robot.ranges.items():
+        times, values = seconds(recording.orders[topic].ns), np.array(recording.values[topic])
+        there = np.isfinite(values)
+        found = zip(times[there].tolist(), values[there], strict=True)
+        records += [Ranges(robot.name, time, (target,), np.array([value])) for time, value in found]
+        if not there.all():
+            said.append(
+                f"{bag.path}: {int((~there).sum())} of {len(there)} ranges of {topic} are outside min_range and "
+                "max_range, and were left out"
+            )
+    return records, said
 
 
 def truth_of(bag: Bag, robot: RobotTopics, recording: Recording) -> list[tuple[float, Array]]:

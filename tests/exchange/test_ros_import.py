@@ -872,7 +872,7 @@ def test_on_the_command_line(bring_in, tmp_path, capsys):
     assert main([*command, "--force"]) == 0
     out, err = capsys.readouterr()
     first, *stood = out.splitlines()
-    assert first.endswith("run.mcap: 40 images, 0 odometry samples, 0 true poses; 1 stance, observers A, B")
+    assert first.endswith("run.mcap: 40 images, 0 odometry samples, 0 ranges, 0 true poses; 1 stance, observers A, B")
     assert stood == ["A stood 3.8 of 3.8 s", "B stood 3.8 of 3.8 s", "C stood 0.0 of 3.8 s"]
     assert "messages read: 80 of 80" in err
     assert main([*command, "--force", "--json", "--image-format", "png"]) == 0

@@ -4,15 +4,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from msgspec.structs import replace as with_fields
+from ros_bags import of_run, range_, write_bag
 
 from coloc_graph.backend import Estimator, KeyframeGraph, diagnose, joint
 from coloc_graph.backend.planar.range_alignment import MIRRORED, OPEN, RangeAlignment
 from coloc_graph.cli import main
-from coloc_graph.errors import EstimationError
+from coloc_graph.errors import BagError, EstimationError
 from coloc_graph.exchange.pyfg import write_pyfg
 from coloc_graph.exchange.range_graph_files import letters_of
 from coloc_graph.exchange.ranging_factors import ranging_gtsam_files
 from coloc_graph.exchange.ranging_graph import ranging_graph
+from coloc_graph.exchange.ros_import import import_ros
 from coloc_graph.frontend.keyframes import keyframes_of
 from coloc_graph.measurements import RangeBearing
 from coloc_graph.pipeline.batch import SolveOptions, solve
@@ -285,3 +287,36 @@ def test_wrong_rows_are_named_with_their_line(csvs, capsys, file, row, why):
     error = capsys.readouterr().err
     assert f"{file}, line {len(text.splitlines()) + 1}: " in error and why in error
     assert not (csvs / "own.mcap").exists()
+
+
+@pytest.fixture(params=["ros1", "mcap"])
+def bag(run, tmp_path, request):
+    """A run as a ROS bag with a map of its topics; one reading is out of the sensor's limits."""
+    sent = of_run(run.path)
+    sent.append(range_("/R1/uwb/R2", sent[-1].received, float("inf")))
+    write_team(run.team, tmp_path / "team.toml")
+    targets = {name: {target for one in run.ranges(name) for target in one.targets} for name in run.team.names}
+    robots = [
+        f'[[robots]]\nname = "{name}"\nodometry = "/{name}/odom"\ntruth = "/{name}/truth"\nranges = {{'
+        + ", ".join(f'{target} = "/{name}/uwb/{target}"' for target in sorted(to)) + "}"
+        for name, to in targets.items()
+    ]  # fmt: skip
+    (tmp_path / "map.toml").write_text("\n".join(['team = "team.toml"', *robots]))
+    return write_bag(tmp_path, request.param, sent)
+
+
+def test_ranges_of_a_ros_bag_without_cameras_are_imported(run, bag, tmp_path):
+    summary = import_ros(bag, tmp_path / "map.toml", tmp_path / "own.mcap")
+    ours = [one for name in run.team.names for one in run.ranges(name)]
+    assert summary.counts["ranges"] == sum(len(one.targets) for one in ours) and not summary.stances
+    assert any("1 of" in one and "/R1/uwb/R2 are outside min_range and max_range" in one for one in summary.warnings)
+    estimate, theirs = solve(run).estimate, solve(open_run(tmp_path / "own.mcap")).estimate
+    path, other = estimate.trajectories["R3"], theirs.trajectories["R3"]
+    assert np.linalg.norm(path.positions[-1] - other.positions[-1]) < 0.01
+
+
+def test_a_range_topic_of_nobody_is_refused(bag, tmp_path):
+    text = (tmp_path / "map.toml").read_text()
+    (tmp_path / "map.toml").write_text(text.replace("ranges = {R2", "ranges = {Q"))
+    with pytest.raises(BagError, match=r"map.toml: `Q` is no other robot or landmark of the team - at `\$.robots"):
+        import_ros(bag, tmp_path / "map.toml", tmp_path / "own.mcap")

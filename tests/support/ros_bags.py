@@ -81,6 +81,11 @@ class Make:
         kind = self.types["nav_msgs/msg/Odometry"]
         return kind(self.header(ns, "odom"), "base_link", self.with_covariance(T, C), twist)
 
+    def range(self, ns, value):
+        header, limits = self.header(ns, "uwb"), {"min_range": 0.05, "max_range": 50.0}
+        kind = self.types["sensor_msgs/msg/Range"]
+        return kind(header=header, radiation_type=0, field_of_view=6.28, range=value, **limits)
+
     def tf(self, ns, parent, child, T):
         w, x, y, z = quaternion(T[:3, :3])
         transform = self.types["geometry_msgs/msg/Transform"](
@@ -145,6 +150,10 @@ def tf(topic, ns, parent, child, T):
     return Sent(topic, ns, "tf2_msgs/msg/TFMessage", lambda make: make.tf(ns, parent, child, T))
 
 
+def range_(topic, ns, value):
+    return Sent(topic, ns, "sensor_msgs/msg/Range", lambda make: make.range(ns, value))
+
+
 def wheels(run, robot, begin, end, rate=10.0):
     """(times [s], poses, covariances of the poses) of a robot's odometry, told also while it stands.
 
@@ -193,6 +202,9 @@ def of_run(path, *, by_tf=(), encodings=None):
             whole = np.zeros((6, 6))
             whole[np.ix_([0, 1, 5], [0, 1, 5])] = C
             sent.append(odometry(f"/{robot}/odom", to_ns(time), pose, whole))
+        for one in run.ranges(robot):
+            for target, value in zip(one.targets, one.range.tolist(), strict=True):
+                sent.append(range_(f"/{robot}/uwb/{target}", to_ns(one.time), value))
         true = read_truth(path)[robot]
         for time, T in zip(true.times.tolist(), true.T_world_body, strict=True):
             if robot in by_tf:
