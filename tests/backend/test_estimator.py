@@ -132,18 +132,19 @@ def test_a_stance_gives_covariances_and_residuals_of_the_last_step():
 
 
 def test_measurements_are_tested_alike_where_the_position_is_known_to_metres_alone():
-    """GTSAM's covariance of both poses has no digits left of their relative one."""
+    """Far from where the heading was known, the covariance of two poses has no digits left of their relative one."""
     isam, factors, values = gtsam.ISAM2(isam_parameters()), gtsam.NonlinearFactorGraph(), gtsam.Values()
     i, j = gtsam.symbol("x", 0), gtsam.symbol("x", 1)
-    first = gtsam.Pose3(gtsam.Rot3(), np.array([1000.0, 0.0, 0.0]))
-    step, precise = gtsam.Pose3(floor_pose(1.0, 0.2, 0.3)), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
-    prior = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3, 1e-3, 0.05, 50.0, 50.0, 1e-3]))
-    factors.add(gtsam.PriorFactorPose3(i, first, prior))
-    between = [gtsam.BetweenFactorPose3(i, j, step.retract(np.full(6, off)), precise) for off in (-1e-4, 1e-4)]
+    far, step = gtsam.Pose3(floor_pose(60000.0, 9000.0, 0.7)), gtsam.Pose3(floor_pose(1.0, 0.2, 0.3))
+    precise = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
+    turned = far.inverse().AdjointMap()[:, 2:3] * 0.05  # rad, about the origin
+    C = turned @ turned.T + np.diag(np.square([1e-3, 1e-3, 1e-4, 1e-3, 1e-3, 1e-3]))
+    factors.add(gtsam.PriorFactorPose3(i, far, gtsam.noiseModel.Gaussian.Covariance(C)))
+    between = [gtsam.BetweenFactorPose3(i, j, step.retract(np.full(6, off)), precise) for off in (-1e-5, 1e-5)]
     for one in between:
         factors.add(one)
-    values.insert(i, first)
-    values.insert(j, first.compose(step))
+    values.insert(i, far)
+    values.insert(j, far.compose(step))
     isam.update(factors, values)
     off = agreement(between[:1], isam.calculateEstimate(), covariance_root(isam, [i, j]))
     assert off.dof == 6 and off.chi2 == pytest.approx(12, rel=1e-3)  # 6 rows, each off by root two of its sigmas
