@@ -162,16 +162,19 @@ def _misfit(estimate: Estimate) -> list[str]:
 
 
 def _unobservable(estimate: Estimate) -> Iterator[str]:
-    """Tolerances of mounts and range sensors that were stated, and that the measurements do not narrow."""
+    """Tolerances of mounts, wheels and range sensors that were stated, and that the measurements do not narrow."""
     mounts = {name: set(mount.rows) for name, mount in estimate.calibration.mounts.items()}
     names: dict[tuple[str, str], list[str]] = {}
     for row in estimate.calibration.unobservable:
-        remedy = (
-            f"record wheel odometry of {row.robot} while it turns and drives between its stances"
-            if row in mounts.get(row.robot, ())
-            else f"let it measure range at more distances to more robots, or state it as exact in {row.robot}'s "
-            "[robots.ranging]"
-        )
+        if row in mounts.get(row.robot, ()):
+            remedy = f"record wheel odometry of {row.robot} while it turns and drives between its stances"
+        elif row.what.startswith("odometry"):
+            remedy = f"let it drive further and turn more, or state it as exact in {row.robot}'s [robots.wheels]"
+        else:
+            remedy = (
+                f"let it measure range at more distances to more robots, or state it as exact in {row.robot}'s "
+                "[robots.ranging]"
+            )
         names.setdefault((row.robot, remedy), []).append(row.what)
     for (robot, remedy), whats in names.items():
         yield f"{robot}: {', '.join(whats)} not observable, and as uncertain as stated: {remedy}"

@@ -89,10 +89,10 @@ def test_nees_of_radio_drives(tmp_path):
     assert 0.6 < np.mean(found) < 1.5
 
 
-def straight(path, names=("A", "B"), landmarks=()):
+def straight(path, names=("A", "B"), landmarks=(), wheels=Wheels()):  # noqa: B008 (frozen)
     """Robots that drive straight on and range all others and the landmarks."""
     ranging = Ranging(range_sigma=0.02, two_way=True)
-    robots = tuple(Robot(name=name, ranging=ranging, wheels=Wheels()) for name in names)
+    robots = tuple(Robot(name=name, ranging=ranging, wheels=wheels) for name in names)
     team = Team(reference=names[0], robots=robots, floor=Floor(), landmarks=landmarks)
     C, start = np.diag([1e-6, 1e-8, 1e-8]), 1_700_000_000.0
     with RunWriter(path, team) as writer:
@@ -128,6 +128,16 @@ def test_two_landmarks_leave_a_straight_way_mirrored_and_three_do_not(tmp_path):
     loose = with_fields(run.team, landmarks=(*marks[:2], Landmark(name="U3")))
     (part,) = diagnose(KeyframeGraph(loose, keyframes_of(run)))
     assert str(part) == f"robot A has no pose: {MIRRORED}"
+
+
+def test_a_turn_scale_of_a_robot_that_never_turns_is_reported_as_not_observable(tmp_path):
+    places = {"U1": (3.0, 2.0), "U2": (0.0, -3.0), "U3": (8.0, -1.0)}
+    marks = tuple(Landmark(name=name, position=xy) for name, xy in places.items())
+    wheels = Wheels(scale_sigma=0.02, turn_scale_sigma=0.02)
+    solution = solve(open_run(straight(tmp_path / "run.mcap", ("A",), marks, wheels)))
+    said = [one for one in solution.warnings if "not observable" in one]
+    assert len(said) == 1 and said[0].startswith("A: odometry turn scale not observable, and as uncertain as stated")
+    assert said[0].endswith("[robots.wheels]")
 
 
 @pytest.mark.parametrize("turns", [True, False])
