@@ -23,6 +23,7 @@ STEP_CHI2 = 50.0  # chi2 that a step must explain
 DRIFT_CHI2 = 25.0  # chi2 that drifts must explain
 MIN_DRIFT = 2e-3  # change of an offset over the run that a drift makes at least [s]
 MIN_FOR_DRIFT = 4  # stances that tell a drift
+DRIFT_SIGMA = 1e-3  # prior of a drift: crystals keep time to 1e-4, and NTP slews by 5e-4 at most [s/s]
 SAME_SIGMA = 5e-3  # camera and wheels of one robot share a clock to this [s]
 SAME_RATE = 1e-6  # and drift alike to this [s/s]
 MAX_CONTRADICTORY = 0.25  # share of the evidence that may fit no clock
@@ -168,8 +169,10 @@ def _split(evidence: list[ClockEvidence]) -> list[list[ClockEvidence]]:
 
 
 def _contradictory(evidence: Sequence[ClockEvidence]) -> bool:
-    """Return whether much of the evidence fits no constant or drifting clocks."""
-    _, _, residuals = _fit(evidence, drifting=len({one.stance for one in evidence}) >= MIN_FOR_DRIFT)
+    """Return whether much of the evidence fits no constant or drifting clocks, or only such as no computer has."""
+    values, _, residuals = _fit(evidence, drifting=len({one.stance for one in evidence}) >= MIN_FOR_DRIFT)
+    if any(abs(drift) > SIGNIFICANT * DRIFT_SIGMA for _, drift in values.values()):
+        return True
     return bool((np.abs(residuals) > 2 * ROBUST).mean() > MAX_CONTRADICTORY)
 
 
@@ -268,7 +271,7 @@ def _fit(
             if drifting:
                 alike[row, n + camera], alike[row, n + wheels] = -1 / SAME_RATE, 1 / SAME_RATE
         prior = np.full(width, 1 / UNKNOWN)
-        prior[n:] = 1 / 1e-2
+        prior[n:] = 1 / DRIFT_SIGMA
         weights = np.ones(len(rows))
         for _ in range(10):
             normal = (rows.T * weights) @ rows + tied.T @ tied + alike.T @ alike + np.diag(prior**2)

@@ -74,6 +74,22 @@ def test_an_offset_that_the_motion_does_not_tell_is_not_found():
     assert search_offset([]) is None
 
 
+def test_a_straight_drive_away_tells_no_offset_where_only_its_far_points_are_compared():
+    """A shift in time is one on the plane then, and far from two seconds off only distant points have a partner."""
+    times = np.arange(0.0, 4.95, 0.1)
+    for seed in (33, 39, 123, 144):
+        rng, pairs = np.random.default_rng(seed), []
+        for y in (-0.12, 0.12):
+            x, both = 0.9 + 0.2 * times, []
+            for side in (0.25, -0.25):
+                depth = x + 0.3 * side
+                across = y + side + 0.1 * x * np.sign(side)
+                uv = np.column_stack([160 + 300 * across / depth, 60 + 75 / depth])
+                both.append(TimedPath(times, uv + 0.3 * rng.standard_normal(uv.shape)))
+            pairs.append(tuple(both))
+        assert search_offset(pairs) is None
+
+
 def test_wheels_are_timed_to_the_bound_that_is_predicted():
     """A robot that drives and turns at will, with wheels that slip, before a camera that looks down at an angle."""
     rng = np.random.default_rng(3)

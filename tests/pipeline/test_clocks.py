@@ -123,6 +123,18 @@ def test_a_clock_is_wrong_only_where_stances_agree_on_it(right, offsets, wrong):
         )
 
 
+@pytest.mark.parametrize(("drift", "wrong"), [(2e-4, True), (0.1, False)])
+def test_a_clock_drifts_no_faster_than_computers_do(right, drift, wrong):
+    evidence = [
+        ClockEvidence(n, 100.0 * n, ("A", "camera"), ("B", "camera"), ClockOffset(100.0 * drift * n, 2e-3))
+        for n in range(STANCES)
+    ]
+    clocks = run_clocks(right.team, right.stances, evidence)
+    assert (clocks is not None) == wrong
+    if clocks is not None:
+        assert clocks.clocks["B", "camera"].segments[0].drift == pytest.approx(drift, rel=0.1)
+
+
 def test_the_reference_s_clock_is_wrong_where_most_robots_share_another(right):
     """Stances are of the clock that most share, and the time of others must not be moved away from it."""
     evidence = [

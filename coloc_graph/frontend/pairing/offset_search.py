@@ -42,6 +42,11 @@ class TimedPath:
     times: Array
     xy: Array
 
+    def shared(self, other: "TimedPath", offset: float) -> "TimedPath":
+        """Return the positions at whose times, and an offset [s], another path has positions, too."""
+        which = np.flatnonzero(np.isfinite(other.at(self.times + offset)).all(axis=-1))
+        return TimedPath(self.times[which], self.xy[which])
+
     def at(self, times: Array) -> Array:
         """Interpolated positions (..., 2); NaN where no samples are near."""
         found = np.full((*times.shape, 2), np.nan)
@@ -73,35 +78,40 @@ def search_offset(
         None where no offset is clearly better than all others, or none explains the paths.
     """
     pairs = [(a, b) for a, b in pairs if len(a.times) >= 4 and len(b.times) >= 4]
-    total = sum(len(a.times) for a, _ in pairs)
+    total = _count(pairs)
     if total < MIN_POINTS:
         return None
     spread = np.concatenate([b.xy for _, b in pairs])
     middle, unit = spread.mean(axis=0), max(float(spread.std()), 1e-12)
 
-    def cost(offsets: Array, points: int) -> Array:
-        every = max(1, -(-total // points))
+    def cost(pairs: Sequence[tuple[TimedPath, TimedPath]], offsets: Array, points: int) -> Array:
+        count = _count(pairs)
+        every = max(1, -(-count // points))
         times = [a.times[::every] for a, _ in pairs]
         x = _scaled(np.concatenate([a.xy[::every] for a, _ in pairs]))
         y = np.concatenate([b.at(t[None] + offsets[:, None]) for t, (_, b) in zip(times, pairs, strict=True)], axis=1)
-        # neighbours err alike, so that not all points count
-        return INDEPENDENT * (2 * min(total, MAX_POINTS) - 9) * _log_variance(x, (y - middle) / unit)
+        return _weight(count) * _log_variance(x, (y - middle) / unit)
 
-    count = round(reach / COARSE_STEP)
-    offsets = np.asarray(COARSE_STEP * np.arange(-count, count + 1), float)
-    coarse = cost(offsets, MAX_COARSE_POINTS)
+    steps = round(reach / COARSE_STEP)
+    offsets = np.asarray(COARSE_STEP * np.arange(-steps, steps + 1), float)
+    coarse = cost(pairs, offsets, MAX_COARSE_POINTS)
     if not np.isfinite(coarse).any():
         return None
     best = float(offsets[np.nanargmin(coarse)])
     near = np.asarray(best + FINE_STEP * np.arange(-15, 16), float)
-    fine = cost(near, MAX_POINTS)
+    fine = cost(pairs, near, MAX_POINTS)
     k = int(np.nanargmin(fine))
-    far = coarse[np.abs(offsets - near[k]) > BASIN]
-    if k in (0, len(near) - 1) or not np.isfinite(fine[k - 1 : k + 2]).all() or not np.isfinite(far).any():
+    if k in (0, len(near) - 1) or not np.isfinite(fine[k - 1 : k + 2]).all():
         return None
-    if float(np.nanmin(far)) - fine[k] < CLEAR:
+    further = np.abs(offsets - near[k]) > BASIN
+    # it may be best only because points that are explained worse, such as near ones, are not compared there: it is to
+    # be clearly the best among the points that both saw at this offset, too
+    shared = [(a.shared(b, float(near[k])), b) for a, b in pairs]
+    if not _is_clear(fine[k], coarse[further]) or not _is_clear(
+        cost(shared, near[k : k + 1], MAX_POINTS)[0], cost(shared, offsets[further], MAX_COARSE_POINTS)
+    ):
         return None
-    if unit * np.exp(fine[k] / (2 * INDEPENDENT * (2 * min(total, MAX_POINTS) - 9))) > max_residual:
+    if unit * np.exp(fine[k] / (2 * _weight(total))) > max_residual:
         return None
     low, here, high = fine[k - 1 : k + 2]
     curvature = low + high - 2 * here
@@ -109,6 +119,21 @@ def search_offset(
         return None
     value = float(near[k] + FINE_STEP * 0.5 * (low - high) / curvature)
     return ClockOffset(value, max(float(FINE_STEP * np.sqrt(2 / curvature)), MIN_SIGMA))
+
+
+def _is_clear(best: float, others: Array) -> bool:
+    """Return whether the cost of the best offset is clearly less than that of others, of which some are known."""
+    return bool(np.isfinite(others).any() and float(np.nanmin(others)) - best >= CLEAR)
+
+
+def _count(pairs: Sequence[tuple[TimedPath, TimedPath]]) -> int:
+    """Return the number of points of the first paths."""
+    return sum(len(a.times) for a, _ in pairs)
+
+
+def _weight(count: int) -> float:
+    """Return the weight of a log-variance of `count` points: neighbours err alike, so that not all of them count."""
+    return INDEPENDENT * (2 * min(count, MAX_POINTS) - 9)
 
 
 def _scaled(x: Array) -> Array:
