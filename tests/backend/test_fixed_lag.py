@@ -9,6 +9,7 @@ import pytest
 from coloc_graph.backend import Estimator
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.errors import EstimationError, MeasurementError
+from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.measurements import Odometry, Sighting
 from coloc_graph.pipeline.batch import solve
 from coloc_graph.run import open_run
@@ -124,6 +125,39 @@ def test_two_robots_are_composed_by_what_ties_them_before_each_by_its_own_odomet
 def test_a_lag_of_nothing_is_refused(graph):
     with pytest.raises(EstimationError, match="a lag of 0 stances"):
         fed(graph, 0)
+
+
+def test_a_shift_of_metres_at_once_is_followed(graph):
+    """A kilometre away, after 2 m more of odometry: bodies tilted by half a milliradian would move along their tilt."""
+    first, second = graph.stances[:2]
+    robot = first.observers[0]
+
+    def driven(x, y, sigma):
+        covariance = np.diag(np.square([1e-3, sigma, sigma]))
+        return Odometry(robot, first.index, first.index + 1, floor_pose(x, y, 0.0), covariance)
+
+    def measured(stance):
+        return [one for one in graph.measurements if max(index for _, index in one.ends) == stance.index]
+
+    def later(stance):
+        here = replace(stance, index=stance.index + 1, start=stance.start + 1000.0, end=stance.end + 1000.0)
+        return here, [
+            replace(one, before=one.before + 1, after=one.after + 1) if isinstance(one, Odometry)
+            else replace(one, stance=one.stance + 1) for one in measured(stance)
+        ]  # fmt: skip
+
+    estimator = Estimator(graph.reference, graph.robots, graph.floor, graph.slips, graph.robot_models)
+    estimator.add(first, measured(first))
+    here, taken = later(first)
+    estimator.add(here, [*taken, driven(1000.0, 0.0, 2.0)], after=first.index)
+    estimator.insert(driven(1002.0, 2.0, 0.01))
+    estimator.add(*later(second), after=here.index)
+    batch = estimator.estimate()
+    assert not estimator.rejected and not batch.rejected
+    for name in "AB":
+        T, C = batch.pose(name, second.index + 1), batch.covariance(name, second.index + 1)
+        off = np.asarray(T.localCoordinates(estimator.pose(name)))
+        assert np.sqrt(off @ np.linalg.solve(C, off) / 6) < 0.1
 
 
 @pytest.mark.parametrize("method", ["joint", "smooth"])
