@@ -3,6 +3,7 @@
     python benchmarks/team.py [--seeds 24] [--json]     6 robots, 10 stances: NEES; against the best single chain
     python benchmarks/team.py --robots 10 --stances 30  the same of others
     python benchmarks/team.py --table [--large]         time and memory against the number of robots; 50 of 100 stances
+    python benchmarks/team.py --size 50 100             that row alone
     python benchmarks/team.py --blink [--clock 0.005]   white markers that blink, against coloured ones
 
 Mounts are wrong by 0.5 deg and 3 mm, the floor by 0.1 deg (one sigma each), 0.3 px, about 100 points a pair. The best
@@ -26,13 +27,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `coloc` does, before nu
 import numpy as np
 from monte_carlo import MemoryRun, anees_interval, over_seeds, truth_of
 
-from coloc_graph.backend import Estimate, joint
+from coloc_graph.backend import Estimate, PoseGraph, joint
 from coloc_graph.backend.chain import spanning_tree
 from coloc_graph.evaluation import align, nees_of
 from coloc_graph.frontend import StanceTracks, Track
 from coloc_graph.frontend.images.detection import Blobs
 from coloc_graph.frontend.stance_tracks import stance_plane
 from coloc_graph.frontend.tracks.marker_pairs import markers_of_movers
+from coloc_graph.geometry.lie import se3_inverse, se3_log
+from coloc_graph.measurements import RelativePose
 from coloc_graph.pipeline import incremental as stance_solver
 from coloc_graph.pipeline.batch import SolveOptions, solve
 from coloc_graph.simulation import Imperfections, reference_team
@@ -43,6 +46,8 @@ from coloc_graph.simulation.tracks import observe
 from coloc_graph.simulation.world import World, stream
 
 WRONG = Imperfections(mount_sigma_deg=0.5, height_sigma=0.003, floor_sigma_deg=0.1)
+EXCHANGED = 0.1  # share of the homographies that are replaced by those of other robots
+FAR_OFF = 5.0  # standard deviations by which such a relative pose is off at least
 
 
 def world_of(robots: int, stances: int, seed: int, at_once: int | None = None) -> World:
@@ -195,6 +200,22 @@ def blink(seeds: int, clock: float, robots: int = 6, stances: int = 10) -> dict[
     return found
 
 
+def exchanged(graph: PoseGraph, share: float) -> tuple[PoseGraph, set[int]]:
+    """Graph in which a share of the relative poses is that of other robots, and their indices in its measurements."""
+    rng = np.random.default_rng(0)
+    poses = [n for n, one in enumerate(graph.measurements) if isinstance(one, RelativePose)]
+    taken, wrong = list(graph.measurements), set[int]()
+    for n in rng.permutation(poses).tolist():
+        own, other = graph.measurements[n], graph.measurements[int(rng.choice(poses))]
+        assert isinstance(own, RelativePose)
+        assert isinstance(other, RelativePose)
+        off = se3_log(se3_inverse(own.T_i_j) @ other.T_i_j)
+        if off @ np.linalg.solve(own.covariance, off) > FAR_OFF**2 and len(wrong) < share * len(poses):
+            taken[n] = replace(other, stance=own.stance, robot_i=own.robot_i, robot_j=own.robot_j)
+            wrong.add(n)
+    return replace(graph, measurements=tuple(taken)), wrong
+
+
 def sized(robots: int, stances: int) -> dict[str, float]:
     """Time and memory of one run, from detections in memory, in a process of its own."""
     world = world_of(robots, stances, 0)
@@ -207,6 +228,12 @@ def sized(robots: int, stances: int) -> dict[str, float]:
     started = time.process_time()
     joint(graph)
     graph_s = time.process_time() - started
+    spoilt, wrong = exchanged(graph, EXCHANGED)
+    started = time.process_time()
+    estimate = joint(spoilt)
+    spoilt_s = time.process_time() - started
+    gone = {id(one.measurement) for one in estimate.rejected}
+    rejected = {n for n, one in enumerate(spoilt.measurements) if id(one) in gone}
     accuracy = _errors(solution.estimate, world)
     return {
         "robots": robots,
@@ -216,6 +243,11 @@ def sized(robots: int, stances: int) -> dict[str, float]:
         "seconds": taken,
         "front_end_s": taken - graph_s,
         "graph_s": graph_s,
+        "exchanged_s": spoilt_s,
+        "exchanged": len(wrong),
+        "found": len(rejected & wrong),
+        "right_rejected": len(rejected - wrong),
+        "exchanged_ate_cm": 100 * _errors(estimate, world)[0],
         "mib_before": before / 1024,
         "mib_at_most": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "ate_cm": 100 * accuracy[0],
@@ -242,12 +274,15 @@ def main() -> None:
     parser.add_argument("--stances", type=int, default=10)
     parser.add_argument("--table", action="store_true")
     parser.add_argument("--large", action="store_true", help="50 robots, 100 stances, too")
+    parser.add_argument("--size", type=int, nargs=2, metavar=("ROBOTS", "STANCES"), help="one row of the table")
     parser.add_argument("--blink", action="store_true")
     parser.add_argument("--clock", type=float, default=0.0, help="offset of the robots' clocks, s")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    if options.table:
-        found: object = table([(n, 30) for n in (3, 5, 10, 20)] + [(50, 30), (50, 100)][: 1 + options.large])
+    if options.size:
+        found: object = table([tuple(options.size)])
+    elif options.table:
+        found = table([(n, 30) for n in (3, 5, 10, 20)] + [(50, 30), (50, 100)][: 1 + options.large])
     elif options.blink:
         found = blink(options.seeds, options.clock)
     else:
