@@ -157,7 +157,7 @@ def find_faults(method: Method, graph: PoseGraph, warm: WarmStart | None) -> tup
         if fit is None:
             rejected = [one.measurement for fault in faults for one in fault.rejections()]
             tested = replace(graph.without(rejected), slips={**dict.fromkeys(robots, TEST_SLIP), **graph.slips})
-            fit = fit_graph(method, tested, warm.start(tested) if warm else None)
+            fit = fit_graph(method, tested, warm.start(tested) if warm else None, roughly=True)
         suspects = _suspects(fit)
         if not suspects:
             return tuple(faults), graph, True
@@ -246,7 +246,7 @@ def _fitted(method: Method, fit: Fit, suspects: list[tuple[Cause, Agreement]]) -
             break
         freed = _without(fit.graph, cause)
         try:
-            other = fit_graph(method, freed, warm.start(freed))
+            other = fit_graph(method, freed, warm.start(freed), roughly=True)
         except EstimationError:
             continue  # without it nothing ties the robots to each other
         if len(freed.disconnected(other.values.keys())) > tied and tested.sigmas < SIGMAS_ALONE:

@@ -206,6 +206,6 @@ def _mounts_first(graph: PoseGraph) -> gtsam.Values | None:
     if len(graph.stances) < LONG_RUN_STANCES or not spanning_tree(part, part.links):
         return None
     known = gtsam.Values()
-    for key, errors in calibrations_in(fit_graph("joint", part, anchorings=1).values).items():
+    for key, errors in calibrations_in(fit_graph("joint", part, anchorings=1, roughly=True).values).items():
         known.insert(key, errors)
     return known

@@ -101,7 +101,7 @@ def gnc_outliers(graph: PoseGraph, fit: Fit | None = None) -> dict[int, Link]:
     # poses alone: GTSAM's optimiser copies its factors, which those that are Python cannot be
     ranges = [one for one in graph.measurements if isinstance(one, Range)]
     if fit is None or ranges:
-        fit = fit_graph("smooth", graph.without(ranges))
+        fit = fit_graph("smooth", graph.without(ranges), roughly=True)
     first, landmarks = fit.factors.size() - len(fit.links), fit.graph.landmarks
     suspects = [
         index
@@ -141,7 +141,7 @@ def _search(method: Method, graph: PoseGraph, suspected: Mapping[int, Link], sta
     """
     suspected, at_rejection, alone = dict[int, Link](suspected), dict[int, Agreement](), set[int]()
     before: Fit | None = None
-    large = roughly = len(graph.links) > ALL_TESTED
+    large, roughly = len(graph.links) > ALL_TESTED, True
     # ends when a set repeats, or after the last round
     for left in reversed(range(MAX_ROUNDS)):
         try:
@@ -151,7 +151,7 @@ def _search(method: Method, graph: PoseGraph, suspected: Mapping[int, Link], sta
                 raise
             # without these nothing ties the robots to each other: they disagree, and it is not known which are wrong
             return Found(graph, {}, fit_graph(method, graph, start))
-        is_rough = left > 0 and fit.is_rough
+        is_rough = large and left > 0 and fit.is_rough
         tested = fit.residuals(SEARCHED) if is_rough else fit.agreements(SEARCHED)
         scale = scale_of(tested.values())
         kept = {index for index, off in tested.items() if id(fit.links[index]) in alone and off.sigmas < SIGMAS_ALONE}
@@ -159,7 +159,7 @@ def _search(method: Method, graph: PoseGraph, suspected: Mapping[int, Link], sta
         wrong = [index for index, one in zip(tested, is_wrong.tolist(), strict=True) if one and index not in kept]
         wrong.sort(key=lambda index: tested[index].log_p_value())
         refused = _apart(fit, wrong, MAX_AT_POSE_WHILE_ROUGH if is_rough else 1) if large else wrong[:1]
-        roughly = bool(is_rough and refused)
+        roughly = not large or bool(is_rough and refused)
         offs = {} if is_rough else _innovations(fit, suspected)
         again = {key for key, off in offs.items() if off.dof and off.p_value(scale) >= REJECTION_P_VALUE}
         untied = [key for key, off in offs.items() if not off.dof and at_rejection.get(key, off).sigmas < SIGMAS_ALONE]

@@ -46,6 +46,7 @@ RELINEARIZE_CALIBRATION = 3e-4  # change of a calibration variable [m, rad, rela
 # each fit of graduated non-convexity begins where the one before it ended
 ROBUST_TOLERANCE = 1e-3  # change of half the squared error, relative and absolute
 ROBUST_ITERATIONS = 10  # iterations of a fit
+ROUGH_ITERATIONS = 50  # iterations of Levenberg-Marquardt where the error stays larger than a fit has without outliers
 
 
 def with_stack(poses: int, work: Callable[[], T]) -> T:
@@ -247,7 +248,8 @@ def optimise(
     Gauss-Newton evaluates all factors at some values within the context `held`, given these values.
     `roughly_first` begins Levenberg-Marquardt with Cholesky, which takes a thirtieth of the time where cliques are
     large, and may get stuck; QR continues from there. Where the error stays `rough_above` this, the search ends once a
-    step lowers it by less than `ROBUST_TOLERANCE` of it; in any case once one lowers it by less than `negligible`.
+    step lowers it by less than `ROBUST_TOLERANCE` of it, and Levenberg-Marquardt after `ROUGH_ITERATIONS`; in any case
+    once one lowers it by less than `negligible`.
 
     Raises
     ------
@@ -271,16 +273,22 @@ def optimise(
     with suppress(EstimationError):
         found = gauss_newton(Nonlinear(factors, held), initial, tolerance, rises=MAX_RISES)
         return found.state, found.iterations
-    if roughly_first:
+    among_outliers = 0 < rough_above < before  # with 0, a robust cost, outliers have their weights
+    if roughly_first or among_outliers:
         parameters = lm_parameters()
-        parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
+        if roughly_first:
+            parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
         if before > rough_above:
             parameters.setRelativeErrorTol(ROBUST_TOLERANCE)
+            parameters.setMaxIterations(ROUGH_ITERATIONS if among_outliers else MAX_ITERATIONS)
         rough = gtsam.LevenbergMarquardtOptimizer(factors, initial, parameters)
-        there = rough.optimize()
-        if factors.error(there) < before:
-            values, used = optimise(factors, there, rough_above=rough_above)
-            return values, used + int(rough.iterations())
+        there, used = rough.optimize(), int(rough.iterations())
+        after = factors.error(there)
+        if after < before:
+            if after > rough_above and among_outliers and not roughly_first:
+                return there, used
+            values, more = optimise(factors, there, rough_above=rough_above, negligible=negligible, held=held)
+            return values, used + more
     optimiser = gtsam.LevenbergMarquardtOptimizer(factors, initial, limits)
     values = optimiser.optimize()
     after = optimiser.error()

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from teams import graph_of_team, planar_nees, team_of
 
-from coloc_graph.backend import blame, smooth
+from coloc_graph.backend import blame, outliers, smooth
+from coloc_graph.backend.optimize import fit_graph
+from coloc_graph.backend.solver import MAX_GAUSS_NEWTON, ROUGH_ITERATIONS
 from coloc_graph.geometry.lie import floor_pose, se3_inverse
 from coloc_graph.measurements import Odometry, RelativePose, Sighting
 
@@ -129,3 +131,23 @@ def test_a_camera_that_moved_within_a_stance_is_no_bump_to_and_fro(robots):
     assert causes
     for m, alternative in causes:
         assert robot in {name for name, _ in m.ends} or any(robot in cause.robots for cause in alternative)
+
+
+def test_among_many_outliers_a_search_does_not_wait_for_fits_to_converge(monkeypatch):
+    team, rng = team_of(4, 10, 3), np.random.default_rng(3)
+    made = []
+    for m in team.measurements:
+        if isinstance(m, RelativePose) and rng.random() < 0.5:
+            m = replace(m, T_i_j=m.T_i_j @ floor_pose(*rng.uniform(-1, 1, 2), rng.uniform(-3, 3)))
+        made.append(m)
+    used = []
+
+    def counted(*args, **kwargs):
+        fit = fit_graph(*args, **kwargs)
+        used.append(fit.iterations)
+        return fit
+
+    for module in (blame, outliers):
+        monkeypatch.setattr(module, "fit_graph", counted)
+    smooth(graph_of_team(team, made))
+    assert max(used) <= MAX_GAUSS_NEWTON + ROUGH_ITERATIONS
