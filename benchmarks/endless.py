@@ -4,8 +4,8 @@
 
 The paper's hallway is simulated once (`--block` stances) and its measurements come again and again. Where one round
 ends and the next begins both observers move, one of them known by odometry, so that no measurement contradicts another.
-One homography in 200 is replaced by a wrong one, except between two rounds, where it alone ties an observer. Times are
-of the thread's processor.
+One homography in 200 is replaced by a wrong one, also between two rounds, where it alone ties an observer. Times are of
+the thread's processor.
 """
 
 import argparse
@@ -72,7 +72,7 @@ def endless(graph: PoseGraph) -> Iterator[tuple[Stance, list[Measurement], int]]
                     taken.append(Odometry(stance.observers[0], here.index - 1, here.index, step, JOIN_COVARIANCE))
             wrong = 0
             for n, one in enumerate(taken):
-                if stance is first or not isinstance(one, RelativePose) or one.homography is None:
+                if not isinstance(one, RelativePose) or one.homography is None:
                     continue
                 if rng.uniform() < WRONG_SHARE:
                     H = one.homography.H_j_i @ (np.eye(3) + 0.05 * rng.standard_normal((3, 3)))

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 from scipy.special import chdtrc, gammaln
 
 Array = NDArray[np.float64]
 
 REJECTION_P_VALUE = 1e-6  # probability by noise below which a measurement is rejected
 MIN_REDUNDANCY = 1e-3  # redundancy (share of variance) below which a direction of a residual is unchecked
+RANK_TOLERANCE = 1e-10  # singular value relative to the largest, of columns of length 1, below which it is zero
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +128,20 @@ def innovations(
     return _each(factors, values, joint, _innovative)
 
 
-def innovation(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, root: Array) -> Agreement:
-    """Test factors that are not in the fit, as `agreement`: e^T (I + A P A^T)^-1 e."""
-    A, b = _whitened(factors, values)
-    spread = A @ root
+def innovation(
+    factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, root: Array, keys: Sequence[int] | None = None
+) -> Agreement:
+    """Test factors that are not in the fit, as `agreement`: e^T (I + A P A^T)^-1 e.
+
+    `keys` are given where the fit lacks some, which come last and are unknown: what determines them is then no part of
+    the test. It is `UNCHECKED` where nothing is left.
+    """
+    A, b = _whitened(factors, values, keys)
+    spread, unknown = A[:, : len(root)] @ root, A[:, len(root) :]
+    if unknown.shape[1]:
+        lengths = np.linalg.norm(unknown, axis=0)
+        beyond = null_space((unknown / np.where(lengths > 0.0, lengths, 1.0)).T, rcond=RANK_TOLERANCE)
+        spread, b = beyond.T @ spread, beyond.T @ b
     return Agreement(float(b @ np.linalg.solve(np.eye(len(b)) + spread @ spread.T, b)), len(b))
 
 
@@ -138,12 +150,14 @@ def keys_of(factors: Iterable[gtsam.NonlinearFactor]) -> list[int]:
     return list(dict.fromkeys(int(key) for factor in factors for key in factor.keys()))  # noqa: SIM118
 
 
-def _whitened(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values) -> tuple[Array, Array]:
+def _whitened(
+    factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, keys: Sequence[int] | None = None
+) -> tuple[Array, Array]:
     """Whitened Jacobian (m, n) by all of their keys, and residual (m,), of the rows that are not zero."""
     graph, ordering = gtsam.NonlinearFactorGraph(), gtsam.Ordering()
     for factor in factors:
         graph.add(factor)
-    for key in keys_of(factors):
+    for key in keys_of(factors) if keys is None else keys:
         ordering.push_back(key)
     return _weighing(*graph.linearize(values).jacobian(ordering))
 

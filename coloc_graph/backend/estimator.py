@@ -20,13 +20,7 @@ from coloc_graph.backend.estimator_state import EstimatorState
 from coloc_graph.backend.factors import Method, require_robot_models
 from coloc_graph.backend.fixed_lag import LAG, MAX_STANCES_PER_LAG
 from coloc_graph.backend.forgetting import Past, require_all
-from coloc_graph.backend.graph import (
-    Link,
-    require_anchor,
-    require_reference,
-    require_robots,
-    slips_of,
-)
+from coloc_graph.backend.graph import Link, require_anchor, require_reference, require_robots, slips_of
 from coloc_graph.backend.insertion import InsertionPlan, InsertionPlanner
 from coloc_graph.backend.landmarks import landmarks_of, map_positions, positions_of
 from coloc_graph.backend.planar import LAG as SECONDS
@@ -402,14 +396,13 @@ class Estimator(EstimatorState):
                 self._pose_keys.forget(before, stance)
                 del self._stances[stance.index]
             raise
-        rejected, agreement = self._update(plan)
+        rejected, agreement, self._disconnected = self._update(plan)
         self._marginalise()
         self._journal.append(Entry(stance, taken))
         self._log += taken
         self._instants |= instants
         self._rejected |= {id(one.measurement): one for one in rejected}
         self._newly = (set() if stance is not None else self._newly) | {id(one.measurement) for one in rejected}
-        self._disconnected = plan.disconnected
         said = self._at(next(reversed(self._stances.values())), rejected, agreement, taken)
         self._forget()
         return said
@@ -429,14 +422,19 @@ class Estimator(EstimatorState):
         reference = -1 if live.tied else self._pose_keys.key((self.reference, next(iter(self._stances))))
         return InsertionPlanner(live.factors_of, self._keys, live.tied, reference, live.pose, live.errors).sort(links)
 
-    def _update(self, plan: InsertionPlan) -> tuple[tuple[Rejection, ...], Agreement]:
-        """Put poses and links into the graph, without outliers."""
+    def _update(self, plan: InsertionPlan) -> tuple[tuple[Rejection, ...], Agreement, list[Link]]:
+        """Put poses and links into the graph, without outliers; return these, and what nothing ties then."""
         self._changed = True
+        ties = list[Rejection]()
         try:
-            outcome = self._live.enter(plan)
+            while not (outcome := self._live.enter(plan)).inserted:
+                ties += (_rejection(*one) for one in outcome.rejected)
+                wrong = {id(link) for link, _ in outcome.rejected}
+                plan = self._plan([link for link in plan.links if id(link) not in wrong])
         except Exception as failure:
             raise EstimationError(f"the graph cannot be solved with this, and was restored: {failure}") from failure
-        return tuple(_rejection(link, off) for link, off in outcome.rejected), outcome.agreement
+        found = (*ties, *(_rejection(*one) for one in outcome.rejected))
+        return found, outcome.agreement, plan.disconnected
 
     def _marginalise(self) -> None:
         """Marginalise the poses of old stances where mounts are calibrated, or the past is forgotten."""

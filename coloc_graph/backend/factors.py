@@ -143,6 +143,22 @@ class Factors:
         R[2, 2] = 1 / POINT_YAW_SIGMA
         return gtsam.PriorFactorPose3(key, gtsam.Pose3(), gtsam.noiseModel.Gaussian.SqrtInformation(R, False))
 
+    def of_new(self, key: int, *, is_point: bool) -> tuple[gtsam.NonlinearFactor, ...]:
+        """Return the priors of a new variable: calibration, or a pose other than that of the world, maybe a point's."""
+        if is_calibration(key):
+            return (self.calibration_prior(key),)
+        return *self.of_pose(key), *((self.of_point(key),) if is_point else ())
+
+    def leading(self, link: Link, i: int, j: int, errors: Callable[[int], Array]) -> gtsam.NonlinearFactor | None:
+        """Return the between-factor by which a distant sighting is tested and led in; None of other links.
+
+        A landmark that drift has displaced is far off in the image, or behind the camera: there its pixels give
+        neither a distance nor a gradient.
+        """
+        if not isinstance(link, Sighting) or self.variables is None:
+            return None
+        return self.between(link, i, j, self.expected(link, i, j, errors))
+
     def of_link(self, link: Link, i: int, j: int) -> gtsam.NonlinearFactor:
         """Return the factor of a link on the keys of its two poses and of its calibration variables."""
         ready = self._ready.pop(id(link), None)

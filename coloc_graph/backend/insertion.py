@@ -51,6 +51,11 @@ class InsertionPlan:
     disconnected: list[Link]
     points: set[int]
 
+    @property
+    def links(self) -> list[Link]:
+        """All links of the plan."""
+        return [*(link for link, _, _ in (*self.ties, *self.near, *self.far)), *self.disconnected]
+
 
 class InsertionPlanner:
     """Planner of the insertion of links.

@@ -17,8 +17,8 @@ from coloc_graph.backend.fixed_lag import marginal_factor
 from coloc_graph.backend.graph import Link
 from coloc_graph.backend.insertion import InsertionPlan, Tie
 from coloc_graph.backend.solver import RELINEARIZE_CALIBRATION, covariance_root, isam_parameters, optimise
+from coloc_graph.backend.tie_test import TieTest
 from coloc_graph.errors import EstimationError
-from coloc_graph.measurements import Sighting
 
 Array = NDArray[np.float64]
 
@@ -36,10 +36,11 @@ class InsertedLink(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Result of an insertion: outliers, and the agreement of all inserted links with the graph before."""
+    """Result: outliers, and the agreement of all links inserted; where ties are outliers, nothing is inserted."""
 
     rejected: list[tuple[Link, Agreement]]
     agreement: Agreement
+    inserted: bool = True
 
 
 class Isam2Graph:
@@ -131,19 +132,33 @@ class Isam2Graph:
         """Insert poses and links, without outliers."""
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for key, pose in plan.start.items():
-            is_reference = not self.tied and not values.size()
             values.insert(key, pose)
-            for factor in (self.factors_of.gauge(key),) if is_reference else self.factors_of.of_pose(key):
+            for factor in self._priors(key, plan):
                 factors.add(factor)
-            if key in plan.points:
-                factors.add(self.factors_of.of_point(key))
         made = [self.factors_of.of_link(*tie) for tie in (*plan.ties, *plan.near)]
+        if wrong := self._tie_test(plan).outliers(plan, made):
+            return Outcome(wrong, UNCHECKED, inserted=False)
         far = {id(tie): self.factors_of.of_link(*tie) for tie in plan.far}
         links = (*plan.ties, *plan.near, *plan.far)
         self._made = {id(tie[0]): (tie[0], one) for tie, one in zip(links, (*made, *far.values()), strict=True)}
         self._latest = _batch(made + list(far.values()))
         with self._latest:
             return self._enter(plan, factors, values, made, far)
+
+    def _priors(self, key: int, plan: InsertionPlan) -> tuple[gtsam.NonlinearFactor, ...]:
+        """Return the priors of a new variable."""
+        if not self.tied and key == next(iter(plan.start)):
+            return (self.factors_of.gauge(key),)
+        return self.factors_of.of_new(key, is_point=key in plan.points)
+
+    def _tie_test(self, plan: InsertionPlan) -> TieTest:
+        return TieTest(
+            lambda key: key in self.tied or key in self._calibrated,
+            None if self.tied else next(iter(plan.start), None),
+            lambda key: plan.start[key] if key in plan.start else self._known(key),
+            lambda keys: covariance_root(self.isam, keys),
+            lambda key: self._priors(key, plan),
+        )
 
     def _enter(
         self,
@@ -154,7 +169,7 @@ class Isam2Graph:
         far: dict[int, gtsam.NonlinearFactor],
     ) -> Outcome:
         """Insert the factors of a plan: those of its poses, its ties and near links, and its distant links."""
-        gates = {id(tie): self._gate(tie) for tie in plan.far}
+        gates = {id(tie): self.factors_of.leading(*tie, self.errors) for tie in plan.far}
         self._new_variables([*made, *far.values()], factors, values)
         first = factors.size() + len(plan.ties)
         for factor in made:
@@ -298,17 +313,6 @@ class Isam2Graph:
             if not values.exists(key):
                 values.insert(key, self._known(key))
         return values
-
-    def _gate(self, tie: Tie) -> gtsam.NonlinearFactor | None:
-        """Return the between-factor by which a distant sighting is tested and led in; None of other links.
-
-        A landmark that drift has displaced is far off in the image, or behind the camera: there its pixels give
-        neither a distance nor a gradient.
-        """
-        link, i, j = tie
-        if not isinstance(link, Sighting) or self.factors_of.variables is None:
-            return None
-        return self.factors_of.between(link, i, j, self.factors_of.expected(link, i, j, self.errors))
 
     def _enter_far(
         self, far: list[tuple[InsertedLink, gtsam.NonlinearFactor | None]], inside: dict[int, InsertedLink]

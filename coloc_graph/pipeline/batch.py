@@ -363,7 +363,7 @@ def _warnings(
         *found,
         *describe_unused(unused),
         *implausible_planes(run, options, measured),
-        *warnings_of_graph(estimate, diagnose(estimate.graph), measured, run),
+        *warnings_of_graph(estimate, measured, run),
     ]
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
-from coloc_graph.backend import DisconnectedComponent, Estimate
+from coloc_graph.backend import DisconnectedComponent, Estimate, diagnose
 from coloc_graph.backend.ranging import RangingProblem
 from coloc_graph.frontend import PairMeasurement, UnusedSighting, little_in_common
 from coloc_graph.frontend.pairing.plane_check import implausible
@@ -110,7 +110,6 @@ def why_disconnected(disconnected: tuple[DisconnectedComponent, ...], measuremen
 
 def warnings_of_graph(
     estimate: Estimate,
-    disconnected: Sequence[DisconnectedComponent],
     measurements: Sequence[PairMeasurement],
     run: Run | None = None,
 ) -> list[str]:
@@ -119,6 +118,7 @@ def warnings_of_graph(
     With the `run`, what its wheels say of bumps is told, too.
     """
     stances = estimate.graph.by_index
+    disconnected = diagnose(estimate.graph.without(one.measurement for one in estimate.rejected))
     warnings = [
         f"stance {m.homography.stance}: {m.homography.robot_i} and {m.homography.robot_j} not used: "
         f"{m.homography.unusable}"

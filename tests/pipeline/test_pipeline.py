@@ -194,7 +194,7 @@ def test_whether_measurements_disagree_depends_on_the_degrees_of_freedom(solutio
 
     estimate = solutions["smooth"].estimate
     for dof, chi2, warned in ((1, 10.0, False), (1, 20.0, True), (24, 55.0, False), (600, 1500.0, True)):
-        warnings = warnings_of_graph(dataclasses.replace(estimate, chi2=chi2, dof=dof), (), ())
+        warnings = warnings_of_graph(dataclasses.replace(estimate, chi2=chi2, dof=dof), ())
         assert (len(warnings) == 1) == warned, (dof, chi2)
         assert all(f"chi2/dof {chi2 / dof:.1f}" in one and "by noise alone" in one for one in warnings)
 
