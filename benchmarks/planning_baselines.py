@@ -17,7 +17,7 @@ import numpy as np
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.planning.belief import POSE, Belief
-from coloc_graph.planning.clearance import apart, conflicts
+from coloc_graph.planning.clearance import ROOM, conflicts
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.gaits import ABREAST, LEAPS, TOE_INS, GaitSearch
@@ -28,7 +28,8 @@ from coloc_graph.planning.mission import Mission, best_stance, stances_of
 from coloc_graph.planning.mover_path import cells, patrol
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import MIN_POINTS, Predictor
-from coloc_graph.planning.route import TO_ROBOT, clear_way
+from coloc_graph.planning.room import TO_ROBOT
+from coloc_graph.planning.route import clear_way
 from coloc_graph.simulation.floor_plans import FloorPlan
 from coloc_graph.team import Team
 
@@ -188,7 +189,7 @@ class FixedGaits:
         parts = [points, points[:3], points[1:], points[:2], points[1:3], points[2:], (points[0], points[3])]
         others = [pose[:2] for pose in standing.values()]
         for part in parts:
-            if clear_way(part, others, predictor.free, to_robot=apart(slips)):
+            if clear_way(part, others, predictor.free, to_robot=ROOM.apart(slips)):
                 return part
         raise InputError("no patrol is clear")
 

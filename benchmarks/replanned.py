@@ -3,8 +3,9 @@
     python benchmarks/replanned.py --on L U --robots 4 --seeds 20     the share that arrives, and why others do not
     python benchmarks/replanned.py --on L --keep f.jsonl              a part, to which later ones add their seeds
 
-A robot that leaps stops off by its slip: 1 cm, 1 cm a metre and 1 deg, or with --wheels by that of a Create. The way of
-each robot is checked every 2 cm against the others' bodies and the walls' rectangles.
+A robot that leaps stops off by its slip: 1 cm, 1 cm a metre and 1 deg, or with --wheels by that of a Create; so does
+the mover, from one fix by cameras to the next: on its way to its drive, and on its drive. The way of each robot is
+checked every 2 cm against the others' bodies and the walls' rectangles.
 """
 
 import argparse
@@ -101,9 +102,9 @@ class Replanned:
         observers = [poses[name][:2] for name in self._observers]
         to_start = [
             poses[self._mover][:2],
-            *route(poses[self._mover][:2], stance.waypoints[0], observers, self._predictor.free),
+            *route(poses[self._mover][:2], stance.waypoints[0], observers, free, rooms=self._predictor.rooms),
         ]
-        self._check(to_start, observers)
+        self._check(self._veered(to_start), observers)
         standing, belief = {}, self._belief
         for name, target in stance.standing.items():
             standing[name] = poses[name]
@@ -111,10 +112,10 @@ class Replanned:
                 continue
             others = [poses[other][:2] for other in self._observers if other != name]
             standing[name] = stop = self._stop(poses[name], target)
-            way = [*route(poses[name][:2], target[:2], others, free)[:-1], stop[:2]]
+            way = [*route(poses[name][:2], target[:2], others, free, rooms=self._predictor.rooms)[:-1], stop[:2]]
             self._check([poses[name][:2], *way], others)
             belief = belief.after_leap(name, stop, self._predictor.wheels)
-        self._check(stance.waypoints, [one[:2] for one in standing.values()])
+        self._check(self._veered(stance.waypoints), [one[:2] for one in standing.values()])
         came = replace(stance, standing=standing)
         promise = self._predictor.of_stance(belief, came)
         x, y = stance.waypoints[-1]
@@ -138,6 +139,17 @@ class Replanned:
             y + on * math.sin(way) + off * math.cos(way),
             yaw + veer + 0.01 * aside,
         )
+
+    def _veered(self, way: Sequence[Sequence[float]]) -> Sequence[Sequence[float]]:
+        """Return the mover's way as its wheels have it drive, from where cameras have told it where it is."""
+        if self._wheels is None:
+            return way
+        points = np.array([point[:2] for point in way])
+        length = float(np.hypot(*np.diff(points, axis=0).T).sum())
+        veer = math.hypot(self._wheels.turned, self._wheels.veer * math.sqrt(length)) / math.sqrt(3)
+        angle = veer * float(self._rng.standard_normal())
+        c, s = math.cos(angle), math.sin(angle)
+        return [tuple(one) for one in (points[0] + (points - points[0]) @ [[c, s], [-s, c]]).tolist()]
 
     def _check(self, way: Sequence[Sequence[float]], others: Sequence[Sequence[float]]) -> None:
         at = dense(way)

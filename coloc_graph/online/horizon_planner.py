@@ -18,7 +18,7 @@ from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.horizon import Horizon
-from coloc_graph.planning.mission import best_stance
+from coloc_graph.planning.mission import stance_there
 from coloc_graph.planning.plan import PlannedStance
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.route import clear_way, polyline_length, route
@@ -201,7 +201,9 @@ class HorizonPlanner:
             return ()
         leaper, target = leap
         others = [poses[name][:2] for name in self._observers if name != leaper]
-        return tuple(route(poses[leaper][:2], target[:2], others, self._predictor.free)[:-1])
+        return tuple(
+            route(poses[leaper][:2], target[:2], others, self._predictor.free, rooms=self._predictor.rooms)[:-1]
+        )
 
     def _approach(
         self, decision: Decision, poses: Mapping[str, Planar], leap: tuple[str, Planar] | None
@@ -213,7 +215,7 @@ class HorizonPlanner:
         found = []
         for one in (drive, drive[::-1]):
             with contextlib.suppress(InputError):
-                way = route(mover[:2], one[0], standing, self._predictor.free)
+                way = route(mover[:2], one[0], standing, self._predictor.free, rooms=self._predictor.rooms)
                 length = polyline_length([mover[:2], *way])
                 crosses = leap is not None and not clear_way([poses[leap[0]][:2], leap[1][:2]], one[:1])
                 found.append((crosses, length, one, tuple(way[:-1])))
@@ -232,8 +234,8 @@ class HorizonPlanner:
         anchors = tuple(name for name in self._observers if name not in moved)
         standing = {name: belief.poses[name] for name in (*anchors, *moved)}
         seconds = self._decision.stance.duration if self._decision is not None else max(0.1 * self._left, 8.0)
-        stance, promise = best_stance(
-            self._predictor, belief, standing, anchors, self._mover, seconds, self._horizon.goal, 0.0
+        stance, promise = stance_there(
+            self._predictor, belief, standing, anchors, self._mover, seconds, self._horizon.goal
         )
         return Decision(stance, promise, (), reason="all stay where they stand")
 

@@ -1,35 +1,17 @@
-"""Distances that a plan keeps, or does not, between robots and to walls; `apart`, `off_walls`, `conflicts`."""
+"""What robots of a plan would touch, where they stand, leap and drive; `conflicts`."""
 
 import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.planning.plan import Plan, PlannedStance
-from coloc_graph.planning.route import TO_ROBOT, TO_WALL, Free, clear_way, from_way, reachable
-from coloc_graph.planning.slip import stop_sigma
-from coloc_graph.team.shared_view import BODY_RADIUS
+from coloc_graph.planning.room import TO_ROBOT, Room
+from coloc_graph.planning.route import Free, clear_way, from_way, reachable
 
 TOLERANCE = 0.01  # distances are taken to be kept to this [m]
-SAFE = 4.5  # robots touch nothing unless they stop further off than this number of standard deviations
-
-
-def apart(leapt: ArrayLike, other: ArrayLike | None = None, *, least: float = TO_ROBOT) -> NDArray[np.float64]:
-    """Return the distance, at `least`, of a way from where robots stop after leaps (...) [m].
-
-    With the leaps of the `other` ones (...) [m], that between where both stop.
-    """
-    sigma = stop_sigma(leapt)
-    if other is not None:
-        sigma = np.hypot(sigma, stop_sigma(other))
-    return np.maximum(least, 2 * BODY_RADIUS + SAFE * sigma)
-
-
-def off_walls(leapt: ArrayLike, *, least: float = TO_WALL) -> NDArray[np.float64]:
-    """Return the distance, at `least`, from walls of where robots are to stop after leaps (...) [m]."""
-    return np.maximum(least, BODY_RADIUS + SAFE * stop_sigma(leapt))
+ROOM = Room()  # of missions that are planned as a whole
 
 
 def leapt_to(leapt: Mapping[str, float], before: Mapping[str, Planar], stance: PlannedStance) -> dict[str, float]:
@@ -69,11 +51,11 @@ def conflicts(plan: Plan, free: Free | None = None) -> list[tuple[int, str]]:
         leapt = leapt_to(leapt, before, stance)
         slips = {name: leapt.get(name, 0.0) for name in names}
         for n, one in enumerate(names):
-            room = float(off_walls(slips[one]))
+            room = float(ROOM.off_walls(slips[one]))
             if free is not None and not free(np.array(places[one]), room - TOLERANCE):
                 found.append((k, f"{one} stands less than {room:.2f} m from a wall"))
             for other in names[n + 1 :]:
-                distance, room = math.dist(places[one], places[other]), float(apart(slips[one], slips[other]))
+                distance, room = math.dist(places[one], places[other]), float(ROOM.apart(slips[one], slips[other]))
                 if distance < room - TOLERANCE:
                     found.append((k, f"{one} and {other} stand {distance:.2f} m apart: they need {room:.2f} m"))
         for name in stance.leapers:
@@ -81,7 +63,7 @@ def conflicts(plan: Plan, free: Free | None = None) -> list[tuple[int, str]]:
                 others = [place for other, place in places.items() if other != name]
                 if not reaches(before[name][:2], places[name], others, free):
                     found.append((k, f"{name} cannot leap there: robots or walls are in its way"))
-        near = from_way(stance.waypoints, list(places.values())) < apart(list(slips.values())) - TOLERANCE
+        near = from_way(stance.waypoints, list(places.values())) < ROOM.apart(list(slips.values())) - TOLERANCE
         if near.any() or not clear_way(stance.waypoints, (), free):
             found.append((k, f"the drive of {stance.mover} comes too near to a robot or a wall"))
         before = {**before, **stance.standing}

@@ -19,12 +19,13 @@ from coloc_graph.planning.durations import MAX_STANCE_DURATION, SHARES, duration
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.gaits import MIN_STANCE_DURATION
 from coloc_graph.planning.leaps import BEND, Leaps, leaps_beside, possible_leaps, steps_aside
-from coloc_graph.planning.mission import Mission, best_stance
+from coloc_graph.planning.mission import Mission, best_stance, stance_there
 from coloc_graph.planning.mover_path import evenly_seen
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor, Promise
 from coloc_graph.planning.refinement import Refinement
 from coloc_graph.planning.rollout import Rollout
+from coloc_graph.planning.room import SAFE
 from coloc_graph.planning.ways_out import NARROW, in_the_way, require_way, stuck
 
 Array = NDArray[np.float64]
@@ -199,7 +200,7 @@ class Horizon:
         standing = {name: belief.poses[name] for name in self.observers}
         each = self._rollout_of(belief.poses).stance_seconds(self.seconds)
         seconds = min(max(each, MIN_STANCE_DURATION), MAX_STANCE_DURATION, max(self.seconds, 1.0))
-        stance, promise = best_stance(self.predictor, belief, standing, (), self.mover, seconds, self.goal)
+        stance, promise = stance_there(self.predictor, belief, standing, (), self.mover, seconds, self.goal)
         return Decision(stance, promise, (), reason="the first stance is where the team stands")
 
     def next(self, belief: Belief, seconds: float, avoid: Sequence[Planar] = (), leaper: str | None = None) -> Decision:
@@ -224,7 +225,7 @@ class Horizon:
         """
         problem: InputError | None = None
         given = belief, seconds, avoid, leaper
-        for nodes in chain(self._ahead(*given), () if self._roomy else self._otherwise(*given)):
+        for nodes in chain(self._ever_nearer(*given), () if self._roomy else self._otherwise(*given)):
             if self.objective != "goal":
                 stance, promise = self._planned(belief, nodes[0].choices[0])
                 return Decision(stance, promise, nodes[0].choices)
@@ -236,6 +237,13 @@ class Horizon:
         if problem is not None and why == NARROW:
             raise problem
         raise stuck(self._stuck_at(belief.poses), why) from problem
+
+    def _ever_nearer(
+        self, belief: Belief, seconds: float, avoid: Sequence[Planar], leaper: str | None
+    ) -> Iterator[list[Node]]:
+        """Yield plans along the course that allow for slips of ever fewer standard deviations, the most first."""
+        for _ in self.predictor.ever_nearer():
+            yield from self._ahead(belief, seconds, avoid, leaper)
 
     def _decided(self, belief: Belief, seconds: float, nodes: Sequence[Node]) -> Decision:
         """Choose among plans, the best first.
@@ -250,6 +258,8 @@ class Horizon:
         reason = self._rollout_of(promise.belief.poses, leaper).reason(
             promise.belief, leaper, seconds - self._spent(duration, belief, leaper, target)
         )
+        if self.predictor.sigmas < SAFE:
+            reason += f"; a narrow way, whose distances allow for {self.predictor.sigmas:g} sigmas of slips"
         if node.aside:
             reason += f"; {leaper} makes way for {node.choices[1][0]}"
         elif not node.by_gait:
@@ -413,6 +423,8 @@ class Horizon:
             grown += self._leaps_of(node, name, avoid, in_lane=in_lane)
             if not grown and number == 0:
                 grown += self._leaps_of(node, name, avoid, come_up=True)
+                if straggles and not grown and self.predictor.may_come_nearer:
+                    break  # before it is left behind it leaps nearer to others
         return grown
 
     def _leaps_of(

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from coloc_graph.geometry.se2 import Planar, between, wrap
 from coloc_graph.planning.belief import POSE, Belief, leap_model
-from coloc_graph.planning.clearance import apart, off_walls
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.prediction import Predictor
-from coloc_graph.planning.route import TO_ROBOT, clear_way, reachable
+from coloc_graph.planning.room import TO_ROBOT, Room
+from coloc_graph.planning.route import clear_way, reachable
 
 Array = NDArray[np.float64]
 
@@ -24,12 +24,14 @@ BEHIND = (-1.2, -0.8, -0.4)  # the same of one that comes up once the front is a
 WIDTHS = (0.7, 1.0, 1.7)  # of a target's distance from the course, in those of the gait
 TOE_INS = (0.0, 1.0, 1.5)  # of a target's heading against the course, in those of the gait
 AHEAD = 0.8  # a robot may look along the course this far ahead of where it stands [m]
+LEFT_BEHIND = 1.5  # a robot further behind the foremost one comes up to it where it cannot leap ahead of it [m]
 COME_UP = 0.3  # by which a robot comes up at least to one in front of it [m]
 TURNS = (0.0, 0.35, 0.7, 1.0)  # share of a corner by which a target is turned
 BEND = 0.1  # turn of the course that is a corner [rad]
 MAX_LEAP = 1.5  # advance of a target [m]
 TO_WALL = 0.25  # least distance of a robot's middle from walls [m]
 STEP = 0.1  # distance between places of a leap that are checked [m]
+ROUND_STEP = 0.5  # leaps whose lengths differ by less go round robots at the same distance [m]
 MANY = 4  # observers from which on fewer targets are compared, each of which costs more
 FAILED = 0.15  # targets nearer to one that failed are avoided [m]
 ASIDE = (0.25, 0.45)  # lengths of a step aside [m]
@@ -109,7 +111,7 @@ def possible_leaps(
     roomy
         True for targets that are so far from others as both may stop off.
     come_up
-        True for targets behind the foremost robot, once that is at the goal.
+        True for targets behind the foremost robot, once that is at the goal or far ahead.
     absent
         Robots that are taken to be in nobody's way, to find out whether they are.
     """
@@ -127,7 +129,9 @@ def possible_leaps(
     toe_ins = TOE_INS if len(observers) < MANY else TOE_INS[:2]
     advances: tuple[float, ...] = ADVANCES
     if come_up:
-        advances = BEHIND if front > course.length - ADVANCES[0] * gait.leap else ()
+        at_goal = front > course.length - ADVANCES[0] * gait.leap
+        left_behind = predictor.anew and front - ways[leaper] > LEFT_BEHIND
+        advances = BEHIND if at_goal or left_behind else ()
     ahead_of = {}
     for advance in advances:
         way = front + min(advance * gait.leap, MAX_LEAP)
@@ -152,8 +156,8 @@ def possible_leaps(
     places = np.array(targets).reshape(-1, 3)
     present = [name for name in anchors if name not in absent]
     others = np.array([belief.poses[name][:2] for name in present]).reshape(-1, 2)
-    slips = [belief.leapt.get(name, 0.0) if roomy else None for name in present]
-    good = _clear(np.array(belief.poses[leaper][:2]), places[:, :2], others, slips, predictor.floor_map)
+    slips = [belief.leapt.get(name, 0.0) if roomy else predictor.known_slip for name in present]
+    good = _clear(np.array(belief.poses[leaper][:2]), places[:, :2], others, slips, predictor.floor_map, predictor.room)
     good &= ~_failed(places, (*avoid, belief.poses[leaper]))
     return _leaps(
         belief, leaper, anchors, predictor, places[good], np.array(gains)[good], np.array(by_gait, bool)[good]
@@ -171,7 +175,7 @@ def steps_aside(
 ) -> Leaps:
     """Find short leaps of an observer that makes way: in all directions, straight, near to robots that stand.
 
-    They stop off by so little that they need less room (`apart`).
+    They stop off by so little that they need less room (`Room.apart`).
     """
     ways = {name: course.way_of(belief.poses[name]) for name in observers}
     anchors = tuple(sorted((name for name in observers if name != leaper), key=lambda name: -ways[name]))
@@ -181,12 +185,12 @@ def steps_aside(
     angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     places = np.array([(x + step * np.cos(a), y + step * np.sin(a), w) for step, a, w in product(ASIDE, angles, looks)])
     leapt = np.hypot(*(places[:, :2] - (x, y)).T)
-    room = apart(leapt, least=0.0)
+    room = predictor.room.apart(leapt, least=0.0)
     others = np.array([belief.poses[name][:2] for name in anchors])
     away = np.hypot(*np.moveaxis(places[:, None, :2] - others, -1, 0))
     good = ~_failed(places, avoid) & (away > room[:, None]).all(axis=1)
     if (free := predictor.free) is not None:
-        good &= free(places[:, :2], off_walls(leapt, least=TO_WALL))
+        good &= free(places[:, :2], predictor.room.off_walls(leapt, least=TO_WALL))
     good &= np.array([
         clear_way(np.array([(x, y), place]), others, free, to_robot=one)
         for place, one in zip(places[:, :2], room.tolist(), strict=True)
@@ -217,7 +221,8 @@ def leaps_beside(
         targets.append((*place, looks + turn - predictor.camera_yaw(leaper)))
     places, start = np.array(targets), np.array(belief.poses[leaper][:2])
     others = np.array([belief.poses[name][:2] for name in anchors])
-    good = _clear(start, places[:, :2], others, [None] * len(anchors), predictor.floor_map)
+    slips = [predictor.known_slip] * len(anchors)
+    good = _clear(start, places[:, :2], others, slips, predictor.floor_map, predictor.room)
     places = places[good & ~_failed(places, avoid)]
     way = course.way_of(belief.poses[leaper])
     gains = np.array([course.way_of(place) - way for place in places.tolist()]) / len(observers)
@@ -253,7 +258,12 @@ def _leaps(
 
 
 def _clear(
-    start: Array, targets: Array, others: Array, slips: Sequence[float | None], floor_map: FloorMap | None
+    start: Array,
+    targets: Array,
+    others: Array,
+    slips: Sequence[float | None],
+    floor_map: FloorMap | None,
+    room: Room,
 ) -> NDArray[np.bool_]:
     """Return which targets (n, 2) a robot can reach from `start`, clear of others and walls.
 
@@ -264,17 +274,21 @@ def _clear(
     longest = float(leapt.max(initial=STEP))
     along = np.linspace(0.0, 1.0, int(np.ceil(longest / STEP)) + 1)[:, None]
     way = start + along * (targets - start)[:, None]
+    to_robot, to_wall = room.further(along[:, 0] * leapt[:, None])
     good, straight = np.ones((2, len(targets)), bool)
     for other, slip in zip(others, slips, strict=True):
-        good &= np.hypot(*np.moveaxis(targets - other, -1, 0)) > (TO_ROBOT if slip is None else apart(leapt, slip))
+        good &= np.hypot(*np.moveaxis(targets - other, -1, 0)) > (TO_ROBOT if slip is None else room.apart(leapt, slip))
         # it may stand nearer already
-        least = min(TO_ROBOT, float(np.hypot(*(start - other))) - 0.01)
-        straight &= np.hypot(*np.moveaxis(way - other, -1, 0)).min(axis=1) > least
+        least = min(TO_ROBOT, float(np.hypot(*(start - other))) - 0.01) + to_robot
+        straight &= (np.hypot(*np.moveaxis(way - other, -1, 0)) > least).all(axis=1)
     if floor_map is not None:
-        straight &= floor_map.clear(way, TO_WALL).all(axis=1)
-        good &= floor_map.clear(targets, off_walls(leapt, least=TO_WALL))
+        straight &= floor_map.clear(way, TO_WALL + to_wall).all(axis=1)
+        good &= floor_map.clear(targets, room.off_walls(leapt, least=TO_WALL))
     # few are in the way of a pair; of more robots some are
     if not (good & straight).any():
         free = None if floor_map is None else floor_map.clear
-        straight[good] = reachable(start, targets[good], others, free)
+        further = room.further(leapt)[0]
+        for low in np.unique(np.floor(leapt[good] / ROUND_STEP)):
+            some = good & (np.floor(leapt / ROUND_STEP) == low)
+            straight[some] = reachable(start, targets[some], others, free, TO_ROBOT + float(further[some].max()))
     return np.asarray(good & straight)

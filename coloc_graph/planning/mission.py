@@ -126,6 +126,32 @@ def leap_frog(
     return Mission(Plan(tuple(stances)), tuple(promises), tuple(times), start)
 
 
+def stance_there(
+    predictor: Predictor,
+    belief: Belief,
+    standing: dict[str, Planar],
+    anchors: tuple[str, ...],
+    mover: str,
+    seconds: float,
+    goal: tuple[float, float],
+) -> tuple[PlannedStance, Promise]:
+    """Choose the mover's drive as `best_stance` where nobody leaps: nearer to robots and walls where there is no other.
+
+    Raises
+    ------
+    InputError
+        As `best_stance`.
+    """
+    problem = None
+    for _ in predictor.ever_nearer():
+        try:
+            return best_stance(predictor, belief, standing, anchors, mover, seconds, goal)
+        except InputError as error:
+            problem = error
+    assert problem is not None
+    raise problem
+
+
 def best_stance(
     predictor: Predictor,
     belief: Belief,
@@ -147,7 +173,8 @@ def best_stance(
     names = tuple(standing)
     margins = predictor.margins(leapt, names)
     slips = [0.0 if predictor.anew and name in anchors else belief.leapt.get(name, 0.0) for name in names]
-    found = cells(predictor.model(names, mover), np.array(list(standing.values())), margins, predictor.free, slips)
+    at = np.array(list(standing.values()))
+    found = cells(predictor.model(names, mover), at, margins, predictor.free, slips, predictor.room)
     if len(found.places) < 2:
         raise InputError(
             f"{' and '.join(names)} have no common view of the floor where they are to stand: "

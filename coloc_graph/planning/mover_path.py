@@ -6,8 +6,8 @@ from itertools import combinations, permutations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coloc_graph.planning.clearance import apart
 from coloc_graph.planning.drive import SPEED, drive_through, there_and_back
+from coloc_graph.planning.room import Room
 from coloc_graph.planning.route import Free, clear_way
 from coloc_graph.planning.stance_information import StanceModel
 
@@ -47,6 +47,8 @@ class Cells:
         Distances (r,) that the mover keeps from each of them in any case [m].
     free
         Returns which places are free of walls; None without a map.
+    slips
+        By which the mover keeps more, the further it has driven; None for no more.
     """
 
     places: Array
@@ -54,28 +56,36 @@ class Cells:
     standing: Array
     room: Array
     free: Free | None = None
+    slips: Room | None = None
 
     def clear(self, points: Array) -> bool:
         """Return whether a drive through points (n, 2) is clear of the robots that stand and of walls."""
-        return clear_way(points, self.standing, self.free, to_robot=np.maximum(CLEARANCE - CELL / 10, self.room))
+        to_robot = np.maximum(CLEARANCE - CELL / 10, self.room)
+        return clear_way(points, self.standing, self.free, to_robot=to_robot, room=self.slips)
 
 
 def cells(
-    model: StanceModel, standing: Array, margins: Array, free: Free | None = None, leapt: ArrayLike = 0.0
+    model: StanceModel,
+    standing: Array,
+    margins: Array,
+    free: Free | None = None,
+    leapt: ArrayLike = 0.0,
+    slips: Room | None = None,
 ) -> Cells:
     """Find the places of the common view of observers at poses (r, 3), and what an image from each brings.
 
     Markers are at least `margins` (r, 2) [px] from the borders of the images: left and right, upper and lower.
-    The observers come from leaps of `leapt` () or (r,) [m].
+    The observers come from leaps of `leapt` () or (r,) [m], and they and the mover slip by `slips`.
     """
-    room = np.broadcast_to(apart(leapt), len(standing))
+    slips = slips or Room()
+    room = np.broadcast_to(slips.apart(leapt), len(standing))
     places = places_in_common_view(model, standing, margins, room, free)
     if not len(places):
-        return Cells(places, np.zeros((0, model.variables, model.variables)), standing[:, :2], room, free)
+        return Cells(places, np.zeros((0, model.variables, model.variables)), standing[:, :2], room, free, slips)
     drive = np.concatenate([np.column_stack([places, np.full(len(places), yaw)]) for yaw in YAWS])
     information = model.see(standing, drive).information
     mean = information.reshape(len(YAWS), len(places), *information.shape[1:]).mean(axis=0)
-    return Cells(places, mean, standing[:, :2], room, free)
+    return Cells(places, mean, standing[:, :2], room, free, slips)
 
 
 def places_in_common_view(

@@ -1,8 +1,8 @@
 """Prediction of the covariance of a team after planned stances; `Predictor`."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from coloc_graph.planning.drive import SPEED, drive_through, leap_time, there_an
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.plan import Plan, PlannedStance
+from coloc_graph.planning.room import SAFE, SIGMAS, Room
 from coloc_graph.planning.route import Free
 from coloc_graph.planning.slip import WheelErrors, view_margins
 from coloc_graph.planning.stance_information import StanceModel
@@ -55,7 +56,9 @@ class Predictor:
     overhead
         Time that a stance takes beside its drive and its leap [s].
     anew
-        True if each stance is planned once it is known where those stand that stay.
+        True if each stance is planned once it is known where those stand that stay; distances then allow for `wheels`.
+    sigmas
+        Number of standard deviations of slips for which distances allow.
     """
 
     team: Team
@@ -66,12 +69,42 @@ class Predictor:
     floor_map: FloorMap | None = None
     overhead: float = 0.0
     anew: bool = False
+    sigmas: float = SAFE
     _models: dict[tuple[tuple[str, ...], str], StanceModel] = field(default_factory=dict)
 
     @property
     def free(self) -> Free | None:
         """Returns which places (..., 2) [m] are free of walls by a distance [m]; None without a map."""
         return None if self.floor_map is None else self.floor_map.clear
+
+    @property
+    def room(self) -> Room:
+        """Distances that robots keep."""
+        return Room((self.wheels or WHEELS) if self.anew else None, self.sigmas)
+
+    @property
+    def may_come_nearer(self) -> bool:
+        """Return whether distances may shrink further where a way is too narrow."""
+        return self.anew and self.sigmas > SIGMAS[-1]
+
+    @property
+    def rooms(self) -> list[Room]:
+        """Distances that robots keep on their ways, the first that leave one: of ever fewer sigmas."""
+        return [replace(self.room, sigmas=sigmas) for sigmas in SIGMAS] if self.anew else []
+
+    @property
+    def known_slip(self) -> float | None:
+        """Leap after which robots that stay are taken to stand [m]; None to keep no more from them than the least."""
+        return 0.0 if self.anew else None
+
+    def ever_nearer(self) -> Iterator[float]:
+        """Let distances allow for ever fewer sigmas of slips, the most first; for all of them again in the end."""
+        if self.anew:
+            for self.sigmas in SIGMAS:
+                yield self.sigmas
+            self.sigmas = SAFE
+        else:
+            yield self.sigmas
 
     def camera_yaw(self, robot: str) -> float:
         """Return the heading of a robot's camera in its body [rad]."""

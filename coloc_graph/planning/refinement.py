@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coloc_graph.geometry.se2 import Planar, between
 from coloc_graph.planning.belief import OBSERVER, POSE, Belief, leap_model, updated
-from coloc_graph.planning.clearance import apart, leapt_to, off_walls, reaches
+from coloc_graph.planning.clearance import ROOM, leapt_to, reaches
 from coloc_graph.planning.gaits import MIN_STANCE_DURATION
 from coloc_graph.planning.leaps import TO_WALL
 from coloc_graph.planning.mover_path import CLEARANCE, commonly_seen
@@ -328,15 +328,15 @@ def _spare(stance: PlannedStance, leapt: Mapping[str, float]) -> Array:
     """Distances (n + 1, n) of robots, and of the mover's way, from those that stand, beyond what they need [m]."""
     places = np.array([pose[:2] for pose in stance.standing.values()])
     slips = np.array([leapt.get(name, 0.0) for name in stance.standing])
-    spare = np.hypot(*np.moveaxis(places[:, None] - places, -1, 0)) - apart(slips[:, None], slips, least=APART)
+    spare = np.hypot(*np.moveaxis(places[:, None] - places, -1, 0)) - ROOM.apart(slips[:, None], slips, least=APART)
     np.fill_diagonal(spare, 0.0)
-    return np.vstack([spare, from_way(stance.waypoints, places) - apart(slips, least=CLEARANCE)])
+    return np.vstack([spare, from_way(stance.waypoints, places) - ROOM.apart(slips, least=CLEARANCE)])
 
 
 def _off_walls(stance: PlannedStance, leapt: Mapping[str, float], free: Free) -> NDArray[np.bool_]:
     """Return which robots that stand keep off walls."""
     places = np.array([pose[:2] for pose in stance.standing.values()])
-    return free(places, off_walls([leapt.get(name, 0.0) for name in stance.standing], least=TO_WALL))
+    return free(places, ROOM.off_walls([leapt.get(name, 0.0) for name in stance.standing], least=TO_WALL))
 
 
 def _leapers(poses: Mapping[str, Planar], stance: PlannedStance) -> list[str]:

@@ -1,7 +1,7 @@
 """Ways of robots clear of others and of walls: `clear_way`, `route`, `reachable`, `from_way`, `polyline_length`."""
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,14 +9,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from coloc_graph.errors import InputError
+from coloc_graph.planning.room import TO_ROBOT, TO_WALL, Room
 
 Array = NDArray[np.float64]
 
 #: Returns whether places (..., 2) [m] are free of walls by a distance [m].
 Free = Callable[[Array, ArrayLike], NDArray[np.bool_]]
 
-TO_ROBOT = 0.42  # least distance between the middles of two robots, where they stand and on the way [m]
-TO_WALL = 0.22  # least distance of a driving robot's middle from walls [m]
 STEP = 0.05  # distance between places of a way that are checked [m]
 GRID = 0.15  # distance between places through which a way round is sought [m]
 NEIGHBOURS = 6  # places of the grid to which a start or goal is joined
@@ -25,30 +24,46 @@ SLACK = 0.01  # a robot that stands nearer to another than it may does not come 
 
 
 def clear_way(
-    points: ArrayLike, others: ArrayLike, free: Free | None = None, *, to_robot: ArrayLike = TO_ROBOT
+    points: ArrayLike,
+    others: ArrayLike,
+    free: Free | None = None,
+    *,
+    to_robot: ArrayLike = TO_ROBOT,
+    room: Room | None = None,
 ) -> bool:
     """Return whether a polyline (n, 2) is clear of robots at `others` (m, 2) and of walls [m].
 
-    It keeps a distance `to_robot` () or (m,) from robots [m]. Where it begins it may be as near to them as it is.
+    It keeps a distance `to_robot` () or (m,) from robots [m]. Where it begins it may be as near to them as it is. With
+    `room` it keeps more, the further it has driven.
     """
     points, others = np.asarray(points, float), np.asarray(others, float).reshape(-1, 2)
     way = _sampled(points)
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
+    robots, walls = (0.0, 0.0) if room is None else room.further(driven)
     if len(others):
-        least = np.minimum(to_robot, np.hypot(*(points[0] - others).T) - SLACK)
+        least = np.minimum(to_robot, np.hypot(*(points[0] - others).T) - SLACK) + np.reshape(robots, (-1, 1))
         if (np.hypot(*np.moveaxis(way[:, None] - others, -1, 0)) < least).any():
             return False
     if free is None:
         return True
-    walled = free(way, TO_WALL)
+    walled = free(way, TO_WALL + walls)
     # out of a place that is too near to a wall, but not through it
     outside = int(walled.argmax())
     return bool(walled[outside:].all() and free(way[:outside], 0.0).all() and walled.any())
 
 
 def route(
-    start: ArrayLike, goal: ArrayLike, others: ArrayLike, free: Free | None = None, *, to_robot: float = TO_ROBOT
+    start: ArrayLike,
+    goal: ArrayLike,
+    others: ArrayLike,
+    free: Free | None = None,
+    *,
+    to_robot: float = TO_ROBOT,
+    rooms: Sequence[Room] = (),
 ) -> list[tuple[float, float]]:
     """Find a short way from start to goal (2,), clear of robots at `others` (m, 2) and of walls; without its start.
+
+    It keeps the first of `rooms` that leaves a way, and `to_robot` [m] alone if none does.
 
     Raises
     ------
@@ -57,6 +72,13 @@ def route(
     """
     start, goal = np.asarray(start, float), np.asarray(goal, float)
     others = np.asarray(others, float).reshape(-1, 2)
+    for room in rooms:
+        if clear_way([start, goal], others, free, to_robot=to_robot, room=room):
+            return [_pair(goal)]
+        further = float(room.further(np.hypot(*(goal - start)))[0])
+        roads = _Roads(start, goal[None], others, free, to_robot + further)
+        if (way := roads.way(0)) is not None:
+            return _pulled([start, *way, goal], others, free, to_robot + further)
     if clear_way([start, goal], others, free, to_robot=to_robot):
         return [_pair(goal)]
     roads = _Roads(start, goal[None], others, free, to_robot)
@@ -69,14 +91,19 @@ def route(
     return _pulled([start, *way, goal], others, free, to_robot)
 
 
-def reachable(start: ArrayLike, goals: ArrayLike, others: ArrayLike, free: Free | None = None) -> NDArray[np.bool_]:
-    """Return to which goals (n, 2) a way from `start` (2,) is clear of robots at `others` (m, 2) and of walls."""
+def reachable(
+    start: ArrayLike, goals: ArrayLike, others: ArrayLike, free: Free | None = None, to_robot: float = TO_ROBOT
+) -> NDArray[np.bool_]:
+    """Return to which goals (n, 2) a way from `start` (2,) is clear of robots at `others` (m, 2) and of walls.
+
+    It keeps a distance `to_robot` from robots [m].
+    """
     goals = np.asarray(goals, float).reshape(-1, 2)
     if not len(goals):
         return np.zeros(0, bool)
     others = np.asarray(others, float).reshape(-1, 2)
     places, which = np.unique(goals.round(6), axis=0, return_inverse=True)
-    return _Roads(np.asarray(start, float), places, others, free, TO_ROBOT).reached[which.ravel()]
+    return _Roads(np.asarray(start, float), places, others, free, to_robot).reached[which.ravel()]
 
 
 class _Roads:

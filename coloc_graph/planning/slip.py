@@ -14,11 +14,6 @@ SIGMAS = 2.0  # a view is kept clear by this number of standard deviations
 DISTANCE = 1.5  # distance of the mover at which a slip turns the view [m]
 
 
-def stop_sigma(leapt: ArrayLike) -> NDArray[np.float64]:
-    """Return the standard deviation of where a robot stops after leaps (...) [m], per axis [m]."""
-    return np.hypot(STOP_SIGMA, STOP_PER_METRE * np.asarray(leapt, float))
-
-
 @dataclass(frozen=True)
 class WheelErrors:
     """Standard deviations of wheel odometry, which grow with the root of the way; where a leap ends is off by them.
@@ -39,6 +34,18 @@ class WheelErrors:
     def of_wheels(cls, metre: float, base: float) -> "WheelErrors":
         """Return those of two wheels `base` [m] apart, each of which is off by `metre` [m] after one metre."""
         return cls(metre / math.sqrt(2), metre / math.sqrt(base), math.sqrt(2) * metre / base)
+
+
+def stop_sigma(leapt: ArrayLike, wheels: WheelErrors | None = None) -> NDArray[np.float64]:
+    """Return the standard deviation of where a robot stops after leaps (...) [m], across its way [m].
+
+    With `wheels`, a heading that is off by their errors turns the way, too.
+    """
+    leapt = np.asarray(leapt, float)
+    stop = np.hypot(STOP_SIGMA, STOP_PER_METRE * leapt)
+    if wheels is None:
+        return np.asarray(stop)
+    return np.asarray(np.sqrt(stop**2 + (wheels.turned**2 / 2 + wheels.veer**2 * leapt / 3) * leapt**2))
 
 
 def view_margins(
@@ -67,8 +74,7 @@ def view_margins(
     leapt = np.asarray(leapt, float)
     stop = stop_sigma(leapt)
     turn = np.sqrt(HEADING_SIGMA**2 + wheels.turned**2 + wheels.veer**2 * leapt)
-    aside = np.sqrt(stop**2 + (wheels.turned**2 / 2 + wheels.veer**2 * leapt / 3) * leapt**2)
-    off = np.stack([np.hypot(turn, aside / DISTANCE), stop / DISTANCE], axis=-1)
+    off = np.stack([np.hypot(turn, stop_sigma(leapt, wheels) / DISTANCE), stop / DISTANCE], axis=-1)
     margins = np.repeat((MIN_MARGIN + SIGMAS * focal_px * off)[..., None, :], observers, axis=-2)
     if known:
         margins[..., :-1, :] = MIN_MARGIN

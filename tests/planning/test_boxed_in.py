@@ -8,14 +8,13 @@ import pytest
 from coloc_graph.errors import InputError
 from coloc_graph.planning.beam import Node
 from coloc_graph.planning.belief import Belief
-from coloc_graph.planning.clearance import apart
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.horizon import Horizon
 from coloc_graph.planning.leaps import steps_aside
 from coloc_graph.planning.plan import PlannedStance
 from coloc_graph.planning.prediction import Predictor
-from coloc_graph.planning.route import TO_ROBOT
+from coloc_graph.planning.room import TO_ROBOT
 from coloc_graph.planning.ways_out import require_way
 from coloc_graph.simulation import Imperfections, reference_team
 from coloc_graph.simulation.floor_plans import FLOOR_PLANS, FloorPlan
@@ -68,7 +67,9 @@ def test_one_that_stands_in_another_s_way_steps_aside_and_the_other_leaps_on():
     step = math.dist(target[:2], ABREAST[leaper][:2])
     assert step < 0.5
     # nearer to robots that are known to stand than on a long leap, and no nearer than it may stop off
-    assert min(math.dist(target[:2], ABREAST[name][:2]) for name in "ABC" if name != leaper) >= apart(step, least=0.0)
+    assert min(
+        math.dist(target[:2], ABREAST[name][:2]) for name in "ABC" if name != leaper
+    ) >= horizon.predictor.room.apart(step, least=0.0)
     require_clear(NARROW, ABREAST, decision)
     after = horizon.next(decision.promise.belief, 90.0)
     assert after.ahead[0][0] != leaper and "makes way" not in after.reason

@@ -15,11 +15,12 @@ from coloc_graph.planning.course import Course
 from coloc_graph.planning.floor_map import FloorMap, read_floor_map
 from coloc_graph.planning.formation import PAPER, Gait
 from coloc_graph.planning.horizon import Horizon
-from coloc_graph.planning.leaps import TO_ROBOT, TO_WALL
+from coloc_graph.planning.leaps import TO_WALL
 from coloc_graph.planning.mission import leap_frog, stances_of
 from coloc_graph.planning.mover_path import evenly_seen
 from coloc_graph.planning.prediction import Predictor
 from coloc_graph.planning.rollout import HEADING_ARM
+from coloc_graph.planning.room import TO_ROBOT
 from coloc_graph.simulation import Imperfections, reference_team
 from coloc_graph.simulation.rig import stated_team
 

@@ -8,7 +8,8 @@ import pytest
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import segment_distance
 from coloc_graph.planning.floor_map import FloorMap
-from coloc_graph.planning.route import TO_ROBOT, TO_WALL, clear_way, polyline_length, route
+from coloc_graph.planning.room import TO_ROBOT, TO_WALL
+from coloc_graph.planning.route import clear_way, polyline_length, route
 
 CELL = 0.05
 WALL = (2.0, -2.0), (2.0, 1.0)  # a wall from the lower end of the map
