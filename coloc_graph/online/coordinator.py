@@ -137,6 +137,7 @@ class Coordinator:
             synchronised=lambda name: link.synchronised(name, options.clock_limit),
             on_stance=on_stance,
             on_plan=on_plan,
+            free=None if floor_map is None else floor_map.clear,
         )
 
     def __enter__(self) -> Self:

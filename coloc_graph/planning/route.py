@@ -29,12 +29,13 @@ def clear_way(
     free: Free | None = None,
     *,
     to_robot: ArrayLike = TO_ROBOT,
+    to_wall: float = TO_WALL,
     room: Room | None = None,
 ) -> bool:
     """Return whether a polyline (n, 2) is clear of robots at `others` (m, 2) and of walls [m].
 
-    It keeps a distance `to_robot` () or (m,) from robots [m]. Where it begins it may be as near to them as it is. With
-    `room` it keeps more, the further it has driven.
+    It keeps a distance `to_robot` () or (m,) from robots, and `to_wall` from walls [m]. Where it begins it may be as
+    near to them as it is. With `room` it keeps more, the further it has driven.
     """
     points, others = np.asarray(points, float), np.asarray(others, float).reshape(-1, 2)
     way = _sampled(points)
@@ -46,7 +47,7 @@ def clear_way(
             return False
     if free is None:
         return True
-    walled = free(way, TO_WALL + walls)
+    walled = free(way, to_wall + walls)
     # out of a place that is too near to a wall, but not through it
     outside = int(walled.argmax())
     return bool(walled[outside:].all() and free(way[:outside], 0.0).all() and walled.any())

@@ -21,13 +21,14 @@ from coloc_graph.online.leap_planner import LeapPlanner, Situation
 from coloc_graph.online.mission import MissionOptions, in_world, roles
 from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import MissionState
+from coloc_graph.online.proximity import require_clear_way, too_near
 from coloc_graph.online.record import Record
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.visibility import InView
 from coloc_graph.pipeline.incremental import IncrementalSolver
 from coloc_graph.planning.course import Course
 from coloc_graph.robot_io.link.messages import Capture, Drive, EndCapture, Event, Halt, Reply, Status, Wheels
-from coloc_graph.run import Detections, Stance
+from coloc_graph.run import Detections, OdometrySample, Stance
 from coloc_graph.simulation.simulated_team import field_team
 
 OPTIONS = MissionOptions(goals=((5.0, 0.0),))
@@ -305,3 +306,69 @@ def test_an_observer_that_leapt_and_looks_past_the_drive_is_turned_as_another_se
         yaw = compose(compose(found, inverse(mission.registry["A"].tracker.in_odometry(found))), (0, 0, drive.yaw))[2]
         assert name == "A" and view.covers("A", (*truly[:2], yaw), DRIVE)
     mission.close()
+
+
+class Through(LeapPlanner):
+    """A leaps to beyond B."""
+
+    def plan(self, situation):
+        a, b = (situation.poses[name] for name in "AB")
+        return replace(super().plan(situation), leap=("A", (2 * b[0] - a[0], 2 * b[1] - a[1], 0.0)), passing=None)
+
+
+def test_a_robot_is_not_sent_off_where_another_stands_in_its_way(tmp_path):
+    mission = Mission(tmp_path, Through(field_team(), "C", Formation(Course(((0.0, 0.0), (5.0, 0.0))), ("A", "B"))))
+    mission.step(MissionState.GATHERING)
+    for name in "ABC":
+        mission.report(name)
+    mission.leap_frog.stances.append(Stance(0, 0.0, mission.registry.utc(), ("A", "B"), ("C",)))
+    mission.step(MissionState.SYNCHRONISING)
+    mission.step(MissionState.PLANNING)
+    mission.await_plan()
+    assert mission.leap_frog.states.now == MissionState.HOLDING
+    assert not [name for name, body in mission.link.asked if isinstance(body, Drive) and name == "A"]
+    assert "A is not sent off: B stands in its way" in (tmp_path / "mission.jsonl").read_text(encoding="utf-8")
+    mission.close()
+
+
+@pytest.mark.parametrize(("to", "stops"), [((0.45, 0.35), True), ((0.45, 0.37), False), ((0.3, 0.35), False)])
+def test_a_robot_that_comes_too_near_to_another_is_stopped_and_one_that_drives_away_is_not(mission, to, stops):
+    """C drives from a distance to another of A [m], as its tracked pose has it."""
+    mission.step(MissionState.GATHERING)
+    for name in "ABC":
+        mission.report(name)
+    mission.step(MissionState.SYNCHRONISING)
+    mission.step(MissionState.PLANNING)
+    mission.await_plan()
+    mission.step(MissionState.PLACING)
+    x, y, _ = mission.registry.poses()["A"]
+    drove(mission, (to[0], to[0], to[1]), (x + to[0], y, 0.0))
+    mission.leap_frog.step()
+    halted = [name for name, body in mission.link.asked if isinstance(body, Halt)]
+    assert (mission.leap_frog.states.now == MissionState.HOLDING) == stops == ("C" in halted)
+
+
+def drove(mission, xs, start):
+    """Let C have driven to these x in its odometry frame [m] within 0.6 s; it was at `start` in the world first."""
+    tracker, now = mission.registry["C"].tracker, mission.registry.utc()
+    frame = tracker.odometry_at(now)
+    for time_, x in zip(np.linspace(now + 0.1, now + 0.7, len(xs)), xs, strict=True):
+        tracker.add(OdometrySample("C", time_, np.array([x, frame[1], 0.0]), 1e-8 * np.eye(3)))
+    tracker.fix(now + 0.1, start)
+    time.sleep(0.6)
+
+
+def test_a_robot_that_comes_too_near_to_a_wall_is_stopped_and_is_not_sent_through_one(mission):
+    def free(places, distance):  # a wall at x = 1
+        return 1.0 - np.asarray(places)[..., 0] > distance
+
+    for name in "ABC":
+        mission.report(name)
+    drove(mission, (0.75, 0.75, 0.81), (0.75, 2.0, 0.0))
+    assert too_near(mission.registry, ["C"], free) == "C came nearer than 0.2 m to a wall"
+    assert too_near(mission.registry, ["C"], None) is None
+    drove(mission, (0.5, 0.5, 0.56), (0.5, 2.0, 0.0))
+    assert too_near(mission.registry, ["C"], free) is None
+    require_clear_way(mission.registry, "C", [(0.7, 3.0)], (), free)
+    with pytest.raises(RobotError, match="C is not sent off: a wall is in its way"):
+        require_clear_way(mission.registry, "C", [(0.85, 3.0)], (), free)
