@@ -5,7 +5,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from coloc_graph.errors import ColocError, RobotError
 from coloc_graph.machine import machine
+from coloc_graph.online.proximity import require_clear_way
 from coloc_graph.online.robot_registry import RobotRegistry
+from coloc_graph.planning.route import Free
 from coloc_graph.robot_io.deadlines import PERMISSION_PERIOD
 from coloc_graph.robot_io.link.coordinator_link import CoordinatorLink
 from coloc_graph.robot_io.link.messages import Body, Drive, EndCapture, Halt
@@ -32,11 +34,19 @@ class Commander:
         Speed of drives [m/s].
     on_drive_resumed
         Called with the name of each robot that is sent on after it stopped on its way.
+    free
+        Returns which places are free of walls; None without a map.
     """
 
     def __init__(
-        self, link: CoordinatorLink, registry: RobotRegistry, speed: float, on_drive_resumed: Callable[[str], None]
+        self,
+        link: CoordinatorLink,
+        registry: RobotRegistry,
+        speed: float,
+        on_drive_resumed: Callable[[str], None],
+        free: Free | None = None,
     ) -> None:
+        self.free = free
         self._link, self._registry, self._speed, self._on_drive_resumed = link, registry, speed, on_drive_resumed
         self._drives = machine.time_ns() // 1_000_000  # drive numbers are unique across coordinators
         self._renewed = -PERMISSION_PERIOD
@@ -86,6 +96,28 @@ class Commander:
         robot.drive = Drive(number=self._drives, places=own, yaw=last, speed=self._speed, backwards=backwards)
         robot.arrived = robot.interrupted = False
         self.ask(name, robot.drive)
+
+    def send_off(
+        self,
+        name: str,
+        waypoints: Iterable[Sequence[float]],
+        yaw: float | None = None,
+        *,
+        backwards: bool = True,
+        leaving: str | None = None,
+    ) -> None:
+        """Send a robot off as `drive` does, where its way is clear of those that stand but the one that is `leaving`.
+
+        Raises
+        ------
+        RobotError
+            If it is not, or the robot does not answer.
+        """
+        way = [(float(x), float(y)) for x, y in waypoints]
+        robots = self._registry.robots.items()
+        others = [other for other, robot in robots if robot.arrived and other not in (name, leaving)]
+        require_clear_way(self._registry, name, way, others, self.free)
+        self.drive(name, way, yaw, backwards=backwards)
 
     def resume_drives(self) -> None:
         """Send on the robots that stopped on their way because no permission came in time."""

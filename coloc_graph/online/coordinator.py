@@ -110,7 +110,11 @@ class Coordinator:
             worker = EstimationWorker(record, self._solver)
             undo.callback(worker.end)
             self._commander = Commander(
-                link, self._registry, options.speed, lambda name: self._log.note("drive resumed", robot=name)
+                link,
+                self._registry,
+                options.speed,
+                lambda name: self._log.note("drive resumed", robot=name),
+                free=None if floor_map is None else floor_map.clear,
             )
             undo.callback(self._commander.halt_all)
             planner: StancePlanner
@@ -137,7 +141,6 @@ class Coordinator:
             synchronised=lambda name: link.synchronised(name, options.clock_limit),
             on_stance=on_stance,
             on_plan=on_plan,
-            free=None if floor_map is None else floor_map.clear,
         )
 
     def __enter__(self) -> Self:

@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from coloc_graph.errors import ColocError, RobotError, RunError
@@ -18,12 +18,11 @@ from coloc_graph.online.leap_planner import Situation, StancePlan, StancePlanner
 from coloc_graph.online.mission import MissionOptions, roles
 from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import NEXT_STATES, WAITING, MissionState, StateChange, StateMachine
-from coloc_graph.online.proximity import require_clear_way, too_near
+from coloc_graph.online.proximity import too_near
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.stance_attempt import OUT_OF_VIEW, StanceAttempt
 from coloc_graph.online.visibility import InView
 from coloc_graph.pipeline.incremental import EnteredStance
-from coloc_graph.planning.route import Free
 from coloc_graph.robot_io.link.messages import Body, Capture, EndCapture, Halt, Recover
 from coloc_graph.run import Detections, Stance
 from coloc_graph.team import Team
@@ -54,8 +53,6 @@ class LeapFrog:
         Returns whether a robot's clock is known well enough.
     on_stance, on_plan
         Called with each stance that has entered the estimate, and with each plan.
-    free
-        Returns which places are free of walls; None without a map.
     """
 
     def __init__(
@@ -72,13 +69,11 @@ class LeapFrog:
         synchronised: Callable[[str], bool],
         on_stance: Callable[[EnteredStance], None] | None = None,
         on_plan: Callable[[StancePlan], None] | None = None,
-        free: Free | None = None,
     ) -> None:
         self._team, self._options, self._planner = team, options, planner
         self._decisions = decisions
         self._registry, self._commander, self._worker, self._log = registry, commander, worker, log
         self._synchronised, self._on_stance, self._on_plan = synchronised, on_stance, on_plan
-        self._free = free
         self.mover, self.observers = roles(team, options.mover)
         self.stances: list[Stance] = []
         self.latencies: list[float] = []
@@ -139,8 +134,7 @@ class LeapFrog:
         """Describe the present state in one line for people."""
         text = f"stance {self._index}: {self.states.now}"
         if self.states.now in (MissionState.CAPTURING, MissionState.TURNING_BACK) and self.attempt is not None:
-            found = self.attempt.precision
-            text += "" if found is None else f", {found}"
+            text += "" if self.attempt.precision is None else f", {self.attempt.precision}"
         return text
 
     # states
@@ -177,8 +171,7 @@ class LeapFrog:
         if self._on_plan is not None:
             self._on_plan(plan)
         self._send_leaper()
-        self._require_clear(self.mover, plan.placing)
-        self._commander.drive(self.mover, plan.placing)
+        self._commander.send_off(self.mover, plan.placing, leaving=self._leap and self._leap[0])
         self._enter(MissionState.PLACING)
 
     def _send_leaper(self) -> None:
@@ -190,8 +183,8 @@ class LeapFrog:
             if not arrived and not self._plan.may_leap(poses[leaper], poses[self.mover]):
                 return
             self._leap = None
-            self._require_clear(leaper, [*self._plan.detour, (x, y)])
-            self._commander.drive(leaper, [*self._plan.detour, (x, y)], yaw, backwards=False)
+            way, leaving = [*self._plan.detour, (x, y)], None if arrived else self.mover
+            self._commander.send_off(leaper, way, yaw, backwards=False, leaving=leaving)
 
     def _place(self) -> None:
         self._commander.resume_drives()
@@ -227,9 +220,7 @@ class LeapFrog:
         if not self._turned and (turn := turn_to_drive(self._team, attempt.view, self._plan, mover.tracker.pose())):
             self._turn(turn)
         elif not missing:
-            drive = attempt.whole_round() if attempt.to_middle else attempt.first_round()
-            self._require_clear(self.mover, drive)
-            self._commander.drive(self.mover, drive)
+            self._commander.send_off(self.mover, attempt.whole_round() if attempt.to_middle else attempt.first_round())
             self._enter(MissionState.CAPTURING)
         elif not attempt.to_middle and self.states.lasted(GLANCE_TIME):
             # a leap that ended some degrees off shows less of the border, but the middle
@@ -260,8 +251,7 @@ class LeapFrog:
                 raise RobotError(f"{self.mover} did not start moving within {LOOK_TIME:g} s: check what blocks it")
             attempt.begin(self._registry.record.rounded(self._registry.utc()))
         self._keep_in_view(attempt)
-        found = self._worker.judged()
-        if found is not None:
+        if (found := self._worker.judged()) is not None:
             attempt.precision = found
             lasted = self._registry.utc() - attempt.stance.start
             if self._plan is not None and (reason := self._plan.ends(found, lasted, self._options)):
@@ -373,25 +363,12 @@ class LeapFrog:
                 )
             if why is not None:
                 return why
-        driving = [name for name, robot in self._registry.robots.items() if not robot.arrived]
-        if near := too_near(self._registry, driving, self._free):
-            return near
         if self.attempt is not None:
             start = self.attempt.stance.start
             moved = [name for name in self.observers if self._registry[name].tracker.moved_since(start)]
             if moved:
                 return f"{' and '.join(moved)} moved during stance {self.attempt.stance.index}"
-        return None
-
-    def _require_clear(self, robot: str, waypoints: Iterable[Sequence[float]]) -> None:
-        """Require that a robot's way is clear of those that stand, where cameras and wheels have them now."""
-        standing = [name for name in self.observers if self._registry[name].arrived and name != robot]
-        if self._leap is not None and robot == self.mover:
-            standing.remove(self._leap[0])  # it is about to leap
-        mover = self._registry[self.mover]
-        if robot != self.mover and mover.arrived and mover.drive is not None:
-            standing.append(self.mover)
-        require_clear_way(self._registry, robot, waypoints, standing, self._free)
+        return too_near(self._registry, self._commander.free)
 
     def _waits_for(self) -> str | None:
         """Describe what keeps the robots from beginning; those that stopped for a reason are told to recover."""

@@ -39,11 +39,11 @@ def require_clear_way(
         raise RobotError(f"{robot} is not sent off: a wall is in its way")
 
 
-def too_near(registry: RobotRegistry, driving: Collection[str], free: Free | None) -> str | None:
-    """Describe which of the robots that are `driving` comes too near to another or to a wall; None if none does."""
+def too_near(registry: RobotRegistry, free: Free | None) -> str | None:
+    """Describe which of the robots that drive comes too near to another or to a wall; None if none does."""
     now = registry.poses()
     before = {name: registry[name].tracker.pose(registry.utc() - LOOK_BACK) for name in now}
-    for name in driving:
+    for name in (name for name, robot in registry.robots.items() if not robot.arrived):
         for other in now:
             if other == name:
                 continue

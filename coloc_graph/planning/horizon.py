@@ -25,7 +25,6 @@ from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor, Promise
 from coloc_graph.planning.refinement import Refinement
 from coloc_graph.planning.rollout import Rollout
-from coloc_graph.planning.room import SAFE
 from coloc_graph.planning.ways_out import NARROW, in_the_way, require_way, stuck
 
 Array = NDArray[np.float64]
@@ -225,7 +224,8 @@ class Horizon:
         """
         problem: InputError | None = None
         given = belief, seconds, avoid, leaper
-        for nodes in chain(self._ever_nearer(*given), () if self._roomy else self._otherwise(*given)):
+        plans = (nodes for _ in self.predictor.ever_nearer() for nodes in self._ahead(*given))
+        for nodes in chain(plans, () if self._roomy else self._otherwise(*given)):
             if self.objective != "goal":
                 stance, promise = self._planned(belief, nodes[0].choices[0])
                 return Decision(stance, promise, nodes[0].choices)
@@ -238,13 +238,6 @@ class Horizon:
             raise problem
         raise stuck(self._stuck_at(belief.poses), why) from problem
 
-    def _ever_nearer(
-        self, belief: Belief, seconds: float, avoid: Sequence[Planar], leaper: str | None
-    ) -> Iterator[list[Node]]:
-        """Yield plans along the course that allow for slips of ever fewer standard deviations, the most first."""
-        for _ in self.predictor.ever_nearer():
-            yield from self._ahead(belief, seconds, avoid, leaper)
-
     def _decided(self, belief: Belief, seconds: float, nodes: Sequence[Node]) -> Decision:
         """Choose among plans, the best first.
 
@@ -255,11 +248,9 @@ class Horizon:
         """
         variance, node, stance, promise = self._finalist(belief, seconds, nodes)
         leaper, target, duration = node.choices[0]
-        reason = self._rollout_of(promise.belief.poses, leaper).reason(
+        reason = self.predictor.narrow + self._rollout_of(promise.belief.poses, leaper).reason(
             promise.belief, leaper, seconds - self._spent(duration, belief, leaper, target)
         )
-        if self.predictor.sigmas < SAFE:
-            reason += f"; a narrow way, whose distances allow for {self.predictor.sigmas:g} sigmas of slips"
         if node.aside:
             reason += f"; {leaper} makes way for {node.choices[1][0]}"
         elif not node.by_gait:
@@ -418,13 +409,13 @@ class Horizon:
         by_way = by_way[:1] if in_lane else by_way
         grown: list[Node] = []
         for number, name in enumerate(by_way if leaper is None else (leaper,)):
-            if grown and (number > 1 or straggles or len(self.observers) == 2):
+            # before a straggler is left behind it leaps nearer to others
+            nearer = straggles and number and self.predictor.may_come_nearer
+            if nearer or (grown and (number > 1 or straggles or len(self.observers) == 2)):
                 break
             grown += self._leaps_of(node, name, avoid, in_lane=in_lane)
             if not grown and number == 0:
                 grown += self._leaps_of(node, name, avoid, come_up=True)
-                if straggles and not grown and self.predictor.may_come_nearer:
-                    break  # before it is left behind it leaps nearer to others
         return grown
 
     def _leaps_of(

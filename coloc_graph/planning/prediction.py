@@ -88,6 +88,11 @@ class Predictor:
         return self.anew and self.sigmas > SIGMAS[-1]
 
     @property
+    def narrow(self) -> str:
+        """For how few sigmas distances allow, in words; empty if for all."""
+        return f"a narrow way: distances allow for {self.sigmas:g} sigmas of slips; " if self.sigmas < SAFE else ""
+
+    @property
     def rooms(self) -> list[Room]:
         """Distances that robots keep on their ways, the first that leave one: of ever fewer sigmas."""
         return [replace(self.room, sigmas=sigmas) for sigmas in SIGMAS] if self.anew else []

@@ -364,11 +364,12 @@ def test_a_robot_that_comes_too_near_to_a_wall_is_stopped_and_is_not_sent_throug
 
     for name in "ABC":
         mission.report(name)
+    mission.registry["C"].arrived = False
     drove(mission, (0.75, 0.75, 0.81), (0.75, 2.0, 0.0))
-    assert too_near(mission.registry, ["C"], free) == "C came nearer than 0.2 m to a wall"
-    assert too_near(mission.registry, ["C"], None) is None
+    assert too_near(mission.registry, free) == "C came nearer than 0.2 m to a wall"
+    assert too_near(mission.registry, None) is None
     drove(mission, (0.5, 0.5, 0.56), (0.5, 2.0, 0.0))
-    assert too_near(mission.registry, ["C"], free) is None
+    assert too_near(mission.registry, free) is None
     require_clear_way(mission.registry, "C", [(0.7, 3.0)], (), free)
     with pytest.raises(RobotError, match="C is not sent off: a wall is in its way"):
         require_clear_way(mission.registry, "C", [(0.85, 3.0)], (), free)
