@@ -1,4 +1,4 @@
-"""What robots of a plan would touch, where they stand, leap and drive; `conflicts`."""
+"""Conflicts of a plan: robots and walls that its robots would touch; `conflicts`."""
 
 import math
 from collections.abc import Mapping, Sequence
