@@ -123,13 +123,13 @@ class Keys:
 
     def add(self, graph: gtsam.GaussianFactorGraph, rows: Rows) -> None:
         """Add factors of one kind to a graph."""
-        make: Callable[..., gtsam.JacobianFactor] = gtsam.JacobianFactor
+        add: Callable[..., None] = graph.add
         noise = gtsam.noiseModel.Unit.Create(rows.jacobians.shape[1])
         for index, parts in self.blocks(rows):
             columns = [column for keys, block in parts for column in (self.names[keys].tolist(), block)]
             if parts:
                 for one in zip(*columns, -rows.residuals[index], strict=True):
-                    graph.push_back(make(*one, noise))
+                    add(*one, noise)
 
     def add_prior(self, graph: gtsam.GaussianFactorGraph, key: int, sigmas: Array, off: Array) -> None:
         """Add the prior of a key: standard deviations (size,) of its variables, and their errors `off` (size,)."""

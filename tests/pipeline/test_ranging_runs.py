@@ -12,8 +12,9 @@ from mrclam_folder import DELAY, DEPTH, LANDMARKS, ROBOT_OFFSET, SCALE, TURN_SCA
 from msgspec.structs import replace as with_fields
 
 from coloc_graph.backend.fixed_lag import marginal_factor
-from coloc_graph.backend.marginals import Marginals
+from coloc_graph.backend.marginals import Marginals, tree_covariances
 from coloc_graph.backend.planar import KeyframeEstimator, optimise_keyframes
+from coloc_graph.backend.planar import incremental as incremental_module
 from coloc_graph.backend.planar.factors import KeyframeFactors, State
 from coloc_graph.backend.planar.filter import Models, filter_forward
 from coloc_graph.backend.planar.initial_pose import RigidAlignmentRansac
@@ -288,7 +289,9 @@ def test_a_linear_system_is_solved_and_summed_up_as_by_the_book(somewhere):
     marginals = Marginals(system, factors.keys.size, ordering)
     at = slice(3 * first, 3 * first + 3)
     assert np.allclose(marginals.covariance(name), C[at, at], rtol=1e-4, atol=1e-12)
-    assert np.allclose(tree.marginalCovariance(name), C[at, at], rtol=1e-4, atol=1e-12)
+    poses = there[there < 3 * len(factors)].reshape(-1, 3)
+    by_tree = tree_covariances(tree, factors.keys.names[poses[:, 0] // 3].tolist(), factors.keys.size)
+    assert np.allclose(by_tree, C[poses[:, :, None], poses[:, None, :]], rtol=1e-4, atol=1e-12)
     of_shared = C[3 * len(factors) :, 3 * len(factors) :]
     assert np.allclose(factors.shared_covariance(marginals), of_shared, rtol=1e-4, atol=1e-9)
     for index, parts in factors.keys.blocks(rows[1]):
@@ -322,6 +325,23 @@ def test_factors_that_leave_a_variable_open_are_one_sentence(somewhere):
     system = factors.linear(state, [factors.steps(state, np.array([3]))])
     with pytest.raises(EstimationError, match="does not determine"):
         eliminated(system, gtsam.Ordering.ColamdGaussianFactorGraph(system))
+
+
+def test_steps_in_recent_poses_alone_are_those_in_the_whole_window(run, monkeypatch):
+    keyframes, latest = keyframes_of(run), []
+    for recent in (incremental_module.RECENT, 0.0):
+        monkeypatch.setattr(incremental_module, "RECENT", recent)
+        one = KeyframeEstimator(run.team, lag=24.0, calibrating=15.0)
+        start = keyframes.measured.time[0]
+        latest.append([one.add(keyframes.between(start + n, start + n + 1)).poses for n in range(30)])
+        counts = one._inside().sum(), np.isfinite(one._state.poses[:, 0]).sum()
+        assert counts[0] < 0.6 * counts[1]
+    for found, expected in zip(*latest, strict=True):
+        assert set(found) == set(expected)
+        for robot, (pose, C) in expected.items():
+            off = found[robot][0] - pose
+            assert np.abs(off[:2]).max() < 0.1 * np.sqrt(np.trace(C[:2, :2])) and abs(off[2]) < 0.1 * np.sqrt(C[2, 2])
+            assert np.allclose(np.diagonal(found[robot][1]), np.diagonal(C), rtol=0.05)
 
 
 def test_what_has_left_the_window_is_not_forgotten(run, batch):

@@ -1,11 +1,13 @@
 """Fixed-lag smoother of a ranging run, with earlier poses marginalised: `KeyframeEstimator`.
 
 A filter gives initial values of robots and landmarks. The estimate of a keyframe is kept twice: at its time, and when
-it leaves the window, corrected by later measurements.
+it leaves the window, corrected by later measurements. Between steps in the whole window, poses that are not recent are
+marginalised for the time being.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -15,7 +17,7 @@ from coloc_graph.backend.estimate import Estimate
 from coloc_graph.backend.fixed_lag import marginal_factor
 from coloc_graph.backend.floor_poses import in_body
 from coloc_graph.backend.forgetting import require_all
-from coloc_graph.backend.marginals import Marginals
+from coloc_graph.backend.marginals import Marginals, tree_covariances
 from coloc_graph.backend.planar.factors import KeyframeFactors, State
 from coloc_graph.backend.planar.filter import INITIAL_PERIOD, Filter, Models, aligned
 from coloc_graph.backend.planar.problem import KeyframeProblem
@@ -32,7 +34,7 @@ Index = NDArray[np.int64]
 
 LAG = 40.0  # s for which poses are corrected
 UPDATE_PERIOD = 1.0  # s between updates
-LEAVING_PERIOD = 4.0  # s between marginalisations
+RECENT = 0.125  # part of the lag in which each update corrects poses, and after which one corrects the whole window
 CALIBRATION_TIME = 300.0  # s at the beginning in which no pose leaves: wheels and sensors are not calibrated yet
 
 
@@ -42,6 +44,13 @@ class Latest:
 
     time: float
     poses: dict[str, tuple[Array, Array]]
+
+
+class _Window(NamedTuple):
+    """Poses that are variables: each robot's from the keyframe of a number on, and what those before say of them."""
+
+    begins: tuple[int, ...]
+    past: gtsam.LinearContainerFactor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +94,8 @@ class KeyframeEstimator:
         self._factors = KeyframeFactors(self._keyframes, models)
         self._state = State(np.empty((0, 3)), self._factors.start())
         self._begun = np.inf  # time of the first keyframe [UTC s]
-        self._left = -np.inf  # time before which all poses were marginalised [UTC s]
-        self._past: gtsam.LinearContainerFactor | None = None  # what these say of the others
+        self._window = self._active = _Window(self._keyframes.begins)  # those active may be the recent ones only
+        self._next = -np.inf  # time of the next step in the whole window [UTC s]
         self._gauge: tuple[int, int, Array] | None = None  # robot, keyframe and pose that define the world
         self._landmarks: set[int] = set()
         self._latest: dict[int, tuple[Array, Array]] = {}
@@ -120,9 +129,16 @@ class KeyframeEstimator:
         self._enter_robots()
         self._enter_landmarks()
         if np.isfinite(self._state.poses[:, 0]).any():
-            linear, ordering, tree = self._step()
+            whole = time >= self._next
+            if whole:
+                self._active, self._next = self._window, time + RECENT * self._lag
+                self._step()  # one of two: in few steps robust weights would not converge before poses leave
+            _, tree = self._step()
             self._note_latest(ends, tree)
-            self._leave(time, linear, ordering)
+            if whole and time >= self._begun + self._calibrating:
+                self._leave(time - self._lag, tree)
+            if whole:
+                self._active = self._without(time - RECENT * self._lag)
         return Latest(time, {self._team.names[robot]: one for robot, one in self._latest.items()})
 
     def _follow(self, keyframes: Keyframes) -> None:
@@ -143,6 +159,7 @@ class KeyframeEstimator:
             own = poses[factors.first[robot] : factors.first[robot + 1]]
             entered = int(np.isfinite(own[:, 0]).sum())
             if not entered:
+                self._active = self._window
                 whole = self._filter.whole()[robot]
                 entered = int(np.isfinite(whole[:, 0]).sum())
                 own[:entered] = whole[:entered]
@@ -162,6 +179,7 @@ class KeyframeEstimator:
             if position is not None and number not in self._landmarks and not self._factors.is_exact(number):
                 self._factors.landmarks(self._state.shared)[number] = position
                 self._landmarks.add(number)
+                self._active = self._window
 
     def _problem(self, steps: Index, measured: Index) -> KeyframeProblem:
         """Return the problem of some factors in the window, with what those before it say."""
@@ -169,49 +187,56 @@ class KeyframeEstimator:
         if self._gauge is not None:
             robot, number, at = self._gauge
             gauge = int(self._factors.first[robot]) + number - self._keyframes.begins[robot], at
-        return KeyframeProblem(self._factors, steps, measured, gauge, self._past)
+        return KeyframeProblem(self._factors, steps, measured, gauge, self._active.past)
 
-    def _step(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Ordering, gtsam.GaussianBayesTree]:
-        """Take one Gauss-Newton step in the window, which was at its optimum before; return what it solved."""
-        factors, inside = self._factors, np.isfinite(self._state.poses[:, 0])
+    def _inside(self) -> NDArray[np.bool_]:
+        """Return True of the poses (n,) that are active."""
+        before = np.array(self._active.begins) - self._keyframes.begins
+        in_window = np.arange(len(self._factors)) >= (self._factors.first[:-1] + before)[self._factors.robot]
+        return in_window & np.isfinite(self._state.poses[:, 0])
+
+    def _step(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.GaussianBayesTree]:
+        """Take one Gauss-Newton step in the window, which was at its optimum before; return what it solved, and how."""
+        factors, inside = self._factors, self._inside()
         problem = self._problem(factors.steps_between(inside), factors.measured_between(inside, self._landmarks))
         linear, newest = problem.linear(self._state), factors.keys.names[self._newest()].tolist()
         # the newest are at the root, where covariances cost least
         ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, newest)
         tree, _ = eliminated(linear, ordering)
         self._state = problem.moved(self._state, tree.optimize())
-        return linear, ordering, tree
+        return linear, tree
 
-    def _leave(self, time: float, solved: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> None:
-        """Keep the estimates of poses older than the lag, and marginalise them; each robot's newest one stays."""
-        factors = self._factors
-        if time < self._begun + self._calibrating or time - self._lag < self._left + LEAVING_PERIOD:
-            return
-        self._left = time - self._lag
-        old = factors.times < self._left
+    def _without(self, before: float) -> _Window:
+        """Marginalise poses from before a time [UTC s], but the newest of robots, and return the window of the rest."""
+        factors, inside = self._factors, self._inside()
+        old, past = factors.times < before, self._active.past
         old[self._lasts()] = False
-        inside = np.isfinite(self._state.poses[:, 0])
         gone = old & inside
-        gone_at = np.flatnonzero(gone)
-        if len(gone_at):
-            if not self._forgets:
-                self._note(self._smoothed, gone_at, Marginals(solved, factors.keys.size, ordering).covariance)
+        if gone.any():
             steps, measured = factors.steps_between(inside), factors.measured_between(inside, self._landmarks)
             seen = gone[factors.seen[measured]] & factors.of_robot[measured]
-            before = gone[steps] | gone[steps + 1], gone[factors.observer[measured]] | seen
-            linear = self._problem(steps[before[0]], measured[before[1]]).linear(self._state)
+            touched = gone[steps] | gone[steps + 1], gone[factors.observer[measured]] | seen
+            linear = self._problem(steps[touched[0]], measured[touched[1]]).linear(self._state)
             # in the order of the whole graph: one robot after the other would tie all poses of the others
-            whole, names = gtsam.Ordering.ColamdGaussianFactorGraph(linear), set(factors.keys.names[gone_at].tolist())
-            values = factors.values(self._state, linear.keyVector())
-            self._past = marginal_factor(linear, values, [k for k in map(whole.at, range(whole.size())) if k in names])
+            order, names = gtsam.Ordering.ColamdGaussianFactorGraph(linear), factors.keys.names[np.flatnonzero(gone)]
+            values, gone_names = factors.values(self._state, linear.keyVector()), set(names.tolist())
+            past = marginal_factor(linear, values, [k for k in map(order.at, range(order.size())) if k in gone_names])
         counts = [int(one.sum()) for one in np.split(old, factors.first[1:-1])]
-        self._follow(self._keyframes.since(np.add(self._keyframes.begins, counts).tolist()))
+        return _Window(tuple(np.add(self._keyframes.begins, counts).tolist()), past)
 
-    def _note(self, log: _Log, poses: Index, covariance: Callable[[int], Array]) -> None:
-        """Note the estimates of poses, with their covariances (3, 3) by GTSAM's key."""
+    def _leave(self, before: float, solved: gtsam.GaussianBayesTree) -> None:
+        """Keep the estimates of poses from before a time [UTC s], and drop them."""
+        self._window = self._active = self._without(before)
+        gone = np.flatnonzero(np.isfinite(self._state.poses[:, 0]) & ~self._inside())
+        if len(gone) and not self._forgets:
+            self._note(self._smoothed, gone, solved)
+        self._follow(self._keyframes.since(self._window.begins))
+
+    def _note(self, log: _Log, poses: Index, tree: gtsam.GaussianBayesTree) -> None:
+        """Note the estimates of poses, with their covariances by the step's Bayes tree."""
         factors, at = self._factors, self._state.poses[poses]
         robots = factors.robot[poses]
-        C = np.array(list(map(covariance, factors.keys.names[poses].tolist()))).reshape(-1, 3, 3)
+        C = np.array(tree_covariances(tree, factors.keys.names[poses].tolist(), factors.keys.size)).reshape(-1, 3, 3)
         numbers = poses - factors.first[robots] + np.array(self._keyframes.begins)[robots]
         log.entries.append((robots, numbers, at, in_body(at, C)))
 
@@ -222,7 +247,7 @@ class KeyframeEstimator:
             robot = int(self._factors.robot[pose])
             if robot not in self._latest or self._keyframes.ends[robot] > ends[robot]:
                 new.append(pose)
-        self._note(self._online, np.array(new, int), tree.marginalCovariance)
+        self._note(self._online, np.array(new, int), tree)
         robots, _, poses, C = self._online.entries[-1]
         self._latest |= zip(robots.tolist(), zip(poses, C, strict=True), strict=True)
         if self._forgets:
@@ -244,15 +269,14 @@ class KeyframeEstimator:
         EstimationError
             It forgets what has left the window, and something has.
         """
-        forgotten = self._forgets and np.isfinite(self._left)
+        forgotten = self._forgets and any(self._keyframes.begins)
         require_all("the keyframes in its window" if forgotten else None, "estimate the whole run")
         C = np.zeros((len(self._factors.free),) * 2)
         if self._latest:
-            linear, ordering, _ = self._step()
-            marginals = Marginals(linear, self._factors.keys.size, ordering)
-            C = self._factors.shared_covariance(marginals)
-            inside = np.flatnonzero(np.isfinite(self._state.poses[:, 0]))
-            self._note(self._smoothed, inside, marginals.covariance)
+            self._active = self._window
+            linear, tree = self._step()
+            C = self._factors.shared_covariance(Marginals(linear, self._factors.keys.size))
+            self._note(self._smoothed, np.flatnonzero(np.isfinite(self._state.poses[:, 0])), tree)
         factors = self._whole()
         poses, covariances = self._smoothed.arrays(factors)
         return ranging_estimate(factors, State(poses, self._state.shared), covariances, C, self._landmarks, 0)
