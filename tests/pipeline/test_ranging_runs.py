@@ -341,7 +341,7 @@ def test_steps_in_recent_poses_alone_are_those_in_the_whole_window(run, monkeypa
         for robot, (pose, C) in expected.items():
             off = found[robot][0] - pose
             assert np.abs(off[:2]).max() < 0.1 * np.sqrt(np.trace(C[:2, :2])) and abs(off[2]) < 0.1 * np.sqrt(C[2, 2])
-            assert np.allclose(np.diagonal(found[robot][1]), np.diagonal(C), rtol=0.05)
+            assert np.allclose(np.diagonal(found[robot][1]), np.diagonal(C), rtol=0.1)
 
 
 def test_what_has_left_the_window_is_not_forgotten(run, batch):
