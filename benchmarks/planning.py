@@ -94,7 +94,8 @@ def outcome(
         off = math.atan2(T[1, 0], T[0, 0]) - math.atan2(q[1, 0], q[0, 0])
         heading.append(abs(math.degrees(math.remainder(off, math.tau))))
     stated = math.sqrt(np.mean(variance))
-    return Outcome(tuple(end), tuple(heading), stated, len(solution.unused), len(plan.stances))
+    used = {one.homography.stance for one in solution.measurements if solution.reason(one) is None}
+    return Outcome(tuple(end), tuple(heading), stated, len(plan.stances) - len(used), len(plan.stances))
 
 
 def from_images(world: World) -> Solution:
