@@ -37,12 +37,17 @@ def run(folder, request):
     """Three robots that range each other and four landmarks, or each other alone."""
     path = folder / f"{request.param}.mcap"
     marks = 0 if request.param == "robots alone" else 4
-    simulate_drives(path, seed=3, seconds=40.0, landmarks=marks, known=request.param == "map known", **WRONG)
+    simulate_drives(path, seed=3, seconds=30.0, landmarks=marks, known=request.param == "map known", **WRONG)
     return open_run(path)
 
 
-def test_robots_that_range_each_other_by_radio_are_where_they_are(run):
-    solution = solve(run)
+@pytest.fixture(scope="module")
+def solution(run):
+    """The batch solution of the run."""
+    return solve(run)
+
+
+def test_robots_that_range_each_other_by_radio_are_where_they_are(run, solution):
     estimate, (accuracy, _) = solution.estimate, assess(solution)
     assert set(estimate.trajectories) == {"R1", "R2", "R3"}
     assert 0.8 < estimate.chi2 / estimate.dof < 1.25
@@ -59,8 +64,8 @@ def test_robots_that_range_each_other_by_radio_are_where_they_are(run):
     assert all(isinstance(one, RangeBearing) and np.isnan(one.bearing) for one in estimate.ranging.measurements)
 
 
-def test_second_by_second_ends_where_batch_does(run):
-    batch, live = solve(run), solve(run, SolveOptions(incremental=True))
+def test_second_by_second_ends_where_batch_does(run, solution):
+    batch, live = solution, solve(run, SolveOptions(incremental=True))
     for name, path in batch.estimate.trajectories.items():
         there = live.estimate.trajectories[name]
         off = np.linalg.norm(there.positions[-20:] - path.positions[-20:], axis=1)
@@ -68,12 +73,12 @@ def test_second_by_second_ends_where_batch_does(run):
         assert name in live.online
 
 
-def test_joint_and_diagnose_take_keyframes_as_they_take_stances(run):
+def test_joint_and_diagnose_take_keyframes_as_they_take_stances(run, solution):
     graph = KeyframeGraph(run.team, keyframes_of(run))
     assert diagnose(graph) == ()
     estimate = joint(graph)
     np.testing.assert_allclose(
-        estimate.trajectories["R2"].positions, solve(run).estimate.trajectories["R2"].positions, atol=1e-9
+        estimate.trajectories["R2"].positions, solution.estimate.trajectories["R2"].positions, atol=1e-9
     )
     assert graph.nodes[:2] == (("R1", 0), ("R1", 1)) and len(graph.measurements) == len(graph.keyframes.measured)
     live = Estimator.of(run.team, "ranging", lag=5.0)
@@ -179,10 +184,10 @@ def test_bearings_whose_noise_is_not_stated_are_said_to_be_unused(folder, tmp_pa
     assert set(solution.estimate.trajectories) == {"R1", "R2", "R3"}
 
 
-def test_what_other_programs_get_has_our_optimum(run, tmp_path):
+def test_what_other_programs_get_has_our_optimum(run, solution):
     import gtsam
 
-    estimate = solve(run).estimate
+    estimate = solution.estimate
     files = ranging_gtsam_files(estimate, run.team)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.deserialize(files["graph.txt"])
@@ -197,8 +202,8 @@ def test_what_other_programs_get_has_our_optimum(run, tmp_path):
     assert not portable.bearings and len(portable.ranges) == int(estimate.ranging.used.sum())
 
 
-def test_an_exported_range_graph_is_solved_where_its_priors_put_it(run, tmp_path):
-    estimate = solve(run).estimate
+def test_an_exported_range_graph_is_solved_where_its_priors_put_it(run, solution, tmp_path):
+    estimate = solution.estimate
     write_pyfg(ranging_graph(estimate, run.team), tmp_path / "graph.pyfg")
     solution = solve_range_graph(tmp_path / "graph.pyfg")
     path, letter = estimate.trajectories["R2"], letters_of(estimate.ranging.robots)["R2"]
@@ -207,8 +212,8 @@ def test_an_exported_range_graph_is_solved_where_its_priors_put_it(run, tmp_path
     assert solution.errors.position < 0.01 and len(solution.rejected) < 5
 
 
-def test_ranges_of_which_most_are_wrong_give_no_poses(run, tmp_path, rng):
-    graph = ranging_graph(solve(run).estimate, run.team)
+def test_ranges_of_which_most_are_wrong_give_no_poses(run, solution, tmp_path, rng):
+    graph = ranging_graph(solution.estimate, run.team)
     wrong = [replace(one, distance=rng.uniform(1.0, 6.0)) if rng.random() < 0.8 else one for one in graph.ranges]
     write_pyfg(replace(graph, ranges=tuple(wrong)), tmp_path / "graph.pyfg")
     with pytest.raises(EstimationError, match=r"graph.pyfg: .*(contradict the others|leave open|two arrangements)"):
@@ -267,12 +272,12 @@ def imported(folder):
     return main(["import", "ranges", *files, "--along", "0.01", "--turn", "0.01", "--out", str(folder / "own.mcap")])
 
 
-def test_ranges_and_odometry_are_imported_from_csv(run, csvs, capsys):
+def test_ranges_and_odometry_are_imported_from_csv(run, solution, csvs, capsys):
     assert imported(csvs) == 0
     assert f"{sum(len(one.targets) for name in run.team.names for one in run.ranges(name))} ranges and" in (
         capsys.readouterr().out
     )
-    ours, theirs = solve(run).estimate, solve(open_run(csvs / "own.mcap")).estimate
+    ours, theirs = solution.estimate, solve(open_run(csvs / "own.mcap")).estimate
     path, other = ours.trajectories["R3"], theirs.trajectories["R3"]
     sigma = np.sqrt(path.covariances[:, 3:5, 3:5].trace(axis1=1, axis2=2))
     assert (np.linalg.norm(path.positions - other.positions, axis=1) < sigma).all()
@@ -315,12 +320,12 @@ def bag(run, tmp_path, request):
     return write_bag(tmp_path, request.param, sent)
 
 
-def test_ranges_of_a_ros_bag_without_cameras_are_imported(run, bag, tmp_path):
+def test_ranges_of_a_ros_bag_without_cameras_are_imported(run, solution, bag, tmp_path):
     summary = import_ros(bag, tmp_path / "map.toml", tmp_path / "own.mcap")
     ours = [one for name in run.team.names for one in run.ranges(name)]
     assert summary.counts["ranges"] == sum(len(one.targets) for one in ours) and not summary.stances
     assert any("1 of" in one and "/R1/uwb/R2 are outside min_range and max_range" in one for one in summary.warnings)
-    estimate, theirs = solve(run).estimate, solve(open_run(tmp_path / "own.mcap")).estimate
+    estimate, theirs = solution.estimate, solve(open_run(tmp_path / "own.mcap")).estimate
     path, other = estimate.trajectories["R3"], theirs.trajectories["R3"]
     assert np.linalg.norm(path.positions[-1] - other.positions[-1]) < 0.01
 
