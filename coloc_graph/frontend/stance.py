@@ -354,7 +354,7 @@ def _measured(
             raise
         doubt = str(why)  # the paper's chain composes every homography that it can fit
     tilt = _floor_tilt(seen, fit, found)
-    fit = persisting(fit, found.pairs, found.markers, found.times, None if tilt is None else tilt.products)
+    fit = persisting(fit, found.pairs, found.markers, found.times)
     fit = fit if tilt is None else tilt.widened(fit, found)
     require_determined(fit)
     own = information_weight(found, (seen.robot_i, seen.robot_j), seen.pairs, seen.tracks, _window(seen.run))

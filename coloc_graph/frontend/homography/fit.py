@@ -10,7 +10,6 @@ The coordinates of a homography are those of sl(3) on the right: H exp(h), `lie.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -132,13 +131,7 @@ def fit_homography(pairs: PointPairs, criterion: Criterion = "reprojection", spr
     return HomographyFit(sl3_normalise(H), information, before, squared, chi2, dof, iterations)
 
 
-def persisting(
-    fit: HomographyFit,
-    pairs: PointPairs,
-    groups: NDArray[np.int64],
-    times: Array,
-    products: Callable[[NDArray[np.int64], NDArray[np.int64]], float] | None = None,
-) -> HomographyFit:
+def persisting(fit: HomographyFit, pairs: PointPairs, groups: NDArray[np.int64], times: Array) -> HomographyFit:
     """Reduce the information of a fit by the autocorrelation of its residuals.
 
     A mover that tilts on an uneven floor lifts its markers while it stands there; a bright background biases a marker
@@ -152,9 +145,6 @@ def persisting(
         Track of each point, (n,).
     times
         Time of each point, (n,) [s].
-    products
-        Sum of the products of the residuals of some inliers with those of others (m,) that a cause explains which is
-        part of the covariance besides; None where there is no such cause.
 
     Returns
     -------
@@ -167,8 +157,7 @@ def persisting(
     A. Sokal, "Monte Carlo Methods in Statistical Mechanics", 1989.
     """
     kept = np.flatnonzero(fit.inliers)
-    order = np.lexsort((times[kept], groups[kept]))
-    kept = kept[order]
+    kept = kept[np.lexsort((times[kept], groups[kept]))]
     at = linearise(fit.H, pairs.x_i[kept], pairs[kept])
     e, group = np.stack([at.e0, at.e1], axis=1), groups[kept]
     # lags up to a third of a group; longer ones have too few pairs
@@ -177,10 +166,7 @@ def persisting(
     for lag in range(1, most + 1):
         alike = group[lag:] == group[:-lag]
         n = 2 * int(alike.sum())
-        common = float((e[lag:][alike] * e[:-lag][alike]).sum())
-        if products is not None:
-            common -= products(order[lag:][alike], order[:-lag][alike])
-        rho = common / (n * variance) if n and variance > 0 else 0.0
+        rho = float((e[lag:][alike] * e[:-lag][alike]).sum()) / (n * variance) if n and variance > 0 else 0.0
         if rho < CORRELATION_SIGMAS / math.sqrt(max(n, 1)):
             break
         total += 2 * rho

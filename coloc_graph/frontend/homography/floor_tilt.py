@@ -35,8 +35,6 @@ class FloorTilt:
         Places (n, 2) of the mover on the marker plane [m].
     arm
         From there to the marker (n, 2) [m], by which a slope lifts it.
-    residuals
-        Derivatives (n, 2) of the whitened residuals by the marker's height [1/m].
     homography
         Derivatives (8, n) of the homography's sl(3) coordinates on the right by it [1/m].
     """
@@ -44,7 +42,6 @@ class FloorTilt:
     sigma: float
     middle: Array
     arm: Array
-    residuals: Array
     homography: Array
 
     @classmethod
@@ -69,8 +66,7 @@ class FloorTilt:
         good = np.isfinite(np.concatenate([middle, *shifts], axis=1)).all(axis=1)
         middle, arm, in_i, in_j = (np.where(good[:, None], one, 0.0) for one in (middle, arm, *shifts))
         sensitivity = Sensitivity(fit, found.pairs)
-        residuals = sensitivity.whitened((in_i, in_j))
-        return cls(sigma, middle, arm, residuals, sensitivity.by_points(residuals))
+        return cls(sigma, middle, arm, sensitivity.by_points(sensitivity.whitened((in_i, in_j))))
 
     def covariance(self, tracks: NDArray[np.int64], times: Array) -> Array:
         """Compute the covariance (8, 8) of the homography's coordinates by the slope.
@@ -87,12 +83,6 @@ class FloorTilt:
         covariance = self.covariance(found.markers[fit.inliers], found.times[fit.inliers])
         information = np.linalg.inv(np.linalg.inv(fit.information) + covariance)
         return replace(fit, information=np.asarray(information, float))
-
-    def products(self, one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
-        """Return the expected sum of products of the residuals of some points with those of others, (m,) each."""
-        arms = (self.arm[one] * self.arm[other]).sum(axis=1)
-        shifts = (self.residuals[one] * self.residuals[other]).sum(axis=1)
-        return float(self.sigma**2 * (arms * shifts) @ _alike(self.middle[one] - self.middle[other]))
 
 
 def _alike(apart: Array) -> Array:
