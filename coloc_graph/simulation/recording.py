@@ -199,11 +199,12 @@ def _write_truth(robot: str, time: float, T_world_body: Array) -> Event:
 
 
 def _truth(world: World, begin: float, stance: Stance) -> list[Event]:
-    """True poses of all robots: while they move at 10 Hz, and at both ends of the stance."""
+    """True poses of all robots: while they move at 10 Hz and where they turn, and at both ends of the stance."""
     events = []
     for robot, path in world.paths.items():
         moving = [move_times(s, e) for mover, s, e in world.moves if mover == robot and begin <= s < stance.end]
-        times = np.unique(np.concatenate([*moving, [stance.start, stance.end]]))
+        turns = path.times[(path.times >= begin) & (path.times <= stance.end)]  # between them its speed is constant
+        times = np.unique(np.concatenate([*moving, turns, [stance.start, stance.end]]))
         events += [_write_truth(robot, t, T) for t, T in zip(times.tolist(), path.pose_at(times), strict=True)]
     return events
 

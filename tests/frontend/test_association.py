@@ -98,6 +98,18 @@ def test_one_light_on_a_straight_way_is_named():
         correspond(*both, FACTS.camera, FACTS.camera, alone=True)
 
 
+def test_what_most_samples_say_is_the_reason_and_not_a_straight_piece():
+    straight = np.tile(movers(1, 7)[:1], (len(movers(1, 7)), 1, 1))
+    straight[:, 0, 1] = np.linspace(-0.4, 0.4, len(straight))
+    pieces = zip(seen_by_both(movers(1, 7), 7), seen_by_both(straight, 7), strict=True)
+    both = [
+        [replace(track, body=-1) for track in (*tracks, cut(lone[0], slice(0, 16)))]
+        for (tracks, _), (lone, _) in pieces
+    ]
+    with pytest.raises(DegenerateGeometry, match="on no common floor"):
+        correspond(*both, FACTS.camera, FACTS.camera, alone=True, plausible=lambda *_: False)
+
+
 def test_a_light_that_only_one_camera_sees_most_of_the_time_is_named():
     right_, other = seen_by_both(movers(1, 7), 7), seen_by_both(movers(1, 11), 11)
     both = [

@@ -61,6 +61,28 @@ def test_of_a_light_and_a_mirror_image_one_robot_would_be_below_the_floor(i, j, 
             correspond(*both, CAMERA, CAMERA, alone=True, plausible=lambda H, _: on_one_floor(H, ROBOT, ROBOT, PLANE))
 
 
+def between(baseline, errors, rise=0.0):
+    """Homography of two robots abreast, toed in by 25 deg, with mounts off by `errors` (2, 3); B higher by `rise`."""
+    T_i_ci, T_j_cj = MOUNT.off_by(errors)
+    T_j_cj[2, 3] += rise
+    T_cj_ci = np.linalg.inv(floor_pose(0.0, -baseline, 0.44) @ T_j_cj) @ floor_pose(0.0, 0.0, -0.44) @ T_i_ci
+    return T_cj_ci[:3, :3] - np.outer(T_cj_ci[:3, 3], T_i_ci[2, :3]) / (T_i_ci[2, 3] - MARKERS.height)
+
+
+@pytest.mark.parametrize("baseline", [1.1, 1.6, 2.2])
+def test_mounts_off_within_their_tolerances_leave_two_robots_on_one_floor(baseline):
+    """Of right homographies with mounts to 1 deg 1 in 20 at 1.6 m, and 1 in 6 at 2.2 m, placed one 10 cm too high."""
+    loose = replace(MOUNT, height_sigma=0.005, tilt_sigma_deg=1.0, roll_sigma_deg=1.0)
+    robot, rng = replace(ROBOT, mount_if_any=loose), np.random.default_rng(0)
+    drawn = rng.standard_normal((200, 2, 3)) * [0.005, np.deg2rad(1.0), np.deg2rad(1.0)]
+    on_floor = [on_one_floor(between(baseline, errors), robot, robot, PLANE) for errors in drawn]
+    assert np.mean(on_floor) > 0.985
+    mirrored = [on_one_floor(between(baseline, errors, 2 * MARKERS.height), robot, robot, PLANE) for errors in drawn]
+    assert np.mean(mirrored) < 0.1
+    stated_exact = [on_one_floor(between(baseline, errors), ROBOT, ROBOT, PLANE) for errors in drawn]
+    assert np.mean(stated_exact) < np.mean(on_floor)
+
+
 def mirrored_run(path, names):
     """A sees the lights of C, and B their mirror images alone."""
     team = reference_team()

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from coloc_graph.errors import InputError
-from coloc_graph.run import open_run, read_true_team, read_truth
+from coloc_graph.evaluation.truth import true_poses
+from coloc_graph.geometry.trajectory import Trajectory
+from coloc_graph.run import RunWriter, open_run, read_true_team, read_truth
 from coloc_graph.simulation import (
     Imperfections,
     build_world,
@@ -17,6 +19,7 @@ from coloc_graph.simulation import (
     six_step,
 )
 from coloc_graph.simulation.paths import SPEED, TURN_RATE, drive, tilt_rotation, travel
+from coloc_graph.simulation.recording import record
 from coloc_graph.team.shared_view import View
 
 FAULTY = Imperfections(
@@ -260,6 +263,18 @@ def increments(poses):
     along = np.cos(yaw) * step[:, 0] + np.sin(yaw) * step[:, 1]
     across = np.cos(yaw) * step[:, 1] - np.sin(yaw) * step[:, 0]
     return np.column_stack([along, across, (step[:, 2] + np.pi) % (2 * np.pi) - np.pi])
+
+
+def test_truth_is_exact_at_any_time_also_where_a_robot_turns_back(tmp_path):
+    """At 10 Hz alone a mover that reverses was up to 10 mm off between two samples: 25 sigmas of its estimate."""
+    world = build_world(hallway(3), seed=3)
+    with RunWriter(tmp_path / "run.mcap", world.team) as writer:
+        record(world, writer, "tracks")
+    truth, path = read_truth(tmp_path / "run.mcap"), world.paths["C"]
+    for stance in world.stances:
+        times = np.linspace(stance.start, stance.end, 997)
+        T_world_body = path.pose_at(times)
+        assert np.abs(true_poses(truth, Trajectory("C", times, T_world_body)) - T_world_body).max() < 1e-9
 
 
 def test_odometry_errs_as_much_as_its_covariance_says(tmp_path):

@@ -105,10 +105,10 @@ def associate(tracks: Tracks) -> Association | Unassociated:
         return Unassociated(
             f"no two of them share {MIN_SHARED} images", "keep the mover in both fields of view, or record for longer"
         )
-    why: list[Unassociated] = []
+    why: list[tuple[int, Unassociated]] = []
     found = _refined(tracks, some, _starts(tracks, some), why)
     if not found:
-        return why[0] if why else NO_HOMOGRAPHY
+        return max(why, key=lambda one: one[0])[1] if why else NO_HOMOGRAPHY
     best = max(found, key=lambda one: one.weight)
     if (share := _explained(tracks, best.chosen)) < tracks.least:
         return Unassociated(
@@ -139,6 +139,10 @@ class _Subsampled:
                 np.stack([one.covariance_i for one in few]),
                 np.stack([one.covariance_j for one in few]),
             )
+
+    def size(self, chosen: Sequence[Pair]) -> int:
+        """Number of samples that the chosen pairs share."""
+        return sum(len(self.pairs[ab]) for ab in chosen)
 
     def medians(self, H: Array) -> Array:
         """Median squared residuals (s, p) of the large pairs by homographies (s, 3, 3); inf behind camera j."""
@@ -220,9 +224,12 @@ def _centred(x: Array) -> tuple[Array, Array]:
 
 
 def _refined(
-    tracks: Tracks, some: _Subsampled, starts: Sequence[tuple[Array, set[Pair]]], why: list[Unassociated]
+    tracks: Tracks, some: _Subsampled, starts: Sequence[tuple[Array, set[Pair]]], why: list[tuple[int, Unassociated]]
 ) -> list[_Hypothesis]:
-    """Refine starts to fits to all the tracks that they explain; `why` gets the reasons of those that fail."""
+    """Refine starts to fits to all the tracks that they explain.
+
+    `why` gets the reasons of those that fail, each with the number of samples that it paired.
+    """
     seen: dict[tuple[Pair, ...], tuple[Array, float] | None] = {}
     tried = 0
     for start, own in starts:
@@ -240,7 +247,7 @@ def _refined(
                 fit = fit_homography(tracks.points(chosen))
             except DegenerateGeometry as error:
                 what, _, remedy = str(error).partition(": ")
-                why.append(Unassociated(what, remedy or IMPLAUSIBLE.remedy))
+                why.append((some.size(chosen), Unassociated(what, remedy or IMPLAUSIBLE.remedy)))
                 break
             again = tuple(tracks.claimed(some.near(fit.H, FIT_GATE)))
             if again == chosen:
@@ -248,9 +255,9 @@ def _refined(
                 break
             chosen = again
     found = {chosen: one for chosen, one in seen.items() if one is not None and tracks.plausible(one[0], chosen)}
-    why += [IMPLAUSIBLE] * (any(seen.values()) and not found)
+    why += [(some.size(chosen), IMPLAUSIBLE) for chosen, one in seen.items() if one is not None and chosen not in found]
     against = {chosen: _unseen(tracks, H, chosen) for chosen, (H, _) in found.items()}
-    sizes = {chosen: sum(len(some.pairs[ab]) for ab in chosen) for chosen in found}
+    sizes = {chosen: some.size(chosen) for chosen in found}
     # noise larger than stated is so for all hypotheses: estimate it from the one that leaves least unpaired
     noise = 2.0
     if found:
