@@ -111,7 +111,8 @@ class GaitSearch:
             found = cells(model, standing, self.predictor.margins(2 * gait.leap, (self.pair[k], self.pair[1 - k])))
             if len(found.places) < 3:
                 return None
-            information.append(self.predictor.fps * found.information.mean(axis=0))
+            evenly = found.seen.total(np.full(len(found.places), self.predictor.fps / len(found.places)))
+            information.append(model.of_stance(evenly))
         D = [between(self._stop(gait, k), self._stop(gait, k + 2)) for k in (0, 1)]
         belief = Belief.start(self.predictor.team, {self.pair[0]: self._stop(gait, 0)})
         leaps = [leap_model(one, belief.floor, self.predictor.wheels) for one in D]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from coloc_graph.planning.drive import SPEED, drive_through, there_and_back
 from coloc_graph.planning.room import Room
 from coloc_graph.planning.route import Free, clear_way
-from coloc_graph.planning.stance_information import StanceModel
+from coloc_graph.planning.stance_information import Seen, StanceModel
 
 Array = NDArray[np.float64]
 Waypoint = tuple[float, float]
@@ -39,8 +39,10 @@ class Cells:
     ----------
     places
         Places (n, 2) [m] where two cameras see all its markers at any heading, and it is clear of robots and walls.
-    information
-        Information (n, d, d) of one image of each camera there.
+    seen
+        Information of one image of each camera there.
+    by_variables
+        Derivatives (k, d) of the variables of `seen` by those of the stance.
     standing
         Places (r, 2) of the robots that stand [m].
     room
@@ -52,7 +54,8 @@ class Cells:
     """
 
     places: Array
-    information: Array
+    seen: Seen
+    by_variables: Array
     standing: Array
     room: Array
     free: Free | None = None
@@ -80,12 +83,9 @@ def cells(
     slips = slips or Room()
     room = np.broadcast_to(slips.apart(leapt), len(standing))
     places = places_in_common_view(model, standing, margins, room, free)
-    if not len(places):
-        return Cells(places, np.zeros((0, model.variables, model.variables)), standing[:, :2], room, free, slips)
     drive = np.concatenate([np.column_stack([places, np.full(len(places), yaw)]) for yaw in YAWS])
-    information = model.see(standing, drive).information
-    mean = information.reshape(len(YAWS), len(places), *information.shape[1:]).mean(axis=0)
-    return Cells(places, mean, standing[:, :2], room, free, slips)
+    seen = model.see(standing, drive).mean_of(len(YAWS))
+    return Cells(places, seen, model.by_variables, standing[:, :2], room, free, slips)
 
 
 def places_in_common_view(
@@ -141,16 +141,21 @@ def design(found: Cells, covariance: Array, rows: NDArray[np.int64], goal: Array
     and Torsney, 1978).
     """
     shares = np.full(len(found.places), 1 / len(found.places))
-    M = found.information
-    small, Gr = covariance[np.ix_(rows, rows)], goal @ covariance[:, rows]
+    small, Gr = _as_seen(found, covariance, rows, goal)
     for _ in range(ROUNDS):
-        total = images * np.einsum("n,nij->ij", shares, M)
-        # G C restricted to the stance's variables after it
-        after = Gr @ np.linalg.inv(np.eye(len(rows)) + total @ small)
-        gain = np.einsum("qi,nij,qj->n", after, M, after, optimize=True)
+        total = found.seen.total(images * shares)
+        # G C restricted to what is seen, after it
+        after = Gr @ np.linalg.inv(np.eye(len(total)) + total @ small)
+        gain = found.seen.sensitivities(images * shares, after)
         shares = shares * np.sqrt(np.maximum(gain, 0.0))
         shares /= shares.sum()
     return np.asarray(shares)
+
+
+def _as_seen(found: Cells, covariance: Array, rows: NDArray[np.int64], goal: Array) -> tuple[Array, Array]:
+    """Covariance (k, k) of the variables of `Cells.seen` before the stance, and that (q, k) of the goal with them."""
+    by = found.by_variables.T
+    return by.T @ covariance[np.ix_(rows, rows)] @ by, goal @ covariance[:, rows] @ by
 
 
 def best_drives(
@@ -241,10 +246,9 @@ def _values(
     images = np.zeros((len(paths), len(found.places)))
     np.add.at(images, (np.repeat(np.arange(len(paths)), SAMPLES), nearest.ravel()), seen.ravel())
     images *= duration * fps / SAMPLES
-    size = found.information.shape[-1]
-    total = (images @ found.information.reshape(len(found.places), -1)).reshape(-1, size, size)
-    small, Gr = covariance[np.ix_(rows, rows)], goal @ covariance[:, rows]
-    drop = total @ np.linalg.inv(np.eye(size) + small @ total)
+    total = found.seen.total(images)
+    small, Gr = _as_seen(found, covariance, rows, goal)
+    drop = total @ np.linalg.inv(np.eye(len(small)) + small @ total)
     return np.asarray(np.trace(goal @ covariance @ goal.T) - np.einsum("qi,nij,qj->n", Gr, drop, Gr, optimize=True))
 
 
@@ -302,6 +306,5 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
     used = np.take_along_axis(common, chosen, axis=1)
     yaw = np.where(rank[chosen] % 2, YAWS[1], YAWS[0])
     drive = np.concatenate([xy[chosen], yaw[..., None]], axis=-1)
-    information = model.see(standing, drive).information
     weight = used / np.maximum(used.sum(axis=1, keepdims=True), 1)
-    return np.einsum("bn,bnij->bij", weight, information), count
+    return model.of_stance(model.see(standing, drive).total(weight)), count

@@ -128,7 +128,9 @@ class Predictor:
         """Return the model of a stance of these robots."""
         key = tuple(observers), mover
         if key not in self._models:
-            self._models[key] = StanceModel(self.team, observers, mover, self.noise_px, floor_map=self.floor_map)
+            self._models[key] = StanceModel(
+                self.team, observers, mover, self.noise_px, None, self.floor_map, self.fps / self.speed
+            )
         return self._models[key]
 
     def margins(self, leapt: ArrayLike, observers: Sequence[str]) -> Array:
@@ -174,9 +176,9 @@ class Predictor:
             times = (np.arange(instants) + 0.5) * stance.duration / instants
             at.append(drive.at(times))
             velocity.append((drive.at(times + MOMENT) - at[-1]) / MOMENT)
-        images = np.array([stance.duration for stance in stances]) * self.fps / instants
+        seconds = np.array([stance.duration for stance in stances]) / instants
         model = self.model(tuple(stances[0].standing), stances[0].mover)
-        return model.total(standing, np.array(at), images, np.array(velocity))
+        return model.total(standing, np.array(at), self.fps * seconds, np.array(velocity), seconds)
 
     def of_plan(self, before: Belief, plan: Plan) -> list[Promise]:
         """Predict all stances of a plan in turn."""

@@ -2,9 +2,12 @@
 
 The pixels of all markers at all instants are linearised about the plan with the camera model of the joint estimate
 (`backend.camera_model`). The mover's pose at each instant is eliminated. What is left is the information of the
-homography, whose latent points lie on the marker plane, and of the spans between the mover's markers.
+homography, whose latent points lie on the marker plane, and of the spans between the mover's markers. The floor's slope
+under the mover lifts its markers off that plane, by the model of the estimator's front end
+(`frontend.homography.floor_tilt`): what is estimated as if the floor there were even has a larger covariance.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from coloc_graph.backend.camera_model import Mounts
 from coloc_graph.errors import InputError
+from coloc_graph.frontend.homography.floor_tilt import GRAIN, alike
 from coloc_graph.geometry.lie import floor_pose, hat
 from coloc_graph.planning.belief import MOUNT, OBSERVER, POSE
 from coloc_graph.planning.floor_map import FloorMap
@@ -24,23 +28,49 @@ Array = NDArray[np.float64]
 MARGIN = 4.0  # least distance of a marker from the border of an image [px]
 MAX_RANGE = 2.6  # largest distance at which a marker is measured [m]
 WEAK = 1e-4  # information that keeps the mover's pose regular where one marker is seen [1/m^2, 1/rad^2]
+NEGLIGIBLE = 1e-11  # information that keeps a sum regular, relative to its trace
+MOVER = 3  # numbers of the mover's pose: x, y [m], yaw [rad]
+SLOPE = 2  # numbers of the floor's slope [rad]
+EVEN = GRAIN * math.sqrt(math.tau)  # way along a line over which slopes are alike as if they were one [m]
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Pixels of a stance, linearised: `information` of the cameras at each instant, and what is seen.
+    """Information of one image of each camera from each of n places of the mover, its pose eliminated.
+
+    The variables (k,) are the cameras' tangents and the markers, `StanceModel.by_variables` from those of a stance.
 
     Attributes
     ----------
     information
-        Information (..., n, d, d) of one image of each camera at each instant, with the mover's pose eliminated.
-        The variables are those of `StanceModel.variables`.
-    points
-        Number (..., n) of correspondences at each instant, over all pairs of cameras.
+        Information (..., n, k, k) as on an even floor.
+    lifted
+        Covariance (..., n, k, k) that the floor's slope adds to the gradient of the pixels' likelihood, of each image
+        of a drive along which slopes change.
     """
 
     information: Array
-    points: Array
+    lifted: Array
+
+    def total(self, images: Array) -> Array:
+        """Sum up the information (..., k, k) of numbers (..., n) of images."""
+        return on_slopes(self._sum(self.information, images), self._sum(self.lifted, images))
+
+    def mean_of(self, number: int) -> "Seen":
+        """Return the mean of as many parts of the places: (..., number n, k, k) to (..., n, k, k)."""
+        *lead, _, k, _ = self.information.shape
+        return Seen(*(one.reshape(*lead, number, -1, k, k).mean(axis=-4) for one in (self.information, self.lifted)))
+
+    def sensitivities(self, images: Array, rows: Array) -> Array:
+        """Derivatives (n,) of the sum, over rows x of (q, k), of x total x^T by the numbers (n,) of images."""
+        estimated = rows @ _estimated(self._sum(self.information, images), self._sum(self.lifted, images)).mT
+        by_information = np.einsum("qi,nij,qj->n", 2 * rows - estimated, self.information, estimated, optimize=True)
+        return np.asarray(by_information - np.einsum("qi,nij,qj->n", estimated, self.lifted, estimated, optimize=True))
+
+    @staticmethod
+    def _sum(each: Array, images: Array) -> Array:
+        *lead, n, k, _ = each.shape
+        return np.asarray((images[..., None, :] @ each.reshape(*lead, n, k * k)).reshape(*images.shape[:-1], k, k))
 
 
 class StanceModel:
@@ -62,6 +92,8 @@ class StanceModel:
         Errors (r, 6) of the observers' mounts as they are estimated; None for mounts as stated.
     floor_map
         Walls that block the view; None where there are none.
+    images_per_metre
+        Images of each camera while the mover drives a metre, for what single images of a drive bring (`see`) [1/m].
 
     Raises
     ------
@@ -77,8 +109,11 @@ class StanceModel:
         noise_px: float | None = None,
         mounts: Array | None = None,
         floor_map: FloorMap | None = None,
+        images_per_metre: float = 150.0,
     ) -> None:
         self._floor_map = floor_map
+        self._slope_sigma = math.radians(team.floor.tilt_sigma_deg) if team.floor is not None else 0.0
+        self._images_alike = max(images_per_metre * EVEN, 1.0)
         markers = team[mover].markers
         if markers is None or len(markers.positions) < 2:
             raise InputError(f"{mover} is to be watched and has fewer than two markers: give it two")
@@ -96,7 +131,7 @@ class StanceModel:
             by[6 * n : 6 * n + 6, at : at + POSE] = cameras.by_body[n]
             by[6 * n : 6 * n + 6, at + POSE : at + OBSERVER] = cameras.by_errors[n]
         by[-2:, -2:] = np.eye(2)
-        self._by_variables = by
+        self.by_variables = by
         noise = np.array([noise_px or camera.noise_px for camera in self._cameras])
         self._scale = np.array([[[c.fx], [c.fy]] for c in self._cameras]) / noise[:, None, None]
         self._bias = np.array([camera.bias_px for camera in self._cameras]) / noise
@@ -142,7 +177,7 @@ class StanceModel:
         return np.asarray(seen & (np.linalg.norm(p, axis=-1) < MAX_RANGE))
 
     def see(self, standing: Array, drive: Array) -> Seen:
-        """Linearise the pixels of a stance at instants of the mover's drive.
+        """Linearise the pixels of a stance at places of the mover's drive.
 
         Parameters
         ----------
@@ -151,14 +186,20 @@ class StanceModel:
         drive
             Poses (..., n, 3) of the mover.
         """
-        J, points = self._pixels(standing, drive)
-        return Seen(self._by_variables.T @ _without_mover(J) @ self._by_variables, points)
+        information = _without_mover(self._pixels(standing, drive)[0])
+        by_slope = information[..., :-SLOPE, -SLOPE:]
+        lifted = self._slope_sigma**2 * self._images_alike * by_slope @ by_slope.mT
+        return Seen(information[..., :-SLOPE, :-SLOPE], lifted)
 
-    def total(self, standing: Array, drive: Array, images: ArrayLike, velocity: Array) -> tuple[Array, Array]:
+    def total(
+        self, standing: Array, drive: Array, images: ArrayLike, velocity: Array, seconds: ArrayLike
+    ) -> tuple[Array, Array]:
         """Sum up stances (...) whose drives (..., n, 3) stand for `images` (...) images at each instant.
 
         Errors that all images share are unknowns: a bias of each marker's centre in each camera, and the offset of the
-        cameras' clocks, by which the mover's `velocity` (..., n, 3) [m/s, rad/s] shifts what they see.
+        cameras' clocks, by which the mover's `velocity` (..., n, 3) [m/s, rad/s] shifts what they see. The floor's
+        slope is the same for all images near a place, however often the mover comes by; each instant stands for
+        `seconds` (...) of the drive.
 
         Returns
         -------
@@ -172,21 +213,30 @@ class StanceModel:
             seen = np.abs(J).max(axis=-1, keepdims=True) > 0
             shared.append(np.repeat(self._bias, rows // r) * np.eye(rows) * seen)
         if self._clock_sigma:
-            late = (J[..., -3:] @ velocity[..., None])[..., 0] * self._clock_sigma
+            late = (J[..., -MOVER:] @ velocity[..., None])[..., 0] * self._clock_sigma
             by_clock = np.zeros((*late.shape, r - 1))
             for k in range(1, r):
                 by_clock[..., own[k], k - 1] = late[..., own[k]]
             shared.append(by_clock)
-        J = np.concatenate([J[..., :-3], *shared, J[..., -3:]], axis=-1)
-        images = np.asarray(images, float)
-        total = images[..., None, None] * _without_mover(J).sum(axis=-3)
-        d = self._by_variables.shape[0]
+        d = self.by_variables.shape[0]
+        information = _without_mover(np.concatenate([J[..., :d], *shared, J[..., d:]], axis=-1))
+        images, seconds = np.asarray(images, float), np.asarray(seconds, float)
+        total = images[..., None, None] * information[..., :-SLOPE, :-SLOPE].sum(axis=-3)
+        if self._slope_sigma:
+            by_place = alike(drive[..., :2], velocity[..., :2] * seconds[..., None, None])
+            by_slope = np.moveaxis(information[..., :-SLOPE, -SLOPE:], -1, -3)  # (..., 2, n, variables)
+            by_slope = self._slope_sigma * images[..., None, None, None] * by_slope
+            total = on_slopes(total, (by_slope.mT @ (by_place[..., None, :, :] @ by_slope)).sum(axis=-3))
         nuisance = total[..., d:, d:] + np.eye(total.shape[-1] - d)
         left = total[..., :d, :d] - total[..., :d, d:] @ np.linalg.solve(nuisance, total[..., d:, :d])
-        return self._by_variables.T @ left @ self._by_variables, images * points.sum(axis=-1)
+        return self.of_stance(left), images * points.sum(axis=-1)
+
+    def of_stance(self, information: Array) -> Array:
+        """Return the information (..., d, d) on a stance's variables of that on the cameras' tangents and markers."""
+        return np.asarray(self.by_variables.T @ information @ self.by_variables)
 
     def _pixels(self, standing: Array, drive: Array) -> tuple[Array, Array]:
-        """Whitened Jacobians (..., n, 2 r m, 6 r + 5) of pixels by cameras, markers and the mover's pose.
+        """Whitened Jacobians (..., n, 2 r m, 6 r + 7) of pixels by cameras, markers, slope and the mover's pose.
 
         With the number of correspondences (..., n). Rows are ordered by camera, marker, axis; those of markers that
         fewer than two cameras see are 0.
@@ -219,20 +269,37 @@ class StanceModel:
         across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)[..., None, :, :, :, None]
         by_yaw = to_world[..., :2] @ across
         by_span = to_world[..., :2] @ arm[..., None, :, :, :, None]
-        J = np.zeros((*lead, n, r, m, 2, 6 * r + 5))
+        lever = (arm - arm.mean(axis=-2, keepdims=True))[..., None, :, :, None, :]
+        by_slope = to_world[..., 2:] * lever
+        J = np.zeros((*lead, n, r, m, 2, 6 * r + 2 + SLOPE + MOVER))
         for k in range(r):
             J[..., k, :, :, 6 * k : 6 * k + 6] = by_camera[..., k, :, :, :, :]
-        by_shared = np.concatenate([by_span, to_world[..., 2:], to_world[..., :2], by_yaw], axis=-1)
+        by_shared = np.concatenate([by_span, to_world[..., 2:], by_slope, to_world[..., :2], by_yaw], axis=-1)
         J[..., 6 * r :] = np.moveaxis(by_shared, -5, -4)
         seen &= seen.sum(axis=-3, keepdims=True) >= 2
         J *= np.moveaxis(seen, -3, -2)[..., None, None]
         shared = seen.sum(axis=-3)
-        return J.reshape(*lead, n, r * m * 2, 6 * r + 5), (shared * (shared - 1) / 2).sum(axis=-1)
+        return J.reshape(*lead, n, r * m * 2, J.shape[-1]), (shared * (shared - 1) / 2).sum(axis=-1)
+
+
+def on_slopes(information: Array, lifted: Array) -> Array:
+    """Return the information (..., k, k) of pixels from which one estimates as if the floor under the mover were even.
+
+    `information` (..., k, k) is theirs there, `lifted` (..., k, k) what slopes add to the covariance of the gradient of
+    their likelihood.
+    """
+    return np.asarray(information @ _estimated(information, lifted))
+
+
+def _estimated(M: Array, S: Array) -> Array:
+    """Return (M + S)^-1 M (..., k, k) of M and S that may be singular."""
+    weak = NEGLIGIBLE * np.trace(M, axis1=-2, axis2=-1)[..., None, None] + WEAK
+    return np.asarray(np.linalg.solve(M + S + weak * np.eye(M.shape[-1]), M))
 
 
 def _without_mover(J: Array) -> Array:
-    """Information of all variables of Jacobians (..., rows, d + 3) but the last three, which are eliminated."""
+    """Information of all variables of Jacobians (..., rows, d + 3) but the mover's, which are eliminated."""
     H = J.mT @ J
-    latent = H[..., -3:, -3:] + WEAK * np.eye(3)
-    cross = H[..., :-3, -3:]
-    return np.asarray(H[..., :-3, :-3] - cross @ np.linalg.solve(latent, cross.mT))
+    latent = H[..., -MOVER:, -MOVER:] + WEAK * np.eye(MOVER)
+    cross = H[..., :-MOVER, -MOVER:]
+    return np.asarray(H[..., :-MOVER, :-MOVER] - cross @ np.linalg.solve(latent, cross.mT))

@@ -5,6 +5,7 @@ that neither more images reduce it nor do residuals show it. It is a random fiel
 in both directions, and alike over `GRAIN`. Both cameras see the same lifted marker.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,8 +76,7 @@ class FloorTilt:
         """
         by_slope = self.homography[:, :, None] * self.arm
         middle, by_slope = _in_blocks(self.middle, by_slope, np.lexsort((times, tracks)))
-        alike = _alike(middle[:, None] - middle)
-        return np.asarray(self.sigma**2 * np.einsum("anc,nm,bmc->ab", by_slope, alike, by_slope, optimize=True))
+        return np.asarray(self.sigma**2 * np.einsum("anc,nm,bmc->ab", by_slope, alike(middle), by_slope, optimize=True))
 
     def widened(self, fit: HomographyFit, found: Correspondences) -> HomographyFit:
         """Return the fit with the slope in its information."""
@@ -85,9 +85,20 @@ class FloorTilt:
         return replace(fit, information=np.asarray(information, float))
 
 
-def _alike(apart: Array) -> Array:
-    """Correlation (...) of the slopes at two places that are (..., 2) apart [m]."""
-    return np.asarray(np.exp(-(apart**2).sum(axis=-1) / (2 * GRAIN**2)))
+def alike(places: Array, stretches: Array | None = None) -> Array:
+    """Correlation (..., n, n) of the slopes at places (..., n, 2) [m].
+
+    With `stretches` (..., n, 2) [m], that of their means along straight stretches about the places.
+    """
+    apart = places[..., :, None, :] - places[..., None, :, :]
+    if stretches is None:
+        return np.asarray(np.exp(-(apart**2).sum(axis=-1) / (2 * GRAIN**2)))
+    # a normal density as wide as a stretch, along it
+    x, y = stretches[..., 0] / math.sqrt(12), stretches[..., 1] / math.sqrt(12)
+    xx, yy, xy = (one[..., :, None] + one[..., None, :] for one in (x * x + GRAIN**2 / 2, y * y + GRAIN**2 / 2, x * y))
+    dx, dy, det = apart[..., 0], apart[..., 1], xx * yy - xy**2
+    squared = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / det
+    return np.asarray(GRAIN**2 / np.sqrt(det) * np.exp(-squared / 2))
 
 
 def _on_floor(x: Array, plane: Plane) -> Array:
