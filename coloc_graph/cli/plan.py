@@ -48,7 +48,10 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     command.add_argument("--mover", metavar="NAME", help="robot that drives before the others' cameras (default: last)")
     command.add_argument("--speed", type=float, default=0.2, metavar="V", help="speed of robots [m/s] (default: 0.2)")
     command.add_argument("--fps", type=float, help="images a second (default: those of the slowest camera)")
-    command.add_argument("--noise", type=float, metavar="PX", help="noise of marker centres [px] (default: the team's)")
+    command.add_argument(
+        "--noise", type=float, metavar="PX",
+        help="noise of marker centres [px] (default: that learnt by a calibrated team, or its noise_px)",
+    )  # fmt: skip
     command.add_argument("--without-odometry", action="store_true", help="ignore wheel odometry")
     command.add_argument("--poses", metavar="CSV", help="write the plan, for `coloc simulate hallway --plan CSV`")
     command.add_argument("--draw", metavar="PNG", help="draw the plan and the paper's formation")

@@ -215,7 +215,11 @@ class NoiseBelief:
 
     def learnt(self, team: Team) -> Team:
         """Return a team that states the learnt noise of its cameras."""
-        noises = {name: self.noise(name) for name, n in zip(self.robots, self.points, strict=True) if n}
+        noises = {
+            name: structs.replace(self.noise(name), typical_px=self.sigma(name)[0])
+            for name, n in zip(self.robots, self.points, strict=True)
+            if n
+        }
         bias = dict(zip(self.robots, self.bias_px, strict=True))
         return _with_noise(team, noises, bias, dict(zip(self.robots, self.bias_factor, strict=True)))
 

@@ -271,7 +271,8 @@ def _better(team: Team) -> dict[str, Team]:
 
     def pixels(robot: Robot) -> Robot:
         c = robot.camera_if_any
-        return new(robot, camera_if_any=c and new(c, noise_px=c.noise_px / 4, bias_px=c.bias_px / 4))
+        quarter = c and new(c, noise_px=c.typical_noise_px / 4, bias_px=c.bias_px / 4, centre_noise=None)
+        return new(robot, camera_if_any=quarter)
 
     f = team.floor
     flat = f and new(f, tilt_sigma_deg=f.tilt_sigma_deg / 4, height_sigma=f.height_sigma / 4)

@@ -46,7 +46,7 @@ class Predictor:
     fps
         Images a second.
     noise_px
-        Standard deviation of a marker centre per axis [px]; None for what the cameras state.
+        Standard deviation of a marker centre per axis [px]; None for what was learnt or is stated of each camera.
     wheels
         Errors of wheel odometry; None to predict without it.
     speed

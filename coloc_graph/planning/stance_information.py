@@ -87,7 +87,7 @@ class StanceModel:
     observers, mover
         Their names.
     noise_px
-        Standard deviation of a marker centre per axis [px]; None for what the cameras state.
+        Standard deviation of a marker centre per axis [px]; None for what was learnt or is stated of each camera.
     mounts
         Errors (r, 6) of the observers' mounts as they are estimated; None for mounts as stated.
     floor_map
@@ -132,7 +132,7 @@ class StanceModel:
             by[6 * n : 6 * n + 6, at + POSE : at + OBSERVER] = cameras.by_errors[n]
         by[-2:, -2:] = np.eye(2)
         self.by_variables = by
-        noise = np.array([noise_px or camera.noise_px for camera in self._cameras])
+        noise = np.array([noise_px or camera.typical_noise_px for camera in self._cameras])
         self._scale = np.array([[[c.fx], [c.fy]] for c in self._cameras]) / noise[:, None, None]
         self._bias = np.array([camera.bias_px for camera in self._cameras]) / noise
         self._clock_sigma = team.clock_sigma

@@ -118,6 +118,12 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return np.asarray(self.lens_px * shifts)
 
     @property
+    def typical_noise_px(self) -> float:
+        """Standard deviation of a typical marker centre per axis [px]: as learnt, or `noise_px`."""
+        learnt = self.centre_noise and self.centre_noise.typical_px
+        return learnt or self.noise_px
+
+    @property
     def K(self) -> Array:
         """Intrinsic matrix, (3, 3), pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])

@@ -27,6 +27,8 @@ class CentreNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     spread, spread_factor
         Standard deviation of the logarithms of variances from stance to stance about all that, and its factor: one
         stance is shaken, or sees lights from the side.
+    typical_px
+        Standard deviation of a typical centre [px], as learnt; plans are made for it. None if nothing was learnt.
     """
 
     scale: float = 1.0
@@ -37,11 +39,12 @@ class CentreNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     saturated_factor: float = 3.0
     spread: float = 0.2
     spread_factor: float = 3.0
+    typical_px: float | None = None
 
     def __post_init__(self) -> None:
         require_finite(self)
-        for name in ("scale", "floor_px", "saturated_px", "spread"):
-            if getattr(self, name) <= 0:
+        for name in ("scale", "floor_px", "saturated_px", "spread", "typical_px"):
+            if getattr(self, name) is not None and getattr(self, name) <= 0:
                 raise ValueError(f"`{name}` is {getattr(self, name)}; give a number above 0")
         for name in ("scale_factor", "floor_factor", "saturated_factor", "spread_factor"):
             if not 1 < getattr(self, name) <= 100:

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from coloc_graph.backend.shared_noise import SharedNoise
 from coloc_graph.frontend.homography.noise_components import NoiseEvidence, learn_components
@@ -160,7 +161,9 @@ def test_learnt_noise_is_in_the_team_that_a_result_writes_and_the_next_run_start
     write_result(first, tmp_path / "out")
     learnt = read_team(tmp_path / "out" / "team.toml")
     noise = learnt["A"].camera.centre_noise
-    assert noise == first.noise.noise("A")
+    assert noise == structs.replace(first.noise.noise("A"), typical_px=first.noise.sigma("A")[0])
+    assert learnt["A"].camera.typical_noise_px == pytest.approx(0.3, rel=0.15)
+    assert learnt["C"].camera.typical_noise_px == learnt["C"].camera.noise_px  # whose camera saw nothing
     assert noise.floor_px == pytest.approx(0.3, rel=0.2)
     assert NoiseBelief.of(learnt).noise("A").floor_factor == pytest.approx(noise.floor_factor)
     rows = json.loads((tmp_path / "out" / "summary.json").read_text())["centre_noise"]

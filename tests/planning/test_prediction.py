@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 from test_plan import straight_plan
 
 from coloc_graph.errors import InputError
@@ -21,6 +22,7 @@ from coloc_graph.simulation import Imperfections, build_world, record, reference
 from coloc_graph.simulation.planned import planned
 from coloc_graph.simulation.rig import stated_team, wide_team
 from coloc_graph.simulation.world import stream
+from coloc_graph.team import CentreNoise
 
 FIELD = Imperfections(mount_sigma_deg=1.0, height_sigma=0.005, span_sigma=1e-4, floor_sigma_deg=0.1)
 
@@ -138,6 +140,19 @@ def test_noise_that_all_images_share_is_not_averaged_away():
         team = stated_team(reference_team(bias_px=bias), exact)
         sigmas.append(predicted(plan, team)[-1].belief.position_sigma(("B",)))
     assert sigmas[1] > 3 * sigmas[0]
+
+
+def test_a_calibrated_team_promises_what_the_noise_does_that_it_has_learnt():
+    plan, team = straight_plan(2), team_of()
+    learnt = CentreNoise(typical_px=0.045)
+    robots = [
+        structs.replace(robot, camera_if_any=structs.replace(robot.camera, centre_noise=learnt))
+        for robot in team.robots
+    ]  # fmt: skip
+    of_learnt = predicted(plan, structs.replace(team, robots=tuple(robots)))[-1].belief.position_sigma(("B",))
+    stated = predicted(plan, team_of(replace(FIELD, noise_px=0.045)))[-1].belief.position_sigma(("B",))
+    assert of_learnt == pytest.approx(stated)
+    assert of_learnt < 0.7 * predicted(plan, team)[-1].belief.position_sigma(("B",))
 
 
 def test_a_stance_without_a_common_view_promises_nothing():
