@@ -23,7 +23,10 @@ def add(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None
     )
     command.add_argument("--stances", type=int, metavar="N", help="end after N stances (default: at the goal)")
     command.add_argument(
-        "--mover", metavar="NAME", help="robot that drives before the others' cameras (default: the last)"
+        "--mover",
+        metavar="NAME",
+        help="robot that drives before the others' cameras (default: the last; with --plan the one of which the others "
+        "promise most)",
     )
     command.add_argument(
         "--speed", type=float, default=0.3, metavar="V", help="speed of the robots [m/s] (default: 0.3)"

@@ -125,7 +125,7 @@ class Checks:
         if one is not None and stances and stances[-1].index == one.stance.index:
             if stances[-1] != one.stance:
                 self._violate(f"stance {one.stance.index} is not the one that has entered")
-            for name in one.stance.observers:
+            for name in _standing(one):
                 tracker = registry[name].tracker
                 if tracker._displaced <= one.stance.start:
                     off = _apart(tracker.pose(one.stance.start), _planar(one.estimate.poses[name].matrix()))
@@ -150,7 +150,7 @@ class Checks:
             self._origin = poses[reference]
         self._newest = one
         self.nees, self.ends = (0.0, 0), ()
-        for name in one.stance.observers:
+        for name in _standing(one):
             if self.pushed or name not in one.estimate.poses or (name == reference and one.stance.index == 0):
                 continue
             covariance = one.estimate.covariances[name][np.ix_(PLANAR, PLANAR)]
@@ -255,6 +255,11 @@ class Checks:
     def _violate(self, text: str) -> None:
         if len(self.violations) < 20:
             self.violations.append(f"{1e-9 * self._scheduler.now:.2f} s: {text}")
+
+
+def _standing(one: EnteredStance) -> list[str]:
+    """Return the robots that stood in a stance, whether they saw the mover or not."""
+    return list(dict.fromkeys((*one.stance.observers, *one.stance.anchors)))
 
 
 def _planar(T: NDArray[np.float64]) -> Planar:

@@ -50,6 +50,8 @@ class Scenario:
         "paper" or "plan"; see `MissionOptions`.
     way
         Length of a mission that goes to its end, as `coloc demo --online` does [m]; 0 for one of some stances.
+    robots
+        Number of robots; the last one is the mover.
     """
 
     seed: int
@@ -57,6 +59,7 @@ class Scenario:
     faults: tuple[Fault, ...] = ()
     formation: str = "paper"
     way: float = 0.0
+    robots: int = 3
 
 
 @dataclass
@@ -101,19 +104,24 @@ class Outcome:
 
 
 def scenario_of(
-    seed: int, stances: int = 6, formation: str = "paper", faults: int | None = None, way: float = 0.0
+    seed: int,
+    stances: int = 6,
+    formation: str = "paper",
+    faults: int | None = None,
+    way: float = 0.0,
+    robots: int = 3,
 ) -> Scenario:
     """Return the mission of a seed, with faults that it draws; every fourth has none."""
     count = (seed % 4) * 2 if faults is None else faults
-    return Scenario(seed, stances, draw_faults(seed, mission_team().names, count, SPAN * stances), formation, way)
+    drawn = draw_faults(seed, mission_team(robots).names, count, SPAN * stances)
+    return Scenario(seed, stances, drawn, formation, way, robots)
 
 
-def mission_team() -> Team:
+def mission_team(robots: int = 3) -> Team:
     """Return the team of simulated missions."""
-    stated = stated_team(reference_team(), FIELD)
+    stated = stated_team(reference_team(names=tuple("ABCDEF"[:robots])), FIELD)
     new = msgspec.structs.replace
-    robots = tuple(new(robot, camera_if_any=new(robot.camera, fps=FPS)) for robot in stated.robots)
-    return new(stated, robots=robots)
+    return new(stated, robots=tuple(new(one, camera_if_any=new(one.camera, fps=FPS)) for one in stated.robots))
 
 
 def run_mission(scenario: Scenario, folder: Path | None = None) -> Outcome:
@@ -138,7 +146,7 @@ def run_mission(scenario: Scenario, folder: Path | None = None) -> Outcome:
 
 
 def _run(scenario: Scenario, scheduler: Scheduler, folder: Path) -> Outcome:
-    team = mission_team()
+    team = mission_team(scenario.robots)
     if scenario.way:
         goals, own = ((scenario.way, 0.0),), {"speed": 0.4, "pace": PACE}
     else:

@@ -65,12 +65,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--faults", type=int, help="faults of each (default: as the seed draws)")
     parser.add_argument("--formation", choices=("paper", "plan"), default="paper", help="as in `coloc coordinate`")
     parser.add_argument("--way", type=float, default=0.0, metavar="M", help="go to a goal M metres ahead, as the demo")
+    parser.add_argument("--robots", type=int, default=3, choices=(3, 4), help="of the team (default: 3)")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, help="(default: CPU count)")
     parser.add_argument("--seconds", type=float, default=1e9, help="begin no more missions after this time")
     parser.add_argument("--no-shrink", action="store_true", help="do not shrink the faults of what fails")
     options = parser.parse_args(arguments)
     seeds = range(options.first, options.first + options.missions)
-    scenarios = [scenario_of(seed, options.stances, options.formation, options.faults, options.way) for seed in seeds]
+    each = options.stances, options.formation, options.faults, options.way, options.robots
+    scenarios = [scenario_of(seed, *each) for seed in seeds]
     began, simulated, cpu, failed = time.monotonic(), 0.0, 0.0, []
     states: dict[str, int] = {}
     nees, freedom, attempts, entered = 0.0, 0, 0, 0

@@ -3,6 +3,7 @@
 import contextlib
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -13,7 +14,7 @@ from coloc_graph.online.commands import Commander, Stopped
 from coloc_graph.online.decision_worker import DecisionWorker
 from coloc_graph.online.estimation_worker import EstimationWorker
 from coloc_graph.online.formation import Formation
-from coloc_graph.online.horizon_planner import HorizonPlanner
+from coloc_graph.online.horizon_planner import HorizonPlanner, best_mover
 from coloc_graph.online.inbox import Inbox, Message, linked
 from coloc_graph.online.leap_frog import LeapFrog
 from coloc_graph.online.leap_planner import LeapPlanner, StancePlan, StancePlanner
@@ -85,6 +86,8 @@ class Coordinator:
         on_plan: Callable[[StancePlan], None] | None = None,
     ) -> None:
         options = options or MissionOptions()
+        if options.formation == "plan" and options.mover is None:
+            options = replace(options, mover=best_mover(team, options.speed))
         mover, observers = roles(team, options.mover)
         starts, waypoints = in_world(team, mover, options.goals)
         course = Course(waypoints)

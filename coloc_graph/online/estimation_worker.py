@@ -2,6 +2,7 @@
 
 import gc
 import logging
+from collections.abc import Sequence
 from concurrent.futures import Future
 from typing import TypeVar
 
@@ -10,7 +11,7 @@ from coloc_graph.backend.batch import faults_of
 from coloc_graph.backend.blame import bumps_of
 from coloc_graph.backend.cause import to_check
 from coloc_graph.errors import ColocError, RobotError
-from coloc_graph.frontend import FrontendOptions, StanceTracks
+from coloc_graph.frontend import FrontendOptions, PairMeasurement, StanceTracks
 from coloc_graph.machine import machine
 from coloc_graph.online.record import Record
 from coloc_graph.online.visibility import Precision, precision
@@ -122,9 +123,7 @@ def enter_stance(
     """
     noisy = Restated(record, solver.noise.used(record.team))  # as a logged run is measured
     pairs = solver.measure(record, stance, tuple(measure_stance(noisy, stance, solver.options, tracks)))
-    unusable = [pair.homography.unusable for pair in pairs if pair.homography.unusable]
-    if len(unusable) == len(pairs):
-        raise RobotError(f"stance {stance.index} measures nothing: {unusable[0]}")
+    _require_measured(stance, pairs)
     try:
         one = solver.enter(record, stance, pairs)
     except ColocError as error:
@@ -141,6 +140,24 @@ def enter_stance(
     if bumped:
         solver.withdraw()
     return bumped or one
+
+
+def _require_measured(stance: Stance, pairs: Sequence[PairMeasurement]) -> None:
+    """Require that a stance measures an observer that did not stay; of the first one, all.
+
+    Raises
+    ------
+    RobotError
+        If it does not: wheels alone would say where it stands.
+    """
+    unusable: dict[str, list[str | None]] = {}
+    for pair in pairs:
+        for name in (pair.homography.robot_i, pair.homography.robot_j):
+            unusable.setdefault(name, []).append(pair.homography.unusable)
+    moved = [name for name in stance.observers if name not in stance.anchors]
+    lost = [name for name in moved or stance.observers if all(unusable.get(name, ["no pair"]))]
+    if lost and (not stance.index or len(lost) == len(moved or stance.observers)):
+        raise RobotError(f"stance {stance.index} measures nothing of {' and '.join(lost)}: {unusable[lost[0]][0]}")
 
 
 def _result(done: "Future[T]", what: str) -> T:

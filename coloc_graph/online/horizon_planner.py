@@ -21,6 +21,7 @@ from coloc_graph.planning.horizon import Horizon
 from coloc_graph.planning.mission import stance_there
 from coloc_graph.planning.plan import PlannedStance
 from coloc_graph.planning.prediction import Predictor
+from coloc_graph.planning.roles import best_roles
 from coloc_graph.planning.route import clear_way, polyline_length, route
 from coloc_graph.planning.slip import WheelErrors
 from coloc_graph.robot_io.create.odometry import ENCODER, SLIP, WHEELS
@@ -28,6 +29,7 @@ from coloc_graph.team import Team
 
 Array = NDArray[np.float64]
 
+MAX_OBSERVERS = 3  # of more, the hindmost one's way round the others is too long for its wheels
 CREATE = WheelErrors.of_wheels(math.hypot(SLIP, ENCODER), WHEELS[2].base)  # of the narrower model
 FIRST_NOISE = 0.1  # noise of a marker centre until a stance has shown it [px]
 PASSING = 0.6  # robots that drive at the same time keep this distance between their ways [m]
@@ -38,8 +40,25 @@ MAX_DELAY = 10.0  # a stance that takes this much longer than expected was halte
 MAX_SHARE = 1.5  # a stance counts for at most this share of the information that was expected of it
 
 
+def best_mover(team: Team, speed: float) -> str:
+    """Return the robot that is to drive before the others' cameras at a `speed` [m/s]: they then promise most.
+
+    Raises
+    ------
+    InputError
+        If no robot can be the mover, or the cameras share no view of any.
+    """
+    return best_roles(_predictor(team, team.names, speed))[1]
+
+
+def _predictor(team: Team, names: Sequence[str], speed: float, floor_map: FloorMap | None = None) -> Predictor:
+    cameras = [team[name].camera_if_any for name in names]
+    fps = min((camera.fps for camera in cameras if camera is not None), default=math.inf)
+    return Predictor(team, fps, FIRST_NOISE, CREATE, speed, floor_map, OVERHEAD, anew=True)
+
+
 class HorizonPlanner:
-    """Plans stances from where the robots are and what is known of them; two observers and a mover.
+    """Plans stances from where the robots are and what is known of them; up to three observers and a mover.
 
     The covariance is that of the planner's own prediction, with the points and the noise that the stances brought.
 
@@ -60,7 +79,7 @@ class HorizonPlanner:
     Raises
     ------
     InputError
-        If there are more than two observers, the goal is in a wall, or the cameras share no view in any formation.
+        If there are too many observers, the goal is in a wall, or the cameras share no view in any formation.
     """
 
     def __init__(
@@ -76,13 +95,12 @@ class HorizonPlanner:
         gait: Gait | None = None,
     ) -> None:
         self._team, self._mover, self._observers = team, mover, observers
-        if len(observers) != 2:
+        if len(observers) > MAX_OBSERVERS:
             raise InputError(
-                f"{len(observers)} observers are to leap, and online plans are made for two and a mover: leave the "
-                "others out of the team"
+                f"{len(observers)} observers are to leap, and online plans are made for up to {MAX_OBSERVERS} and a "
+                "mover: leave the others out of the team"
             )
-        fps = min(team[name].camera.fps for name in observers)
-        self._predictor = Predictor(team, fps, FIRST_NOISE, CREATE, speed, floor_map, OVERHEAD, anew=True)
+        self._predictor = _predictor(team, observers, speed, floor_map)
         self._ended: float | None = None  # time of the end of the stance before [UTC s]
         self._left = pace * course.length
         self._horizon = Horizon(self._predictor, course, observers, mover, self._left, gait=gait, timed=True)
@@ -109,7 +127,7 @@ class HorizonPlanner:
         if before is not None and attempt < RETRIES and self._may_leap(before, situation):
             decision = before
         elif index == 0:
-            decision = self._horizon.first(belief)
+            decision = _watched(self._horizon.first(belief))
         elif len(situation.moved) == len(self._observers):
             decision = self._without_anchor(belief, situation, before)
         elif attempt < RETRIES and situation.moved:
@@ -117,8 +135,8 @@ class HorizonPlanner:
             decision = self._where_they_stand(belief, situation.moved)
         else:
             failed = () if before is None or not before.ahead else (before.ahead[0][1],)
-            leaper = situation.moved[0] if situation.moved else None
-            decision = self._horizon.next(belief, max(self._left, 0.0), failed, leaper)
+            leaper = self._leaper if self._leaper in situation.moved else next(iter(situation.moved), None)
+            decision = self._horizon.next(belief, max(self._left, 0.0), failed, leaper, situation.moved)
         self._decision = decision
         leap = decision.ahead[0][:2] if decision.ahead else None
         self._leaper = self._leaper if leap is None else leap[0]
@@ -133,8 +151,9 @@ class HorizonPlanner:
         if attempt:
             drive = np.concatenate([middle, drive])
         detour = self._detour(situation.poses, leap)
-        promise = self._promise(decision)
-        self._plan = StancePlan(index, leap, drive, decision.stance.duration, PASSING, promise, approach, detour)
+        promise, duration = self._promise(decision), decision.stance.duration
+        watching = tuple(name for name in self._observers if name in decision.stance.watching)
+        self._plan = StancePlan(index, leap, watching, drive, duration, PASSING, promise, approach, detour)
         return self._plan
 
     def take(self, entered: EnteredStance, poses: Mapping[str, Planar]) -> None:
@@ -142,7 +161,7 @@ class HorizonPlanner:
         if self._decision is None or self._plan is None:
             return
         found = [pair.correspondences for pair in entered.pairs if pair.correspondences is not None]
-        points = min((len(one) for one in found), default=0)
+        points = sum(map(len, found))
         if points:
             focal = self._team[self._observers[0]].camera.fx
             self._predictor.learn_noise(float(np.median([one.pairs.sigma for one in found])) * focal)
@@ -159,7 +178,7 @@ class HorizonPlanner:
         standing = {name: belief.poses[name] for name in (*anchors, *(o for o in self._observers if o not in anchors))}
         driven = tuple((float(x), float(y)) for x, y in self._plan.patrol)
         self._stood.append(standing)
-        came = PlannedStance(standing, anchors, self._mover, driven, seconds)
+        came = PlannedStance(standing, anchors, self._mover, driven, seconds, entered.stance.observers)
         information, expected = self._predictor.information(came)
         if expected > 0:
             share = min(points / expected, MAX_SHARE)
@@ -237,7 +256,7 @@ class HorizonPlanner:
         stance, promise = stance_there(
             self._predictor, belief, standing, anchors, self._mover, seconds, self._horizon.goal
         )
-        return Decision(stance, promise, (), reason="all stay where they stand")
+        return _watched(Decision(stance, promise, (), reason="all stay where they stand"))
 
     def _without_anchor(self, belief: Belief, situation: Situation, before: Decision | None) -> Decision:
         """Let all stay where they stand, or where they share no view there the one that leapt last leap on.
@@ -248,9 +267,26 @@ class HorizonPlanner:
             with contextlib.suppress(InputError):
                 return self._where_they_stand(belief, situation.moved)
         failed = () if before is None or not before.ahead else (before.ahead[0][1],)
-        return self._horizon.next(belief, max(self._left, 0.0), failed, self._leaper or situation.moved[0])
+        leaper = self._leaper or situation.moved[0]
+        return self._horizon.next(belief, max(self._left, 0.0), failed, leaper, situation.moved)
 
     def _promise(self, decision: Decision) -> StancePromise:
         belief, standing = decision.promise.belief, decision.stance.standing
         covariances = {name: belief.planar_covariance(name) for name in standing}
         return StancePromise(standing, covariances, decision.promise.points, decision.expected, decision.reason)
+
+
+def _watched(decision: Decision) -> Decision:
+    """Require that in a stance without anchors all observers see the whole drive.
+
+    Raises
+    ------
+    InputError
+        If they do not: nothing else says where those stand that do not.
+    """
+    if not decision.stance.watching:
+        raise InputError(
+            f"{', '.join(decision.stance.standing)} do not all see the same part of the floor where they stand: bring "
+            "them nearer, or turn their cameras towards each other"
+        )
+    return decision

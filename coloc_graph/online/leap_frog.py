@@ -200,17 +200,17 @@ class LeapFrog:
 
     def _begin_attempt(self) -> None:
         assert self._plan is not None
-        now = self._registry.utc()
+        now, watching = self._registry.utc(), self._plan.watching
         self._captures, self._missing = self._captures + 1, ()
         self.attempt = StanceAttempt(
-            Stance(self._index, now, now, self.observers, (self.mover,), self._anchors()),
-            InView(self._team, self.mover, self._registry.poses(self.observers)),
+            Stance(self._index, now, now, watching, (self.mover,), self._anchors()),
+            InView(self._team, self.mover, self._registry.poses(self.observers), watching),
             self._captures,
             self._plan.patrol,
             self._registry[self.mover].tracker,
         )
         self._worker.forget()
-        for name in self.observers:
+        for name in watching:
             self._commander.ask(name, Capture(capture=self._captures))
         self._enter(MissionState.LOOKING)
 
@@ -286,9 +286,9 @@ class LeapFrog:
             raise RobotError(f"{self.mover} did not come back into the view of {' and '.join(missing)}")
 
     def _end_capture(self, reason: str) -> None:
-        commands: dict[str, Body] = {self.mover: Halt(), **dict.fromkeys(self.observers, EndCapture())}
-        answers = self._commander.ask_each(commands)
-        self._attempted().expect({name: int(answers[name] or 0) for name in self.observers})
+        attempt = self._attempted()
+        commands: dict[str, Body] = {self.mover: Halt(), **dict.fromkeys(attempt.stance.observers, EndCapture())}
+        attempt.expect(self._commander.ask_each(commands))
         self._enter(MissionState.COLLECTING, reason)
 
     def _collect(self) -> None:
@@ -405,11 +405,10 @@ class LeapFrog:
         return self.stances[-1].index + 1 if self.stances else 0
 
     def _anchors(self) -> tuple[str, ...]:
-        """Return the observers of the stance before that have stood since, by their wheels."""
-        if not self.stances:
-            return ()
-        before = self.stances[-1]
-        return self._registry.stand_since(before.end, [name for name in self.observers if name in before.observers])
+        """Return the observers that had a pose in the stance before and have stood since, by their wheels."""
+        posed = [name for one in self.stances[-1:] for name in one.observers + one.anchors]
+        names = [name for name in self.observers if name in posed]
+        return self._registry.stand_since(self.stances[-1].end, names) if names else ()
 
     def _at_goal(self) -> bool:
         if self._options.stances is not None and len(self.stances) >= self._options.stances:

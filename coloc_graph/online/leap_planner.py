@@ -49,8 +49,10 @@ class StancePlan:
     ----------
     leap
         Observer that leaps and its target in the world (x [m], y [m], yaw [rad]); None where nobody leaps.
+    watching
+        Observers that are to see the whole drive, in the team's order: the stance is theirs. Others only stand.
     patrol
-        Waypoints (n, 2) [m] of the mover, in the world, spread over what all observers see.
+        Waypoints (n, 2) [m] of the mover, in the world, spread over what they see.
     duration
         Time of the mover's drive after which the stance ends [s]; None to end it once it is precise enough.
     passing
@@ -64,6 +66,7 @@ class StancePlan:
 
     index: int
     leap: tuple[str, Planar] | None
+    watching: tuple[str, ...]
     patrol: NDArray[np.float64]
     duration: float | None = None
     passing: float | None = None
@@ -81,6 +84,7 @@ class StancePlan:
         row: dict[str, object] = {
             "stance": self.index,
             "leap": self.leap,
+            "watching": self.watching,
             "patrol": np.round(self.patrol, 3).tolist(),
             "duration": self.duration,
         }
@@ -176,7 +180,7 @@ class LeapPlanner:
         standing = {name: poses[name] for name in self._formation.observers}
         views = list(InView(self._team, self._mover, standing).views.values())
         patrol = self._formation.patrol(standing, views, self._p_markers, bool((index + situation.attempt) % 2))
-        self._plan = StancePlan(index, leap, patrol)
+        self._plan = StancePlan(index, leap, self._formation.observers, patrol)
         return self._plan
 
     def take(self, entered: EnteredStance, poses: Mapping[str, Planar]) -> None:

@@ -30,7 +30,8 @@ class MissionOptions:
     stances
         Number of stances after which it ends earlier; None for no limit.
     mover
-        Name of the robot that drives before the others' cameras; None for the last one of the team.
+        Name of the robot that drives before the others' cameras; None for the last one of the team, with formation
+        "plan" for the one of which the others promise most.
     place_sigma, heading_sigma_deg, least_points
         A stance is long enough when it measures the relative pose of every pair with standard deviations below these
         [m], [deg], with at least this number of points.
@@ -107,7 +108,9 @@ def in_world(
     formation = Formation(Course(((0.0, 0.0), (10.0, 0.0))), tuple(n for n in team.names if n != mover))
     starts: dict[str, Planar] = {}
     for n, name in enumerate(formation.observers):
-        starts[name] = formation.place(name, STAGGER * (n % 2))
+        left, turn = formation.lane(name)
+        # the outer ones stand where they look at the mover, too
+        starts[name] = formation.place(name, STAGGER * n if n < 2 else MOVER_AHEAD + left / math.tan(turn))
     starts[mover] = MOVER_AHEAD, 0.0, 0.0
     for robot in team.robots:
         if robot.devices is not None and robot.devices.start is not None:

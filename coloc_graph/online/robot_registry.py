@@ -184,8 +184,9 @@ class RobotRegistry:
     def follow(self, entered: EnteredStance) -> None:
         """Set the poses of the robots that a stance's estimate has newly found."""
         sighted = {m.seen: m.time for m in entered.measurements if isinstance(m, Sighting)}
+        standing = {*entered.stance.observers, *entered.stance.anchors}
         for name, pose in entered.estimate.poses.items():
-            if name in entered.stance.observers or name in sighted:
+            if name in standing or name in sighted:
                 T = pose.matrix()
                 planar = float(T[0, 3]), float(T[1, 3]), math.atan2(T[1, 0], T[0, 0])
                 self.robots[name].tracker.fix(sighted.get(name, entered.stance.start), planar)

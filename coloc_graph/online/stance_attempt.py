@@ -1,6 +1,7 @@
 """One attempt to measure a stance: images of it, their precision, and the mover in view; `StanceAttempt`."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -110,9 +111,9 @@ class StanceAttempt:
         self._rounds += 1
         return self._patrol[::-1] if self._rounds % 2 else self._patrol
 
-    def expect(self, samples: dict[str, int]) -> None:
-        """Set how many samples each observer has sent in all."""
-        self._expected = samples
+    def expect(self, answers: Mapping[str, str]) -> None:
+        """Take in the observers' answers: how many samples each has sent in all."""
+        self._expected = {name: int(answers[name] or 0) for name in self.stance.observers}
 
     @property
     def complete(self) -> bool:

@@ -43,15 +43,20 @@ class InView:
         The team, and the name of the mover, which has markers.
     observers
         Poses of the observers in the world.
+    watching
+        Those that are to see the mover, all by default; nothing is taken from the others.
     """
 
-    def __init__(self, team: Team, mover: str, observers: Mapping[str, Planar]) -> None:
+    def __init__(
+        self, team: Team, mover: str, observers: Mapping[str, Planar], watching: Sequence[str] | None = None
+    ) -> None:
         markers = team[mover].markers
         assert markers is not None
         self._p_markers = markers.p_body
         self.views = {
             name: View(team[name].camera, floor_pose(*place) @ team[name].mount.T_body_camera)
             for name, place in observers.items()
+            if watching is None or name in watching
         }
         self._T_body_camera = {name: team[name].mount.T_body_camera for name in observers}
         self._standing = dict(observers)

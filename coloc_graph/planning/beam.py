@@ -7,11 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from coloc_graph.geometry.se2 import Planar
+from coloc_graph.geometry.se2 import Planar, wrap
 from coloc_graph.planning.belief import Belief
+from coloc_graph.planning.course import Course
+from coloc_graph.planning.leaps import BEND
 from coloc_graph.planning.plan import PlannedStance
 from coloc_graph.planning.prediction import Promise
 
+BEAM = 4  # plans that are followed from one stance to the next
+MANY_BEAM = 3  # the same of more than two observers
+CORNER_BEAM = 30  # the same before a corner
+CORNER = 3.0  # a corner is near from this distance along the course on [m]
 DIFFERENT = 0.15  # poses are compared one by one from this distance on, in which a radian counts as 0.5 m [m]
 
 
@@ -76,6 +82,15 @@ class Node:
         )
         standing, choices = {**self.standing, leaper: target}, (*self.choices, (leaper, target, seconds))
         return Node(belief, standing, left, score, choices, by_gait, self.aside)
+
+
+def beam_width(course: Course, standing: Sequence[Planar]) -> int:
+    """Number of plans that are followed from one stance to the next: more before a corner, where most end."""
+    ways = [course.way_of(pose) for pose in standing]
+    headings = [course.at(way)[2] for way in np.arange(min(ways), max(ways) + CORNER, 0.5)]
+    if np.abs(wrap(np.diff(headings))).max(initial=0.0) > BEND:
+        return CORNER_BEAM
+    return BEAM if len(standing) == 2 else MANY_BEAM
 
 
 def different(nodes: Sequence[Node], beam: int) -> list[Node]:

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
-from coloc_graph.geometry.se2 import Planar, wrap
-from coloc_graph.planning.beam import Decision, Node, different, first_leaps
+from coloc_graph.geometry.se2 import Planar
+from coloc_graph.planning.beam import CORNER_BEAM, Decision, Node, beam_width, different, first_leaps
 from coloc_graph.planning.belief import Belief, updated
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.drive import effective_seconds
 from coloc_graph.planning.durations import MAX_STANCE_DURATION, SHARES, durations
 from coloc_graph.planning.formation import Gait
 from coloc_graph.planning.gaits import MIN_STANCE_DURATION
-from coloc_graph.planning.leaps import BEND, Leaps, leaps_beside, possible_leaps, steps_aside
+from coloc_graph.planning.leaps import Leaps, leaps_beside, possible_leaps, steps_aside
 from coloc_graph.planning.mission import Mission, best_stance, stance_there
 from coloc_graph.planning.mover_path import evenly_seen
 from coloc_graph.planning.plan import Plan, PlannedStance
@@ -30,10 +30,6 @@ from coloc_graph.planning.ways_out import NARROW, in_the_way, require_way, stuck
 Array = NDArray[np.float64]
 
 DEPTH = 2  # stances that are looked ahead
-BEAM = 4  # plans that are followed from one stance to the next
-MANY_BEAM = 3  # the same of more than two observers
-CORNER_BEAM = 30  # the same before a corner
-CORNER = 3.0  # a corner is near from this distance along the course on [m]
 FINALISTS = 3  # first leaps whose stances are planned to be compared, with the gait's own
 PREFERRED = 1.03  # the gait's own leap is left for one that promises a variance this much smaller
 ROW = 0.6  # distance between rows of observers at the beginning [m]
@@ -202,7 +198,14 @@ class Horizon:
         stance, promise = stance_there(self.predictor, belief, standing, (), self.mover, seconds, self.goal)
         return Decision(stance, promise, (), reason="the first stance is where the team stands")
 
-    def next(self, belief: Belief, seconds: float, avoid: Sequence[Planar] = (), leaper: str | None = None) -> Decision:
+    def next(
+        self,
+        belief: Belief,
+        seconds: float,
+        avoid: Sequence[Planar] = (),
+        leaper: str | None = None,
+        moved: Sequence[str] = (),
+    ) -> Decision:
         """Plan the next stance of a team that stands where `belief` has it.
 
         Parameters
@@ -215,6 +218,8 @@ class Horizon:
             Targets at which this stance failed.
         leaper
             The observer that has to leap; None to choose it.
+        moved
+            Observers that are no anchors of the next stance, whether they leap or not.
 
         Raises
         ------
@@ -227,10 +232,10 @@ class Horizon:
         plans = (nodes for _ in self.predictor.ever_nearer() for nodes in self._ahead(*given))
         for nodes in chain(plans, () if self._roomy else self._otherwise(*given)):
             if self.objective != "goal":
-                stance, promise = self._planned(belief, nodes[0].choices[0])
+                stance, promise = self._planned(belief, nodes[0].choices[0], moved)
                 return Decision(stance, promise, nodes[0].choices)
             try:
-                return self._decided(belief, seconds, nodes)
+                return self._decided(belief, seconds, nodes, moved)
             except InputError as error:
                 problem = error
         why = in_the_way(belief, self.course, self.gait, self.observers, self.predictor)
@@ -238,7 +243,7 @@ class Horizon:
             raise problem
         raise stuck(self._stuck_at(belief.poses), why) from problem
 
-    def _decided(self, belief: Belief, seconds: float, nodes: Sequence[Node]) -> Decision:
+    def _decided(self, belief: Belief, seconds: float, nodes: Sequence[Node], moved: Sequence[str] = ()) -> Decision:
         """Choose among plans, the best first.
 
         Raises
@@ -246,7 +251,7 @@ class Horizon:
         InputError
             If the mover cannot drive in the first stance of any.
         """
-        variance, node, stance, promise = self._finalist(belief, seconds, nodes)
+        variance, node, stance, promise = self._finalist(belief, seconds, nodes, moved)
         leaper, target, duration = node.choices[0]
         reason = self.predictor.narrow + self._rollout_of(promise.belief.poses, leaper).reason(
             promise.belief, leaper, seconds - self._spent(duration, belief, leaper, target)
@@ -262,7 +267,7 @@ class Horizon:
     ) -> Iterator[list[Node]]:
         """Yield plans of the next stances along the course, the best first; then those of the next stance alone."""
         standing = {name: belief.poses[name] for name in self.observers}
-        many = self._beam(standing)
+        many = beam_width(self.course, tuple(standing.values()))
         beam, first = [Node(belief, standing, seconds, 0.0)], list[Node]()
         for depth in range(self.depth):
             grown = [
@@ -302,14 +307,6 @@ class Horizon:
         after = [one for step in steps for one in self._expand(step, (), in_lane=False)]
         yield from filter(None, (sorted(after, key=lambda one: one.score), grown(leaps_beside)))
 
-    def _beam(self, standing: Mapping[str, Planar]) -> int:
-        """Number of plans that are followed from one stance to the next: more before a corner, where most end."""
-        ways = [self.course.way_of(pose) for pose in standing.values()]
-        headings = [self.course.at(way)[2] for way in np.arange(min(ways), max(ways) + CORNER, 0.5)]
-        if np.abs(wrap(np.diff(headings))).max(initial=0.0) > BEND:
-            return CORNER_BEAM
-        return BEAM if len(self.observers) == 2 else MANY_BEAM
-
     def require_progress(self, before: Sequence[Mapping[str, Planar]]) -> None:
         """Require that of the stances before, each with where the observers stood, one of the last brought them on.
 
@@ -326,17 +323,20 @@ class Horizon:
         """Return the way along the course at which a team is [m]."""
         return self.course.length - self.remaining(standing)
 
-    def _planned(self, belief: Belief, choice: tuple[str, Planar, float]) -> tuple[PlannedStance, Promise]:
+    def _planned(
+        self, belief: Belief, choice: tuple[str, Planar, float], moved: Sequence[str]
+    ) -> tuple[PlannedStance, Promise]:
         """Plan the mover's drive of a stance after a leap."""
         leaper, target, duration = choice
         after = belief.after_leap(leaper, target, self.predictor.wheels)
-        anchors = self.foremost_first(belief.poses, leaper)
-        placed = {name: after.poses[name] for name in (*anchors, leaper)}
+        others = self.foremost_first(belief.poses, leaper)
+        anchors = tuple(name for name in others if name not in moved) or others
+        placed = {name: after.poses[name] for name in (*anchors, *(o for o in others if o not in anchors), leaper)}
         leapt = math.dist(belief.poses[leaper][:2], target[:2])
         return best_stance(self.predictor, after, placed, anchors, self.mover, duration, self.goal, leapt)
 
     def _finalist(
-        self, belief: Belief, seconds: float, nodes: Sequence[Node]
+        self, belief: Belief, seconds: float, nodes: Sequence[Node], moved: Sequence[str] = ()
     ) -> tuple[float, Node, PlannedStance, Promise]:
         """Choose among the best first leaps by what their stances promise with planned drives.
 
@@ -350,7 +350,7 @@ class Horizon:
                 continue
             leaper, target, duration = node.choices[0]
             try:
-                stance, promise = self._planned(belief, node.choices[0])
+                stance, promise = self._planned(belief, node.choices[0], moved)
                 if self.predictor.anew:  # else it is not known where the mover will be
                     require_way(belief, stance, self.observers, self.predictor)
             except InputError as error:
@@ -434,8 +434,8 @@ class Horizon:
         observers = (*leaps.anchors, leaps.leaper)
         standing = np.array([[node.standing[name] for name in leaps.anchors]] * len(leaps.targets))
         standing = np.concatenate([standing, leaps.targets[:, None]], axis=1)
-        model = self.predictor.model(observers, self.mover)
-        information, count = evenly_seen(model, standing, leaps.margins, self.predictor.free)
+        predictor, model = self.predictor, self.predictor.model(observers, self.mover)
+        information, count = evenly_seen(model, standing, leaps.margins, predictor.free, by_last=predictor.anew)
         seen = np.flatnonzero(count >= MIN_CELLS)
         if not len(seen):
             return []

@@ -1,17 +1,21 @@
 """A plan for a whole mission with what it promises: `Mission`, and `leap_frog`, which plans one of a gait."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import Planar
 from coloc_graph.planning.belief import Belief
 from coloc_graph.planning.formation import Gait
-from coloc_graph.planning.mover_path import best_drives, cells, design, patrol
+from coloc_graph.planning.mover_path import best_drives, cells, commonly_seen, design, patrol
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor, Promise
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +169,9 @@ def best_stance(
 ) -> tuple[PlannedStance, Promise]:
     """Choose the mover's drive in a stance of a team, `belief`, that stands there after a leap of `leapt` [m].
 
+    Where stances are planned anew, all observers that are no anchors see the whole drive, and with them one that is;
+    or the last observer does, and one anchor. Where there is no anchor, all do, or some two at each place.
+
     Raises
     ------
     InputError
@@ -174,8 +181,12 @@ def best_stance(
     margins = predictor.margins(leapt, names)
     slips = [0.0 if predictor.anew and name in anchors else belief.leapt.get(name, 0.0) for name in names]
     at = np.array(list(standing.values()))
-    found = cells(predictor.model(names, mover), at, margins, predictor.free, slips, predictor.room)
-    if len(found.places) < 2:
+    model, given = predictor.model(names, mover), (at, margins, predictor.free, slips, predictor.room)
+    for groups in _groups(names, anchors) if predictor.anew else [[()]]:
+        found = cells(model, *given, groups)
+        if len(found.places) > 1:
+            break
+    else:
         raise InputError(
             f"{' and '.join(names)} have no common view of the floor where they are to stand: "
             "bring them nearer, or turn their cameras towards each other"
@@ -193,6 +204,40 @@ def best_stance(
         if not drives:
             raise InputError(f"{mover} finds no drive before {' and '.join(names)} that is clear: give it more room")
     options = [PlannedStance(standing, anchors, mover, drive, seconds) for drive in drives]
+    if found.watching:
+        options = _watched(predictor, options, found.watching, margins)
     promises = [predictor.of_stance(belief, option) for option in options]
     best = min(range(len(options)), key=lambda n: promises[n].belief.end_variance(names, goal))
     return options[best], promises[best]
+
+
+def _watched(
+    predictor: Predictor, options: list[PlannedStance], group: tuple[int, ...], margins: Array
+) -> list[PlannedStance]:
+    """Name the observers that see each drive: a `group`, as indices, and others that see all of it.
+
+    Drives on which one robot hides the mover from one of the group are left out, where there are others.
+    """
+    watched: list[tuple[bool, PlannedStance]] = []
+    for option in options:
+        names, at = tuple(option.standing), np.array(list(option.standing.values()))
+        model, drive = predictor.model(names, option.mover), np.array(option.waypoints)
+        sees = np.asarray(predictor.sees(option).all(axis=1))
+        others = [n for n in np.flatnonzero(sees).tolist() if commonly_seen(model, at, drive, margins, (n,)).all()]
+        watching = tuple(name for n, name in enumerate(names) if n in group or n in others)
+        watched.append((bool(sees[list(group)].all()), replace(option, watching=watching)))
+    whole = [option for seen, option in watched if seen]
+    return whole or [option for _, option in watched]
+
+
+def _groups(names: Sequence[str], anchors: Sequence[str]) -> Iterator[list[tuple[int, ...]]]:
+    """Yield groups of observers, as indices, one of which has to see the mover; then others, if none of them can.
+
+    A group without members are some two.
+    """
+    others = tuple(n for n, name in enumerate(names) if name not in anchors)
+    yield [(names.index(anchor), *others) for anchor in anchors] or [others]
+    if not anchors:
+        yield [()]
+    elif len(others) > 1:
+        yield [(names.index(anchor), others[-1]) for anchor in anchors]

@@ -1,5 +1,6 @@
 """Path of the mover in a stance: waypoints by optimal design within the common view; `MoverPlanner`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 
@@ -38,7 +39,7 @@ class Cells:
     Attributes
     ----------
     places
-        Places (n, 2) [m] where two cameras see all its markers at any heading, and it is clear of robots and walls.
+        Places (n, 2) [m] where cameras see all its markers at any heading, and it is clear of robots and walls.
     seen
         Information of one image of each camera there.
     by_variables
@@ -51,6 +52,8 @@ class Cells:
         Returns which places are free of walls; None without a map.
     slips
         By which the mover keeps more, the further it has driven; None for no more.
+    watching
+        Observers, as indices, that see the mover at all places; () where some two do.
     """
 
     places: Array
@@ -60,6 +63,7 @@ class Cells:
     room: Array
     free: Free | None = None
     slips: Room | None = None
+    watching: tuple[int, ...] = ()
 
     def clear(self, points: Array) -> bool:
         """Return whether a drive through points (n, 2) is clear of the robots that stand and of walls."""
@@ -74,36 +78,52 @@ def cells(
     free: Free | None = None,
     leapt: ArrayLike = 0.0,
     slips: Room | None = None,
+    groups: Sequence[tuple[int, ...]] = ((),),
 ) -> Cells:
     """Find the places of the common view of observers at poses (r, 3), and what an image from each brings.
 
     Markers are at least `margins` (r, 2) [px] from the borders of the images: left and right, upper and lower.
-    The observers come from leaps of `leapt` () or (r,) [m], and they and the mover slip by `slips`.
+    The observers come from leaps of `leapt` () or (r,) [m], and they and the mover slip by `slips`. All of one of the
+    `groups` of observers see the mover at each place, that of the largest common view; of () some two.
     """
     slips = slips or Room()
     room = np.broadcast_to(slips.apart(leapt), len(standing))
-    places = places_in_common_view(model, standing, margins, room, free)
+    views = [places_in_common_view(model, standing, margins, room, free, group) for group in groups]
+    number = max(range(len(views)), key=lambda n: len(views[n]))
+    places, watching = views[number], groups[number]
     drive = np.concatenate([np.column_stack([places, np.full(len(places), yaw)]) for yaw in YAWS])
-    seen = model.see(standing, drive).mean_of(len(YAWS))
-    return Cells(places, seen, model.by_variables, standing[:, :2], room, free, slips)
+    counts = np.isin(np.arange(len(standing)), watching or np.arange(len(standing)))
+    seen = model.see(standing, drive, counts).mean_of(len(YAWS))
+    return Cells(places, seen, model.by_variables, standing[:, :2], room, free, slips, watching)
 
 
 def places_in_common_view(
-    model: StanceModel, standing: Array, margins: Array, room: Array, free: Free | None = None
+    model: StanceModel,
+    standing: Array,
+    margins: Array,
+    room: Array,
+    free: Free | None = None,
+    group: tuple[int, ...] = (),
 ) -> Array:
-    """Places (n, 2) [m] where two cameras see all markers of the mover at any heading, clear of robots and walls."""
+    """Places (n, 2) [m] where two cameras see all markers of the mover at any heading, clear of robots and walls.
+
+    Or the cameras of a `group` of observers, as indices.
+    """
     xy = _grid(model, standing)
     away = np.hypot(*np.moveaxis(xy[:, None] - standing[None, :, :2], -1, 0))
     xy = xy[(away > np.maximum(CLEARANCE, room)).all(axis=1)]
     if free is not None:
         xy = xy[free(xy, CLEARANCE / 2)]
-    return np.asarray(xy[commonly_seen(model, standing, xy, margins)])
+    return np.asarray(xy[commonly_seen(model, standing, xy, margins, group)])
 
 
-def commonly_seen(model: StanceModel, standing: Array, places: Array, margins: Array) -> NDArray[np.bool_]:
-    """Return at which places (n, 2) two cameras see all markers of the mover at any heading."""
+def commonly_seen(
+    model: StanceModel, standing: Array, places: Array, margins: Array, group: tuple[int, ...] = ()
+) -> NDArray[np.bool_]:
+    """Return at which places (n, 2) two cameras, or those of a `group`, see all markers of the mover at any heading."""
     seen = model.in_view(standing, _rim(model, places).reshape(-1, 3), margins).reshape(len(standing), len(places), 4)
-    return np.asarray(seen.all(axis=2).sum(axis=0) >= 2)
+    whole = np.asarray(seen.all(axis=2))
+    return np.asarray(whole[list(group)].all(axis=0) if group else whole.sum(axis=0) >= 2)
 
 
 def _rim(model: StanceModel, places: Array) -> Array:
@@ -263,7 +283,9 @@ def patrol(places: Array, heading: float = 0.0) -> tuple[Waypoint, ...]:
     return tuple((float(x), float(y)) for x, y in np.vstack([corners, places.mean(axis=0)]))
 
 
-def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free | None = None) -> tuple[Array, Array]:
+def evenly_seen(
+    model: StanceModel, standing: Array, margins: Array, free: Free | None = None, *, by_last: bool = False
+) -> tuple[Array, Array]:
     """Return what an image brings in many stances, spread evenly over the common view of each.
 
     Parameters
@@ -276,6 +298,8 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
         Distances (b, r, 2) of the markers from the borders of the images [px].
     free
         Returns which places are free of walls.
+    by_last
+        True where only places count that the last observer sees.
 
     Returns
     -------
@@ -296,7 +320,10 @@ def evenly_seen(model: StanceModel, standing: Array, margins: Array, free: Free 
         return np.zeros((len(standing), model.variables, model.variables)), np.zeros(len(standing), int)
     everywhere = np.broadcast_to(points.reshape(-1, 3), (len(standing), 4 * len(xy), 3))
     seen = model.in_view(standing, everywhere, margins).reshape(len(standing), -1, len(xy), 4)
-    common = seen.all(axis=3).sum(axis=1) >= 2
+    whole = np.asarray(seen.all(axis=3))
+    common = whole.sum(axis=1) >= 2
+    if by_last:
+        common &= whole[:, -1]
     away = np.hypot(*np.moveaxis(xy[None, :, None] - standing[:, None, :, :2], -1, 0)).min(axis=2)
     common &= away > CLEARANCE
     count = np.where(_bends(xy, common) >= BEND, common.sum(axis=1), 0)

@@ -32,6 +32,8 @@ class PlannedStance:
         Places x, y [m] that it drives through, there and back, until the stance ends.
     duration
         Duration of the drive [s].
+    watching
+        Observers that are to see the whole drive, and whose images alone count; () where all count that see it.
     """
 
     standing: Mapping[str, Planar]
@@ -39,6 +41,7 @@ class PlannedStance:
     mover: str
     waypoints: tuple[tuple[float, float], ...]
     duration: float
+    watching: tuple[str, ...] = ()
 
     @property
     def leapers(self) -> tuple[str, ...]:

@@ -178,7 +178,15 @@ class Predictor:
             velocity.append((drive.at(times + MOMENT) - at[-1]) / MOMENT)
         seconds = np.array([stance.duration for stance in stances]) / instants
         model = self.model(tuple(stances[0].standing), stances[0].mover)
-        return model.total(standing, np.array(at), self.fps * seconds, np.array(velocity), seconds)
+        watching = np.array([[not one.watching or name in one.watching for name in one.standing] for one in stances])
+        return model.total(standing, np.array(at), self.fps * seconds, np.array(velocity), seconds, watching)
+
+    def sees(self, stance: PlannedStance, instants: int = INSTANTS) -> NDArray[np.bool_]:
+        """Return which observers see all markers of the mover at instants of its drive, (r, instants)."""
+        drive = drive_through(there_and_back(stance.waypoints, stance.duration, self.speed), self.speed)
+        at = drive.at((np.arange(instants) + 0.5) * stance.duration / instants)
+        standing = np.array(list(stance.standing.values()))
+        return self.model(tuple(stance.standing), stance.mover).sees(standing, at)
 
     def of_plan(self, before: Belief, plan: Plan) -> list[Promise]:
         """Predict all stances of a plan in turn."""

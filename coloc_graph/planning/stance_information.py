@@ -156,6 +156,14 @@ class StanceModel:
         p = (points[..., None, :, :] - eyes[..., None, :]) @ R
         return self._visible(standing, points, eyes, p, margin)
 
+    def sees(self, standing: Array, drive: Array) -> NDArray[np.bool_]:
+        """Return which observers at poses (r, 3) see all markers of a mover at poses (n, 3), (r, n)."""
+        c, s = np.cos(drive[:, 2:]), np.sin(drive[:, 2:])
+        (mx, my, _), height = self.p_markers.T, self.p_markers[:, 2]
+        arm = np.stack([c * mx - s * my, s * mx + c * my], axis=-1)
+        points = np.concatenate([drive[:, None, :2] + arm, np.broadcast_to(height[:, None], (*arm.shape[:2], 1))], -1)
+        return np.asarray(self.in_view(standing, points.reshape(-1, 3)).reshape(len(standing), *arm.shape[:2]).all(-1))
+
     def _visible(
         self, standing: Array, points: Array, eyes: Array, p: Array, margin: float | Array
     ) -> NDArray[np.bool_]:
@@ -176,7 +184,7 @@ class StanceModel:
                 seen[..., n, :][which] = ~self._floor_map.blocked(from_eyes, np.broadcast_to(points, shape)[which])
         return np.asarray(seen & (np.linalg.norm(p, axis=-1) < MAX_RANGE))
 
-    def see(self, standing: Array, drive: Array) -> Seen:
+    def see(self, standing: Array, drive: Array, watching: ArrayLike = True) -> Seen:
         """Linearise the pixels of a stance at places of the mover's drive.
 
         Parameters
@@ -185,17 +193,26 @@ class StanceModel:
             Poses (..., r, 3) of the observers (x [m], y [m], yaw [rad]).
         drive
             Poses (..., n, 3) of the mover.
+        watching
+            Which observers' images count, (..., r).
         """
-        information = _without_mover(self._pixels(standing, drive)[0])
+        information = _without_mover(self._pixels(standing, drive, watching)[0])
         by_slope = information[..., :-SLOPE, -SLOPE:]
         lifted = self._slope_sigma**2 * self._images_alike * by_slope @ by_slope.mT
         return Seen(information[..., :-SLOPE, :-SLOPE], lifted)
 
     def total(
-        self, standing: Array, drive: Array, images: ArrayLike, velocity: Array, seconds: ArrayLike
+        self,
+        standing: Array,
+        drive: Array,
+        images: ArrayLike,
+        velocity: Array,
+        seconds: ArrayLike,
+        watching: ArrayLike = True,
     ) -> tuple[Array, Array]:
         """Sum up stances (...) whose drives (..., n, 3) stand for `images` (...) images at each instant.
 
+        Those of the observers count that are `watching` (..., r).
         Errors that all images share are unknowns: a bias of each marker's centre in each camera, and the offset of the
         cameras' clocks, by which the mover's `velocity` (..., n, 3) [m/s, rad/s] shifts what they see. The floor's
         slope is the same for all images near a place, however often the mover comes by; each instant stands for
@@ -206,7 +223,7 @@ class StanceModel:
         tuple
             Information (..., d, d) of the variables, and the number (...) of correspondences.
         """
-        J, points = self._pixels(standing, drive)
+        J, points = self._pixels(standing, drive, watching)
         r, rows = len(self.observers), J.shape[-2]
         own, shared = np.arange(rows).reshape(r, -1), []
         if self._bias.any():
@@ -235,7 +252,7 @@ class StanceModel:
         """Return the information (..., d, d) on a stance's variables of that on the cameras' tangents and markers."""
         return np.asarray(self.by_variables.T @ information @ self.by_variables)
 
-    def _pixels(self, standing: Array, drive: Array) -> tuple[Array, Array]:
+    def _pixels(self, standing: Array, drive: Array, watching: ArrayLike) -> tuple[Array, Array]:
         """Whitened Jacobians (..., n, 2 r m, 6 r + 7) of pixels by cameras, markers, slope and the mover's pose.
 
         With the number of correspondences (..., n). Rows are ordered by camera, marker, axis; those of markers that
@@ -253,6 +270,7 @@ class StanceModel:
         flat = points.reshape(*lead, n * m, 3)
         p = (flat[..., None, :, :] - eyes[..., None, :]) @ R
         seen = self._visible(standing, flat, eyes, p, MARGIN).reshape(*lead, r, n, m)
+        seen &= np.broadcast_to(watching, (*lead, r))[..., None, None]
         p = p.reshape(*lead, r, n, m, 3)
         z = np.maximum(p[..., 2], 0.05)
         project = np.zeros((*p.shape[:-1], 2, 3))

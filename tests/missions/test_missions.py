@@ -1,5 +1,6 @@
 """Whole missions on simulated time: shipped programs, all that is promised of them checked, faults from a seed."""
 
+import json
 import re
 from functools import cache
 
@@ -85,6 +86,21 @@ def test_promises_hold_when(what):
     assert any("No space left on device" in line for line in outcome.log) == ("disk" in what)
     nees, freedom = outcome.nees
     assert freedom == 6 and nees < 30  # chi2 exceeds this by chance in 4 of 100,000
+
+
+def test_four_robots_go_on_where_two_observers_share_the_view(tmp_path):
+    outcome = run_mission(Scenario(1, 3, formation="plan", robots=4), tmp_path)
+    assert outcome.state == "done" and not outcome.violations and outcome.attempts == outcome.entered == 3
+    nees, freedom = outcome.nees
+    assert freedom == 9 and nees < 40  # of those that stood and saw nothing, too; exceeded in 1 of 100,000
+    rows = [json.loads(line) for line in (tmp_path / "mission" / "mission.jsonl").read_text().splitlines()]
+    _, *later = (row for row in rows if row["what"] == "planned")
+    entered = {row["stance"]: row for row in rows if row["what"] == "entered"}
+    for plan in later:
+        leaper, anchors = plan["leap"][0], set(entered[plan["stance"]]["anchors"])
+        assert leaper in plan["watching"] and anchors == {"A", "B", "C"} - {leaper} and anchors & set(plan["watching"])
+    assert any(len(plan["watching"]) == 2 for plan in later)
+    assert len({plan["leap"][0] for plan in later}) == 2
 
 
 def without_follow(monkeypatch):

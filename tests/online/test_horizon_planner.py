@@ -3,14 +3,17 @@
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
 from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import between
+from coloc_graph.missions.mission import mission_team
+from coloc_graph.online.coordinator import Coordinator
 from coloc_graph.online.horizon_planner import HorizonPlanner
 from coloc_graph.online.leap_planner import Situation
-from coloc_graph.online.mission import in_world
+from coloc_graph.online.mission import MissionOptions, in_world
 from coloc_graph.online.record import Record
 from coloc_graph.online.robot_registry import RobotRegistry
 from coloc_graph.online.visibility import InView
@@ -21,7 +24,7 @@ from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.run import atomic_run, open_run
 from coloc_graph.simulation import Imperfections, build_world, record
 from coloc_graph.simulation.planned import planned
-from coloc_graph.simulation.simulated_team import field_team
+from coloc_graph.simulation.simulated_team import field_team, free_address
 
 GAIT = Gait(0.8, 0.6, 20.0)
 
@@ -116,9 +119,44 @@ def test_a_stance_that_came_makes_the_team_better_known_and_spends_its_time(miss
     assert mission.planner.noise_px == pytest.approx(0.2, rel=0.2)
 
 
-def test_three_observers_are_refused(mission):
-    with pytest.raises(InputError, match="plans are made for two and a mover"):
-        mission.make(("A", "B", "C"))
+def test_four_observers_are_refused(mission):
+    with pytest.raises(InputError, match="4 observers are to leap, and online plans are made for up to 3 and a mover"):
+        mission.make(("A", "B", "D", "E"))
+
+
+def test_the_mover_is_the_robot_of_which_the_others_promise_most_unless_one_is_named(tmp_path):
+    A, B, C = field_team().robots
+    team = msgspec.structs.replace(field_team(), robots=(A, B, msgspec.structs.replace(C, markers=None)))
+    for mover, chosen in ((None, "B"), ("B", "B")):
+        options = MissionOptions(formation="plan", mover=mover)
+        with Coordinator(team, tmp_path / f"{mover}", options, listen=free_address()) as coordinator:
+            assert coordinator._mission.mover == chosen and coordinator._mission.observers == ("A", "C")
+    with pytest.raises(InputError, match="C is to move and has no markers"):
+        Coordinator(team, tmp_path / "paper", MissionOptions(), listen=free_address())
+
+
+def test_of_three_observers_the_one_that_leapt_and_one_that_stayed_are_to_see_the_whole_drive():
+    team = mission_team(4)
+    poses, waypoints = in_world(team, "D", ((4.0, 0.0),))
+    planner = HorizonPlanner(team, "D", ("A", "B", "C"), Course(waypoints), pace=24.0, speed=0.4, gait=GAIT)
+    x, y, yaw = poses["C"]
+    with pytest.raises(InputError, match="A, B, C do not all see the same part of the floor where they stand"):
+        planner.plan(Situation(0, 0, {**poses, "C": (x, y, yaw + 1.5)}))
+    assert planner.plan(Situation(0, 0, poses)).watching == ("A", "B", "C")
+    watching = []
+    for index in range(1, 5):
+        plan = planner.plan(Situation(index, 0, poses))
+        leaper, target = plan.leap
+        poses |= {leaper: target, "D": (*plan.patrol[-1].tolist(), 0.0)}
+        view = InView(team, "D", {name: poses[name] for name in plan.watching})
+        assert leaper in plan.watching and len(plan.watching) > 1
+        assert all(view.covers(name, poses[name], plan.patrol) for name in plan.watching)
+        watching.append(len(plan.watching))
+    assert 2 in watching
+    # one that has moved is none that stayed
+    stayed = next(name for name in plan.watching if name != leaper)
+    moved = tuple(name for name in "ABC" if name != stayed)
+    assert stayed in planner.plan(Situation(4, 1, poses, moved)).watching
 
 
 def test_one_that_has_leapt_and_fails_leaps_on_and_the_anchor_stays(mission):

@@ -12,8 +12,9 @@ import pytest
 from coloc_graph.errors import InputError, RobotError, RunError
 from coloc_graph.geometry.lie import floor_pose
 from coloc_graph.geometry.se2 import compose, inverse
+from coloc_graph.missions.mission import mission_team
 from coloc_graph.online.encoder_log import Counted, EncoderLog, way_since
-from coloc_graph.online.estimation_worker import EstimationWorker
+from coloc_graph.online.estimation_worker import EstimationWorker, enter_stance
 from coloc_graph.online.formation import APART, BETWEEN, STAGGER, Formation
 from coloc_graph.online.mission_log import MissionLog
 from coloc_graph.online.mission_states import NEXT_STATES, MissionState, StateMachine, as_dot, as_mermaid
@@ -24,7 +25,11 @@ from coloc_graph.online.record import Record, continued
 from coloc_graph.online.visibility import InView, Precision
 from coloc_graph.pipeline.incremental import EnteredStance, IncrementalSolver
 from coloc_graph.planning.course import Course
-from coloc_graph.run import Detections, OdometrySample, Stance, open_run
+from coloc_graph.planning.plan import Plan, PlannedStance
+from coloc_graph.run import Detections, OdometrySample, Stance, atomic_run, open_run
+from coloc_graph.simulation import Imperfections, build_world
+from coloc_graph.simulation import record as record_world
+from coloc_graph.simulation.planned import planned
 from coloc_graph.simulation.rig import reference_team
 from coloc_graph.team.shared_view import View
 
@@ -453,3 +458,51 @@ def test_a_warning_is_in_the_log_once(tmp_path):
 def test_a_precision_is_told_where_a_pair_is_measured():
     assert str(Precision(40, 0.0123, 0.01)) == "40 points, 12.3 mm, 0.57 deg"
     assert str(Precision(4, math.inf, math.inf, "too few points")) == "4 points"
+
+
+def recorded(plan, team, folder):
+    world = build_world(planned(plan), team=team, fps=10.0, imperfections=Imperfections(noise_px=0.3))
+    with atomic_run(folder / "planned.mcap", team) as writer:
+        record_world(world, writer, "tracks")
+    return open_run(folder / "planned.mcap")
+
+
+def test_a_stance_is_void_where_the_observer_that_leapt_is_not_measured(tmp_path):
+    team, drive = mission_team(4), ((1.2, 0.3), (1.7, -0.3), (1.2, -0.2), (1.7, 0.3))
+    stayed = {"A": (0.0, 0.45, -0.2), "B": (0.0, -0.45, 0.2)}
+    plan = Plan((
+        PlannedStance({**stayed, "C": (-0.5, 0.0, 0.0)}, (), "D", drive, 6.0),
+        PlannedStance({**stayed, "C": (-0.5, 0.1, 2.0)}, ("A", "B"), "D", drive, 6.0),
+    ))  # fmt: skip
+    run, solver = recorded(plan, team, tmp_path), IncrementalSolver(team)
+    first, second = run.stances
+    everybody = ("A", "B", "C")
+    with pytest.raises(RobotError, match="stance 0 measures nothing of C: the observers never see"):
+        enter_stance(solver, run, replace(second, index=0, observers=everybody, anchors=()))
+    assert isinstance(enter_stance(solver, run, first), EnteredStance)
+    with pytest.raises(RobotError, match="stance 1 measures nothing of C: the observers never see"):
+        enter_stance(solver, run, replace(second, observers=everybody))
+    assert isinstance(enter_stance(solver, run, replace(second, observers=("A", "B"))), EnteredStance)
+
+
+def test_an_anchor_that_was_pushed_while_it_saw_nothing_is_found_once_it_sees_the_mover_again(tmp_path):
+    team = mission_team(4)
+    A, B, C, pushed = (0.0, 0.45, -0.2), (0.0, -0.45, 0.2), (-0.5, 0.0, 0.0), (-0.46, 0.03, 0.06)
+    ahead = {"A": (0.3, 0.45, -0.2), "B": (0.3, -0.45, 0.2)}
+    drive = ((1.2, 0.3), (1.7, -0.3), (1.2, -0.2), (1.7, 0.3))
+    plan = Plan((
+        PlannedStance({"A": A, "B": B, "C": C}, (), "D", drive, 6.0),
+        PlannedStance({"B": B, "C": C, "A": ahead["A"]}, ("B", "C"), "D", drive, 6.0),
+        PlannedStance({"A": ahead["A"], "C": C, "B": ahead["B"]}, ("A", "C"), "D", drive, 6.0),
+        PlannedStance({**ahead, "C": pushed}, ("A", "B"), "D", drive, 6.0),
+    ))  # fmt: skip
+    run, solver = recorded(plan, team, tmp_path), IncrementalSolver(team)
+    first, *unseen, last = run.stances
+    for stance in (first, *(replace(one, observers=("A", "B")) for one in unseen)):
+        entered = enter_stance(solver, run, stance)
+        assert isinstance(entered, EnteredStance) and "C" in entered.estimate.poses
+    (bump,) = enter_stance(solver, run, replace(last, anchors=("A", "B", "C")))
+    assert (bump.stay_put.robot, bump.stay_put.after) == ("C", last.index)
+    assert bump.T_before_after.rotation().yaw() == pytest.approx(0.06, abs=0.02)
+    # as an observer that moved it is where it stands
+    assert isinstance(enter_stance(solver, run, replace(last, anchors=("A", "B"))), EnteredStance)
