@@ -138,6 +138,8 @@ class Checks:
             since, last = robot.stands_since(), registry.record.last_odometry(name)
             if since is None or last is None or last.time < registry.utc(since):
                 continue  # the last metres of its way have not come yet
+            if name in coordinator._mission._missing:
+                continue  # it leapt and did not see the mover: that is being put right
             off = _apart(robot.tracker.pose(), self._in_world(poses[name]))
             more = MORE if name == self._mover else 1.0
             if off[0] > more * ASTRAY or off[1] > more * TURNED:
