@@ -20,6 +20,7 @@ from coloc_graph.pipeline.clocks import (
     clocks_of_run,
     contradicts,
     misfit,
+    suspicious,
     unknown_clocks,
 )
 from coloc_graph.pipeline.contents import Unused, repeated_in, require_applicable, unused_in, unused_ranges
@@ -178,7 +179,8 @@ def _in_batch(
     alone = [one for stance in run.stances for one in measure(stance, belief.used(run.team))]
     measured, clock_warnings = share_clock_offsets(alone, run.team.clock_sigma)
     if doubt_clocks and (found := clocks_of_run(run, measured)) is not None:
-        return _best_explained(run, options, measure, found, time.perf_counter() - started)
+        doubted = next(suspicious(measured), None) is not None
+        return _best_explained(run, options, measure, found, time.perf_counter() - started, doubted=doubted)
     if doubt_clocks and not run.team.clock_sigma and not _usable(measured):
         apart = clocks_of_images_apart(measured)
         if apart is not None:
@@ -204,7 +206,7 @@ def _in_batch(
     if doubt_clocks and contradicts(estimate):
         found = clocks_of_run(run, measured, any_pair=True)
         if found is not None:
-            return _best_explained(run, options, measure, found, made - started)
+            return _best_explained(run, options, measure, found, made - started, doubted=True)
     arms = dict[str, LeverArm]()
     if options.method != "chain":
         arms, estimate = find_lever_arms(estimate, BATCH[options.method])
@@ -243,20 +245,27 @@ def _usable(measured: Sequence[PairMeasurement]) -> int:
     return sum(one.relative_pose is not None for one in measured)
 
 
-def _best_explained(run: Run, options: SolveOptions, measure: "_Counted", clocks: RunClocks, before: float) -> _Solved:
-    """Solve with corrected stamps, and with those of the run unless the corrected ones fit; keep the better fit."""
+def _best_explained(
+    run: Run, options: SolveOptions, measure: "_Counted", clocks: RunClocks, before: float, *, doubted: bool
+) -> _Solved:
+    """Solve with corrected stamps, and with those of the run, too; keep the better fit.
+
+    Where the run's own were `doubted`, corrected ones that fit are kept without that. Elsewhere pairs of cameras agree
+    on what they saw, wheels that slip look like another clock, and a correction has to gain its price.
+    """
     right = clocks.corrected(run)
     try:
         corrected = _in_batch(right, options, measure.of(right), clocks, before)
     except EstimationError:
         return _in_batch(run, options, measure, before=before, doubt_clocks=False)
-    if not contradicts(corrected.estimate):
+    if doubted and not contradicts(corrected.estimate):
         return corrected
     try:
         plain = _in_batch(run, options, measure, before=before, doubt_clocks=False)
     except EstimationError:
         return corrected
-    return min(corrected, plain, key=lambda one: misfit(one.estimate))
+    price = 0.0 if doubted else clocks.price / max(corrected.estimate.dof, 1)
+    return corrected if misfit(corrected.estimate) + price <= misfit(plain.estimate) else plain
 
 
 def _or_by_clocks(run: Run, options: SolveOptions, measure: "_Counted", plain: _Solved) -> _Solved:

@@ -47,6 +47,12 @@ class RunClocks:
     sigma: float
     apart: float = 0.0
 
+    @property
+    def price(self) -> float:
+        """Chi2 that the corrections of cameras' clocks have to gain: `REJECTION_PRICE` for each."""
+        cameras = [clock.segments for (_, kind), clock in self.clocks.items() if kind == "camera"]
+        return REJECTION_PRICE * sum(bool(one.offset or one.drift) for segments in cameras for one in segments)
+
     def of_stamps(self, evidence: ClockEvidence) -> ClockEvidence:
         """Return evidence of the run with corrected stamps as evidence of the stamps as they are."""
         errors = (_error(self.clocks.get(sensor), evidence.time) for sensor in (evidence.first, evidence.second))
