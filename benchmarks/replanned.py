@@ -2,6 +2,7 @@
 
     python benchmarks/replanned.py --on L U --robots 4 --seeds 20     the share that arrives, and why others do not
     python benchmarks/replanned.py --on L --keep f.jsonl              a part, to which later ones add their seeds
+    python benchmarks/replanned.py --on narrow --scattered            from random poses from which two share a view
 
 A robot that leaps stops off by its slip: 1 cm, 1 cm a metre and 1 deg, or with --wheels by that of a Create; so does
 the mover, from one fix by cameras to the next: on its way to its drive, and on its drive. The way of each robot is
@@ -9,6 +10,7 @@ checked every 2 cm against the others' bodies and the walls' rectangles.
 """
 
 import argparse
+import contextlib
 import json
 import math
 import sys
@@ -27,8 +29,11 @@ from coloc_graph.planning.beam import Decision
 from coloc_graph.planning.belief import WHEELS, Belief
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.horizon import Horizon
+from coloc_graph.planning.leaps import TO_WALL
+from coloc_graph.planning.plan import PlannedStance
 from coloc_graph.planning.prediction import Predictor
-from coloc_graph.planning.route import route
+from coloc_graph.planning.room import TO_ROBOT
+from coloc_graph.planning.route import polyline_length, route
 from coloc_graph.planning.slip import HEADING_SIGMA, WheelErrors, stop_sigma
 from coloc_graph.simulation import reference_team
 from coloc_graph.simulation.floor_plans import FLOOR_PLANS, FloorPlan
@@ -36,6 +41,17 @@ from coloc_graph.simulation.rig import stated_team
 from coloc_graph.simulation.world import stream
 
 MAX_STANCES = 60
+STRETCH = 2.0  # length of the course over which scattered robots stand [m]
+BEFORE = 1.0  # least way from there to the goal [m]
+TURNED = 0.7  # heading of scattered robots against the course, at most [rad]
+#: A corridor of 1.3 m with an end, besides the floors for planned missions.
+FLOORS = {
+    **FLOOR_PLANS,
+    "narrow": FloorPlan(
+        ((-1.8, -0.95, 7.3, -0.65), (-1.8, 0.65, 7.3, 0.95), (-1.8, -0.95, -1.5, 0.95), (7.0, -0.95, 7.3, 0.95)),
+        ((5.4, 0.0),),
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -63,7 +79,9 @@ class Outcome:
 class Replanned:
     """A mission that is planned anew after each stance."""
 
-    def __init__(self, scene: Scene, seed: int, wheels: WheelErrors | None, floor_map: FloorMap | None) -> None:
+    def __init__(
+        self, scene: Scene, seed: int, wheels: WheelErrors | None, floor_map: FloorMap | None, *, scattered: bool = False
+    ) -> None:
         self._rng, self._wheels, self._walls = stream(seed, "formation"), wheels, scene.floor_plan
         self._predictor = Predictor(scene.team, scene.fps, wheels=wheels or WHEELS, floor_map=floor_map, anew=True)
         observers, mover = scene.observers, scene.mover
@@ -71,6 +89,8 @@ class Replanned:
         self._mover, self._observers, self._left = mover, observers, scene.capture
         poses = {**self._horizon.starts(), mover: MOVER_START}
         self._belief = Belief.start(scene.team, poses)
+        if scattered:
+            self._belief = self._scattered(scene)
         self.to_robot, self.to_wall, self.slowest, self.stances = math.inf, math.inf, 0.0, 0
 
     def run(self) -> Outcome:
@@ -91,6 +111,28 @@ class Replanned:
         promised = self._belief.position_sigma(self._observers)
         return Outcome(self.stances, left, promised, self.to_robot, self.to_wall, self.slowest, failed)
 
+    def _scattered(self, scene: Scene) -> Belief:
+        """Team in random poses along the course, clear of each other and of walls, in which two share a view."""
+        course, names, rng = scene.course, (*self._observers, self._mover), self._rng
+        assert self._walls is not None
+        while True:
+            begin = rng.uniform(0.0, course.length - BEFORE - STRETCH)
+            ways = begin + STRETCH * rng.random(len(names))
+            poses = {}
+            for name, way in zip(names, [*ways[:-1], ways.max() + 0.5], strict=True):
+                x, y, heading = course.at(float(way))
+                aside = rng.uniform(-0.8, 0.8)
+                yaw = heading + rng.uniform(-TURNED, TURNED) - (self._predictor.camera_yaw(name) if name != self._mover else 0.0)
+                poses[name] = x - aside * math.sin(heading), y + aside * math.cos(heading), float(yaw)
+            at = np.array([pose[:2] for pose in poses.values()])
+            apart = np.hypot(*np.moveaxis(at[:, None] - at, -1, 0)) + np.eye(len(at))
+            if apart.min() < TO_ROBOT or self._walls.distance(at).min() < TO_WALL:
+                continue
+            belief = Belief.start(scene.team, poses)
+            with contextlib.suppress(InputError):
+                self._horizon.first(belief)
+                return belief
+
     def _decide(self) -> Decision:
         if not self.stances:
             return self._horizon.first(self._belief)
@@ -100,10 +142,7 @@ class Replanned:
         """Drive as decided; robots stop off, and what is known grows by what the stance is expected to bring there."""
         stance, poses, free = decision.stance, self._belief.poses, self._predictor.free
         observers = [poses[name][:2] for name in self._observers]
-        to_start = [
-            poses[self._mover][:2],
-            *route(poses[self._mover][:2], stance.waypoints[0], observers, free, rooms=self._predictor.rooms),
-        ]
+        stance, to_start = self._approach(stance, observers)
         self._check(self._veered(to_start), observers)
         standing, belief = {}, self._belief
         for name, target in stance.standing.items():
@@ -122,6 +161,20 @@ class Replanned:
         poses = {**promise.belief.poses, **standing, self._mover: (x, y, 0.0)}
         self._belief = replace(promise.belief, poses=poses, leapt={})
         self._left -= stance.duration
+
+    def _approach(
+        self, stance: PlannedStance, observers: Sequence[Sequence[float]]
+    ) -> tuple[PlannedStance, Sequence[Sequence[float]]]:
+        """Return the stance driven from the end to which the mover has the shorter way, and that way."""
+        start, found = self._belief.poses[self._mover][:2], []
+        for drive in (stance.waypoints, stance.waypoints[::-1]):
+            with contextlib.suppress(InputError):
+                way = route(start, drive[0], observers, self._predictor.free, rooms=self._predictor.rooms)
+                found.append((polyline_length([start, *way]), drive, [start, *way]))
+        if not found:
+            raise InputError(f"{self._mover} finds no way to its drive")
+        _, drive, way = min(found, key=lambda each: each[0])
+        return replace(stance, waypoints=drive), way
 
     def _stop(self, start: Sequence[float], target: Sequence[float]) -> tuple[float, float, float]:
         x, y, yaw = target
@@ -158,12 +211,12 @@ class Replanned:
             self.to_wall = min(self.to_wall, float(self._walls.distance(at).min()))
 
 
-def outcome(seed: int, robots: int, floor: str, wheels: WheelErrors | None) -> Outcome:
+def outcome(seed: int, robots: int, floor: str, wheels: WheelErrors | None, *, scattered: bool = False) -> Outcome:
     """Outcome of a seed."""
-    floor_plan: FloorPlan | None = FLOOR_PLANS.get(floor)
+    floor_plan: FloorPlan | None = FLOORS.get(floor)
     names = tuple("ABCDEF"[:robots])
     scene = Scene.of(stated_team(reference_team(names=names), WRONG), 10.0, 5.0, 7.2, floor_plan)
-    return Replanned(scene, seed, wheels, floor_plan and floor_plan.floor_map()).run()
+    return Replanned(scene, seed, wheels, floor_plan and floor_plan.floor_map(), scattered=scattered).run()
 
 
 def main() -> int:
@@ -171,9 +224,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--on", nargs="*", choices=("straight", *FLOOR_PLANS), default=["L", "U"])
+    parser.add_argument("--on", nargs="*", choices=("straight", *FLOORS), default=["L", "U"])
     parser.add_argument("--robots", type=int, choices=range(3, 7), default=4, help="of the team; the last drives")
     parser.add_argument("--wheels", action="store_true", help="slip of a Create's wheels")
+    parser.add_argument("--scattered", action="store_true", help="from random poses; not on the straight")
     parser.add_argument("--keep", type=Path, metavar="FILE", help="outcomes of earlier parts, to which this one adds")
     args = parser.parse_args()
     kept = {}
@@ -184,7 +238,9 @@ def main() -> int:
     for floor in args.on:
         found = []
         for seed in range(args.first, args.first + args.seeds):
-            one = kept.get((floor, seed)) or outcome(seed, args.robots, floor, CREATE if args.wheels else None)
+            one = kept.get((floor, seed)) or outcome(
+                seed, args.robots, floor, CREATE if args.wheels else None, scattered=args.scattered
+            )
             if args.keep and (floor, seed) not in kept:
                 with args.keep.open("a", encoding="utf-8") as file:
                     file.write(json.dumps({"on": floor, "seed": seed, **asdict(one)}) + "\n")

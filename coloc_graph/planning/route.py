@@ -131,7 +131,9 @@ class _Roads:
         total = len(self._nodes)
         for extra, point in enumerate((start, *goals)):  # which reach the places that they see
             near = np.argsort(np.hypot(*(self._nodes - point).T))[:NEIGHBOURS]
-            seen = [n for n in near.tolist() if clear_way([point, self._nodes[n]], others, free, to_robot=to_robot)]
+            # a start may be too near to others already, a goal may not
+            ways = ((n, [point, self._nodes[n]] if extra == 0 else [self._nodes[n], point]) for n in near.tolist())
+            seen = [n for n, way in ways if clear_way(way, others, free, to_robot=to_robot)]
             ends.append(np.array([[total + extra] * len(seen), seen], int).reshape(2, -1))
             lengths.append(np.hypot(*(self._nodes[seen] - point).T) if seen else np.zeros(0))
         (i, j), w = np.hstack(ends), np.concatenate(lengths)
