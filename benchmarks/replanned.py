@@ -24,6 +24,7 @@ from planning import RADIUS, WRONG, dense
 from planning_baselines import MOVER_START, Scene
 
 from coloc_graph.errors import InputError
+from coloc_graph.geometry.se2 import Planar
 from coloc_graph.online.horizon_planner import CREATE
 from coloc_graph.planning.beam import Decision
 from coloc_graph.planning.belief import WHEELS, Belief
@@ -80,7 +81,13 @@ class Replanned:
     """A mission that is planned anew after each stance."""
 
     def __init__(
-        self, scene: Scene, seed: int, wheels: WheelErrors | None, floor_map: FloorMap | None, *, scattered: bool = False
+        self,
+        scene: Scene,
+        seed: int,
+        wheels: WheelErrors | None,
+        floor_map: FloorMap | None,
+        *,
+        scattered: bool = False,
     ) -> None:
         self._rng, self._wheels, self._walls = stream(seed, "formation"), wheels, scene.floor_plan
         self._predictor = Predictor(scene.team, scene.fps, wheels=wheels or WHEELS, floor_map=floor_map, anew=True)
@@ -98,9 +105,9 @@ class Replanned:
         failed, stood = "", []
         try:
             while self.stances < MAX_STANCES and not self._horizon.arrived(self._belief.poses):
-                self._horizon.require_progress(stood)
+                idle = self._horizon.require_progress(stood)
                 began = time.process_time()
-                decision = self._decide()
+                decision = self._decide(idle)
                 self.slowest = max(self.slowest, time.process_time() - began)
                 self._follow(decision)
                 stood.append({name: self._belief.poses[name] for name in self._observers})
@@ -122,7 +129,11 @@ class Replanned:
             for name, way in zip(names, [*ways[:-1], ways.max() + 0.5], strict=True):
                 x, y, heading = course.at(float(way))
                 aside = rng.uniform(-0.8, 0.8)
-                yaw = heading + rng.uniform(-TURNED, TURNED) - (self._predictor.camera_yaw(name) if name != self._mover else 0.0)
+                yaw = (
+                    heading
+                    + rng.uniform(-TURNED, TURNED)
+                    - (self._predictor.camera_yaw(name) if name != self._mover else 0.0)
+                )
                 poses[name] = x - aside * math.sin(heading), y + aside * math.cos(heading), float(yaw)
             at = np.array([pose[:2] for pose in poses.values()])
             apart = np.hypot(*np.moveaxis(at[:, None] - at, -1, 0)) + np.eye(len(at))
@@ -133,10 +144,10 @@ class Replanned:
                 self._horizon.first(belief)
                 return belief
 
-    def _decide(self) -> Decision:
+    def _decide(self, idle: Sequence[Planar]) -> Decision:
         if not self.stances:
             return self._horizon.first(self._belief)
-        return self._horizon.next(self._belief, max(self._left, 0.0))
+        return self._horizon.next(self._belief, max(self._left, 0.0), idle)
 
     def _follow(self, decision: Decision) -> None:
         """Drive as decided; robots stop off, and what is known grows by what the stance is expected to bring there."""

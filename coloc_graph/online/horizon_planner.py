@@ -122,7 +122,7 @@ class HorizonPlanner:
             If no observer can leap, or the observers see too little of the floor together.
         """
         index, attempt, belief = situation.index, situation.attempt, self._believed(situation.poses)
-        self._horizon.require_progress(self._stood)
+        idle = self._horizon.require_progress(self._stood)
         before = self._decision if self._plan is not None and self._plan.index == index else None
         if before is not None and attempt < RETRIES and self._may_leap(before, situation):
             decision = before
@@ -136,7 +136,7 @@ class HorizonPlanner:
         else:
             failed = () if before is None or not before.ahead else (before.ahead[0][1],)
             leaper = self._leaper if self._leaper in situation.moved else next(iter(situation.moved), None)
-            decision = self._horizon.next(belief, max(self._left, 0.0), failed, leaper, situation.moved)
+            decision = self._horizon.next(belief, max(self._left, 0.0), (*failed, *idle), leaper, situation.moved)
         self._decision = decision
         leap = decision.ahead[0][:2] if decision.ahead else None
         self._leaper = self._leaper if leap is None else leap[0]

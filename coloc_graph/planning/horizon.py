@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain, combinations
 from typing import Any, Literal
 
@@ -23,6 +24,7 @@ from coloc_graph.planning.mission import Mission, best_stance, stance_there
 from coloc_graph.planning.mover_path import evenly_seen
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor, Promise
+from coloc_graph.planning.progress import ARRIVED, STRAGGLE, leading_on, require_progress
 from coloc_graph.planning.refinement import Refinement
 from coloc_graph.planning.rollout import Rollout
 from coloc_graph.planning.ways_out import NARROW, in_the_way, require_way, stuck
@@ -33,11 +35,8 @@ DEPTH = 2  # stances that are looked ahead
 FINALISTS = 3  # first leaps whose stances are planned to be compared, with the gait's own
 PREFERRED = 1.03  # the gait's own leap is left for one that promises a variance this much smaller
 ROW = 0.6  # distance between rows of observers at the beginning [m]
-STRAGGLE = 2.2  # an observer further behind the foremost one than this leaps next [m]
 MIN_CELLS = 3  # cells of the common view without which a stance is not planned
 MAX_STANCES = 2000
-STALLED = 6  # stances without progress after which a mission is given up
-ARRIVED = 0.1  # the goal is reached within this distance along the course [m]
 
 #: What decides between stances: the variance at the goal with the cost to go, the information gained, the size of the
 #: common view, or nothing.
@@ -229,8 +228,12 @@ class Horizon:
         """
         problem: InputError | None = None
         given = belief, seconds, avoid, leaper
-        plans = (nodes for _ in self.predictor.ever_nearer() for nodes in self._ahead(*given))
-        for nodes in chain(plans, () if self._roomy else self._otherwise(*given)):
+        plans: Iterator[list[Node]] = (nodes for _ in self.predictor.ever_nearer() for nodes in self._ahead(*given))
+        plans = chain(plans, () if self._roomy else self._otherwise(*given))
+        if self.predictor.anew:  # those that only change places come last
+            expand = partial(self._expand, avoid=(), in_lane=False)
+            plans = chain(leading_on(plans, belief, self.course, self.arrived, expand), self._ahead(*given))
+        for nodes in plans:
             if self.objective != "goal":
                 stance, promise = self._planned(belief, nodes[0].choices[0], moved)
                 return Decision(stance, promise, nodes[0].choices)
@@ -307,17 +310,17 @@ class Horizon:
         after = [one for step in steps for one in self._expand(step, (), in_lane=False)]
         yield from filter(None, (sorted(after, key=lambda one: one.score), grown(leaps_beside)))
 
-    def require_progress(self, before: Sequence[Mapping[str, Planar]]) -> None:
+    def require_progress(self, before: Sequence[Mapping[str, Planar]]) -> tuple[Planar, ...]:
         """Require that of the stances before, each with where the observers stood, one of the last brought them on.
+
+        Return where they stood in the last ones if these did not: to be avoided in the next.
 
         Raises
         ------
         InputError
             If robots only change their places: none can pass another.
         """
-        left = [self.remaining(standing) for standing in before]
-        if len(left) > STALLED and min(left[-STALLED:]) > min(left[:-STALLED]) - ARRIVED:
-            raise stuck(self._stuck_at(before[-1]))
+        return require_progress(before, [self.remaining(standing) for standing in before], self.course.length)
 
     def _stuck_at(self, standing: Mapping[str, Planar]) -> float:
         """Return the way along the course at which a team is [m]."""
@@ -381,8 +384,7 @@ class Horizon:
     @property
     def goal(self) -> tuple[float, float]:
         """The last point of the course, x, y [m]."""
-        x, y, _ = self.course.at(self.course.length)
-        return x, y
+        return self.course.at(self.course.length)[:2]
 
     def foremost_first(self, poses: Mapping[str, Planar], leaper: str) -> tuple[str, ...]:
         """Return the observers but the one that leaps, the foremost first."""

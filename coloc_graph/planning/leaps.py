@@ -27,6 +27,7 @@ AHEAD = 0.8  # a robot may look along the course this far ahead of where it stan
 LEFT_BEHIND = 1.5  # a robot further behind the foremost one comes up to it where it cannot leap ahead of it [m]
 COME_UP = 0.3  # by which a robot comes up at least to one in front of it [m]
 TURNS = (0.0, 0.35, 0.7, 1.0)  # share of a corner by which a target is turned
+LOOKS_BACK = 0.35  # a robot looks along an earlier part of the course from this angle on, beside its toe-in [rad]
 BEND = 0.1  # turn of the course that is a corner [rad]
 MAX_LEAP = 1.5  # advance of a target [m]
 TO_WALL = 0.25  # least distance of a robot's middle from walls [m]
@@ -126,6 +127,10 @@ def possible_leaps(
         lane = 1.0 if (ahead[1] - y) * np.cos(heading) - (ahead[0] - x) * np.sin(heading) < 0 else -1.0
     before = course.at(front)[2]
     turning = any(abs(float(wrap(course.at(front + ahead)[2] - before))) > BEND for ahead in (AHEAD, 2 * AHEAD))
+    foremost = belief.poses[anchors[0]][2] + predictor.camera_yaw(anchors[0])
+    looks_back = abs(float(wrap(foremost - before))) > 1.5 * np.radians(gait.toe_in_deg) + LOOKS_BACK
+    if looks_back and predictor.anew:  # it has passed a corner, and looks as before that: turn on from there
+        before, turning = foremost, True
     toe_ins = TOE_INS if len(observers) < MANY else TOE_INS[:2]
     advances: tuple[float, ...] = ADVANCES
     if come_up:

@@ -20,6 +20,8 @@ STEP = 0.05  # distance between places of a way that are checked [m]
 GRID = 0.15  # distance between places through which a way round is sought [m]
 NEIGHBOURS = 6  # places of the grid to which a start or goal is joined
 ROUND = 2.5  # a way round goes this far beyond all robots [m]
+SHORT = 0.5  # a straight way shorter than this may come nearer to robots, where there is no other [m]
+MIN_TO_ROBOT = 0.37  # up to this distance [m]
 SLACK = 0.01  # a robot that stands nearer to another than it may does not come nearer than this less [m]
 
 
@@ -64,7 +66,7 @@ def route(
 ) -> list[tuple[float, float]]:
     """Find a short way from start to goal (2,), clear of robots at `others` (m, 2) and of walls; without its start.
 
-    It keeps the first of `rooms` that leaves a way, and `to_robot` [m] alone if none does.
+    It keeps the first of `rooms` that leaves a way, `to_robot` [m] alone if none does; steps aside may keep less.
 
     Raises
     ------
@@ -83,13 +85,14 @@ def route(
     if clear_way([start, goal], others, free, to_robot=to_robot):
         return [_pair(goal)]
     roads = _Roads(start, goal[None], others, free, to_robot)
-    way = roads.way(0)
-    if way is None:
-        raise InputError(
-            f"there is no way for a robot from {start[0]:.1f}, {start[1]:.1f} to {goal[0]:.1f}, {goal[1]:.1f} that is "
-            "clear of robots and walls: give them more room"
-        )
-    return _pulled([start, *way, goal], others, free, to_robot)
+    if (way := roads.way(0)) is not None:
+        return _pulled([start, *way, goal], others, free, to_robot)
+    if np.hypot(*(goal - start)) < SHORT and clear_way([start, goal], others, free, to_robot=MIN_TO_ROBOT):
+        return [_pair(goal)]
+    raise InputError(
+        f"there is no way for a robot from {start[0]:.1f}, {start[1]:.1f} to {goal[0]:.1f}, {goal[1]:.1f} that is "
+        "clear of robots and walls: give them more room"
+    )
 
 
 def reachable(

@@ -9,9 +9,10 @@ from coloc_graph.planning.belief import Belief
 from coloc_graph.planning.clearance import conflicts
 from coloc_graph.planning.course import Course
 from coloc_graph.planning.formation import Gait
-from coloc_graph.planning.horizon import STRAGGLE, Horizon
+from coloc_graph.planning.horizon import Horizon
 from coloc_graph.planning.plan import Plan, PlannedStance
 from coloc_graph.planning.prediction import Predictor
+from coloc_graph.planning.progress import STRAGGLE
 from coloc_graph.planning.roles import best_roles, roles_of
 from coloc_graph.simulation import Imperfections, reference_team
 from coloc_graph.simulation.rig import stated_team

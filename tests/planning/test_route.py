@@ -9,7 +9,7 @@ from coloc_graph.errors import InputError
 from coloc_graph.geometry.se2 import segment_distance
 from coloc_graph.planning.floor_map import FloorMap
 from coloc_graph.planning.room import TO_ROBOT, TO_WALL
-from coloc_graph.planning.route import clear_way, polyline_length, route
+from coloc_graph.planning.route import clear_way, polyline_length, reachable, route
 
 CELL = 0.05
 WALL = (2.0, -2.0), (2.0, 1.0)  # a wall from the lower end of the map
@@ -52,3 +52,18 @@ def test_a_robot_leaves_a_place_that_is_too_near_but_passes_through_nothing():
     assert not clear_way([(1.8, 0.0), (3.0, 0.0)], [], free)
     assert clear_way([(0.0, 0.0), (-1.0, 0.0)], [(0.3, 0.0)])
     assert not clear_way([(0.0, 0.0), (1.0, 0.0)], [(0.3, 0.0)])
+
+
+def test_no_way_leads_to_a_place_in_another_robot():
+    # where a way begins a robot may be near to others, where it ends not
+    beside = [(3.0, 0.15)]
+    assert not reachable((0, 0), [(3, 0)], beside).any()
+    with pytest.raises(InputError, match=r"no way for a robot from 0.0, 0.0 to 3.0, 0.0"):
+        route((0, 0), (3, 0), beside)
+    assert len(route((3, 0), (0, 0), beside)) >= 1
+
+
+def test_a_step_aside_may_come_nearer_to_robots_than_a_leap():
+    assert route((0, 0), (0.3, 0), [(0.3, 0.4)]) == [(0.3, 0.0)]
+    with pytest.raises(InputError, match="no way"):
+        route((0, 0), (3, 0), [(3.0, 0.4)])
