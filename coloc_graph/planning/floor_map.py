@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -48,11 +49,29 @@ class FloorMap:
         return cls(np.asarray(distance, float) * resolution, resolution, origin)
 
     def clear(self, places: Array, distance: ArrayLike) -> NDArray[np.bool_]:
-        """Return which places (..., 2) [m] are further than a distance (...) [m] from all that is not free."""
-        return np.asarray(self._distance(np.asarray(places, float)) > np.asarray(distance))
+        """Return which places (..., 2) [m] are further than a distance (...) [m] from all that is not free.
+
+        Cells count with their corners, so that no place is taken to be further from them than it is.
+        """
+        at = (np.asarray(places, float) - np.array(self.origin)) / self.resolution + 0.5  # in cells of the padded map
+        with np.errstate(invalid="ignore"):
+            inside = ((at >= 0.5) & (at < np.array(self.distance.shape[::-1]) + 0.5)).all(-1)
+        at = np.where(np.asarray(inside)[..., None], at, 0.0)
+        cell = at.astype(int)
+        column, row = np.moveaxis(cell, -1, 0)
+        (x, y), padded = np.moveaxis(at - cell, -1, 0), self._padded
+        low = (1 - x) * padded[row, column] + x * padded[row, column + 1]
+        high = (1 - x) * padded[row + 1, column] + x * padded[row + 1, column + 1]
+        away = (1 - y) * low + y * high - math.sqrt(0.5) * self.resolution
+        return np.asarray(inside & (away > np.asarray(distance)))
+
+    @cached_property
+    def _padded(self) -> Array:
+        """Distances (rows + 2, columns + 2) with those of the cells around the map, which are not free [m]."""
+        return np.pad(self.distance, 1)
 
     def _distance(self, places: Array) -> Array:
-        """Distance (...) from places (..., 2) to the nearest wall [m], 0 in it and beyond the map."""
+        """Distance (...) from the cells of places (..., 2) to the nearest wall's [m], 0 in it and beyond the map."""
         cell = np.floor((places - np.array(self.origin)) / self.resolution)
         with np.errstate(invalid="ignore"):
             inside = ((cell >= 0) & (cell < np.array(self.distance.shape[::-1]))).all(-1)

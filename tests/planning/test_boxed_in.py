@@ -26,9 +26,9 @@ from coloc_graph.simulation.rig import stated_team
 WRONG = Imperfections(mount_sigma_deg=1.0, height_sigma=0.005, span_sigma=1e-4, floor_sigma_deg=0.1)
 TEAM = stated_team(reference_team(names=("A", "B", "C", "D")), WRONG)
 RADIUS = 0.17  # of a Create [m]
-# a corridor of 1.3 m, with an end
+# a corridor of 1.4 m, with an end
 NARROW = FloorPlan(
-    ((-1.8, -0.95, 4.3, -0.65), (-1.8, 0.65, 4.3, 0.95), (-1.8, -0.95, -1.5, 0.95), (4.0, -0.95, 4.3, 0.95)),
+    ((-1.8, -1.0, 4.3, -0.7), (-1.8, 0.7, 4.3, 1.0), (-1.8, -1.0, -1.5, 1.0), (4.0, -1.0, 4.3, 1.0)),
     ((3.4, 0.0),),
 )
 # C and B stand side by side in front of A, before the end
