@@ -35,7 +35,7 @@ from monte_carlo import over_seeds, solved, truth_of
 from planning_baselines import MOUNT_SIGMA_DEG, NAMES, Scene, missions, mounted
 from scipy.stats import beta
 
-from coloc_graph.errors import ColocError
+from coloc_graph.errors import ColocError, InputError
 from coloc_graph.evaluation import align
 from coloc_graph.pipeline.batch import Solution, SolveOptions, solve
 from coloc_graph.planning.drive import SETTLE
@@ -199,46 +199,46 @@ def safety(mission: Mission, draws: int, floor_plan: FloorPlan | None) -> str:
     not the map of the planner.
     """
     rng = np.random.default_rng(0)
+    drawn = [_least(mission.plan, rng, floor_plan) for _ in range(draws)]
+    to_robot, to_wall = np.min([one[:2] for one in drawn], axis=0)
+    collisions = sum(one[0] < 2 * RADIUS or one[1] < RADIUS for one in drawn)
+    stopped = sum(one[2] for one in drawn)
+    return (
+        f"{collisions} of {draws} missions with a collision, {stopped} that could not go on; least distance of two "
+        f"middles {to_robot:.3f} m, of a middle from a wall {to_wall:.3f} m (robots have a radius of {RADIUS} m)"
+    )
+
+
+def _least(plan: Plan, rng: np.random.Generator, floor_plan: FloorPlan | None) -> tuple[float, float, bool]:
+    """Least distances of two middles and of one from walls in one drawn mission [m]; True if one finds no way."""
     free = None if floor_plan is None else floor_plan.floor_map().clear
-    to_robot, to_wall, collisions = math.inf, math.inf, 0
-    for _ in range(draws):
-        stood: dict[str, np.ndarray] = {}
-        touched, last = False, mission.plan.stances[0].waypoints[0]
-        for stance in mission.plan.stances:
-            places = {}
-            for name, pose in stance.standing.items():
-                if name in stance.anchors:
-                    places[name] = stood[name]
-                    continue
-                leapt = math.dist(pose[:2], stood[name]) if name in stood else 0.0
-                places[name] = np.array(pose[:2]) + rng.standard_normal(2) * float(stop_sigma(leapt))
-            ways = {}
+    stood: dict[str, np.ndarray] = {}
+    to_robot, to_wall, last = math.inf, math.inf, plan.stances[0].waypoints[0]
+    for stance in plan.stances:
+        places = {}
+        for name, pose in stance.standing.items():
+            if name in stance.anchors:
+                places[name] = stood[name]
+                continue
+            leapt = math.dist(pose[:2], stood[name]) if name in stood else 0.0
+            places[name] = np.array(pose[:2]) + rng.standard_normal(2) * float(stop_sigma(leapt))
+        ways = [(dense(stance.waypoints), list(places.values()))]
+        try:
             for name, place in places.items():
                 others = [one for other, one in places.items() if other != name]
                 start = stood.get(name, place)
-                ways[name] = dense([start, *route(start, place, others, free)] if name in stood else [place, place])
-            ways[stance.mover] = dense(stance.waypoints)
+                leap = dense([start, *route(start, place, others, free)] if name in stood else [place, place])
+                ways.append((leap, others))
             if stood:  # it drives to there while the observers still stand where they did
                 before = list(stood.values())
-                approach = dense([last, *route(last, stance.waypoints[0], before, free)])
-                near = min(float(np.hypot(*(approach - other).T).min()) for other in before)
-                to_robot, touched = min(to_robot, near), touched or near < 2 * RADIUS
-                if floor_plan is not None:
-                    walled = float(floor_plan.distance(approach).min())
-                    to_wall, touched = min(to_wall, walled), touched or walled < RADIUS
-            last = stance.waypoints[-1]
-            for name, way in ways.items():
-                others = [place for other, place in places.items() if other != name]
-                near = min(float(np.hypot(*(way - other).T).min()) for other in others)
-                walled = math.inf if floor_plan is None else float(floor_plan.distance(way).min())
-                to_robot, to_wall = min(to_robot, near), min(to_wall, walled)
-                touched |= near < 2 * RADIUS or walled < RADIUS
-            stood = places
-        collisions += touched
-    return (
-        f"{collisions} of {draws} missions with a collision; least distance of two middles {to_robot:.3f} m, "
-        f"of a middle from a wall {to_wall:.3f} m (robots have a radius of {RADIUS} m)"
-    )
+                ways.append((dense([last, *route(last, stance.waypoints[0], before, free)]), before))
+        except InputError:
+            return to_robot, to_wall, True
+        for way, others in ways:
+            to_robot = min(to_robot, *(float(np.hypot(*(way - other).T).min()) for other in others))
+            to_wall = min(to_wall, math.inf if floor_plan is None else float(floor_plan.distance(way).min()))
+        last, stood = stance.waypoints[-1], places
+    return to_robot, to_wall, False
 
 
 def dense(points: Sequence[Sequence[float]]) -> np.ndarray:
