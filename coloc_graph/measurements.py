@@ -147,6 +147,9 @@ class MarkerSpan:
         Square root of the covariance of errors that all rays to one marker share.
     R_camera_view : (3, 3) float or None
         Rotation of the frame of the rays; None: the camera's own.
+    uneven : (n, 2, 2) float or None
+        Displacement of both rays of an instant by one standard deviation of the floor's slope, which tilts the mover;
+        as if slopes of instants were independent of each other. None of a level floor.
     """
 
     mover: str
@@ -155,6 +158,7 @@ class MarkerSpan:
     by_h: Array
     shared: Array
     R_camera_view: Array | None = None
+    uneven: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -136,13 +136,16 @@ class SpanModel:
             np.concatenate([getattr(one, name) for one in spans]) for name in ("x_i", "covariance", "by_h")
         )
         shared = _widened([span.shared for span in spans])
+        uneven = np.concatenate([np.zeros_like(one.x_i) if one.uneven is None else one.uneven for one in spans])
         of = np.repeat(np.arange(len(spans)), [len(span.x_i) for span in spans])
         sine = ((x_i * N[of, None, :2]).sum(-1) + N[of, None, 2]) / np.sqrt(1 + (x_i**2).sum(-1))
         which = (sine > np.maximum(MIN_SINE, CLEARANCE_SIGMAS * normal_sigma)[of, None]).all(axis=1)
         which &= (np.bincount(of[which], minlength=len(spans)) >= MIN_INSTANTS)[of]
         if not which.any():
             return tuple(out)
-        x_i, covariance, by_h, shared, of = x_i[which], covariance[which], by_h[which], shared[which], of[which]
+        x_i, covariance, by_h, shared, uneven, of = (
+            each[which] for each in (x_i, covariance, by_h, shared, uneven, of)
+        )
         # the instants of all spans, one after the other; `apart` gives them by span, padded with zeros
         some, count = np.unique(of, return_counts=True)
         own = np.arange(count.max()) < count[:, None]
@@ -164,7 +167,8 @@ class SpanModel:
             off = np.where(known, (found - length) / (by_x * by_noise).sum(axis=(1, 2)), 0.0)
             _, by_n, X, u = _at_instants(x_i - by_noise * off[:, None, None], planes)
             by_x = _by_rays(X, u, planes)
-        sigma = np.sqrt((by_x * (covariance @ by_x[..., None])[..., 0]).sum(axis=(1, 2)))
+        variance = (by_x * (covariance @ by_x[..., None])[..., 0]).sum(axis=(1, 2))
+        sigma = np.sqrt(variance + (by_x * uneven).sum(axis=(1, 2)) ** 2)
         bases = np.linalg.svd(N[some, None])[2]
         bases[:, 0] = N[some]
         J = apart(by_n / sigma[:, None]) @ bases[:, [1, 2, 0]].mT

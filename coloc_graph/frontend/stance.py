@@ -379,7 +379,7 @@ def _measured(
     if seen.team.floor is not None and seen.plane.normal_from_mount:
         require_on_floor(pose, seen.team.floor)
     marked = tuple(name for name in seen.stance.movers if seen.team[name].markers is not None)
-    pose = replace(pose, homography=measurement, plane=seen.plane, movers=marked, spans=_spans(seen, found, fit))
+    pose = replace(pose, homography=measurement, plane=seen.plane, movers=marked, spans=_spans(seen, found, fit, tilt))
     return PairMeasurement(
         measurement, pose, found, tracks=(seen.tracks_i, seen.tracks_j), fit=fit, cameras=seen.cameras
     )
@@ -395,7 +395,7 @@ def _floor_tilt(seen: _Seen, fit: HomographyFit, found: Correspondences) -> Floo
     return FloorTilt.of(fit, found, planes, seen.cameras, math.radians(floor.tilt_sigma_deg))
 
 
-def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[MarkerSpan, ...]:
+def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit, tilt: FloorTilt | None) -> tuple[MarkerSpan, ...]:
     """Marker spans of the movers whose two markers are identified; () if the plane is stated."""
     if not (seen.plane.normal_from_mount and seen.plane.d_from_mount):
         return ()
@@ -417,7 +417,7 @@ def _spans(seen: _Seen, found: Correspondences, fit: HomographyFit) -> tuple[Mar
             couple = longest_pair([seen.tracks_i[n] for n in own], robot.camera, planes, markers.span)
             if couple is not None:
                 couples[mover] = own[couple[0]], own[couple[1]]
-    return tuple(span_in_view(one, view) for one in marker_spans(couples, found, fit, bias)) if couples else ()
+    return tuple(span_in_view(one, view) for one in marker_spans(couples, found, fit, bias, tilt)) if couples else ()
 
 
 def _plane_by_span(plane: Plane, tracks: list[Track], camera: Camera, markers: Markers | None) -> Plane:

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as new
 
+from coloc_graph.backend.span_factor import SpanModel, Spans
 from coloc_graph.frontend.homography.fit import fit_homography, persisting
 from coloc_graph.frontend.homography.floor_tilt import FloorTilt
+from coloc_graph.frontend.homography.marker_span import marker_spans
 from coloc_graph.frontend.homography.plane import plane_from_mount
 from coloc_graph.frontend.homography.refinement import PointPairs
 from coloc_graph.frontend.pairing.correspondence import Correspondences
@@ -69,6 +71,7 @@ def error(fit):
     return np.linalg.lstsq(np.reshape(SL3_BASIS, (8, 9)).T, (off - np.eye(3)).ravel(), rcond=None)[0]
 
 
+AWAY = ((1.2, 0.0), (2.3, -0.1))
 SHORT, ROUND = ((1.2, 0.2), (1.6, 0.0)), ((1.2, 0.4), (1.7, 0.3), (1.7, -0.3), (1.2, -0.3))
 
 
@@ -89,6 +92,27 @@ def test_the_covariance_of_a_homography_is_that_of_its_errors_over_many_floors(w
     by_noise, whole = np.mean(squares, axis=0)
     assert by_noise > 2.0  # what the images alone say is too good
     assert 0.75 < whole < 1.3
+
+
+@pytest.mark.parametrize(("waypoints", "duration"), [(SHORT, 4.4), (ROUND, 8.0), (AWAY, 12.0)],
+                         ids=["short", "round", "away"])  # fmt: skip
+def test_the_covariance_of_a_span_is_that_of_its_errors_over_many_floors(waypoints, duration):
+    """Three runs of eight on a way of 21.5 m rejected a right relative pose for the spans of a straight drive."""
+    squares, n = [], (PLANES[0].N / PLANES[0].d)[None]
+    for seed in range(60):
+        found = seen(waypoints, duration, seed, SIGMA)
+        fit = fit_homography(found.pairs)
+        h, tilt = error(fit), FloorTilt.of(fit, found, PLANES, BOTH, SIGMA)
+        row = []
+        for known in (None, tilt):
+            spans = marker_spans({"C": (0, 1)}, found, fit, np.zeros((len(found), 2, 0)), known)
+            (model,) = SpanModel.near(spans, n, np.zeros(1), [MARKERS.span])
+            off = Spans([model]).at(n, np.zeros(1))[0][0] + model.by_h @ h
+            row.append(off @ off / 3)
+        squares.append(row)
+    by_noise, whole = np.mean(squares, axis=0)
+    assert by_noise > 1.4  # of the short drives, 18
+    assert 0.6 < whole < 1.2
 
 
 def test_driving_there_and_back_longer_makes_the_floor_no_better_known():

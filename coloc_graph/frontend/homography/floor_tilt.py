@@ -38,12 +38,15 @@ class FloorTilt:
         From there to the marker (n, 2) [m], by which a slope lifts it.
     homography
         Derivatives (8, n) of the homography's sl(3) coordinates on the right by it [1/m].
+    lifted
+        Derivatives (2, n, 2) of the points in both images by it [1/m].
     """
 
     sigma: float
     middle: Array
     arm: Array
     homography: Array
+    lifted: Array
 
     @classmethod
     def of(
@@ -67,7 +70,8 @@ class FloorTilt:
         good = np.isfinite(np.concatenate([middle, *shifts], axis=1)).all(axis=1)
         middle, arm, in_i, in_j = (np.where(good[:, None], one, 0.0) for one in (middle, arm, *shifts))
         sensitivity = Sensitivity(fit, found.pairs)
-        return cls(sigma, middle, arm, sensitivity.by_points(sensitivity.whitened((in_i, in_j))))
+        homography = sensitivity.by_points(sensitivity.whitened((in_i, in_j)))
+        return cls(sigma, middle, arm, homography, np.stack([in_i, in_j]))
 
     def covariance(self, tracks: NDArray[np.int64], times: Array) -> Array:
         """Compute the covariance (8, 8) of the homography's coordinates by the slope.
@@ -77,6 +81,19 @@ class FloorTilt:
         by_slope = self.homography[:, :, None] * self.arm
         middle, by_slope = _in_blocks(self.middle, by_slope, np.lexsort((times, tracks)))
         return np.asarray(self.sigma**2 * np.einsum("anc,nm,bmc->ab", by_slope, alike(middle), by_slope, optimize=True))
+
+    def of_spans(self, both: NDArray[np.int64], by_j: Array, B: Array) -> Array:
+        """Compute `MarkerSpan.uneven` (m, 2, 2) of pairs `both` (m, 2) of inliers, the two markers at m instants.
+
+        `by_j` (n, 2, 2) are the derivatives of fused positions by those in image j, `B` (n, 2, 2) those of positions
+        in image j by those in image i. Instants at one place have one slope: each has the variance of all of them. It
+        lifts one marker as far as it lowers the other.
+        """
+        in_i, in_j = self.lifted[:, both]
+        shift = in_i + (by_j[both] @ (in_j - (B[both] @ in_i[..., None])[..., 0])[..., None])[..., 0]
+        repeats = alike(self.middle[both[:, 0]]).sum(axis=1)
+        lift = np.hypot(*np.moveaxis(self.arm[both], -1, 0)) * np.array([1.0, -1.0])
+        return np.asarray(self.sigma * (np.sqrt(repeats)[:, None] * lift)[..., None] * shift)
 
     def widened(self, fit: HomographyFit, found: Correspondences) -> HomographyFit:
         """Return the fit with the slope in its information."""
