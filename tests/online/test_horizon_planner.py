@@ -93,6 +93,14 @@ def test_another_attempt_turns_the_drive_round_and_a_third_chooses_another_targe
     assert math.hypot(x, y) + abs(yaw) > 0.1
 
 
+def test_a_target_from_which_stances_did_not_bring_the_team_on_is_not_chosen_again(mission):
+    leaper, target = mission.plan(1).leap
+    mission.planner._stood += [{**mission.registry.poses(("A", "B")), leaper: target}] * 3
+    _, other = mission.plan(2).leap
+    x, y, yaw = between(target, other)
+    assert math.hypot(x, y) + abs(yaw) > 0.1
+
+
 def test_a_stance_that_came_makes_the_team_better_known_and_spends_its_time(mission, tmp_path):
     plan = mission.plan(0)
     poses = mission.registry.poses()

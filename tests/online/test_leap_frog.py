@@ -255,6 +255,17 @@ def test_nobody_leaps_without_an_anchor(tmp_path):
     mission.close()
 
 
+def plan_after_one_stance(mission):
+    """Have the stance after the first one planned, and its robots sent off."""
+    mission.step(MissionState.GATHERING)
+    for name in "ABC":
+        mission.report(name)
+    mission.leap_frog.stances.append(Stance(0, 0.0, mission.registry.utc(), ("A", "B"), ("C",)))
+    mission.step(MissionState.SYNCHRONISING)
+    mission.step(MissionState.PLANNING)
+    mission.await_plan()
+
+
 TARGET, DRIVE = (1.3, 0.1, -0.1), np.array([[2.2, -0.05], [2.4, 0.1], [2.3, 0.0]])
 
 
@@ -271,13 +282,7 @@ class Leaping(LeapPlanner):
 def test_an_observer_that_leapt_and_looks_past_the_drive_is_turned_as_another_sees_it(tmp_path, astray, turns):
     team = field_team()
     mission = Mission(tmp_path, Leaping(team, "C", Formation(Course(((0.0, 0.0), (5.0, 0.0))), ("A", "B"))))
-    mission.step(MissionState.GATHERING)
-    for name in "ABC":
-        mission.report(name)
-    mission.leap_frog.stances.append(Stance(0, 0.0, mission.registry.utc(), ("A", "B"), ("C",)))
-    mission.step(MissionState.SYNCHRONISING)
-    mission.step(MissionState.PLANNING)
-    mission.await_plan()
+    plan_after_one_stance(mission)
     # by their wheels both have arrived
     for name, place in (("A", TARGET), ("C", (*DRIVE[0], 0.3))):
         mission.registry[name].tracker.fix(mission.registry.utc(), place)
@@ -318,13 +323,7 @@ class Through(LeapPlanner):
 
 def test_a_robot_is_not_sent_off_where_another_stands_in_its_way(tmp_path):
     mission = Mission(tmp_path, Through(field_team(), "C", Formation(Course(((0.0, 0.0), (5.0, 0.0))), ("A", "B"))))
-    mission.step(MissionState.GATHERING)
-    for name in "ABC":
-        mission.report(name)
-    mission.leap_frog.stances.append(Stance(0, 0.0, mission.registry.utc(), ("A", "B"), ("C",)))
-    mission.step(MissionState.SYNCHRONISING)
-    mission.step(MissionState.PLANNING)
-    mission.await_plan()
+    plan_after_one_stance(mission)
     assert mission.leap_frog.states.now == MissionState.HOLDING
     assert not [name for name, body in mission.link.asked if isinstance(body, Drive) and name == "A"]
     assert "A is not sent off: B stands in its way" in (tmp_path / "mission.jsonl").read_text(encoding="utf-8")
